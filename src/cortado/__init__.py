@@ -1,0 +1,53 @@
+"""Cortado: a differentiable SPH fluid simulator with verified gradients.
+
+Names are imported when they are first used, so that ``import cortado`` is quick.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cortado import losses as losses
+    from cortado import optimisers as optimisers
+    from cortado import policies as policies
+    from cortado.errors import ComputationError as ComputationError
+    from cortado.errors import CortadoError as CortadoError
+    from cortado.errors import DivergedError as DivergedError
+    from cortado.errors import InputError as InputError
+    from cortado.errors import SceneError as SceneError
+    from cortado.optimisation import optimise as optimise
+    from cortado.problem import Problem as Problem
+    from cortado.scene import Scene as Scene
+    from cortado.scene import load_scene as load_scene
+    from cortado.simulation import Simulation as Simulation
+    from cortado.trajectory import Trajectory as Trajectory
+
+__version__ = "0.1.0"
+
+_MODULES = ("losses", "optimisers", "policies")
+_HOMES = {
+    "ComputationError": "errors",
+    "CortadoError": "errors",
+    "DivergedError": "errors",
+    "InputError": "errors",
+    "Problem": "problem",
+    "Scene": "scene",
+    "SceneError": "errors",
+    "Simulation": "simulation",
+    "Trajectory": "trajectory",
+    "load_scene": "scene",
+    "optimise": "optimisation",
+}
+__all__ = [*_MODULES, *_HOMES]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return importlib.import_module(f"cortado.{name}")
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"cortado.{_HOMES[name]}"), name)
+    raise AttributeError(f"module 'cortado' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -1,0 +1,95 @@
+"""What a rollout is judged by: objects with a value and an adjoint at the end of the trajectory."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+from cortado.errors import InputError
+from cortado.particles import State
+from cortado.precision import FLOAT32, FLOAT64
+
+
+@dataclass(frozen=True)
+class TrajectoryEnd:
+    """The last state of a rollout, as NumPy arrays or as Warp arrays, in the scene's order of particles."""
+
+    state: State
+    """Warp arrays of vectors (n,): positions [m] and velocities [m / s]."""
+    dimension: int
+
+    @cached_property
+    def positions(self) -> np.ndarray:
+        """(n, d) [m], float64"""
+        return self.state.positions.numpy()[:, : self.dimension].astype(np.float64)
+
+    @cached_property
+    def velocities(self) -> np.ndarray:
+        """(n, d) [m / s], float64"""
+        return self.state.velocities.numpy()[:, : self.dimension].astype(np.float64)
+
+
+class Loss(Protocol):
+    """A differentiable number of the end of a trajectory."""
+
+    def value(self, end: TrajectoryEnd) -> float:
+        """The loss."""
+
+    def adjoint(self, end: TrajectoryEnd) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of the loss with respect to positions and velocities, (n, d) each."""
+
+
+class FinalPositions:
+    """Mean over particles of the squared distance to their targets [m2] (the report's 6.2.2, for one particle)."""
+
+    def __init__(self, target: np.ndarray):
+        """``target`` (n, d) [m], in the scene's order."""
+        self.target = np.asarray(target, dtype=np.float64)
+        if self.target.ndim != 2 or not np.isfinite(self.target).all():
+            raise InputError(f"target has shape {self.target.shape}, but must be (particles, dimension) and finite.")
+
+    def value(self, end: TrajectoryEnd) -> float:
+        return float((self._miss(end) ** 2).sum() / len(self.target))
+
+    def adjoint(self, end: TrajectoryEnd) -> tuple[np.ndarray, np.ndarray]:
+        return 2.0 / len(self.target) * self._miss(end), np.zeros_like(self.target)
+
+    def _miss(self, end: TrajectoryEnd) -> np.ndarray:
+        if end.positions.shape != self.target.shape:
+            raise InputError(f"target has shape {self.target.shape}, but must be {end.positions.shape}.")
+        return end.positions - self.target
+
+
+WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
+
+
+class Recorded:
+    """A loss that is any function of Warp arrays, differentiated by Warp's tape.
+
+    ``function(positions, velocities, loss)`` launches kernels that add to ``loss``, an array (1,) of the precision of
+    the (n,) vectors it is given. Mind Warp's rules for kernels that loop: a sum that is used non-linearly belongs
+    into a function of its own.
+    """
+
+    def __init__(self, function: WarpFunction):
+        self.function = function
+
+    def value(self, end: TrajectoryEnd) -> float:
+        loss, _, _ = self._run(end)
+        return float(loss.numpy()[0])
+
+    def adjoint(self, end: TrajectoryEnd) -> tuple[np.ndarray, np.ndarray]:
+        with wp.Tape() as tape:
+            loss, positions, velocities = self._run(end)
+        tape.backward(loss)
+        return tuple(array.grad.numpy()[:, : end.dimension].astype(np.float64) for array in (positions, velocities))  # type: ignore[return-value]
+
+    def _run(self, end: TrajectoryEnd) -> tuple[wp.array, wp.array, wp.array]:
+        copies = [wp.clone(a, requires_grad=True) for a in (end.state.positions, end.state.velocities)]
+        precision = FLOAT64 if copies[0].dtype == FLOAT64.vector else FLOAT32
+        loss = wp.zeros(1, dtype=precision.real, device=copies[0].device, requires_grad=True)
+        self.function(copies[0], copies[1], loss)
+        return loss, copies[0], copies[1]

@@ -1,0 +1,118 @@
+"""Density by summation (report eq. 5, with the wall masses of Akinci et al. 2012):
+
+rho_i = m (W(0) + sum_j W_ij + sum_b (psi_b / m) W_ib),  m = rho_0 V_0.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
+
+
+@cache
+def density_sums(discretisation: Discretisation) -> SimpleNamespace:
+    """Raw neighbour sums: ``weights`` (sum of W, without the particle itself), ``weights_tangent`` and
+    ``weights_adjoint`` (sum_j (r_i + r_j) G_ij + sum_b (psi_b / m) r_i G_ib: the adjoint of positions for an
+    adjoint r of the sum of every particle)."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    surroundings = surroundings_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    separation, weight, gradient = pair.separation, pair.weight, pair.gradient
+
+    @wp.func
+    def weights(i: int, x: wp.array(dtype=vector), s: surroundings) -> real:
+        x_i = x[i]
+        total = real(0.0)
+        for k in range(s.fluid_count[i]):
+            total += weight(separation(x_i, x[s.neighbours[k, i]], s), s)
+        for k in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[k, i]
+            total += s.wall_weights[b] * weight(separation(x_i, s.wall_positions[b], s), s)
+        return total
+
+    @wp.func
+    def weights_tangent(i: int, x: wp.array(dtype=vector), x_dot: wp.array(dtype=vector), s: surroundings) -> real:
+        x_i = x[i]
+        x_dot_i = x_dot[i]
+        total = real(0.0)
+        for k in range(s.fluid_count[i]):
+            j = s.neighbours[k, i]
+            total += wp.dot(gradient(separation(x_i, x[j], s), s), x_dot_i - x_dot[j])
+        for k in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[k, i]
+            g_ib = gradient(separation(x_i, s.wall_positions[b], s), s)
+            total += s.wall_weights[b] * wp.dot(g_ib, x_dot_i)
+        return total
+
+    @wp.func
+    def weights_adjoint(i: int, x: wp.array(dtype=vector), r: wp.array(dtype=real), s: surroundings) -> vector:
+        x_i = x[i]
+        r_i = r[i]
+        total = vector()
+        for k in range(s.fluid_count[i]):
+            j = s.neighbours[k, i]
+            total += (r_i + r[j]) * gradient(separation(x_i, x[j], s), s)
+        for k in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[k, i]
+            total += (s.wall_weights[b] * r_i) * gradient(separation(x_i, s.wall_positions[b], s), s)
+        return total
+
+    return SimpleNamespace(weights=weights, weights_tangent=weights_tangent, weights_adjoint=weights_adjoint)
+
+
+@cache
+def density_kernels(discretisation: Discretisation) -> SimpleNamespace:
+    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the density at given positions."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    surroundings = surroundings_type(discretisation.precision)
+    sums = density_sums(discretisation)
+    weights, weights_tangent, weights_adjoint = sums.weights, sums.weights_tangent, sums.weights_adjoint
+
+    @wp.kernel(module=discretisation.module(True))
+    def density(
+        s: surroundings,
+        rest_density: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        # out
+        rho: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        total = weights(i, x, s)
+        rho[i] = rest_density[0] * s.volume * (s.self_weight + total)
+
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    def density_tangent(
+        s: surroundings,
+        rest_density: wp.array(dtype=real),
+        rest_density_dot: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        rho: wp.array(dtype=real),
+        # out
+        rho_dot: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        total = weights_tangent(i, x, x_dot, s)
+        scaling = rest_density_dot[0] / rest_density[0]
+        rho_dot[i] = rest_density[0] * s.volume * total + rho[i] * scaling
+
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    def density_adjoint(
+        s: surroundings,
+        rest_density: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        rho: wp.array(dtype=real),
+        rho_bar: wp.array(dtype=real),
+        # in and out
+        x_bar: wp.array(dtype=vector),
+        scalars_bar: wp.array(dtype=vector),
+    ):
+        """``scalars_bar`` gathers the adjoints of (rest density, viscosity, time step), particle by particle."""
+        i = wp.tid()
+        total = weights_adjoint(i, x, rho_bar, s)
+        x_bar[i] = x_bar[i] + rest_density[0] * s.volume * total
+        scalars_bar[i] = scalars_bar[i] + vector(rho_bar[i] * rho[i] / rest_density[0], real(0.0), real(0.0))
+
+    return SimpleNamespace(forward=density, tangent=density_tangent, adjoint=density_adjoint)

@@ -1,0 +1,172 @@
+"""Semi-implicit Euler (report eqs. 3 and 4), gravity (eq. 8), and the way between scene order and sorted order."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from cortado.precision import Precision
+
+
+def _module(precision: Precision, differentiable: bool):
+    kind = "forward" if differentiable else "derivative"
+    module = wp.get_module(f"cortado_integration_{kind}_{precision.name}")
+    module.options["enable_backward"] = differentiable
+    return module
+
+
+@cache
+def prediction_functions(precision: Precision) -> SimpleNamespace:
+    """``adjoint``: what one prediction v* = v + dt a, x* = x + dt v* adds to the adjoints of the scalars."""
+    real, vector = precision.real, precision.vector
+
+    @wp.func
+    def adjoint(x_star_bar: vector, speed_bar: vector, v: vector, v_star: vector, dt: real) -> vector:
+        time_step_bar = wp.dot(x_star_bar, v_star) + wp.dot(speed_bar, v_star - v) / dt
+        return vector(real(0.0), real(0.0), time_step_bar)
+
+    return SimpleNamespace(adjoint=adjoint)
+
+
+@cache
+def gravity_kernels(precision: Precision) -> SimpleNamespace:
+    """Kernels ``forward``, ``tangent`` and ``adjoint`` of an acceleration that is the same everywhere."""
+    vector = precision.vector
+
+    @wp.kernel(module=_module(precision, True))
+    def gravity(
+        table: wp.array(dtype=vector),
+        step: wp.array(dtype=wp.int32),
+        acceleration_in: wp.array(dtype=vector),
+        # out
+        acceleration: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        acceleration[i] = acceleration_in[i] + table[step[0]]
+
+    @wp.kernel(module=_module(precision, False), enable_backward=False)
+    def gravity_adjoint(
+        total: wp.array(dtype=vector),
+        step: wp.array(dtype=wp.int32),
+        # out
+        table_bar: wp.array(dtype=vector),
+    ):
+        table_bar[step[0]] = total[0]
+
+    return SimpleNamespace(forward=gravity, tangent=gravity, adjoint=gravity_adjoint)
+
+
+@cache
+def integration_kernels(precision: Precision) -> SimpleNamespace:
+    """Kernels of the time step: ``sort`` and ``unsort`` a state, ``predict`` without pressure, and derivatives."""
+    real, vector = precision.real, precision.vector
+    adjoin_prediction = prediction_functions(precision).adjoint
+
+    @wp.kernel(module=_module(precision, True))
+    def sort(
+        order: wp.array(dtype=wp.int32),
+        x_scene: wp.array(dtype=vector),
+        v_scene: wp.array(dtype=vector),
+        # out
+        x: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        x[i] = x_scene[order[i]]
+        v[i] = v_scene[order[i]]
+
+    @wp.kernel(module=_module(precision, True))
+    def unsort(
+        order: wp.array(dtype=wp.int32),
+        x: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
+        # out
+        x_scene: wp.array(dtype=vector),
+        v_scene: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        x_scene[order[i]] = x[i]
+        v_scene[order[i]] = v[i]
+
+    @wp.kernel(module=_module(precision, True))
+    def predict(
+        time_step: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
+        acceleration: wp.array(dtype=vector),
+        # out
+        x_star: wp.array(dtype=vector),
+        v_star: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        velocity = v[i] + time_step[0] * acceleration[i]
+        v_star[i] = velocity
+        x_star[i] = x[i] + time_step[0] * velocity
+
+    @wp.kernel(module=_module(precision, False), enable_backward=False)
+    def predict_tangent(
+        time_step: wp.array(dtype=real),
+        time_step_dot: wp.array(dtype=real),
+        x_dot: wp.array(dtype=vector),
+        v_dot: wp.array(dtype=vector),
+        acceleration: wp.array(dtype=vector),
+        acceleration_dot: wp.array(dtype=vector),
+        v_star: wp.array(dtype=vector),
+        # out
+        x_star_dot: wp.array(dtype=vector),
+        v_star_dot: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        dt = time_step[0]
+        velocity_dot = v_dot[i] + dt * acceleration_dot[i] + time_step_dot[0] * acceleration[i]
+        v_star_dot[i] = velocity_dot
+        x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[0] * v_star[i]
+
+    @wp.kernel(module=_module(precision, False), enable_backward=False)
+    def begin_adjoint(
+        order: wp.array(dtype=wp.int32),
+        time_step: wp.array(dtype=real),
+        v: wp.array(dtype=vector),
+        v_star: wp.array(dtype=vector),
+        x_scene_bar: wp.array(dtype=vector),
+        v_scene_bar: wp.array(dtype=vector),
+        # in and out
+        scalars_bar: wp.array(dtype=vector),
+        # out
+        x_bar: wp.array(dtype=vector),
+        v_bar: wp.array(dtype=vector),
+        push_bar: wp.array(dtype=vector),
+        rho_bar: wp.array(dtype=real),
+        p_bar: wp.array(dtype=real),
+    ):
+        """From the adjoint of the new state, in scene order, to that of the last prediction."""
+        i = wp.tid()
+        dt = time_step[0]
+        x_star_bar = x_scene_bar[order[i]]
+        speed_bar = v_scene_bar[order[i]] + dt * x_star_bar
+        x_bar[i] = x_star_bar
+        v_bar[i] = speed_bar
+        push_bar[i] = dt * speed_bar
+        rho_bar[i] = real(0.0)
+        p_bar[i] = real(0.0)
+        scalars_bar[i] = scalars_bar[i] + adjoin_prediction(x_star_bar, speed_bar, v[i], v_star[i], dt)
+
+    @wp.kernel(module=_module(precision, False), enable_backward=False)
+    def acceleration_adjoint(
+        time_step: wp.array(dtype=real),
+        v_bar: wp.array(dtype=vector),
+        # out
+        acceleration_bar: wp.array(dtype=vector),
+    ):
+        """Every prediction of the step used v + dt a, so that one adjoint is dt times the other."""
+        i = wp.tid()
+        acceleration_bar[i] = time_step[0] * v_bar[i]
+
+    return SimpleNamespace(
+        sort=sort,
+        unsort=unsort,
+        predict=predict,
+        predict_tangent=predict_tangent,
+        begin_adjoint=begin_adjoint,
+        acceleration_adjoint=acceleration_adjoint,
+    )

@@ -1,0 +1,280 @@
+"""One predictive-corrective iteration (Solenthaler and Pajarola 2009; report eqs. 6 and 9, put right):
+
+    p_i  = max(p_i + delta (rho*_i - rho_0), 0),   delta = k / dt^2
+    c_i  = p_i / rho_i^2
+    ap_i = -m (sum_j (c_i + c_j) G_ij + sum_b (psi_b / m) c_i G_ib)
+    v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
+
+G is taken at x(t), rho* at the predicted positions over the neighbours of x(t). After the last iteration
+(x*, v*) is the new state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from cortado.physics.density import density_sums
+from cortado.physics.integration import prediction_functions
+from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
+
+
+@cache
+def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
+    """Kernels ``forward``, ``tangent``, ``adjoint`` of the pressure from the predicted density."""
+    real, vector, pair_of = (
+        discretisation.precision.real,
+        discretisation.precision.vector,
+        discretisation.precision.pair,
+    )
+    surroundings = surroundings_type(discretisation.precision)
+    sums = density_sums(discretisation)
+    weights, weights_tangent, weights_adjoint = sums.weights, sums.weights_tangent, sums.weights_adjoint
+    adjoin_prediction = prediction_functions(discretisation.precision).adjoint
+
+    @wp.kernel(module=discretisation.module(True))
+    def pressure(
+        s: surroundings,
+        stiffness: real,
+        rest_density: wp.array(dtype=real),
+        time_step: wp.array(dtype=real),
+        rho: wp.array(dtype=real),
+        x_star: wp.array(dtype=vector),
+        p_in: wp.array(dtype=real),
+        # out
+        p_out: wp.array(dtype=real),
+        c: wp.array(dtype=real),
+        error: wp.array(dtype=pair_of),
+    ):
+        """``error``: the compression (rho* - rho_0)+ / rho_0 of a particle, twice (for a sum and a maximum)."""
+        i = wp.tid()
+        total = weights(i, x_star, s)
+        rho_0 = rest_density[0]
+        excess = rho_0 * s.volume * (s.self_weight + total) - rho_0
+        delta = stiffness / (time_step[0] * time_step[0])
+        p_i = wp.max(p_in[i] + delta * excess, real(0.0))
+        compression = wp.max(excess / rho_0, real(0.0))
+        p_out[i] = p_i
+        c[i] = p_i / (rho[i] * rho[i])
+        error[i] = pair_of(compression, compression)
+
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    def pressure_tangent(
+        s: surroundings,
+        stiffness: real,
+        rest_density: wp.array(dtype=real),
+        rest_density_dot: wp.array(dtype=real),
+        time_step: wp.array(dtype=real),
+        time_step_dot: wp.array(dtype=real),
+        rho: wp.array(dtype=real),
+        rho_dot: wp.array(dtype=real),
+        x_star: wp.array(dtype=vector),
+        x_star_dot: wp.array(dtype=vector),
+        p_in: wp.array(dtype=real),
+        p_in_dot: wp.array(dtype=real),
+        p_out: wp.array(dtype=real),
+        # out
+        p_out_dot: wp.array(dtype=real),
+        c_dot: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        total = weights_tangent(i, x_star, x_star_dot, s)
+        p_i = p_out[i]
+        p_dot_i = real(0.0)
+        if p_i > real(0.0):
+            delta = stiffness / (time_step[0] * time_step[0])
+            excess = (p_i - p_in[i]) / delta
+            excess_dot = rest_density[0] * s.volume * total + excess * rest_density_dot[0] / rest_density[0]
+            delta_dot = real(-2.0) * delta * time_step_dot[0] / time_step[0]
+            p_dot_i = p_in_dot[i] + delta * excess_dot + delta_dot * excess
+        rho_i = rho[i]
+        p_out_dot[i] = p_dot_i
+        c_dot[i] = (p_dot_i - real(2.0) * p_i / rho_i * rho_dot[i]) / (rho_i * rho_i)
+
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    def pressure_adjoint(
+        s: surroundings,
+        rest_density: wp.array(dtype=real),
+        time_step: wp.array(dtype=real),
+        v: wp.array(dtype=vector),
+        x_star: wp.array(dtype=vector),
+        v_star: wp.array(dtype=vector),
+        r: wp.array(dtype=real),
+        # in and out
+        x_bar: wp.array(dtype=vector),
+        v_bar: wp.array(dtype=vector),
+        scalars_bar: wp.array(dtype=vector),
+        # out
+        push_bar: wp.array(dtype=vector),
+    ):
+        """From the adjoint r of rho* to that of x*, and on to what x* was predicted from."""
+        i = wp.tid()
+        total = weights_adjoint(i, x_star, r, s)
+        x_star_bar = rest_density[0] * s.volume * total
+        dt = time_step[0]
+        speed_bar = dt * x_star_bar
+        x_bar[i] = x_bar[i] + x_star_bar
+        v_bar[i] = v_bar[i] + speed_bar
+        push_bar[i] = dt * speed_bar
+        scalars_bar[i] = scalars_bar[i] + adjoin_prediction(x_star_bar, speed_bar, v[i], v_star[i], dt)
+
+    return SimpleNamespace(forward=pressure, tangent=pressure_tangent, adjoint=pressure_adjoint)
+
+
+@cache
+def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
+    """Kernels ``forward``, ``tangent``, ``adjoint`` of the pressure force and the prediction that follows it."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    surroundings = surroundings_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    separation, gradient, hessian_product = pair.separation, pair.gradient, pair.hessian_product
+
+    @wp.func
+    def force_sum(i: int, x: wp.array(dtype=vector), c: wp.array(dtype=real), s: surroundings) -> vector:
+        x_i = x[i]
+        c_i = c[i]
+        total = vector()
+        for k in range(s.fluid_count[i]):
+            j = s.neighbours[k, i]
+            total += (c_i + c[j]) * gradient(separation(x_i, x[j], s), s)
+        for k in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[k, i]
+            total += (s.wall_weights[b] * c_i) * gradient(separation(x_i, s.wall_positions[b], s), s)
+        return total
+
+    @wp.func
+    def force_sum_tangent(
+        i: int,
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        c: wp.array(dtype=real),
+        c_dot: wp.array(dtype=real),
+        s: surroundings,
+    ) -> vector:
+        x_i = x[i]
+        x_dot_i = x_dot[i]
+        c_i = c[i]
+        c_dot_i = c_dot[i]
+        total = vector()
+        for k in range(s.fluid_count[i]):
+            j = s.neighbours[k, i]
+            x_ij = separation(x_i, x[j], s)
+            total += (c_dot_i + c_dot[j]) * gradient(x_ij, s)
+            total += (c_i + c[j]) * hessian_product(x_ij, x_dot_i - x_dot[j], s)
+        for k in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[k, i]
+            x_ib = separation(x_i, s.wall_positions[b], s)
+            total += (s.wall_weights[b] * c_dot_i) * gradient(x_ib, s)
+            total += (s.wall_weights[b] * c_i) * hessian_product(x_ib, x_dot_i, s)
+        return total
+
+    @wp.kernel(module=discretisation.module(True))
+    def pressure_force(
+        s: surroundings,
+        rest_density: wp.array(dtype=real),
+        time_step: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
+        acceleration: wp.array(dtype=vector),
+        c: wp.array(dtype=real),
+        # out
+        x_star: wp.array(dtype=vector),
+        v_star: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        total = force_sum(i, x, c, s)
+        dt = time_step[0]
+        push = -(rest_density[0] * s.volume) * total
+        velocity = v[i] + dt * (acceleration[i] + push)
+        v_star[i] = velocity
+        x_star[i] = x[i] + dt * velocity
+
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    def pressure_force_tangent(
+        s: surroundings,
+        rest_density: wp.array(dtype=real),
+        rest_density_dot: wp.array(dtype=real),
+        time_step: wp.array(dtype=real),
+        time_step_dot: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
+        v_dot: wp.array(dtype=vector),
+        acceleration: wp.array(dtype=vector),
+        acceleration_dot: wp.array(dtype=vector),
+        c: wp.array(dtype=real),
+        c_dot: wp.array(dtype=real),
+        v_star: wp.array(dtype=vector),
+        # out
+        x_star_dot: wp.array(dtype=vector),
+        v_star_dot: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        total_dot = force_sum_tangent(i, x, x_dot, c, c_dot, s)
+        dt = time_step[0]
+        accelerated = (v_star[i] - v[i]) / dt
+        push = accelerated - acceleration[i]
+        push_dot = -(rest_density[0] * s.volume) * total_dot + (rest_density_dot[0] / rest_density[0]) * push
+        velocity_dot = v_dot[i] + dt * (acceleration_dot[i] + push_dot) + time_step_dot[0] * accelerated
+        v_star_dot[i] = velocity_dot
+        x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[0] * v_star[i]
+
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    def pressure_force_adjoint(
+        s: surroundings,
+        stiffness: real,
+        rest_density: wp.array(dtype=real),
+        time_step: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        rho: wp.array(dtype=real),
+        p_in: wp.array(dtype=real),
+        p_out: wp.array(dtype=real),
+        c: wp.array(dtype=real),
+        push_bar: wp.array(dtype=vector),
+        # in and out
+        x_bar: wp.array(dtype=vector),
+        rho_bar: wp.array(dtype=real),
+        p_bar: wp.array(dtype=real),
+        scalars_bar: wp.array(dtype=vector),
+        # out
+        r: wp.array(dtype=real),
+    ):
+        """From the adjoint of the pressure acceleration to those of c, p and (r) of rho*: every sum a gather."""
+        i = wp.tid()
+        x_i = x[i]
+        c_i = c[i]
+        push_bar_i = push_bar[i]
+        stretch = real(0.0)
+        bend = vector()
+        for k in range(s.fluid_count[i]):
+            j = s.neighbours[k, i]
+            x_ij = separation(x_i, x[j], s)
+            u_ij = push_bar_i - push_bar[j]
+            stretch += wp.dot(gradient(x_ij, s), u_ij)
+            bend += (c_i + c[j]) * hessian_product(x_ij, u_ij, s)
+        for k in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[k, i]
+            x_ib = separation(x_i, s.wall_positions[b], s)
+            stretch += s.wall_weights[b] * wp.dot(gradient(x_ib, s), push_bar_i)
+            bend += (s.wall_weights[b] * c_i) * hessian_product(x_ib, push_bar_i, s)
+        mass = rest_density[0] * s.volume
+        rho_i = rho[i]
+        p_i = p_out[i]
+        delta = stiffness / (time_step[0] * time_step[0])
+        c_bar = -mass * stretch
+        p_bar_i = real(0.0)
+        if p_i > real(0.0):
+            p_bar_i = p_bar[i] + c_bar / (rho_i * rho_i)
+        r_i = delta * p_bar_i
+        excess = (p_i - p_in[i]) / delta
+        x_bar[i] = x_bar[i] - mass * bend
+        rho_bar[i] = rho_bar[i] - real(2.0) * c_i / rho_i * c_bar
+        p_bar[i] = p_bar_i
+        r[i] = r_i
+        scalars_bar[i] = scalars_bar[i] + vector(
+            (r_i * excess + c_i * c_bar) / rest_density[0],
+            real(0.0),
+            real(-2.0) * r_i * excess / time_step[0],
+        )
+
+    return SimpleNamespace(forward=pressure_force, tangent=pressure_force_tangent, adjoint=pressure_force_adjoint)

@@ -1,0 +1,99 @@
+"""What a particle sees: its neighbours and the walls, as one argument of every kernel that sums over them."""
+
+from dataclasses import dataclass
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from cortado.precision import Precision
+from cortado.smoothing import SmoothingKernel, smoothing_functions
+
+
+@dataclass(frozen=True)
+class Discretisation:
+    """A smoothing kernel in a precision: what a kernel factory is asked for."""
+
+    smoothing: SmoothingKernel
+    precision: Precision
+
+    def module(self, differentiable: bool, topic: str = "pcisph") -> Any:
+        """The Warp module of these kernels; only the forward kernels get Warp's own adjoint (for `policies.Tape`)."""
+        kind = "forward" if differentiable else "derivative"
+        module = wp.get_module(f"cortado_{topic}_{kind}_{self.smoothing.name}_{self.precision.name}")
+        module.options["enable_backward"] = differentiable
+        return module
+
+
+@cache
+def surroundings_type(precision: Precision) -> Any:
+    """The Warp struct of one precision; arrays are sorted by cell, lists are [neighbour, particle]."""
+    real, vector = precision.real, precision.vector
+
+    class Surroundings:
+        neighbours: wp.array2d(dtype=wp.int32)
+        """First the fluid neighbours of a particle (without itself), then its wall neighbours."""
+        fluid_count: wp.array(dtype=wp.int32)
+        count: wp.array(dtype=wp.int32)
+        wall_positions: wp.array(dtype=vector)
+        """[m]"""
+        wall_weights: wp.array(dtype=real)
+        """psi_b / m [-]: the mass of a wall particle over that of a fluid particle (Akinci et al. 2012)."""
+        support: real
+        """Support radius h [m]."""
+        reach: real
+        """Neighbours are listed up to this distance [m], a little beyond the support."""
+        normalisation: real
+        """sigma of the kernel [1 / m^d]."""
+        self_weight: real
+        """W(0) [1 / m^d]."""
+        volume: real
+        """Rest volume of a particle [m^d]: with it the lattice of the rest spacing has the rest density."""
+        periodic: wp.int32
+        period: vector
+        """[m], 0 along an axis that is not periodic."""
+        frequency: vector
+        """1 / period [1 / m], or 0."""
+
+    Surroundings.__qualname__ = f"Surroundings_{precision.name}"
+    Surroundings.__name__ = Surroundings.__qualname__
+    return wp.struct(Surroundings)
+
+
+@cache
+def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
+    """Warp functions of a separation in given surroundings: ``separation``, ``weight``, ``gradient``,
+    ``hessian_product``."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    surroundings = surroundings_type(discretisation.precision)
+    smooth = smoothing_functions(discretisation.smoothing, discretisation.precision)
+    smooth_weight, smooth_gradient = smooth.weight, smooth.gradient
+    smooth_hessian_product = smooth.hessian_product
+
+    @wp.func
+    def separation(x_i: vector, x_j: vector, s: surroundings) -> vector:
+        """x_i - x_j, of the nearest image."""
+        x_ij = x_i - x_j
+        if s.periodic != 0:
+            turns = vector(
+                wp.round(x_ij[0] * s.frequency[0]),
+                wp.round(x_ij[1] * s.frequency[1]),
+                wp.round(x_ij[2] * s.frequency[2]),
+            )
+            return x_ij - wp.cw_mul(turns, s.period)
+        return x_ij
+
+    @wp.func
+    def weight(x: vector, s: surroundings) -> real:
+        return smooth_weight(x, s.support, s.normalisation)
+
+    @wp.func
+    def gradient(x: vector, s: surroundings) -> vector:
+        return smooth_gradient(x, s.support, s.normalisation)
+
+    @wp.func
+    def hessian_product(x: vector, u: vector, s: surroundings) -> vector:
+        return smooth_hessian_product(x, u, s.support, s.normalisation)
+
+    return SimpleNamespace(separation=separation, weight=weight, gradient=gradient, hessian_product=hessian_product)

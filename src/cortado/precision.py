@@ -1,0 +1,38 @@
+"""The two floating-point precisions as objects: scalar, vector and NumPy types that belong together."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.errors import InputError
+
+
+@dataclass(frozen=True)
+class Precision:
+    """One floating-point format, in the three spellings that the code needs."""
+
+    name: str
+    real: Any
+    """Warp scalar type."""
+    vector: Any
+    """Warp vector type of three components (z is 0 in two dimensions)."""
+    pair: Any
+    """Warp vector type of two components."""
+    numpy: type
+    """NumPy scalar type."""
+    tiny: float
+    """A number that is far below round-off of 1, and whose reciprocal is finite."""
+
+
+FLOAT32 = Precision("float32", wp.float32, wp.vec3f, wp.vec2f, np.float32, 1e-30)
+FLOAT64 = Precision("float64", wp.float64, wp.vec3d, wp.vec2d, np.float64, 1e-200)
+
+
+def precision_named(name: str) -> Precision:
+    """The precision called ``"float32"`` or ``"float64"``; raises `InputError` for any other name."""
+    for precision in (FLOAT32, FLOAT64):
+        if precision.name == name:
+            return precision
+    raise InputError(f'precision is {name!r}, but must be "float32" or "float64".')

@@ -1,0 +1,129 @@
+"""Parameters in, loss out; loss and gradient; and the derivative along a direction."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from cortado.errors import InputError
+from cortado.losses import Loss, Recorded, TrajectoryEnd
+from cortado.particles import Parameters, State
+from cortado.policies import Exact, Policy
+from cortado.rollout import Rollout, StepDerivative
+from cortado.simulation import Simulation, check_steps
+
+SCALARS = ("rest_density", "viscosity", "time_step")
+"""Parameters that are one number, in the order in which the solver adds up their adjoints."""
+STATES = ("initial_positions", "initial_velocities")
+NAMES = ("gravity", *STATES, *SCALARS)
+
+Values = Mapping[str, Any]
+
+
+class Problem:
+    """A simulation of a number of steps, judged by a loss.
+
+    Parameters, any of them together: ``gravity`` (d,) or (steps, d) [m / s2]; ``initial_positions`` [m] and
+    ``initial_velocities`` [m / s], (n, d); ``viscosity`` [Pa s], ``rest_density`` [kg / m3], ``time_step`` [s], numbers.
+    What is not given is the scene's. n counts fluid particles in the order in which the scene lists them.
+    """
+
+    def __init__(self, simulation: Simulation, steps: int, loss: Loss | Callable[..., Any]):
+        """``loss``: an object with ``value`` and ``adjoint``, or a function of Warp arrays (see `losses.Recorded`)."""
+        self.simulation, self.steps = simulation, check_steps(steps)
+        self.loss: Loss = loss if hasattr(loss, "adjoint") else Recorded(loss)  # type: ignore[assignment]
+        self._rollout = Rollout(simulation.solver, self.steps)
+        self._derivatives: dict[Policy, StepDerivative] = {}
+
+    def value(self, parameters: Values) -> float:
+        """The loss, forward only."""
+        return self.loss.value(self.end(parameters))
+
+    def end(self, parameters: Values, keep: bool = False) -> TrajectoryEnd:
+        """The last state of the rollout under these parameters; ``keep`` checkpoints for a derivative."""
+        self._set(self._checked(parameters))
+        return TrajectoryEnd(self._rollout.forward(keep=keep), self.simulation.dimension)
+
+    def value_and_gradient(
+        self, parameters: Values, policy: Policy | None = None
+    ) -> tuple[float, dict[str, np.ndarray]]:
+        """The loss and its derivatives: for each parameter given, an array of its shape (float64)."""
+        values = self._checked(parameters)
+        end = self.end(values, keep=True)
+        bar = self._state(*self.loss.adjoint(end))
+        derivative = self._derivative(policy or Exact())
+        self._rollout.backward(derivative, bar)
+        gravity, scalars = derivative.parameters()
+        positions, velocities = bar.numpy(self.simulation.dimension)
+        found = {
+            "gravity": gravity[:, : self.simulation.dimension],
+            "initial_positions": positions.astype(np.float64),
+            "initial_velocities": velocities.astype(np.float64),
+            **dict(zip(SCALARS, scalars, strict=True)),
+        }
+        if "gravity" in values and values["gravity"].ndim == 1:
+            found["gravity"] = found["gravity"].sum(axis=0)
+        return self.loss.value(end), {name: np.asarray(found[name]) for name in values}
+
+    def tangent(self, parameters: Values, directions: Values) -> float:
+        """The derivative of the loss along ``directions`` (any of the parameters), by forward mode."""
+        end = self.end(parameters, keep=False)
+        dot, parameters_dot = self._directions(self._checked(directions, "direction"))
+        self._rollout.tangent(dot, parameters_dot)
+        dimension = self.simulation.dimension
+        bars = self.loss.adjoint(end)
+        return float(sum((bar * d).sum() for bar, d in zip(bars, dot.numpy(dimension), strict=True)))
+
+    def iterations(self) -> np.ndarray:
+        """(steps,) pressure iterations of the last evaluation."""
+        return self._rollout.iterations
+
+    def _derivative(self, policy: Policy) -> StepDerivative:
+        if policy not in self._derivatives:
+            self._derivatives[policy] = policy.derivative(self._rollout)
+        return self._derivatives[policy]
+
+    def _checked(self, values: Values, what: str = "parameter") -> dict[str, np.ndarray]:
+        shape = self.simulation.positions.shape
+        checked = {}
+        for name, value in values.items():
+            if name not in NAMES:
+                raise InputError(f"{what} {name!r} is unknown, but must be one of {', '.join(NAMES)}.")
+            array = np.asarray(value, dtype=np.float64)
+            wanted = {"gravity": array.shape, "initial_positions": shape, "initial_velocities": shape}.get(name, ())
+            if array.shape != wanted:
+                raise InputError(f"{what} {name} has shape {array.shape}, but must be {wanted}.")
+            if name == "gravity":
+                self.simulation.gravity_table(array, self.steps)
+            if not np.isfinite(array).all():
+                raise InputError(f"{what} {name} has a value that is not finite, but must be numbers.")
+            if what == "parameter" and name in ("rest_density", "time_step") and array <= 0:
+                raise InputError(f"{what} {name} is {array}, but must be greater than 0.")
+            checked[name] = array
+        return checked
+
+    def _set(self, values: dict[str, np.ndarray]) -> None:
+        simulation, phase = self.simulation, self.simulation.phase
+        self._rollout.initial.set(
+            values.get("initial_positions", simulation.positions),
+            values.get("initial_velocities", simulation.velocities),
+        )
+        self._rollout.parameters.set(
+            simulation.gravity_table(values.get("gravity"), self.steps),
+            float(values.get("rest_density", phase.rest_density)),
+            float(values.get("viscosity", phase.viscosity)),
+            float(values.get("time_step", simulation.scene.solver.time_step)),
+        )
+
+    def _directions(self, values: dict[str, np.ndarray]) -> tuple[State, Parameters]:
+        nothing = np.zeros_like(self.simulation.positions)
+        dot = self._state(*(values.get(name, nothing) for name in STATES))
+        parameters = Parameters.zeros(self.steps, self.simulation.precision, self.simulation.device)
+        scalars = {name: float(values.get(name, 0.0)) for name in SCALARS}
+        parameters.set(values.get("gravity", np.zeros(self.simulation.dimension)), **scalars)
+        return dot, parameters
+
+    def _state(self, positions: np.ndarray, velocities: np.ndarray) -> State:
+        state = State.zeros(self.simulation.particles, self.simulation.precision, self.simulation.device)
+        state.set(positions, velocities)
+        return state

@@ -1,0 +1,197 @@
+"""The only time loop: run forward, keep checkpoints, go back.
+
+Steps are launched in chunks without a host read in between; at the end of a chunk the host looks whether the
+neighbour lists were long enough (if not, they grow and the chunk is repeated) and whether a particle was lost.
+On a GPU a step is a captured graph.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+from cortado.errors import DivergedError
+from cortado.particles import Parameters, State
+from cortado.physics.convergence import NO_PARTICLE
+from cortado.solvers.pcisph import Pcisph
+from cortado.solvers.pcisph_derivatives import PcisphTangent
+
+CHUNK = 16
+"""Steps between two looks of the host, on a GPU."""
+MEMORY_BUDGET = 8 * 2**30
+"""Bytes of checkpoints; beyond it states are kept less often and recomputed on the way back."""
+
+Observer = Callable[[int, State], None]
+
+
+class StepDerivative(Protocol):
+    """How one step is gone back through; made by a policy for one rollout."""
+
+    capturable: bool
+    """Whether a step may be captured as a graph."""
+
+    def begin(self) -> None:
+        """Forget the parameters' adjoints of an earlier way back."""
+
+    def step(self, state: State, iterations: int, bar: State) -> None:
+        """Replace ``bar``, the adjoint of the step's result, by that of its first state."""
+
+    def parameters(self) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoints of gravity (steps, 3), and of (rest density, viscosity, time step), (3,)."""
+
+
+class Rollout:
+    """A number of steps of a solver from a first state, which can be repeated and differentiated."""
+
+    def __init__(self, solver: Pcisph, steps: int, memory_budget: int = MEMORY_BUDGET):
+        self.solver, self.steps = solver, steps
+        self._precision, self._device = solver.discretisation.precision, solver.search.device
+        self._particles = solver.search.particles
+        self.initial = self._new_state()
+        self.parameters = Parameters.zeros(steps, self._precision, self._device)
+        self._records = (
+            wp.zeros(max(steps, 1), dtype=wp.int32, device=self._device),
+            wp.zeros(max(steps, 1), dtype=self._precision.pair, device=self._device),
+        )
+        state_bytes = 2 * 3 * np.dtype(self._precision.numpy).itemsize * self._particles
+        self._interval = max(1, -(-steps * state_bytes // memory_budget))
+        self._states: dict[int, State] = {}
+        self._buffer, self._bar, self._graph = self._new_state(), self._new_state(), None
+        self._backward_graphs: dict[tuple[StepDerivative, int], Any] = {}
+        self.iterations = np.zeros(0, dtype=int)
+        """(steps,) pressure iterations of the last forward run."""
+        self.errors = np.zeros((0, 2))
+        """(steps, 2) average and greatest compression (rho* - rho_0)+ / rho_0 at each step."""
+
+    # ---- forward -------------------------------------------------------------------------------------------------
+
+    def forward(self, observe: Observer | None = None, keep: bool = True) -> State:
+        """Run all steps and return the last state. ``observe`` is given every state; ``keep`` checkpoints for a way
+        back. Raises `DivergedError` after the good states were observed."""
+        self._states = {0: self.initial}
+        state, step = self.initial, 0
+        self.solver.bad_particle.fill_(NO_PARTICLE)
+        self.solver.bad_step.fill_(-1)
+        self._read_records(0)
+        while step < self.steps:
+            last = min(step + (1 if self._device.is_cpu else CHUNK), self.steps)
+            chunk = self._advance(state, step, last)
+            if self._grow_lists():
+                continue
+            bad_step = int(self.solver.bad_step.numpy()[0])
+            good = chunk if bad_step < 0 else chunk[: bad_step - step]
+            for number, new_state in enumerate(good, step + 1):
+                if observe is not None:
+                    observe(number, new_state)
+                if keep and number % self._interval == 0:
+                    self._states[number] = new_state
+            if bad_step >= 0:
+                self._read_records(bad_step + 1)
+                raise self._diverged(bad_step)
+            state, step = chunk[-1], last
+        self._read_records(self.steps)
+        return state
+
+    def _advance(self, state: State, first: int, last: int) -> list[State]:
+        self.solver.step_number.fill_(first)
+        chunk = []
+        for _ in range(first, last):
+            new_state = self._new_state()
+            if self._device.is_cpu:
+                self.solver.step(state, new_state, self.parameters, self._records)
+            else:
+                self._buffer.assign(state)
+                self._launch_graph()
+                new_state.assign(self._buffer)
+            chunk.append(new_state)
+            state = new_state
+        return chunk
+
+    def _launch_graph(self) -> None:
+        if self._graph is None:
+            self._graph = self._capture(
+                lambda: self.solver.step(self._buffer, self._buffer, self.parameters, self._records)
+            )
+        wp.capture_launch(self._graph)
+
+    def _capture(self, work: Callable[[], None]) -> Any:
+        wp.load_module(device=self._device)
+        with wp.ScopedCapture(device=self._device) as capture:
+            work()
+        return capture.graph
+
+    def _grow_lists(self) -> bool:
+        """Whether the neighbour lists were too short; they are longer now, and what used them must be repeated."""
+        needed = int(self.solver.search.needed.numpy()[0])
+        if needed <= self.solver.search.capacity:
+            return False
+        self.solver.grow(needed + needed // 8 + 1)
+        self._graph, self._backward_graphs = None, {}
+        self.solver.bad_particle.fill_(NO_PARTICLE)
+        self.solver.bad_step.fill_(-1)
+        return True
+
+    def _diverged(self, step: int) -> DivergedError:
+        particle = int(self.solver.bad_particle.numpy()[0])
+        dt = float(self.parameters.time_step.numpy()[0])
+        return DivergedError(
+            step=step + 1,
+            particle=particle,
+            advice=f"try a smaller time step than {dt:g} s, or more pressure iterations",
+        )
+
+    def _read_records(self, steps: int) -> None:
+        self.iterations = self._records[0].numpy()[:steps].astype(int)
+        self.errors = self._records[1].numpy()[:steps].astype(np.float64)
+
+    # ---- derivatives ---------------------------------------------------------------------------------------------
+
+    def backward(self, derivative: StepDerivative, bar: State) -> None:
+        """Replace ``bar``, the adjoint of the last state, by that of the first; `forward` has run."""
+        graphs = self._backward_graphs if derivative.capturable and not self._device.is_cpu else None
+        derivative.begin()
+        for n in reversed(range(self.steps)):
+            state, iterations = self._restore(n), int(self.iterations[n])
+            self.solver.step_number.fill_(n)
+            if graphs is None:
+                derivative.step(state, iterations, bar)
+                continue
+            self._buffer.assign(state)
+            self._bar.assign(bar)
+            key = (derivative, iterations)
+            if key not in graphs:
+                self.solver.iterates.reserve(iterations)
+                work = partial(derivative.step, self._buffer, iterations, self._bar)
+                graphs[key] = self._capture(work)
+            wp.capture_launch(graphs[key])
+            bar.assign(self._bar)
+
+    def tangent(self, dot: State, parameters_dot: Parameters) -> None:
+        """Replace ``dot``, the tangent of the first state, by that of the last; `forward` has run."""
+        derivative = PcisphTangent(self.solver)
+        state = self._new_state()
+        state.assign(self.initial)
+        for n in range(self.steps):
+            iterations = int(self.iterations[n])
+            self.solver.step_number.fill_(n)
+            self.solver.record(state, self.parameters, iterations)
+            derivative.step(iterations, dot, dot, self.parameters, parameters_dot)
+            self.solver.recorded(iterations, state)
+
+    def _restore(self, n: int) -> State:
+        """State n: a checkpoint, or recomputed from the one before, with the states in between."""
+        if n not in self._states:
+            start = n - n % self._interval
+            for m in range(start, n):
+                self.solver.step_number.fill_(m)
+                self.solver.record(self._states[m], self.parameters, int(self.iterations[m]))
+                self._states[m + 1] = self._new_state()
+                self.solver.recorded(int(self.iterations[m]), self._states[m + 1])
+        if (n + 1) % self._interval:
+            self._states.pop(n + 1, None)
+        return self._states[n]
+
+    def _new_state(self) -> State:
+        return State.zeros(self._particles, self._precision, self._device)

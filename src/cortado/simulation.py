@@ -1,0 +1,212 @@
+"""A scene on a device in a precision: the thing that runs."""
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.calibration import pressure_stiffness, rest_volume
+from cortado.errors import CortadoWarning, InputError
+from cortado.neighbours import SKIN, Grid, NeighbourSearch
+from cortado.particles import State
+from cortado.physics.surroundings import Discretisation
+from cortado.precision import precision_named
+from cortado.rollout import Observer, Rollout
+from cortado.sampling import boundary_particles, boundary_volumes, fluid_particles, period
+from cortado.scene import Scene
+from cortado.smoothing import smoothing_kernel
+from cortado.solvers.forces import ForceTerm, Gravity, laminar_viscosity, pairwise_viscosity
+from cortado.solvers.pcisph import Lattice, Pcisph, PressureSolve
+from cortado.trajectory import Trajectory
+
+VISCOSITIES = {"pairwise": pairwise_viscosity, "laminar": laminar_viscosity}
+
+
+class Simulation:
+    """A scene made ready to run: particles sampled, masses calibrated, kernels chosen."""
+
+    def __init__(self, scene: Scene, device: str = "cpu", precision: str = "float32"):
+        """``device`` as Warp names it ("cpu", "cuda:0"), ``precision`` "float32" or "float64"."""
+        self.scene = scene
+        self.device = _device(device)
+        self.precision = precision_named(precision)
+        sample = fluid_particles(scene)
+        self.positions = sample.positions
+        """(n, d) first positions [m]."""
+        self.velocities = sample.velocities
+        """(n, d) first velocities [m / s]."""
+        self.particles = len(sample.positions)
+        self.phase = scene.phase[int(sample.phase[0])]
+        self.walls = boundary_particles(scene)
+        """(b, d) wall particles [m]."""
+        self.solver = self._solver()
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return self.scene.dimension
+
+    def run(
+        self,
+        steps: int,
+        controls: Mapping[str, Any] | None = None,
+        record_every: int = 1,
+        observe: Observer | None = None,
+    ) -> Trajectory:
+        """Run from the scene's first state and return the frames, the first state included.
+
+        ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity. ``observe(step, state)`` is
+        called for every new state. Raises `DivergedError` when a particle is lost.
+        """
+        if record_every < 1:
+            raise InputError(f"record_every is {record_every}, but must be at least 1.")
+        unknown = set(controls or {}) - {"gravity"}
+        if unknown:
+            raise InputError(f"controls has the key {sorted(unknown)[0]!r}, but may have only 'gravity'.")
+        rollout = Rollout(self.solver, check_steps(steps))
+        self.begin(rollout, **dict(controls or {}))
+        frames = [(0, *rollout.initial.numpy(self.dimension))]
+
+        def keep(step: int, state: State) -> None:
+            if observe is not None:
+                observe(step, state)
+            if step % record_every == 0 or step == steps:
+                frames.append((step, *state.numpy(self.dimension)))
+
+        rollout.forward(keep, keep=False)
+        return self._trajectory(frames, rollout)
+
+    def begin(self, rollout: Rollout, gravity: Any = None) -> None:
+        """Give a rollout the scene's first state and parameters."""
+        rollout.initial.set(self.positions, self.velocities)
+        rollout.parameters.set(
+            self.gravity_table(gravity, rollout.steps),
+            self.phase.rest_density,
+            self.phase.viscosity,
+            self.scene.solver.time_step,
+        )
+
+    def gravity_table(self, gravity: Any, steps: int) -> np.ndarray:
+        """Gravity (d,) or (steps, d) as an array, checked; the scene's where None is given."""
+        table = np.asarray(self.scene.forces.gravity if gravity is None else gravity, dtype=np.float64)
+        if table.shape not in ((self.dimension,), (steps, self.dimension)):
+            wanted = f"({self.dimension},) or ({steps}, {self.dimension})"
+            raise InputError(f"gravity has shape {table.shape}, but must be {wanted} in m/s2.")
+        if not np.isfinite(table).all():
+            raise InputError("gravity has a value that is not finite, but must be numbers in m/s2.")
+        return table
+
+    def converged(self, rollout: Rollout) -> np.ndarray:
+        """(steps,) whether the density error came below the tolerances that the scene asks for."""
+        solve = self.solver.pressure
+        if solve is None:
+            return np.ones(len(rollout.errors), dtype=bool)
+        average, greatest = rollout.errors.T
+        return (average <= solve.tolerance) & (greatest <= solve.greatest_tolerance)
+
+    def _trajectory(self, frames: list[tuple[int, np.ndarray, np.ndarray]], rollout: Rollout) -> Trajectory:
+        steps = np.array([step for step, _, _ in frames])
+        converged = self.converged(rollout)
+        if not converged.all() and self.solver.pressure is not None:
+            solve = self.solver.pressure
+            if solve.maximum_iterations > solve.minimum_iterations:
+                warnings.warn(not_converged_sentence(converged, solve.maximum_iterations), CortadoWarning, stacklevel=3)
+        return Trajectory(
+            times=steps * self.scene.solver.time_step,
+            steps=steps,
+            positions=np.stack([positions for _, positions, _ in frames]),
+            velocities=np.stack([velocities for _, _, velocities in frames]),
+            iterations=rollout.iterations,
+            density_errors=rollout.errors[:, 0],
+            converged=converged,
+        )
+
+    def _solver(self) -> Pcisph:
+        scene, dimension = self.scene, self.scene.dimension
+        kernel = smoothing_kernel(scene.discretisation.kernel)
+        spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
+        discretisation = Discretisation(kernel, self.precision)
+        lower, lengths = period(scene)
+        volume = rest_volume(kernel, spacing, support, dimension)
+        weights = boundary_volumes(self.walls, lambda r: kernel.weight(r, dimension, support), support, lower, lengths)
+        everything = np.concatenate([self.positions, self.walls])
+        grid = Grid.around(
+            everything.min(axis=0),
+            everything.max(axis=0),
+            lengths,
+            reach=(1.0 + SKIN) * support,
+            most=max(4 * self.particles, 512),
+        )
+        search = NeighbourSearch(
+            discretisation,
+            grid,
+            _padded(self.walls),
+            weights / volume,
+            self.particles,
+            first_capacity(support / spacing, dimension),
+            self.device,
+        )
+        lattice = Lattice(
+            support=support,
+            normalisation=kernel.normalisation(dimension, support),
+            self_weight=float(kernel.weight(np.zeros(1), dimension, support)[0]),
+            volume=volume,
+            stiffness=pressure_stiffness(kernel, spacing, support, dimension),
+        )
+        periods = [*lengths, *np.zeros(3 - dimension)]
+        return Pcisph(discretisation, lattice, search, self._terms(discretisation), self._pressure(), periods)
+
+    def _terms(self, discretisation: Discretisation) -> list[ForceTerm]:
+        terms: list[ForceTerm] = [Gravity(discretisation, self.particles, self.device)]
+        if self.scene.forces.viscosity in VISCOSITIES:
+            friction = 1.0 if getattr(self.scene.container, "slip", "free") == "no" else 0.0
+            make = VISCOSITIES[self.scene.forces.viscosity]
+            terms.append(make(discretisation, self.dimension, friction))
+        return terms
+
+    def _pressure(self) -> PressureSolve | None:
+        solver = self.scene.solver
+        if not self.scene.forces.pressure:
+            return None
+        greatest = solver.maximum_density_tolerance
+        return PressureSolve(
+            solver.minimum_iterations,
+            solver.maximum_iterations,
+            solver.density_tolerance,
+            float("inf") if greatest is None else greatest,
+        )
+
+
+def check_steps(steps: int) -> int:
+    """The number of steps, or an `InputError` in a sentence."""
+    if int(steps) != steps or steps < 1:
+        raise InputError(f"steps is {steps}, but must be a whole number of at least 1.")
+    return int(steps)
+
+
+def first_capacity(support: float, dimension: int) -> int:
+    """Room for neighbours to begin with: half again as many as the lattice has, for a support in spacings."""
+    filled = np.pi * support**2 if dimension == 2 else 4.0 / 3.0 * np.pi * support**3
+    return int(1.5 * filled) + 6
+
+
+def not_converged_sentence(converged: np.ndarray, most: int) -> str:
+    """What to say of steps that ended above the tolerance."""
+    return (
+        f"the pressure did not converge within {most} iterations in {np.count_nonzero(~converged)} of "
+        f"{len(converged)} steps; try more iterations or a smaller time step."
+    )
+
+
+def _padded(vectors: np.ndarray) -> np.ndarray:
+    return np.hstack([vectors, np.zeros((len(vectors), 3 - vectors.shape[1]))])
+
+
+def _device(name: str) -> Any:
+    try:
+        return wp.get_device(name)
+    except (RuntimeError, ValueError) as error:
+        found = ", ".join(str(device) for device in wp.get_devices())
+        raise InputError(f"device is {name!r}, but must be one of: {found}.") from error

@@ -1,0 +1,239 @@
+"""Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009; the report's Algorithm 1, put right).
+
+`Pcisph.step` goes on until the density error is small, `Pcisph.record` repeats a step with a known number of
+iterations and keeps every intermediate value, and `Pcisph.tangent` and `Pcisph.adjoint` differentiate the step that was
+recorded last (the report's Algorithm 2, and its transpose). Nothing here reads from the device.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from cortado.launching import Launcher, sum_and_maximum
+from cortado.neighbours import SKIN, NeighbourSearch
+from cortado.particles import Fields, Parameters, State
+from cortado.physics.convergence import NO_PARTICLE, convergence_kernels
+from cortado.physics.density import density_kernels
+from cortado.physics.integration import integration_kernels
+from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
+from cortado.physics.surroundings import Discretisation, surroundings_type
+from cortado.solvers.forces import ForceTerm, Moment
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Constants of the rest lattice and of the kernel on it."""
+
+    support: float
+    """Support radius h [m]."""
+    normalisation: float
+    """sigma [1 / m^d]."""
+    self_weight: float
+    """W(0) [1 / m^d]."""
+    volume: float
+    """Rest volume V_0 of a particle [m^d]."""
+    stiffness: float
+    """k [kg / m3 -> Pa s2]: delta = k / dt^2 (report eq. 7, put right) for a filled neighbourhood."""
+
+
+@dataclass(frozen=True)
+class PressureSolve:
+    """When the pressure loop may stop."""
+
+    minimum_iterations: int
+    maximum_iterations: int
+    tolerance: float
+    """Bound on the average of (rho* - rho_0)+ / rho_0."""
+    greatest_tolerance: float
+    """Bound on the maximum of the same; infinite where none is asked for."""
+
+
+class Iterates:
+    """Predicted states and pressures of the iterations of one step; a single slot is overwritten each time."""
+
+    def __init__(self, particles: int, precision: Any, device: Any, requires_grad: bool):
+        self._make = lambda dtype: wp.zeros(particles, dtype=dtype, device=device, requires_grad=requires_grad)
+        self._real, self._vector = precision.real, precision.vector
+        self.x_star: list[wp.array] = []
+        self.v_star: list[wp.array] = []
+        self.p: list[wp.array] = [self._make(self._real)]
+        """``p[k]`` before iteration k; ``p[0]`` is 0 and never written."""
+        self.c: list[wp.array] = []
+        self.reserve(1)
+
+    def reserve(self, iterations: int) -> None:
+        """Room for every value of so many iterations."""
+        while len(self.x_star) <= iterations:
+            self.x_star.append(self._make(self._vector))
+            self.v_star.append(self._make(self._vector))
+            self.p.append(self._make(self._real))
+            self.c.append(self._make(self._real))
+
+
+class Pcisph:
+    """The solver of one set of particles on one device; its arrays are reused by every step."""
+
+    def __init__(
+        self,
+        discretisation: Discretisation,
+        lattice: Lattice,
+        search: NeighbourSearch,
+        terms: Sequence[ForceTerm],
+        pressure: PressureSolve | None,
+        periods: Sequence[float],
+        requires_grad: bool = False,
+    ):
+        """``pressure`` None leaves the pressure out; ``periods`` (3,) [m], 0 along an axis that is not periodic."""
+        precision, particles, device = discretisation.precision, search.particles, search.device
+        self.discretisation, self.lattice, self.search = discretisation, lattice, search
+        self.terms, self.pressure, self.periods = tuple(terms), pressure, tuple(periods)
+        self.launch = Launcher(particles, device)
+        self._density = density_kernels(discretisation)
+        self._pressure = pressure_kernels(discretisation)
+        self._force = pressure_force_kernels(discretisation)
+        self._integration = integration_kernels(precision)
+        self._convergence = convergence_kernels(precision)
+        self._sum = sum_and_maximum(particles, precision, device)
+
+        def vectors() -> wp.array:
+            return wp.zeros(particles, dtype=precision.vector, device=device, requires_grad=requires_grad)
+
+        def count(value: int = 0) -> wp.array:
+            return wp.full(1, value, dtype=wp.int32, device=device)
+
+        self.fields = Fields.zeros(particles, precision, device, requires_grad)
+        self.accelerations = [vectors() for _ in range(len(self.terms) + 1)]
+        """``accelerations[t]``: of the first t terms; the first is 0 and never written."""
+        self.iterates = Iterates(particles, precision, device, requires_grad)
+        self._errors = wp.zeros(particles, dtype=precision.pair, device=device)
+        self._error_sums = wp.zeros(1, dtype=precision.pair, device=device)
+        self.step_number = count()
+        self._iteration, self._active = count(), count()
+        self.bad_particle, self.bad_step = count(NO_PARTICLE), count(-1)
+        self._surroundings: Any = None
+        self.grow(search.capacity)
+
+    def grow(self, capacity: int) -> None:
+        """Make room for neighbour lists of that length."""
+        if capacity != self.search.capacity:
+            self.search.allocate(capacity)
+        search, lattice, precision = self.search, self.lattice, self.discretisation.precision
+        s = surroundings_type(precision)()
+        s.neighbours, s.fluid_count, s.count = search.neighbours, search.fluid_count, search.count
+        s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
+        s.support, s.reach = lattice.support, (1.0 + SKIN) * lattice.support
+        s.normalisation = lattice.normalisation
+        s.self_weight, s.volume = lattice.self_weight, lattice.volume
+        s.periodic = int(any(self.periods))
+        s.period = precision.vector(*self.periods)
+        s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in self.periods))
+        self._surroundings = s
+
+    def differentiable(self) -> "Pcisph":
+        """The same solver, over the same neighbour search, with arrays that Warp's tape can differentiate."""
+        return Pcisph(
+            self.discretisation,
+            self.lattice,
+            self.search,
+            self.terms,
+            self.pressure,
+            self.periods,
+            requires_grad=True,
+        )
+
+    # ---- forward -------------------------------------------------------------------------------------------------
+
+    def step(self, state: State, new_state: State, parameters: Parameters, records: tuple[wp.array, wp.array]) -> None:
+        """One step; ``records`` take its number of iterations and its (average, greatest) density error."""
+        self._begin(state, parameters)
+        if self.pressure is not None:
+            self._solve_pressure(self.pressure, parameters)
+        self.recorded(0, new_state)
+        f, c = self.iterates, self._convergence
+        self.launch(
+            c.check, [self.search.order, 1e6 * self.lattice.support, f.x_star[0], f.v_star[0]], [self.bad_particle]
+        )
+        self.launch(
+            c.finish,
+            [self.search.particles, self._error_sums, self.bad_particle],
+            [self.step_number, self._iteration, self.bad_step, *records],
+            threads=1,
+        )
+
+    def record(self, state: State, parameters: Parameters, iterations: int) -> None:
+        """The same step again, bit for bit, with every intermediate value kept (and the new state: `recorded`)."""
+        self.iterates.reserve(iterations)
+        self._begin(state, parameters)
+        for k in range(iterations):
+            self._iterate(k, k + 1, parameters)
+
+    def recorded(self, iterations: int, new_state: State) -> None:
+        """The new state of the step that was recorded: its last prediction, in the scene's order."""
+        it = self.iterates
+        self.launch(
+            self._integration.unsort,
+            [self.search.order, it.x_star[iterations], it.v_star[iterations]],
+            [new_state.positions, new_state.velocities],
+        )
+
+    def moment(self, parameters: Parameters) -> Moment:
+        """The present step as a force term sees it."""
+        return Moment(self.launch, self._surroundings, self.fields, parameters, self.step_number)
+
+    def _begin(self, state: State, parameters: Parameters) -> None:
+        """Neighbours, density, explicit forces, and the first prediction."""
+        f, it, s = self.fields, self.iterates, self._surroundings
+        self.search.sort(state.positions)
+        self.launch(self._integration.sort, [self.search.order, state.positions, state.velocities], [f.x, f.v])
+        self.search.fill(s, f.x)
+        self.launch(self._density.forward, [s, parameters.rest_density, f.x], [f.rho])
+        moment = self.moment(parameters)
+        for t, term in enumerate(self.terms):
+            term.accelerate(moment, self.accelerations[t], self.accelerations[t + 1])
+        self.launch(
+            self._integration.predict,
+            [parameters.time_step, f.x, f.v, self.accelerations[-1]],
+            [it.x_star[0], it.v_star[0]],
+        )
+
+    def _solve_pressure(self, solve: PressureSolve, parameters: Parameters) -> None:
+        """Iterate in one slot until the density error is small enough; the device decides."""
+        for k in range(solve.minimum_iterations):
+            self._iterate(k, 0, parameters)
+        self._decide(solve, solve.minimum_iterations)
+        if solve.maximum_iterations > solve.minimum_iterations:
+
+            def once_more() -> None:
+                self._iterate(1, 0, parameters)
+                self._decide(solve, 1)
+
+            wp.capture_while(self._active, once_more)
+
+    def _decide(self, solve: PressureSolve, done: int) -> None:
+        self._error_sums = self._sum(self._errors)
+        self.launch(
+            self._convergence.decide,
+            [done, solve.maximum_iterations, self.search.particles, solve.tolerance, solve.greatest_tolerance]
+            + [self._error_sums],
+            [self._iteration, self._active],
+            threads=1,
+        )
+
+    def _iterate(self, k: int, slot: int, parameters: Parameters) -> None:
+        """Iteration k, from the predicted state of the slot before to that of ``slot`` (0: the only one)."""
+        f, it, s, p = self.fields, self.iterates, self._surroundings, parameters
+        before = max(slot - 1, 0)
+        pressure_before = it.p[0] if k == 0 else it.p[max(slot - 1, 1)]
+        pressure = it.p[max(slot, 1)]
+        self.launch(
+            self._pressure.forward,
+            [s, self.lattice.stiffness, p.rest_density, p.time_step, f.rho, it.x_star[before], pressure_before],
+            [pressure, it.c[before], self._errors],
+        )
+        self.launch(
+            self._force.forward,
+            [s, p.rest_density, p.time_step, f.x, f.v, self.accelerations[-1], it.c[before]],
+            [it.x_star[slot], it.v_star[slot]],
+        )

@@ -1,0 +1,96 @@
+"""The frames of one run, in memory and on disk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado import vtkhdf
+from cortado.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """What a run leaves: recorded frames, and what the pressure solver did at every step.
+
+    Raises:
+        InputError: arrays whose shapes do not belong together.
+    """
+
+    times: NDArray[Any]
+    """(frames,) [s]"""
+    steps: NDArray[Any]
+    """(frames,) [-] steps taken before each frame; 0 is the first state"""
+    positions: NDArray[Any]
+    """(frames, n, d) [m]"""
+    velocities: NDArray[Any]
+    """(frames, n, d) [m/s]"""
+    iterations: NDArray[Any]
+    """(steps,) [-] pressure iterations used at each step"""
+    density_errors: NDArray[Any]
+    """(steps,) [-] average (rho - rho_0) / rho_0 at the end of each step"""
+    converged: NDArray[Any]
+    """(steps,) bool: whether the pressure solver reached its tolerance"""
+
+    def __post_init__(self) -> None:
+        frames = {len(self.times), len(self.steps), len(self.positions), len(self.velocities)}
+        steps = {len(self.iterations), len(self.density_errors), len(self.converged)}
+        if self.positions.ndim != 3 or self.positions.shape != self.velocities.shape or len(frames) > 1:
+            raise InputError(
+                f"Positions and velocities must both be (frames, n, d) with a time and a step per frame, "
+                f"but found {self.positions.shape}, {self.velocities.shape}, {self.times.shape} and "
+                f"{self.steps.shape}."
+            )
+        if len(steps) > 1:
+            raise InputError(
+                f"Iterations, density errors and converged must be of one length, but have {sorted(steps)}."
+            )
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return self.positions.shape[2]
+
+    @property
+    def particles(self) -> int:
+        """n"""
+        return self.positions.shape[1]
+
+    @property
+    def not_converged(self) -> int:
+        """Number of steps at which the pressure solver did not reach its tolerance."""
+        return int(np.count_nonzero(~self.converged))
+
+    def save(self, path: str | Path) -> None:
+        """Writes a VTKHDF file, which ParaView opens; a file of that name is replaced.
+
+        Raises:
+            InputError: no frames, or a path that cannot be written.
+        """
+        single = self.positions.dtype == np.float32
+        with vtkhdf.TrajectoryWriter(
+            path,
+            frames=len(self.times),
+            particles=self.particles,
+            dimension=self.dimension,
+            precision="float32" if single else "float64",
+            steps=len(self.iterations),
+        ) as writer:
+            writer.append_steps(self.iterations, self.density_errors, self.converged)
+            for time, step, x, v in zip(self.times, self.steps, self.positions, self.velocities, strict=True):
+                writer.append(time, x, v, step=int(step))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Reads a file written by `save` or by `TrajectoryWriter`, whose writer may be dead or still at work.
+
+        Raises:
+            InputError: the file is missing, damaged, or none of Cortado's trajectories.
+        """
+        arrays = vtkhdf.read(path)
+        names = ("times", "steps", "positions", "velocities", "iterations", "density_errors", "converged")
+        return cls(**{name: arrays[name] for name in names})

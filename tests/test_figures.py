@@ -1,0 +1,108 @@
+"""The pictures: that each is drawn at a legible size, shows what it was given, and survives odd input."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from cortado import figures
+from cortado.errors import InputError
+from cortado.trajectory import Trajectory
+
+
+def pixels(path) -> np.ndarray:
+    """(height, width, 3) in 0..255"""
+    picture = Image.open(path)
+    assert picture.format == "PNG" and picture.width >= 1200
+    return np.asarray(picture.convert("RGB")).astype(int)
+
+
+def share_of(colour: tuple[int, int, int], image: np.ndarray) -> float:
+    """Share of the pixels that have nearly this colour."""
+    return float(np.mean(np.abs(image - colour).max(axis=-1) < 12))
+
+
+def block(dimension: int) -> np.ndarray:
+    return 0.1 * np.stack(np.meshgrid(*[np.arange(6)] * dimension, indexing="ij"), -1).reshape(-1, dimension)
+
+
+def trajectory_of(steps: int) -> Trajectory:
+    frames = np.zeros((1, 4, 2))
+    converged = np.arange(steps) % 5 != 3
+    errors = 0.01 + 0.001 * np.arange(steps)
+    return Trajectory(np.zeros(1), np.zeros(1, int), frames, frames, np.full(steps, 5), errors, converged)
+
+
+@pytest.mark.parametrize(
+    "losses", [[3.0, 1.0, 0.1], [0.0, 0.0], [], [1.0, np.nan, np.inf, 2.0], [5.0], [1.0, 0.0, 1e-9]]
+)
+def test_loss_curve_takes_any_losses(tmp_path, losses):
+    image = pixels(figures.loss_curve(losses, tmp_path / "loss.png"))
+    assert (share_of((0x3D, 0x6B, 0x8E), image) > 1e-5) == bool(losses)
+
+
+def test_nearer_particles_hide_farther_ones(tmp_path):
+    sheet = 0.1 * np.stack(np.meshgrid(np.arange(6), np.arange(6), [0.0], indexing="ij"), -1).reshape(-1, 3)
+    red, green = np.tile([0.8, 0.0, 0.0], (36, 1)), np.tile([0.0, 0.8, 0.0], (36, 1))
+    near, far = sheet + np.array([0.0, 0.0, 1.0]), sheet
+    for first, second in ((near, far), (far, near)):  # in whatever order they come
+        colours = np.concatenate([red, green] if first is near else [green, red])
+        positions = np.concatenate([first, second])
+        image = pixels(figures.particles([positions], ["a"], tmp_path / "a.png", colours=[colours]))
+        assert share_of((204, 0, 0), image) > 0.1
+        assert share_of((0, 204, 0), image) == 0.0
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_particles_side_by_side_share_their_scale(tmp_path, dimension):
+    points = block(dimension)
+    corners = (np.full(dimension, -0.1), np.full(dimension, 0.8))
+    path = figures.particles(
+        [points, points + 0.1],
+        ["before", "after"],
+        tmp_path / "a.png",
+        container=corners,
+        dimension=dimension,
+    )
+    ink = pixels(path).sum(axis=-1) < 450
+    left, right = ink[:, : ink.shape[1] // 2], ink[:, ink.shape[1] // 2 :]
+    assert 0.8 < left.sum() / right.sum() < 1.25
+    assert np.nonzero(left)[0].mean() > np.nonzero(right)[0].mean() + 20  # the second set is drawn higher up
+
+
+def test_particles_by_speed_have_a_colour_bar(tmp_path):
+    points = block(2)
+    speed = np.linalg.norm(points, axis=1)
+    plain = figures.particles([points], ["a"], tmp_path / "a.png")
+    coloured = figures.particles(
+        [points], ["a"], tmp_path / "b.png", colours=[speed], colour_label="speed [m/s]"
+    )
+    yellow = (254, 232, 56)
+    assert share_of(yellow, pixels(coloured)) > 0.002 and share_of(yellow, pixels(plain)) == 0.0
+
+
+@pytest.mark.parametrize(
+    "points", [np.full((3, 2), np.nan), np.zeros((1, 3)), np.zeros((0, 2)), np.zeros((4, 3))]
+)
+def test_particles_that_cannot_be_seen_do_not_stop_the_picture(tmp_path, points):
+    pixels(figures.particles([points], ["odd"], tmp_path / "a.png"))
+
+
+@pytest.mark.parametrize("shape", [(3,), (1,), (8, 3)])
+def test_parameters_are_drawn_against_the_hidden_ones(tmp_path, shape):
+    history = np.linspace(0.0, 1.0, 20).reshape(20, *[1] * len(shape)) * np.ones(shape)
+    known = pixels(figures.parameters(history, np.full(shape, 0.9), tmp_path / "a.png", unit="m/s²"))
+    unknown = pixels(figures.parameters(history, None, tmp_path / "b.png"))
+    assert np.any(known.shape != unknown.shape) or np.any(known != unknown)
+
+
+def test_steps_that_did_not_converge_are_marked(tmp_path):
+    mark = (0xA8, 0x50, 0x4F)
+    image = pixels(figures.density_errors(trajectory_of(50), tmp_path / "a.png", tolerance=0.01))
+    assert share_of(mark, image) > 1e-4
+    assert share_of(mark, pixels(figures.density_errors(trajectory_of(3), tmp_path / "b.png"))) == 0.0
+    pixels(figures.density_errors(trajectory_of(0), tmp_path / "c.png"))
+
+
+def test_unwritable_picture_is_a_sentence(tmp_path):
+    with pytest.raises(InputError, match="cannot be written"):
+        figures.loss_curve([1.0], tmp_path / "absent" / "loss.png")

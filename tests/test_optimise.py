@@ -1,0 +1,501 @@
+"""The optimisers against closed forms and plain twins, and resuming bit for bit."""
+
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cortado.errors import ComputationError, InputError
+from cortado.evaluations import FILE_NAME
+from cortado.optimisation import Record, Result, optimise
+from cortado.optimisers import LBFGS, Adam, GradientDescent
+
+OPTIMISERS = [Adam(learning_rate=0.05), GradientDescent(learning_rate=1e-3, momentum=0.5), LBFGS()]
+
+
+class Interrupted(Exception):
+    """Stands for whatever ends a process."""
+
+
+class Rosenbrock:
+    """(1 - a)^2 + 100 (b - a^2)^2 of two scalars, with its minimum 0 at (1, 1); counts its evaluations."""
+
+    def __init__(self, fail_at: int = -1) -> None:
+        self.evaluations = 0
+        self.fail_at = fail_at
+
+    def value_and_gradient(self, parameters, policy=None):
+        if self.evaluations == self.fail_at:
+            raise Interrupted
+        self.evaluations += 1
+        a, b = float(parameters["a"]), float(parameters["b"])
+        loss = (1.0 - a) ** 2 + 100.0 * (b - a**2) ** 2
+        slope_a = -2.0 * (1.0 - a) - 400.0 * a * (b - a**2)
+        return loss, {"a": np.asarray(slope_a), "b": np.asarray(200.0 * (b - a**2))}
+
+
+class Quadratic:
+    """sum over the parameters of stiffness / 2 |p - target|^2; notes the parameters that it is given."""
+
+    def __init__(self, targets, stiffness=1.0):
+        self.targets = {name: np.asarray(target) for name, target in targets.items()}
+        self.stiffness = stiffness
+        self.seen: list[dict[str, np.ndarray]] = []
+        self.policies: list[object] = []
+
+    def value_and_gradient(self, parameters, policy=None):
+        self.seen.append(parameters)
+        self.policies.append(policy)
+        offsets = {name: parameters[name] - target for name, target in self.targets.items()}
+        loss = sum(0.5 * self.stiffness * float(np.sum(offset**2)) for offset in offsets.values())
+        return loss, {name: self.stiffness * np.asarray(offset) for name, offset in offsets.items()}
+
+
+def bits(result: Result) -> list[bytes]:
+    """Everything an optimisation computed, as bytes: equal only if equal bit for bit."""
+    numbers = [result.loss, *result.parameters.values(), *result.last_parameters.values()]
+    for record in result.history:
+        numbers += [record.iteration, record.loss, record.gradient_norm, *record.parameters.values()]
+    return [np.asarray(number).tobytes() for number in numbers]
+
+
+def rosenbrock(optimiser, iterations=30, problem=None, **options) -> Result:
+    return optimise(problem or Rosenbrock(), {"a": -1.2, "b": 1.0}, optimiser, iterations, **options)
+
+
+# Convergence
+
+
+@pytest.mark.parametrize(
+    ("optimiser", "iterations"),
+    [
+        (Adam(learning_rate=0.1), 600),
+        (GradientDescent(learning_rate=0.2), 120),
+        (GradientDescent(learning_rate=0.2, momentum=0.5), 120),
+        (LBFGS(), 10),
+    ],
+)
+def test_quadratic_of_scalar_and_array_converges(optimiser, iterations):
+    targets = {"viscosity": np.array(0.3), "velocities": np.arange(12.0).reshape(4, 3) / 10.0}
+    problem = Quadratic(targets)
+    result = optimise(problem, {"viscosity": 1.0, "velocities": np.zeros((4, 3))}, optimiser, iterations)
+    assert isinstance(result.parameters["viscosity"], float)
+    assert result.parameters["viscosity"] == pytest.approx(0.3, abs=1e-6)
+    np.testing.assert_allclose(result.parameters["velocities"], targets["velocities"], atol=1e-6)
+    assert result.evaluations == len(problem.seen) == len(result.history)
+    assert problem.seen[0]["viscosity"].shape == () and problem.seen[0]["velocities"].shape == (4, 3)
+    assert problem.seen[0]["velocities"].dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("optimiser", "iterations", "tolerance"),
+    [
+        (Adam(learning_rate=0.02), 4000, 1e-3),
+        (GradientDescent(learning_rate=1e-3, momentum=0.9), 3000, 1e-3),
+        (LBFGS(), 100, 1e-8),
+    ],
+)
+def test_rosenbrock_converges(optimiser, iterations, tolerance):
+    result = rosenbrock(optimiser, iterations)
+    assert result.parameters["a"] == pytest.approx(1.0, abs=tolerance)
+    assert result.parameters["b"] == pytest.approx(1.0, abs=2.0 * tolerance)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_lbfgs_takes_its_tolerance_from_the_first_gradient(unit):
+    class InUnit(Rosenbrock):
+        def value_and_gradient(self, parameters, policy=None):
+            loss, gradient = super().value_and_gradient(parameters)
+            return unit * loss, {name: unit * slope for name, slope in gradient.items()}
+
+    loose, tight = (rosenbrock(LBFGS(tolerance=t), 100, problem=InUnit()) for t in (1e-3, 1e-9))
+    assert loose.converged and tight.converged
+    assert tight.history[-1].gradient_norm < 2e-9 * tight.history[0].gradient_norm
+    assert 1e-7 < loose.history[-1].gradient_norm / loose.history[0].gradient_norm < 2e-3
+    assert loose.evaluations < tight.evaluations
+
+
+@pytest.mark.parametrize("stiffness", [1e-8, 1.0, 1e8])
+def test_lbfgs_first_step_is_as_long_as_its_scale(stiffness):
+    problem = Quadratic({"viscosity": 0.08}, stiffness)
+    result = optimise(problem, {"viscosity": 0.05}, LBFGS(scale={"viscosity": 0.01}), 20)
+    assert problem.seen[1]["viscosity"] == pytest.approx(0.06)
+    assert result.parameters["viscosity"] == pytest.approx(0.08)
+
+
+def test_lbfgs_at_an_optimum_stops_at_once():
+    result = optimise(Quadratic({"x": 2.0}), {"x": 2.0}, LBFGS(), 20)
+    assert result.converged and result.evaluations == 1
+
+
+# Against plain twins
+
+
+def test_adam_follows_algorithm_1_of_its_paper():
+    alpha, beta_1, beta_2, epsilon = 0.05, 0.8, 0.97, 1e-6
+    theta, m, v = [-1.2, 1.0], [0.0, 0.0], [0.0, 0.0]
+    expected = [tuple(theta)]
+    for t in range(1, 41):
+        _, gradient = Rosenbrock().value_and_gradient({"a": theta[0], "b": theta[1]})
+        for i, g in enumerate([float(gradient["a"]), float(gradient["b"])]):
+            m[i] = beta_1 * m[i] + (1 - beta_1) * g
+            v[i] = beta_2 * v[i] + (1 - beta_2) * g * g
+            theta[i] -= alpha * (m[i] / (1 - beta_1**t)) / ((v[i] / (1 - beta_2**t)) ** 0.5 + epsilon)
+        expected.append(tuple(theta))
+    result = rosenbrock(Adam(alpha, beta_1, beta_2, epsilon), 40)
+    found = [(record.parameters["a"], record.parameters["b"]) for record in result.history]
+    np.testing.assert_allclose(found, expected, rtol=1e-10)
+    assert result.evaluations == 41
+    assert result.last_parameters == {"a": found[-1][0], "b": found[-1][1]}
+
+
+def test_momentum_follows_the_heavy_ball():
+    x, before, expected = 3.0, 3.0, [3.0]
+    for _ in range(10):
+        x, before = x - 0.1 * 2.0 * x + 0.7 * (x - before), x
+        expected.append(x)
+    result = optimise(Quadratic({"x": 0.0}, 2.0), {"x": 3.0}, GradientDescent(0.1, momentum=0.7), 10)
+    np.testing.assert_allclose([record.parameters["x"] for record in result.history], expected, rtol=1e-12)
+
+
+def test_learning_rate_by_parameter():
+    start = {"slow": 1.0, "fast": np.array([1.0, 1.0])}
+    problem = Quadratic({"slow": 0.0, "fast": np.zeros(2)})
+    result = optimise(problem, start, GradientDescent({"fast": 0.5, "slow": 0.1}), 1)
+    assert result.last_parameters["slow"] == pytest.approx(0.9)
+    np.testing.assert_allclose(result.last_parameters["fast"], [0.5, 0.5])
+
+
+def test_the_best_is_not_the_last():
+    result = optimise(Quadratic({"x": 0.0}), {"x": 1.0}, GradientDescent(learning_rate=3.0), 4)
+    assert result.parameters == {"x": 1.0} and result.loss == 0.5
+    assert result.last_parameters == {"x": 16.0}
+    assert not result.converged
+
+
+# Bounds
+
+
+@pytest.mark.parametrize("optimiser", [Adam(0.05), GradientDescent(0.2, momentum=0.5), LBFGS(scale=0.3)])
+def test_bounds_are_kept_and_reached(optimiser):
+    problem = Quadratic({"g": np.array([2.0, -2.0, 0.1]), "mu": 0.7})
+    lower, upper = np.array([-1.0, -0.5, -1.0]), 1.0
+    result = optimise(
+        problem,
+        {"g": np.zeros(3), "mu": 0.5},
+        optimiser,
+        200,
+        bounds={"g": (lower, upper), "mu": (None, 0.6)},
+    )
+    for parameters in problem.seen:
+        assert (parameters["g"] >= lower).all() and (parameters["g"] <= upper).all()
+        assert parameters["mu"] <= 0.6
+    np.testing.assert_allclose(result.parameters["g"], [1.0, -0.5, 0.1], atol=1e-4)
+    assert result.parameters["mu"] == pytest.approx(0.6, abs=1e-12)
+
+
+def test_lbfgs_knows_its_bounds():
+    result = rosenbrock(LBFGS(), 100, bounds={"a": (None, 0.5)})
+    assert result.parameters["a"] == 0.5
+    assert result.parameters["b"] == pytest.approx(0.25, abs=1e-8)
+
+
+def test_a_component_with_equal_bounds_stays():
+    bounds = {"g": (np.array([-5.0, 0.3]), np.array([5.0, 0.3]))}
+    for optimiser in OPTIMISERS:
+        result = optimise(Quadratic({"g": np.zeros(2)}), {"g": np.array([1.0, 0.3])}, optimiser, 5, bounds)
+        assert {record.parameters["g"][1] for record in result.history} == {0.3}
+
+
+# Resuming
+
+
+@pytest.mark.parametrize("optimiser", OPTIMISERS, ids=lambda optimiser: type(optimiser).__name__)
+@pytest.mark.parametrize("evaluations", [0, 1, 13])
+def test_interrupted_run_resumes_bit_for_bit(optimiser, evaluations, tmp_path):
+    whole = rosenbrock(optimiser)
+    with pytest.raises(Interrupted):
+        rosenbrock(optimiser, problem=Rosenbrock(fail_at=evaluations), checkpoint=tmp_path / "run")
+    rest, records = Rosenbrock(), []
+    resumed = rosenbrock(
+        optimiser, problem=rest, checkpoint=tmp_path / "run", resume=True, on_iteration=records.append
+    )
+    assert bits(resumed) == bits(whole)
+    assert resumed.message == whole.message
+    assert rest.evaluations == whole.evaluations - evaluations
+    assert [record.replayed for record in records] == [i < evaluations for i in range(whole.evaluations)]
+    assert records == list(resumed.history)
+
+
+@pytest.mark.parametrize("optimiser", OPTIMISERS, ids=lambda optimiser: type(optimiser).__name__)
+def test_finished_run_resumes_to_more_and_to_fewer_iterations(optimiser, tmp_path):
+    rosenbrock(optimiser, 10, checkpoint=tmp_path)
+    longer = rosenbrock(optimiser, 25, checkpoint=tmp_path, resume=True)
+    assert bits(longer) == bits(rosenbrock(optimiser, 25))
+    unused = Rosenbrock()
+    shorter = rosenbrock(optimiser, 5, problem=unused, checkpoint=tmp_path, resume=True)
+    assert bits(shorter) == bits(rosenbrock(optimiser, 5))
+    assert unused.evaluations == 0
+
+
+KILLED = """
+import os, signal, sys
+sys.path.insert(0, {tests!r})
+from test_optimise import Adam, Rosenbrock, rosenbrock
+
+class Killed(Rosenbrock):
+    def value_and_gradient(self, parameters, policy=None):
+        if self.evaluations == 17:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().value_and_gradient(parameters, policy)
+
+rosenbrock(Adam(learning_rate=0.05), problem=Killed(), checkpoint={folder!r})
+"""
+
+
+def test_killed_process_resumes_bit_for_bit(tmp_path):
+    script = KILLED.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
+    killed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    rest = Rosenbrock()
+    resumed = rosenbrock(Adam(learning_rate=0.05), problem=rest, checkpoint=tmp_path, resume=True)
+    assert rest.evaluations == 31 - 17
+    assert bits(resumed) == bits(rosenbrock(Adam(learning_rate=0.05)))
+
+
+def test_torn_last_record_is_computed_again(tmp_path):
+    optimiser = Adam(learning_rate=0.05)
+    whole = bits(rosenbrock(optimiser, 3, checkpoint=tmp_path))
+    log = tmp_path / FILE_NAME
+    content = log.read_bytes()
+    record_size = 8 + 8 * 5 + 4
+    torn = [content[:-cut] for cut in range(1, record_size + 1, 3)]
+    torn.append(content[:-record_size] + bytes(record_size))
+    torn.append(content[:-1] + bytes([content[-1] ^ 1]))
+    for remains in torn:
+        log.write_bytes(remains)
+        problem = Rosenbrock()
+        assert bits(rosenbrock(optimiser, 3, problem=problem, checkpoint=tmp_path, resume=True)) == whole
+        assert problem.evaluations == 1
+        assert log.read_bytes() == content
+
+
+def test_damage_before_the_last_record_is_refused(tmp_path):
+    optimiser = Adam(learning_rate=0.05)
+    rosenbrock(optimiser, 5, checkpoint=tmp_path)
+    log = tmp_path / FILE_NAME
+    content = bytearray(log.read_bytes())
+    content[-100] ^= 1
+    log.write_bytes(content)
+    with pytest.raises(InputError, match=r"Evaluation 4 of the 6 .* damaged"):
+        rosenbrock(optimiser, 5, checkpoint=tmp_path, resume=True)
+    assert log.read_bytes() == content
+
+
+def test_a_foreign_file_is_refused(tmp_path):
+    (tmp_path / FILE_NAME).write_bytes(b"something else\n")
+    with pytest.raises(InputError, match="no log of evaluations"):
+        rosenbrock(Adam(0.05), 5, checkpoint=tmp_path, resume=True)
+
+
+def test_other_settings_are_refused_and_leave_the_log(tmp_path):
+    optimiser = Adam(learning_rate=0.05)
+    rosenbrock(optimiser, 5, checkpoint=tmp_path)
+    before = (tmp_path / FILE_NAME).read_bytes()
+    with pytest.raises(InputError, match=r"learning_rate=0.05.* now given optimiser = .*learning_rate=0.06"):
+        rosenbrock(replace(optimiser, learning_rate=0.06), 5, checkpoint=tmp_path, resume=True)
+    with pytest.raises(InputError, match="policy = None and is now given policy = 'exact'"):
+        rosenbrock(optimiser, 5, checkpoint=tmp_path, resume=True, policy="exact")
+    with pytest.raises(InputError, match=r"names = \[.a., .b.\] and is now given names = \[.c.\]"):
+        optimise(Quadratic({"c": 0.0}), {"c": 1.0}, optimiser, 5, checkpoint=tmp_path, resume=True)
+    with pytest.raises(InputError, match="evaluation 0 at another 'b'"):
+        start = {"a": -1.2, "b": np.nextafter(1.0, 2.0)}
+        optimise(Rosenbrock(), start, optimiser, 5, checkpoint=tmp_path, resume=True)
+    with pytest.raises(InputError, match="evaluation 2 at another 'a'"):
+        rosenbrock(optimiser, 5, checkpoint=tmp_path, resume=True, bounds={"a": (-2.0, -1.12)})
+    with pytest.raises(InputError, match="already holds the evaluations"):
+        rosenbrock(optimiser, 5, checkpoint=tmp_path)
+    assert (tmp_path / FILE_NAME).read_bytes() == before
+
+
+def test_another_problem_is_refused_by_its_fingerprint(tmp_path):
+    one, other = Rosenbrock(), Rosenbrock()
+    one.fingerprint, other.fingerprint = "60 steps", "61 steps"
+    rosenbrock(Adam(0.05), 2, problem=one, checkpoint=tmp_path)
+    with pytest.raises(InputError, match="problem = 60 steps and is now given problem = 61 steps"):
+        rosenbrock(Adam(0.05), 2, problem=other, checkpoint=tmp_path, resume=True)
+
+
+def test_a_policy_without_a_repr_of_its_own_can_be_resumed(tmp_path):
+    class Plain:
+        pass
+
+    one, same = Plain(), Plain()
+    rosenbrock(Adam(0.05), 2, checkpoint=tmp_path, policy=one)
+    assert rosenbrock(Adam(0.05), 3, checkpoint=tmp_path, policy=same, resume=True).evaluations == 4
+
+
+def test_resume_begins_where_there_is_nothing(tmp_path):
+    folder = tmp_path / "deep" / "run"
+    assert bits(rosenbrock(Adam(0.05), 3, checkpoint=folder, resume=True)) == bits(rosenbrock(Adam(0.05), 3))
+
+
+def test_resume_without_a_checkpoint_is_refused():
+    with pytest.raises(InputError, match="resume=True needs the checkpoint"):
+        rosenbrock(Adam(0.05), 3, resume=True)
+
+
+def test_a_checkpoint_that_cannot_be_made_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be made"):
+        rosenbrock(Adam(0.05), 3, checkpoint=tmp_path / "file" / "run")
+
+
+# Not finite
+
+
+@dataclass
+class Breaks:
+    """A quadratic of which one number is broken from the third evaluation on."""
+
+    loss: float = 1.0
+    gradient: float = 1.0
+    evaluations: int = 0
+
+    def value_and_gradient(self, parameters, policy=None):
+        self.evaluations += 1
+        broken = self.evaluations > 2
+        x, g = parameters["x"], parameters["g"].copy()
+        if broken:
+            g[1, 2] = self.gradient
+        return (self.loss if broken else float(x**2 + np.sum(parameters["g"] ** 2))), {"x": 2.0 * x, "g": g}
+
+
+@pytest.mark.parametrize("optimiser", [Adam(0.1), GradientDescent(0.1), LBFGS()])
+@pytest.mark.parametrize(
+    ("problem", "what"),
+    [
+        (Breaks(gradient=np.nan), "gradient with respect to 'g' is not finite"),
+        (Breaks(gradient=1e200), "gradient with respect to 'g' is not finite or beyond"),
+        (Breaks(loss=np.inf), "loss is inf as a function of 'x', 'g'"),
+        (Breaks(loss=np.nan), "loss is nan"),
+    ],
+)
+def test_not_finite_stops_with_advice_and_keeps_the_rest(optimiser, problem, what, tmp_path):
+    start = {"x": 1.0, "g": np.ones((2, 3))}
+    with pytest.raises(ComputationError, match=f"At iteration 2 the {what}.*smaller learning rate") as caught:
+        optimise(replace(problem), start, optimiser, 10, checkpoint=tmp_path)
+    assert str(tmp_path) in str(caught.value)
+    records: list[Record] = []
+    with pytest.raises(ComputationError):
+        optimise(
+            replace(problem, evaluations=2),
+            start,
+            optimiser,
+            10,
+            checkpoint=tmp_path,
+            resume=True,
+            on_iteration=records.append,
+        )
+    assert [record.replayed for record in records] == [True, True]
+
+
+# Wrong input
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Adam(learning_rate=0.0),
+        lambda: Adam(learning_rate=-1.0),
+        lambda: Adam(learning_rate=np.nan),
+        lambda: Adam(learning_rate="fast"),
+        lambda: Adam(learning_rate={"x": 0.0}),
+        lambda: Adam(0.1, beta1=1.0),
+        lambda: Adam(0.1, beta2=-0.1),
+        lambda: Adam(0.1, epsilon=0.0),
+        lambda: GradientDescent(learning_rate=np.inf),
+        lambda: GradientDescent(0.1, momentum=1.0),
+        lambda: LBFGS(memory=0),
+        lambda: LBFGS(tolerance=-1.0),
+        lambda: LBFGS(scale=0.0),
+    ],
+)
+def test_wrong_settings_are_refused(make):
+    with pytest.raises(InputError, match="must be"):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"start": {}}, "names no parameter"),
+        ({"start": {"x": np.array([1.0, np.nan])}}, "'x' has components that are not finite"),
+        ({"start": {"x": "one"}}, "'x' must be a number or an array of numbers"),
+        ({"start": {"x": np.zeros((0, 3))}}, "'x' must be a number or an array of numbers"),
+        ({"start": {"x": [[1.0], [1.0, 2.0]]}}, "'x' is not a number or a regular array"),
+        ({"optimiser": "adam"}, "optimiser must be an object"),
+        (
+            {"optimiser": Adam({"y": 0.1})},
+            "learning_rate is given for 'y', but the optimised parameters are 'x'",
+        ),
+        ({"optimiser": LBFGS(scale={})}, "scale is given for none"),
+        ({"iterations": 0}, "number of iterations"),
+        ({"iterations": 2.5}, "number of iterations"),
+        ({"bounds": {"y": (0.0, 1.0)}}, "Bounds are given for 'y'"),
+        ({"bounds": {"x": (2.0, 3.0)}}, "start of 'x' is outside of its bounds in 2 of 2"),
+        ({"bounds": {"x": (3.0, 2.0)}}, "lower bound of 'x' must not exceed"),
+        ({"bounds": {"x": (np.nan, 2.0)}}, "lower bound of 'x' must not exceed"),
+        ({"bounds": {"x": (np.zeros(3), None)}}, r"bounds of 'x' must be \(lower, upper\)"),
+        ({"bounds": {"x": 2.0}}, r"bounds of 'x' must be \(lower, upper\)"),
+    ],
+)
+def test_wrong_input_is_refused_before_anything_is_evaluated(change, message):
+    problem = Quadratic({"x": np.zeros(2)})
+    call = {"start": {"x": np.ones(2)}, "optimiser": Adam(0.1), "iterations": 3} | change
+    with pytest.raises(InputError, match=message):
+        optimise(problem, **call)
+    assert not problem.seen
+
+
+def test_a_gradient_of_another_shape_is_refused():
+    class Wrong(Quadratic):
+        def value_and_gradient(self, parameters, policy=None):
+            loss, gradient = super().value_and_gradient(parameters)
+            return loss, {"x": gradient["x"][:1]}
+
+    with pytest.raises(InputError, match="gradients of shapes"):
+        optimise(Wrong({"x": np.zeros(2)}), {"x": np.ones(2)}, Adam(0.1), 3)
+
+
+# What is handed on
+
+
+def test_policy_and_values_are_handed_on_as_given():
+    problem, policy = Quadratic({"x": 0.0, "y": 0.0, "z": np.zeros(2)}), object()
+    start = {"x": 1, "y": np.array(1.0), "z": [1, 2]}
+    result = optimise(problem, start, Adam(0.1), 2, policy=policy)
+    assert all(found is policy for found in problem.policies)
+    for parameters in (result.parameters, result.last_parameters, result.history[0].parameters):
+        assert list(parameters) == ["x", "y", "z"]
+        assert type(parameters["x"]) is float
+        assert isinstance(parameters["y"], np.ndarray) and parameters["y"].shape == ()
+        assert parameters["z"].shape == (2,)
+    assert start == {"x": 1, "y": np.array(1.0), "z": [1, 2]}
+
+
+def test_the_history_is_safe_from_a_problem_that_overwrites_its_arguments():
+    class Careless(Quadratic):
+        def value_and_gradient(self, parameters, policy=None):
+            answer = super().value_and_gradient({"x": parameters["x"].copy()})
+            parameters["x"][:] = np.nan
+            return answer
+
+    start = np.ones(2)
+    careful = optimise(Quadratic({"x": np.zeros(2)}), {"x": start}, LBFGS(), 5)
+    assert bits(optimise(Careless({"x": np.zeros(2)}), {"x": start}, LBFGS(), 5)) == bits(careful)
+    np.testing.assert_array_equal(start, np.ones(2))

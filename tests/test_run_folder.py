@@ -1,0 +1,150 @@
+"""Run folders, their reports, and the progress lines that go with them."""
+
+import io
+import json
+import os
+import re
+import stat
+
+import numpy as np
+import pytest
+
+from cortado.errors import InputError
+from cortado.progress import track
+from cortado.report import write_report
+from cortado.run_folder import RunFolder, write_atomically
+
+SCENE = '{"name": "drop", "dimension": 2}'
+COMMAND = ["cortado", "run", "drop.toml"]
+
+
+def new_run(path, **options) -> RunFolder:
+    return RunFolder.create(path, SCENE, COMMAND, **options)
+
+
+def test_new_folder_says_what_ran_where(tmp_path):
+    folder = new_run(tmp_path / "runs" / "drop", device="a small computer")
+    environment = json.loads(folder.environment.read_text())
+    assert json.loads(folder.scene.read_text())["name"] == "drop"
+    assert environment["command"] == COMMAND and environment["device"] == "a small computer"
+    assert environment["packages"]["numpy"] == np.__version__
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", environment["started"])
+    assert sorted(os.listdir(folder.path)) == ["environment.json", "figures", "scene.json"]
+    assert RunFolder.open(folder.path) == folder
+
+
+def test_metrics_come_back_and_a_torn_line_is_left_out(tmp_path):
+    folder = new_run(tmp_path / "a")
+    assert folder.read_metrics() == []
+    folder.append_metrics(step=1, loss=np.float32(0.5), gravity=np.array([0.0, -9.5]))
+    folder.append_metrics(step=2, loss=float("nan"))
+    with open(folder.metrics, "a") as file:
+        file.write('{"step": 3, "lo')
+    lines = folder.read_metrics()
+    assert lines[0] == {"step": 1, "loss": 0.5, "gravity": [0.0, -9.5]}
+    assert [line["step"] for line in lines] == [1, 2] and np.isnan(lines[1]["loss"])
+
+    RunFolder.resume(folder.path, SCENE, COMMAND).append_metrics(step=3)
+    assert [line["step"] for line in folder.read_metrics()] == [1, 2, 3]
+
+    folder.metrics.write_text("torn{\n{}\n")
+    with pytest.raises(InputError, match="not JSON"):
+        folder.read_metrics()
+
+
+def test_a_folder_with_a_run_is_refused_unless_overwritten(tmp_path):
+    folder = new_run(tmp_path / "a")
+    folder.append_metrics(step=1)
+    (folder.path / "notes.txt").write_text("mine")
+    (folder.figures / "old.png").write_text("")
+    with pytest.raises(InputError, match=r"--out.*--resume.*--overwrite"):
+        new_run(folder.path)
+    assert folder.read_metrics() == [{"step": 1}]
+    new_run(folder.path, overwrite=True)
+    assert folder.read_metrics() == [] and os.listdir(folder.figures) == []
+    assert (folder.path / "notes.txt").read_text() == "mine"
+
+
+def test_files_of_somebody_else_are_never_overwritten(tmp_path):
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "holiday.png").write_text("")
+    with pytest.raises(InputError, match="no run of Cortado"):
+        new_run(tmp_path, overwrite=True)
+    assert os.listdir(tmp_path / "figures") == ["holiday.png"]
+
+
+def test_resume_needs_the_same_scene_and_is_noted(tmp_path):
+    folder = new_run(tmp_path / "a")
+    with pytest.raises(InputError, match="another scene"):
+        RunFolder.resume(folder.path, '{"name": "other"}', COMMAND)
+    RunFolder.resume(folder.path, '{"dimension": 2, "name": "drop"}', [*COMMAND, "--resume"])
+    environment = json.loads(folder.environment.read_text())
+    assert environment["command"] == COMMAND
+    assert [session["command"] for session in environment["resumed"]] == [[*COMMAND, "--resume"]]
+    with pytest.raises(InputError, match="no run in"):
+        RunFolder.resume(tmp_path / "b", SCENE, COMMAND)
+
+
+def test_unwritable_places_are_sentences(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        new_run(tmp_path / "file")
+    with pytest.raises(InputError, match="cannot be written"):
+        new_run(tmp_path / "file" / "below")
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "a.json"
+    write_atomically(path, "old")
+
+    def full_disk(*arguments):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        write_atomically(path, "new")
+    assert path.read_text() == "old" and os.listdir(tmp_path) == ["a.json"]
+    assert path.stat().st_mode & stat.S_IRUSR
+
+
+def test_report_is_one_self_contained_escaped_page(tmp_path):
+    folder = new_run(tmp_path / "a")
+    picture = folder.figures / "loss.png"
+    picture.write_bytes(b"\x89PNG pixels")
+    rows = [("loss & more", 0.25), ("x", "<script>")]
+    path = write_report(folder, "a < b", rows, [("the <loss>", picture)])
+    page = path.read_text()
+    assert path == folder.report
+    assert "<h1>a &lt; b</h1>" in page and "<th>loss &amp; more</th><td>0.25</td>" in page
+    assert "<script" not in page and "http" not in page
+    assert "data:image/png;base64,iVBORyBwaXhlbHM=" in page and "the &lt;loss&gt;" in page
+    assert "&quot;drop&quot;" in page
+    for bad in (folder.figures / "absent.png", folder.scene):
+        with pytest.raises(InputError, match=bad.name):
+            write_report(folder, "t", [], [("c", bad)])
+
+
+def test_progress_on_a_file_is_a_line_now_and_then():
+    quiet, chatty = io.StringIO(), io.StringIO()
+    with track(50, "run", stream=quiet) as advance:
+        for _ in range(50):
+            advance(loss=1.0)
+    with track(4, "run", stream=chatty, interval=0.0) as advance:
+        advance(loss=0.123456)
+        advance(3)
+    assert quiet.getvalue() == ""
+    assert chatty.getvalue() == "run 1/4, 0:00:00 left, loss 0.1235\nrun 4/4, 0:00:00 left\n"
+
+
+def test_progress_on_a_terminal_is_a_bar_with_fields(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "120")
+    terminal = Terminal()
+    with track(4, "optimise", stream=terminal) as advance:
+        advance(4, loss=0.123456)
+    assert "optimise" in terminal.getvalue() and "4/4" in terminal.getvalue()
+    assert "loss 0.1235" in terminal.getvalue()
