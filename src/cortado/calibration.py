@@ -37,3 +37,16 @@ def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, 
     total = gradients.sum(axis=0)
     volume = rest_volume(kernel, spacing, support, dimension)
     return float(1.0 / (2.0 * volume**2 * (total @ total + (gradients**2).sum())))
+
+
+def wall_factor(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """By how much the wall volumes of Akinci et al. (2012) are scaled, so that a flat wall of one layer completes the
+    lattice: fluid that starts at rest beside a wall then has the rest density, and does not jump off (the factor of
+    Band, Gissler, Ihmsen, Cornelis, Peer and Teschner 2018, here computed for the kernel and its support).
+    """
+    offsets = lattice_offsets(spacing, support, dimension)
+    weights = kernel.weight(np.linalg.norm(offsets, axis=1), dimension, support)
+    layer = np.rint(offsets[:, 0] / spacing).astype(int)
+    missing = weights[layer < 0].sum() / weights.sum()
+    of_the_layer = weights[layer == -1].sum() / weights[layer == 0].sum()
+    return float(missing / of_the_layer)

@@ -1,33 +1,83 @@
-"""What Cortado raises: every error is one sentence for the user."""
+"""What can go wrong, each with one sentence for the user."""
+
+from collections.abc import Mapping
+from typing import Any
+
+LONGEST = 90
+"""How many characters of a value a sentence repeats."""
 
 
 class CortadoError(Exception):
-    """Any error of ours."""
-
-
-class InputError(CortadoError):
-    """Wrong input by the user: one sentence that says what was found and what is wanted."""
-
-
-class SceneError(InputError):
-    """A mistake in a scene."""
-
-    def __init__(self, file: str, field: str, found: str, wanted: str):
-        super().__init__(f"{file}: {field} is {found}, but must be {wanted}.")
-        self.file, self.field, self.found, self.wanted = file, field, found, wanted
-
-
-class ComputationError(CortadoError):
-    """The computation failed: it diverged, or did not converge."""
-
-
-class DivergedError(ComputationError):
-    """A particle was lost: its position is not finite, or absurdly far away."""
-
-    def __init__(self, step: int, particle: int, advice: str):
-        super().__init__(f"the run diverged at step {step}, particle {particle}: {advice}.")
-        self.step, self.particle, self.advice = step, particle, advice
+    """Any error of Cortado's own."""
 
 
 class CortadoWarning(UserWarning):
-    """Something that a user should know and may choose to live with."""
+    """Something that works but is probably not meant."""
+
+
+class InputError(CortadoError):
+    """What the user gave is wrong; takes the sentence that says so. Exit code 2."""
+
+
+class Phrase(str):
+    """Words that describe what was found, as opposed to a text that the user wrote."""
+
+
+class SceneError(CortadoError):
+    """A scene is wrong: where, what was found and what was wanted. Exit code 2."""
+
+    def __init__(self, file: str | None, field: str, found: Any = None, wanted: str = "", sentence: str | None = None):
+        """``sentence`` replaces "is <found>, but must be <wanted>." where that does not fit, the field left out."""
+        super().__init__(file, field, found, wanted, sentence)
+        self.file = file
+        """As the user gave it; None for a scene that was built in Python."""
+        self.field = field
+        """Such as ``fluid[0].upper``; empty for the scene as a whole."""
+        self.found = found
+        """The value, or a `Phrase`."""
+        self.wanted = wanted
+        """What would have been right, in words."""
+        self.sentence = sentence or f"is {shown(found)}, but must be {wanted}."
+
+    def in_file(self, file: str) -> "SceneError":
+        """The same error with the name of the file."""
+        _, *rest = self.args
+        return SceneError(file, *rest)
+
+    def __str__(self) -> str:
+        place = self.field or "the scene"
+        return f"{self.file}: {place} {self.sentence}" if self.file else f"{place} {self.sentence}"
+
+
+class ComputationError(CortadoError):
+    """The computation failed although the input was good. Exit code 1."""
+
+
+class DivergedError(ComputationError):
+    """A particle was lost: its position is no longer finite, or far away from everything."""
+
+    def __init__(self, step: int, particle: int, advice: str):
+        super().__init__(step, particle, advice)
+        self.step = step
+        """The first bad step, counted from 1."""
+        self.particle = particle
+        """The first bad particle, in the scene's order."""
+        self.advice = advice
+        """What to try, in words."""
+
+    def __str__(self) -> str:
+        return f"The simulation diverged in step {self.step}, where particle {self.particle} was lost; {self.advice}."
+
+
+def shown(value: Any) -> str:
+    """A value on one short line, for a sentence."""
+    if isinstance(value, Phrase):
+        return str(value)
+    if isinstance(value, Mapping):
+        return "a table"
+    try:
+        text = repr(list(value) if isinstance(value, tuple) else value)
+    except ValueError:
+        return "too long to print"
+    text = " ".join(text.split())
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."

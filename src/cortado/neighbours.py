@@ -208,7 +208,7 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
         n_y = grid.shape[1]
         n_z = grid.shape[2]
         capacity = s.neighbours.shape[0]
-        found = 0
+        found = int(0)
         for o_z in range(below(n_z), above(n_z)):
             for o_y in range(below(n_y), above(n_y)):
                 row = (wrap(c[2] + o_z, n_z) * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.calibration import pressure_stiffness, rest_volume
+from cortado.calibration import pressure_stiffness, rest_volume, wall_factor
 from cortado.errors import CortadoWarning, InputError
 from cortado.neighbours import SKIN, Grid, NeighbourSearch
 from cortado.particles import State
 from cortado.physics.surroundings import Discretisation
 from cortado.precision import precision_named
-from cortado.rollout import Observer, Rollout
+from cortado.rollout import Rollout
 from cortado.sampling import boundary_particles, boundary_volumes, fluid_particles, period
 from cortado.scene import Scene
 from cortado.smoothing import smoothing_kernel
@@ -48,35 +48,44 @@ class Simulation:
         """2 or 3."""
         return self.scene.dimension
 
-    def run(
-        self,
-        steps: int,
-        controls: Mapping[str, Any] | None = None,
-        record_every: int = 1,
-        observe: Observer | None = None,
-    ) -> Trajectory:
-        """Run from the scene's first state and return the frames, the first state included.
+    def run(self, steps: int, controls: Mapping[str, Any] | None = None, record_every: int = 1) -> Trajectory:
+        """Run from the scene's first state and return the frames, the first and the last state included.
 
-        ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity. ``observe(step, state)`` is
-        called for every new state. Raises `DivergedError` when a particle is lost.
+        ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity. Warns when the pressure did
+        not converge; raises `DivergedError` when a particle is lost.
         """
         if record_every < 1:
             raise InputError(f"record_every is {record_every}, but must be at least 1.")
+        rollout = self.rollout(steps, controls)
+        frames = [(0, *rollout.initial.numpy(self.dimension))]
+
+        def keep(step: int, state: State) -> None:
+            if step % record_every == 0 or step == steps:
+                frames.append((step, *state.numpy(self.dimension)))
+
+        rollout.forward(keep, keep=False)
+        converged = self.converged(rollout)
+        if not converged.all():
+            warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=2)
+        numbers, positions, velocities = (np.array(column) for column in zip(*frames, strict=True))
+        return Trajectory(
+            times=numbers * self.scene.solver.time_step,
+            steps=numbers,
+            positions=positions,
+            velocities=velocities,
+            iterations=rollout.iterations,
+            density_errors=rollout.errors[:, 0],
+            converged=converged,
+        )
+
+    def rollout(self, steps: int, controls: Mapping[str, Any] | None = None) -> Rollout:
+        """A rollout that is ready to go forward from the scene's first state; see `run` for ``controls``."""
         unknown = set(controls or {}) - {"gravity"}
         if unknown:
             raise InputError(f"controls has the key {sorted(unknown)[0]!r}, but may have only 'gravity'.")
         rollout = Rollout(self.solver, check_steps(steps))
         self.begin(rollout, **dict(controls or {}))
-        frames = [(0, *rollout.initial.numpy(self.dimension))]
-
-        def keep(step: int, state: State) -> None:
-            if observe is not None:
-                observe(step, state)
-            if step % record_every == 0 or step == steps:
-                frames.append((step, *state.numpy(self.dimension)))
-
-        rollout.forward(keep, keep=False)
-        return self._trajectory(frames, rollout)
+        return rollout
 
     def begin(self, rollout: Rollout, gravity: Any = None) -> None:
         """Give a rollout the scene's first state and parameters."""
@@ -99,29 +108,12 @@ class Simulation:
         return table
 
     def converged(self, rollout: Rollout) -> np.ndarray:
-        """(steps,) whether the density error came below the tolerances that the scene asks for."""
+        """(steps,) whether the density error came below the tolerances; always, with a fixed number of iterations."""
         solve = self.solver.pressure
-        if solve is None:
+        if solve is None or solve.minimum_iterations == solve.maximum_iterations:
             return np.ones(len(rollout.errors), dtype=bool)
         average, greatest = rollout.errors.T
         return (average <= solve.tolerance) & (greatest <= solve.greatest_tolerance)
-
-    def _trajectory(self, frames: list[tuple[int, np.ndarray, np.ndarray]], rollout: Rollout) -> Trajectory:
-        steps = np.array([step for step, _, _ in frames])
-        converged = self.converged(rollout)
-        if not converged.all() and self.solver.pressure is not None:
-            solve = self.solver.pressure
-            if solve.maximum_iterations > solve.minimum_iterations:
-                warnings.warn(not_converged_sentence(converged, solve.maximum_iterations), CortadoWarning, stacklevel=3)
-        return Trajectory(
-            times=steps * self.scene.solver.time_step,
-            steps=steps,
-            positions=np.stack([positions for _, positions, _ in frames]),
-            velocities=np.stack([velocities for _, _, velocities in frames]),
-            iterations=rollout.iterations,
-            density_errors=rollout.errors[:, 0],
-            converged=converged,
-        )
 
     def _solver(self) -> Pcisph:
         scene, dimension = self.scene, self.scene.dimension
@@ -130,7 +122,8 @@ class Simulation:
         discretisation = Discretisation(kernel, self.precision)
         lower, lengths = period(scene)
         volume = rest_volume(kernel, spacing, support, dimension)
-        weights = boundary_volumes(self.walls, lambda r: kernel.weight(r, dimension, support), support, lower, lengths)
+        factor = wall_factor(kernel, spacing, support, dimension)
+        volumes = boundary_volumes(self.walls, lambda r: kernel.weight(r, dimension, support), support, lower, lengths)
         everything = np.concatenate([self.positions, self.walls])
         grid = Grid.around(
             everything.min(axis=0),
@@ -143,7 +136,7 @@ class Simulation:
             discretisation,
             grid,
             _padded(self.walls),
-            weights / volume,
+            factor * volumes / volume,
             self.particles,
             first_capacity(support / spacing, dimension),
             self.device,
@@ -192,11 +185,11 @@ def first_capacity(support: float, dimension: int) -> int:
     return int(1.5 * filled) + 6
 
 
-def not_converged_sentence(converged: np.ndarray, most: int) -> str:
+def not_converged_sentence(converged: np.ndarray) -> str:
     """What to say of steps that ended above the tolerance."""
     return (
-        f"the pressure did not converge within {most} iterations in {np.count_nonzero(~converged)} of "
-        f"{len(converged)} steps; try more iterations or a smaller time step."
+        f"the pressure did not converge in {np.count_nonzero(~converged)} of {len(converged)} steps: "
+        "try a smaller time step, more iterations or a larger tolerance."
     )
 
 

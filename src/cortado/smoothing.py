@@ -105,13 +105,13 @@ def _wendland_c4(precision: Precision) -> SimpleNamespace:
     def value(q: real) -> real:
         t = wp.max(real(1.0) - q, real(0.0))
         t_2 = t * t
-        return t_2 * t_2 * t_2 * (real(1.0) + real(6.0) * q + real(35.0 / 3.0) * q * q)
+        return t_2 * t_2 * t_2 * (real(1.0) + real(6.0) * q + (real(35.0) / real(3.0)) * q * q)
 
     @wp.func
     def slope(q: real) -> real:
         t = wp.max(real(1.0) - q, real(0.0))
         t_2 = t * t
-        return real(-56.0 / 3.0) * (real(1.0) + real(5.0) * q) * t_2 * t_2 * t
+        return (real(-56.0) / real(3.0)) * (real(1.0) + real(5.0) * q) * t_2 * t_2 * t
 
     @wp.func
     def bend(q: real) -> real:

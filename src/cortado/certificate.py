@@ -1,0 +1,126 @@
+"""Is a gradient right? Reverse mode against forward mode against central differences, along random directions."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from cortado.policies import Policy
+from cortado.problem import Problem
+
+STEPS = tuple(10.0**-k for k in range(2, 10))
+"""Steps of the central differences, in units of a parameter's scale."""
+AGREEMENT = 1e-8
+"""How near reverse and forward mode must be, relative, in float64; both are exact to round-off."""
+PLATEAU = 1e-3
+"""Two neighbouring differences this near to each other, relative, are believed; and so near must the adjoint be."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One parameter: the loss's derivative along one direction, three times."""
+
+    parameter: str
+    adjoint: float
+    tangent: float
+    differences: tuple[float, ...]
+    """Central differences at `STEPS`."""
+
+    @property
+    def disagreement(self) -> float:
+        """Relative distance of reverse and forward mode."""
+        return _relative(self.adjoint, self.tangent)
+
+    @property
+    def best_difference(self) -> float:
+        """Relative distance of the adjoint and the central difference that is nearest to it."""
+        return min(_relative(self.adjoint, difference) for difference in self.differences)
+
+    @property
+    def plateau(self) -> float | None:
+        """The central difference where two neighbouring steps agree best; None where none agree (chaos, round-off)."""
+        pairs = list(zip(self.differences, self.differences[1:], strict=False))
+        a, b = min(pairs, key=lambda pair: _relative(*pair))
+        return a if _relative(a, b) < PLATEAU else None
+
+    @property
+    def right(self) -> bool:
+        """Whether nothing speaks against the adjoint."""
+        believed = self.plateau
+        near = believed is None or min(self.best_difference, _relative(self.adjoint, believed)) < PLATEAU
+        return bool(self.disagreement < AGREEMENT and near)
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The comparisons of one problem."""
+
+    steps: int
+    particles: int
+    loss: float
+    comparisons: tuple[Comparison, ...]
+
+    @property
+    def right(self) -> bool:
+        """Whether every adjoint is right."""
+        return all(comparison.right for comparison in self.comparisons)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        rows = [
+            {
+                **asdict(c),
+                "disagreement": c.disagreement,
+                "best_difference": c.best_difference,
+                "right": c.right,
+            }
+            for c in self.comparisons
+        ]
+        return {**asdict(self), "difference_steps": STEPS, "comparisons": rows, "right": self.right}
+
+
+def certify(problem: Problem, seed: int = 0, policy: Policy | None = None) -> Certificate:
+    """Compare the derivatives of a problem's loss with respect to every parameter, at the scene's own values.
+
+    Each parameter is moved along a random direction of the size of its scale: gravity by its own size, positions by a
+    tenth of a spacing, velocities by 0.1 m / s, numbers by a tenth of their value.
+    """
+    random = np.random.default_rng(seed)
+    compared = []
+    loss = 0.0
+    for name, point, scale in _points(problem):
+        direction = scale * random.standard_normal(point.shape) if point.ndim else np.asarray(scale)
+        parameter = name.removesuffix(" over time")
+        loss, gradient = problem.value_and_gradient({parameter: point}, policy)
+        tangent = problem.tangent({parameter: point}, {parameter: direction})
+        differences = tuple(
+            (problem.value({parameter: point + h * direction}) - problem.value({parameter: point - h * direction}))
+            / (2.0 * h)
+            for h in STEPS
+        )
+        compared.append(Comparison(name, float((gradient[parameter] * direction).sum()), tangent, differences))
+    return Certificate(problem.steps, problem.simulation.particles, loss, tuple(compared))
+
+
+def _points(problem: Problem) -> list[tuple[str, np.ndarray, float]]:
+    simulation = problem.simulation
+    scene = simulation.scene
+    gravity = np.array(scene.forces.gravity, dtype=np.float64)
+    size = float(np.linalg.norm(gravity)) or 1.0
+    numbers = {
+        "viscosity": simulation.phase.viscosity or 0.01,
+        "rest_density": simulation.phase.rest_density,
+        "time_step": scene.solver.time_step,
+    }
+    return [
+        ("gravity", gravity, 0.1 * size),
+        ("gravity over time", np.tile(gravity, (problem.steps, 1)), 0.1 * size),
+        ("initial_positions", simulation.positions, 0.1 * scene.discretisation.spacing),
+        ("initial_velocities", simulation.velocities, 0.1),
+        *((name, np.array(value, dtype=np.float64), 0.1 * value) for name, value in numbers.items()),
+    ]
+
+
+def _relative(a: float, b: float) -> float:
+    size = max(abs(a), abs(b))
+    return abs(a - b) / size if size > 0 else 0.0

@@ -1,0 +1,147 @@
+"""The command line: ``cortado run | optimise | gradients | bench``.
+
+Exit codes: 0 done, 1 the computation failed (or a check did), 2 the input is wrong. A mistake of the user's is one
+sentence on stderr, never a traceback.
+"""
+
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, UseAppendAction, arg
+from tyro.extras import SubcommandApp
+
+from cortado.errors import ComputationError, CortadoError, CortadoWarning
+
+app = SubcommandApp()
+gradients = SubcommandApp()
+app.add(gradients, name="gradients", help="Judge gradients.")
+
+Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
+Overrides = Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")]
+
+
+@app.command
+def run(
+    scene: Scene,
+    steps: int = 200,
+    out: Path = Path("runs/run"),
+    overrides: Overrides = (),
+    device: str = "cpu",
+    precision: str = "float32",
+    record_every: int = 1,
+    overwrite: bool = False,
+) -> None:
+    """Run a scene forward and write its trajectory.
+
+    Args:
+        scene: The scene file.
+        steps: Number of time steps.
+        out: Folder of the run.
+        overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
+        device: "cpu", or "cuda:0" for the first GPU.
+        precision: "float32" or "float64".
+        record_every: Steps from one frame of the trajectory to the next.
+        overwrite: Replace an earlier run in the same folder.
+    """
+    from cortado.commands.run import run_scene
+
+    print(
+        run_scene(
+            scene, steps, out, list(overrides), device, precision, record_every, overwrite, ["cortado", *sys.argv[1:]]
+        )
+    )
+
+
+@app.command
+def optimise(
+    task: Annotated[Positional[Path], arg(metavar="TASK.toml")],
+    out: Path = Path("runs/optimise"),
+    overrides: Overrides = (),
+    device: str = "cpu",
+    precision: str = "float32",
+    resume: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Optimise what a task file names, and check the result as the file asks.
+
+    Args:
+        task: A scene file with the tables [problem] and [optimise].
+        out: Folder of the run.
+        overrides: Replace a value of the file, such as optimise.iterations=50; may be given again.
+        device: "cpu", or "cuda:0" for the first GPU.
+        precision: "float32" or "float64".
+        resume: Go on with the run in the folder, bit for bit.
+        overwrite: Replace an earlier run in the same folder.
+    """
+    from cortado.commands.optimise import optimise_task
+
+    command = ["cortado", *sys.argv[1:]]
+    print(optimise_task(task, out, list(overrides), device, precision, resume, overwrite, command))
+
+
+@gradients.command
+def check(
+    scene: Scene,
+    steps: int = 50,
+    overrides: Overrides = (),
+    device: str = "cpu",
+    json: bool = False,
+    seed: int = 0,
+) -> None:
+    """Check the gradient of the final positions: reverse mode, forward mode and finite differences, in float64.
+
+    Args:
+        scene: The scene file.
+        steps: Number of time steps.
+        overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
+        device: "cpu", or "cuda:0" for the first GPU.
+        json: Print JSON for machines instead of a table.
+        seed: Of the random directions.
+    """
+    from cortado.commands.check import check_scene
+
+    print(check_scene(scene, steps, list(overrides), device, json, seed))
+
+
+@app.command
+def bench(particles: int = 8000, steps: int = 20, device: str = "cpu", precision: str = "float32", json: bool = False) -> None:
+    """Time a dam break, forward and with its gradient.
+
+    Args:
+        particles: Number of fluid particles, about.
+        steps: Number of time steps.
+        device: "cpu", or "cuda:0" for the first GPU.
+        precision: "float32" or "float64".
+        json: Print JSON for machines instead of a table.
+    """
+    from cortado.commands.bench import bench_dam_break
+
+    print(bench_dam_break(particles, steps, device, precision, json))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command and exit with its code."""
+    warnings.showwarning = _show_warning  # type: ignore[assignment]
+    try:
+        app.cli(prog="cortado", args=arguments, config=(tyro.conf.OmitArgPrefixes,))
+    except ComputationError as error:
+        sys.exit(_say(error, 1))
+    except CortadoError as error:
+        sys.exit(_say(error, 2))
+    except KeyboardInterrupt:
+        print("Interrupted; what was computed is on disk.", file=sys.stderr)
+        sys.exit(130)
+
+
+def _say(error: CortadoError, code: int) -> int:
+    print(str(error), file=sys.stderr)
+    return code
+
+
+def _show_warning(message: Warning, category: type[Warning], *rest: object) -> None:
+    if issubclass(category, CortadoWarning):
+        print(f"Warning: {message}", file=sys.stderr)

@@ -1,0 +1,1 @@
+"""The commands of the command line, one a file: arguments in, files and an exit code out."""

@@ -1,0 +1,106 @@
+"""``cortado run``: a scene, forward."""
+
+from pathlib import Path
+
+import numpy as np
+
+from cortado.errors import DivergedError
+from cortado.figures import density_errors, particles
+from cortado.particles import State
+from cortado.progress import track
+from cortado.report import write_report
+from cortado.rollout import Rollout
+from cortado.run_folder import RunFolder
+from cortado.scene import Scene, load_scene
+from cortado.simulation import Simulation, check_steps, not_converged_sentence
+from cortado.trajectory import Trajectory
+from cortado.vtkhdf import TrajectoryWriter
+
+
+def run_scene(
+    scene_file: Path,
+    steps: int,
+    out: Path,
+    overrides: list[str],
+    device: str,
+    precision: str,
+    record_every: int,
+    overwrite: bool,
+    command: list[str],
+) -> str:
+    """Run a scene, write its folder, and return a sentence that says where the results are."""
+    scene = load_scene(scene_file, overrides)
+    simulation = Simulation(scene, device, precision)
+    rollout = simulation.rollout(check_steps(steps))
+    folder = RunFolder.create(out, scene.to_json(), command, device=str(simulation.device), overwrite=overwrite)
+    try:
+        _write_trajectory(simulation, rollout, folder, max(record_every, 1))
+    except DivergedError as error:
+        raise DivergedError(error.step, error.particle, f"{error.advice}; the frames so far are in {folder.path}") from error
+    finally:
+        _write_pictures(scene, simulation, folder)
+    converged = simulation.converged(rollout)
+    warning = "" if converged.all() else f"Mind that {not_converged_sentence(converged)} "
+    return f"{warning}The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
+
+
+def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:
+    steps, time_step = rollout.steps, simulation.scene.solver.time_step
+    frames = 1 + steps // record_every + (steps % record_every > 0)
+    with (
+        TrajectoryWriter(
+            folder.trajectory,
+            frames=frames,
+            particles=simulation.particles,
+            dimension=simulation.dimension,
+            precision=simulation.precision.name,  # type: ignore[arg-type]
+            steps=steps,
+        ) as writer,
+        track(steps, "run") as advance,
+    ):
+        writer.append(0.0, *rollout.initial.numpy(simulation.dimension), step=0)
+
+        def observe(step: int, state: State) -> None:
+            if step % record_every == 0 or step == steps:
+                writer.append(step * time_step, *state.numpy(simulation.dimension), step=step)
+            advance()
+
+        try:
+            rollout.forward(observe, keep=False)
+        finally:
+            writer.append_steps(rollout.iterations, rollout.errors[:, 0], simulation.converged(rollout))
+            for step, (iterations, error) in enumerate(zip(rollout.iterations, rollout.errors, strict=True), 1):
+                folder.append_metrics(
+                    step=step, iterations=iterations, density_error=error[0], greatest_density_error=error[1]
+                )
+
+
+def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder) -> None:
+    trajectory = Trajectory.load(folder.trajectory)
+    shown = sorted({0, len(trajectory.times) // 2, len(trajectory.times) - 1})
+    speeds = [np.linalg.norm(trajectory.velocities[frame], axis=1) for frame in shown]
+    figures = [
+        (
+            "The fluid at the start, half-way and at the end, seen along the third axis.",
+            particles(
+                [trajectory.positions[frame] for frame in shown],
+                [f"t = {trajectory.times[frame]:.3f} s" for frame in shown],
+                folder.figures / "particles.png",
+                colours=speeds,
+                colour_label="speed [m/s]",
+            ),
+        )
+    ]
+    if len(trajectory.density_errors) and scene.forces.pressure:
+        path = folder.figures / "density_errors.png"
+        density_errors(trajectory, path, tolerance=scene.solver.density_tolerance)
+        figures.append(("Average density error of each step, and the tolerance asked.", path))
+    rows = [
+        ("particles", simulation.particles),
+        ("wall particles", len(simulation.walls)),
+        ("steps", len(trajectory.iterations)),
+        ("simulated time [s]", f"{trajectory.times[-1]:.4g}"),
+        ("precision", simulation.precision.name),
+    ]
+    write_report(folder, scene.name, rows, figures)
+

@@ -1,0 +1,205 @@
+"""What the user writes: a scene, from a TOML file or in Python, checked and frozen. SI units.
+
+Vectors have as many components as the scene has dimensions. Whatever is wrong raises a `SceneError`, one sentence.
+"""
+
+import json
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from cortado.errors import CortadoWarning, SceneError
+from cortado.scene_checks import check_scene
+from cortado.scene_containers import AnyContainer, BoxContainer, CylinderContainer, NoContainer
+from cortado.scene_fluids import AnyFluid, BoxFluid, CylinderFluid, PointsFluid, SphereFluid
+from cortado.scene_stability import stability_limit
+from cortado.scene_toml import read_toml
+from cortado.scene_values import (
+    Choice,
+    Components,
+    Count,
+    Flag,
+    Quantity,
+    Table,
+    Tables,
+    Text,
+    sentences,
+    wrong,
+)
+
+__all__ = [
+    "BoxContainer",
+    "BoxFluid",
+    "CylinderContainer",
+    "CylinderFluid",
+    "Discretisation",
+    "Forces",
+    "NoContainer",
+    "Phase",
+    "PointsFluid",
+    "Scene",
+    "Solver",
+    "SphereFluid",
+    "load_scene",
+    "read_toml",
+    "scene_from_dict",
+    "stability_limit",
+]
+
+OTHER_TABLES = ("problem", "optimise")
+"""Tables that a scene file may hold for other modules."""
+
+
+class Discretisation(Table):
+    """How the fluid is cut into particles."""
+
+    spacing: Annotated[float, Quantity("m", above=0.0)]
+    """Distance between particles at rest [m]."""
+    support: Annotated[float, Quantity(least=1.2, most=4.0)] = 2.0
+    """Support radius / spacing."""
+    kernel: Annotated[str, Choice(("cubic_spline", "wendland_c2", "wendland_c4"))] = "cubic_spline"
+    """Name of the smoothing kernel."""
+
+    @property
+    def support_radius(self) -> float:
+        """The distance at which the smoothing kernel ends [m]."""
+        return self.support * self.spacing
+
+
+class Phase(Table):
+    """A material."""
+
+    name: Annotated[str, Text()]
+    """What fluids call it."""
+    rest_density: Annotated[float, Quantity("kg/m3", above=0.0)]
+    """[kg/m3]"""
+    viscosity: Annotated[float, Quantity("Pa s", least=0.0)]
+    """Dynamic [Pa s]."""
+    colour: Annotated[tuple[float, ...], Components(Quantity(least=0.0, most=1.0))] = (0.1, 0.3, 0.8)
+    """(3,) red, green and blue, each from 0 to 1."""
+
+    @field_validator("colour")
+    @classmethod
+    def _check_colour(cls, colour: tuple[float, ...]) -> tuple[float, ...]:
+        if len(colour) != 3:
+            raise wrong((), colour, "a list of 3 components: red, green and blue")
+        return colour
+
+
+class Forces(Table):
+    """Which forces act."""
+
+    gravity: Annotated[tuple[float, ...], Components(Quantity("m/s2"), default=(0.0, -9.81, 0.0))] = ()
+    """(d,) [m/s2]"""
+    viscosity: Annotated[str, Choice(("pairwise", "laminar", "none"))] = "pairwise"
+    """"pairwise": the report's equation 10; "laminar": Morris et al. (1997)."""
+    pressure: Annotated[bool, Flag()] = True
+    """Whether the fluid resists compression."""
+
+
+class Solver(Table):
+    """How a step is solved."""
+
+    kind: Annotated[str, Choice(("pcisph",))] = "pcisph"
+    """Name of the algorithm."""
+    time_step: Annotated[float, Quantity("s", above=0.0)]
+    """[s]"""
+    minimum_iterations: Annotated[int, Count(1, 1_000_000)] = 3
+    """Pressure iterations of a step, at least."""
+    maximum_iterations: Annotated[int, Count(1, 1_000_000)] = 50
+    """Pressure iterations of a step, at most."""
+    density_tolerance: Annotated[float, Quantity(least=0.0)] = 0.01
+    """On the average of (rho - rho_0) / rho_0."""
+    maximum_density_tolerance: Annotated[float, Quantity(least=0.0)] | None = None
+    """On the maximum of (rho - rho_0) / rho_0; not used if None."""
+
+    @model_validator(mode="after")
+    def _check_iterations(self) -> Self:
+        if self.minimum_iterations > self.maximum_iterations:
+            wanted = f"at most maximum_iterations, {self.maximum_iterations}"
+            raise wrong(("minimum_iterations",), self.minimum_iterations, wanted)
+        return self
+
+
+class Scene(Table):
+    """Everything that a simulation starts from."""
+
+    name: Annotated[str, Text()] = "scene"
+    """Shown in titles."""
+    dimension: Annotated[int, Count(2, 3)]
+    """2 or 3; d below."""
+    discretisation: Discretisation
+    """How the fluid is cut into particles."""
+    phase: Annotated[tuple[Phase, ...], Tables("phase")]
+    """The materials."""
+    fluid: Annotated[tuple[AnyFluid, ...], Tables("fluid")]
+    """The bodies of fluid; particles come in this order."""
+    container: AnyContainer = Field(default=NoContainer(), validate_default=True)
+    """What holds the fluid."""
+    forces: Forces = Field(default=Forces(), validate_default=True)
+    """Which forces act."""
+    solver: Solver
+    """How a step is solved."""
+
+    @field_validator("container", "forces")
+    @classmethod
+    def _resolve(cls, table: Any, info: ValidationInfo) -> Any:
+        return table.in_dimension(info.data["dimension"]) if "dimension" in info.data else table
+
+    @field_validator("fluid")
+    @classmethod
+    def _resolve_fluids(cls, fluids: Any, info: ValidationInfo) -> Any:
+        if "dimension" not in info.data:
+            return fluids
+        return tuple(fluid.in_dimension(info.data["dimension"], (index,)) for index, fluid in enumerate(fluids))
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        check_scene(self)
+        limit, time_step = stability_limit(self), self.solver.time_step
+        if time_step > limit * (1.0 + 1e-9):
+            sentence = f"solver.time_step is {time_step:g} s, but the limit of stability is about {limit:.3g} s."
+            warnings.warn(sentence, CortadoWarning, stacklevel=2)
+        return self
+
+    def to_json(self) -> str:
+        """The scene with all defaults filled in, to be read by `from_json`."""
+        return json.dumps(self.model_dump(mode="json"), indent=2)
+
+    @classmethod
+    def from_json(cls, text: str) -> "Scene":
+        """The scene that `to_json` wrote."""
+        try:
+            data = json.loads(text)
+        except (ValueError, RecursionError) as problem:
+            raise SceneError(None, "", sentence=f"is not valid JSON: {problem}.") from None
+        return scene_from_dict(data)
+
+
+def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Scene:
+    """Read a scene from a TOML file.
+
+    Args:
+        path: the file. Its tables [problem] and [optimise] belong to others and are ignored.
+        overrides: replacements such as ``solver.time_step=0.002`` or ``fluid[0].upper=[1,1,1]``.
+
+    Raises:
+        SceneError: in one sentence, with the file, the field, what was found and what was wanted.
+    """
+    return scene_from_dict(read_toml(path, overrides), os.fspath(path))
+
+
+def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
+    """A scene from the contents of its file, whose folder is where its other files are looked for."""
+    if isinstance(data, Mapping):
+        data = {key: value for key, value in data.items() if key not in OTHER_TABLES}
+    folder = Path(file).parent if file else Path()
+    try:
+        with sentences():
+            return Scene.model_validate(data, context={"folder": folder})
+    except SceneError as error:
+        raise (error.in_file(file) if file else error) from None

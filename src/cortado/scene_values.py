@@ -1,0 +1,309 @@
+"""The kinds of value that a scene holds, and how a wrong one becomes a sentence.
+
+A kind is put beside the type of a field, ``Annotated[float, Quantity("kg/m3", above=0.0)]``: it checks the value and
+says what was wanted. A wrong value ends in a `SceneError`, whether the scene comes from a file or is built in Python.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from difflib import get_close_matches
+from numbers import Real
+from typing import Any, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError, model_validator
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+from cortado.errors import Phrase, SceneError
+
+GREATEST = 1e50
+"""No number of a scene is larger, as its cube must fit into a float64, and no positive one smaller than its inverse."""
+MISSING = Phrase("missing")
+SHAPES = ("box", "cylinder", "sphere", "points", "none")
+FieldPath = Sequence[str | int]
+
+
+# ---- sentences ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, repr=False)
+class Trouble:
+    """What a check found. Pydantic takes the text of it, which must not hold the value: that may be of any length."""
+
+    path: tuple[str | int, ...]
+    found: Any
+    wanted: str
+    sentence: str | None
+
+
+def wrong(path: FieldPath, found: Any, wanted: str, sentence: str | None = None) -> PydanticCustomError:
+    """What a check raises; the path (names and indices) starts at the model that is being checked."""
+    return PydanticCustomError("scene", "wrong value", {"trouble": Trouble(tuple(path), found, wanted, sentence)})
+
+
+@contextmanager
+def sentences() -> Iterator[None]:
+    """Turn the first trouble that pydantic reports into a `SceneError`."""
+    try:
+        yield
+    except ValidationError as error:
+        raise _scene_error(error) from None
+
+
+def field_name(path: FieldPath) -> str:
+    """``("fluid", 0, "upper")`` as ``fluid[0].upper``."""
+    text = ""
+    for part in path:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        else:
+            name = part if part.replace("-", "_").isidentifier() else repr(part)
+            text += f".{name}" if text else name
+    return text
+
+
+def _scene_error(error: ValidationError) -> SceneError:
+    first = error.errors(include_url=False)[0]
+    path = [part for part in first["loc"] if part not in SHAPES]  # pydantic names the member of a union
+    if first["type"] != "scene":
+        return SceneError(None, field_name(path), first["input"], f"valid ({first['msg']})")
+    trouble = first["ctx"]["trouble"]
+    path += trouble.path
+    sentence = trouble.sentence
+    if sentence:
+        sentence = sentence.replace("{table}", f"[{field_name(path[:-1])}]" if path[1:] else "the scene")
+    return SceneError(None, field_name(path), trouble.found, trouble.wanted, sentence)
+
+
+# ---- tables ------------------------------------------------------------------------------------------------------
+
+
+class Table(BaseModel):
+    """A table of the scene: frozen, without unknown keys, and with a `SceneError` for whatever is wrong."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def __init__(self, /, **data: Any):
+        with sentences():
+            super().__init__(**data)
+
+    # Tells pydantic to build nested tables without this method, so that an error carries its whole path.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_keys(cls, data: Any) -> Any:
+        if isinstance(data, cls):
+            return data
+        if not isinstance(data, Mapping):
+            raise wrong((), data, "a table")
+        for key in data:
+            if key not in cls.model_fields:
+                raise _unknown_key(str(key), list(cls.model_fields))
+        for name, field in cls.model_fields.items():
+            if field.is_required() and name not in data:
+                kinds = [kind.wanted for kind in field.metadata if isinstance(kind, Kind)]
+                raise wrong((name,), MISSING, kinds[0] if kinds else "a table")
+        return data
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        """This table, at a path, with its vectors checked, and those left out filled in, for 2 or 3 dimensions."""
+        filled = {}
+        for name, field in type(self).model_fields.items():
+            for kind in field.metadata:
+                if isinstance(kind, Components):
+                    filled[name] = kind.in_dimension((*path, name), getattr(self, name), dimension)
+        return self.model_copy(update=filled)
+
+
+def _unknown_key(key: str, known: list[str]) -> PydanticCustomError:
+    close = get_close_matches(key, known, n=1)
+    advice = f"did you mean {close[0]}?" if close else f"its keys are {', '.join(known)}."
+    return wrong((key,), Phrase("unknown"), f"one of {', '.join(known)}", f"is not a key of {{table}}; {advice}")
+
+
+# ---- kinds -------------------------------------------------------------------------------------------------------
+
+
+class Kind:
+    """A kind of value: checks it, and says what was wanted."""
+
+    @property
+    def wanted(self) -> str:
+        """What a value must be, in words."""
+        raise NotImplementedError
+
+    def check(self, value: Any) -> Any:
+        """The value as it is kept; raises `wrong`."""
+        raise NotImplementedError
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_before_validator_function(self.check, handler(source))
+
+
+@dataclass(frozen=True)
+class Quantity(Kind):
+    """A finite number with a unit."""
+
+    unit: str = ""
+    above: float | None = None
+    least: float | None = None
+    most: float | None = None
+
+    @property
+    def wanted(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        limits = [
+            f"{word} {limit:g}{unit}"
+            for word, limit in (("greater than", self.above), ("at least", self.least), ("at most", self.most))
+            if limit is not None
+        ]
+        return " and ".join(limits) if limits else f"a number{f' in {self.unit}' if unit else ''}"
+
+    def check(self, value: Any) -> float:
+        number = as_number(value)
+        if number is None:
+            raise wrong((), value, f"a finite number{'' if self.wanted.startswith('a ') else f', {self.wanted}'}")
+        if abs(number) > GREATEST or (self.above == 0.0 and 0.0 < number < 1.0 / GREATEST):
+            raise wrong((), value, f"a number between {1.0 / GREATEST:g} and {GREATEST:g} in size")
+        low = (self.above is not None and number <= self.above) or (self.least is not None and number < self.least)
+        if low or (self.most is not None and number > self.most):
+            raise wrong((), value, self.wanted)
+        return number
+
+
+@dataclass(frozen=True)
+class Count(Kind):
+    """A whole number."""
+
+    least: int
+    most: int
+
+    @property
+    def wanted(self) -> str:
+        return f"a whole number from {self.least} to {self.most}"
+
+    def check(self, value: Any) -> int:
+        if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
+            raise wrong((), value, self.wanted)
+        if not self.least <= value <= self.most:
+            raise wrong((), value, self.wanted)
+        return int(value)
+
+
+@dataclass(frozen=True)
+class Choice(Kind):
+    """One of a few names."""
+
+    options: tuple[str, ...]
+
+    @property
+    def wanted(self) -> str:
+        return " or ".join(f'"{option}"' for option in self.options)
+
+    def check(self, value: Any) -> str:
+        if not isinstance(value, str) or value not in self.options:
+            raise wrong((), value, self.wanted)
+        return value
+
+
+class Text(Kind):
+    """A text that is not empty."""
+
+    wanted = "a text that is not empty"
+
+    def check(self, value: Any) -> str:
+        if not isinstance(value, str) or not value.strip():
+            raise wrong((), value, self.wanted)
+        return value
+
+
+class Flag(Kind):
+    """Yes or no."""
+
+    wanted = "true or false"
+
+    def check(self, value: Any) -> bool:
+        if not isinstance(value, (bool, np.bool_)):
+            raise wrong((), value, self.wanted)
+        return bool(value)
+
+
+@dataclass(frozen=True)
+class Components(Kind):
+    """One component for each axis: a vector, or flags. Left out, it is () until the scene's dimension is known."""
+
+    kind: Kind
+    default: tuple[Any, ...] = ()
+
+    @property
+    def wanted(self) -> str:
+        return f"a list with one component for each axis, each {self.kind.wanted}"
+
+    def check(self, value: Any) -> tuple[Any, ...]:
+        if isinstance(value, np.ndarray):
+            value = value.tolist()
+        if not isinstance(value, (list, tuple)) or not value:
+            raise wrong((), value, self.wanted)
+        return tuple(self._check_component(index, component) for index, component in enumerate(value))
+
+    def _check_component(self, index: int, value: Any) -> Any:
+        try:
+            return self.kind.check(value)
+        except PydanticCustomError as error:
+            trouble = (error.context or {})["trouble"]
+            raise wrong((index,), trouble.found, trouble.wanted) from None
+
+    def in_dimension(self, path: FieldPath, value: tuple[Any, ...], dimension: int) -> tuple[Any, ...]:
+        """The value with as many components as there are dimensions."""
+        value = value or self.default[:dimension]
+        if len(value) != dimension:
+            raise wrong(path, value, f"a list of {dimension} components, as the scene has {dimension} dimensions")
+        return value
+
+
+@dataclass(frozen=True)
+class Tables(Kind):
+    """One table or more, in a list."""
+
+    name: str
+
+    @property
+    def wanted(self) -> str:
+        return f"a list of at least one table, each written [[{self.name}]]"
+
+    def check(self, value: Any) -> Any:
+        if not isinstance(value, (list, tuple)) or not value:
+            raise wrong((), value, self.wanted)
+        return value
+
+
+@dataclass(frozen=True)
+class Shaped(Kind):
+    """A table whose key ``shape`` says which of several it is."""
+
+    shapes: tuple[str, ...]
+    wanted = "a table"
+
+    def check(self, value: Any) -> Any:
+        if isinstance(value, Mapping):
+            choice = Choice(self.shapes)
+            shape = value.get("shape", MISSING)
+            if isinstance(shape, Phrase) or not isinstance(shape, str) or shape not in self.shapes:
+                raise wrong(("shape",), shape, choice.wanted)
+        elif not isinstance(value, Table):
+            raise wrong((), value, self.wanted)
+        return value
+
+
+def as_number(value: Any) -> float | None:
+    """A finite number as a float; None for anything else, a bool included."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None

@@ -1,0 +1,128 @@
+"""Shapes as points, in float64: blocks of a lattice, and the walls of boxes and of cups."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Points = NDArray[np.float64]
+
+ROUND_OFF = 1e-6
+"""Share of a spacing by which a length may fall short of a whole number of cells: 0.25 / 0.05 holds 5."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A lattice of points that fills a box: ``first + i spacing``, 0 <= i < counts."""
+
+    first: Points
+    """(d,) [m]"""
+    counts: Points
+    """(d,) whole numbers, as floats: they may be larger than any array."""
+    spacing: float
+    """[m]"""
+
+    @cached_property
+    def size(self) -> float:
+        """The number of points."""
+        return float(np.prod(self.counts))
+
+    @cached_property
+    def extent(self) -> tuple[Points, Points]:
+        """The first and the last point, each (d,) [m]."""
+        return self.first, self.first + (self.counts - 1.0) * self.spacing
+
+    def points(self) -> Points:
+        """(n, d) [m], the last axis fastest."""
+        return grid([x + self.spacing * np.arange(int(n)) for x, n in zip(self.first, self.counts, strict=True)])
+
+
+def block_between(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
+    """The points ``lower + (i + 1/2) spacing`` whose cells lie within the box; lower and upper (d,) [m]."""
+    first = np.asarray(lower, dtype=np.float64)
+    counts = whole_cells(np.asarray(upper, dtype=np.float64) - first, spacing)
+    return Block(first + 0.5 * spacing, counts, spacing)
+
+
+def block_about(centre: ArrayLike, half: ArrayLike, spacing: float) -> Block:
+    """A lattice that is symmetric about a centre (d,) [m] and reaches as far as half lengths (d,) [m] allow."""
+    counts = whole_cells(2.0 * np.asarray(half, dtype=np.float64), spacing)
+    return Block(np.asarray(centre, dtype=np.float64) - 0.5 * (counts - 1.0) * spacing, counts, spacing)
+
+
+def whole_cells(lengths: Points, spacing: float) -> Points:
+    """How many cells fit into lengths [m], any shape."""
+    return np.maximum(np.floor(lengths / spacing + ROUND_OFF), 0.0)
+
+
+def nearest_cells(length: float, spacing: float) -> int:
+    """How many cells fill a length [m] best, at least 1."""
+    return max(int(np.floor(length / spacing + 0.5)), 1)
+
+
+def grid(axes: Sequence[Points]) -> Points:
+    """(n, d): every combination of the values of the axes, the last axis fastest."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+
+
+def corners(lower: Points, upper: Points) -> Points:
+    """(2^d, d) the corners of a box."""
+    return np.array(list(product(*zip(lower, upper, strict=True))), dtype=np.float64)
+
+
+# ---- walls -------------------------------------------------------------------------------------------------------
+
+
+def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, layers: int) -> Points:
+    """(n, d) the lattice of a box continued outside of it: faces, edges and corners, each point once.
+
+    An axis whose length is no multiple of the spacing is stretched a little between its walls. A periodic axis has no
+    wall. Axis by axis: outside on this axis, inside on those before it, either on those after it.
+    """
+    inside = [_cells(a, b, nearest_cells(b - a, spacing)) for a, b in zip(lower, upper, strict=True)]
+    depths = (np.arange(layers) + 0.5) * spacing
+    outside = [
+        np.zeros(0) if open_axis else np.concatenate([a - depths[::-1], b + depths])
+        for a, b, open_axis in zip(lower, upper, periodic, strict=True)
+    ]
+    both = [np.sort(np.concatenate(pair)) for pair in zip(inside, outside, strict=True)]
+    return np.concatenate([grid([*inside[:axis], outside[axis], *both[axis + 1 :]]) for axis in range(len(inside))])
+
+
+def cup_walls(radius: float, height: float, lid: bool, spacing: float, layers: int) -> Points:
+    """(n, 3) the walls of an upright cup whose base is centred on the origin, the third axis along its height.
+
+    The side: rings at ``radius + spacing / 2``, about a spacing apart along and across. The base, and the lid if there
+    is one: concentric rings half a spacing outside, the outermost continuing the side.
+    """
+    depths = (np.arange(layers) + 0.5) * spacing
+    levels = _cells(0.0, height, nearest_cells(height, spacing))
+    side = np.concatenate([ring(radius + depth, spacing) for depth in depths])
+    rim = radius + depths[0]
+    rings = nearest_cells(rim, spacing)
+    radii = [*(rim * np.arange(rings + 1) / rings), *(radius + depths[1:])]
+    disc = np.concatenate([ring(value, spacing) for value in radii])
+    ends = [*(-depths), *(height + depths if lid else [])]
+    return np.concatenate([_stacked(side, levels), _stacked(disc, np.array(ends))])
+
+
+def ring(radius: float, spacing: float) -> Points:
+    """(n, 2) points on a circle, about a spacing apart; one point for the radius 0."""
+    if radius == 0.0:
+        return np.zeros((1, 2))
+    count = max(nearest_cells(2.0 * np.pi * radius, spacing), 3)
+    angles = 2.0 * np.pi * np.arange(count) / count
+    return radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+
+
+def _cells(lower: float, upper: float, count: int) -> Points:
+    """(count,) the centres of equal cells between two ends."""
+    return lower + (upper - lower) * (np.arange(count) + 0.5) / count
+
+
+def _stacked(flat: Points, levels: Points) -> Points:
+    """(levels n, 3) a plane set of points (n, 2) repeated at every level."""
+    return np.column_stack([np.tile(flat, (len(levels), 1)), np.repeat(levels, len(flat))])

@@ -1,0 +1,147 @@
+"""Scenes that are wrong in one way each: (name, what to replace in the good scene, by what, the field to be named)."""
+
+GOOD_SCENE = """\
+name = "two blocks"
+dimension = 3
+
+[discretisation]
+spacing = 0.05
+support = 2.0
+kernel = "cubic_spline"
+
+[[phase]]
+name = "water"
+rest_density = 1000.0
+viscosity = 0.05
+colour = [0.1, 0.3, 0.8]
+
+[[fluid]]
+shape = "box"
+lower = [0.0, 0.0, 0.0]
+upper = [0.25, 0.25, 0.25]
+velocity = [0.0, 0.0, 0.0]
+phase = "water"
+
+[[fluid]]
+shape = "sphere"
+centre = [0.2, 0.45, 0.12]
+radius = 0.1
+phase = "water"
+
+[container]
+shape = "box"
+lower = [0.0, 0.0, 0.0]
+upper = [0.4, 0.6, 0.25]
+periodic = [true, false, false]
+slip = "no"
+
+[forces]
+gravity = [0.0, -9.81, 0.0]
+viscosity = "pairwise"
+pressure = true
+
+[solver]
+kind = "pcisph"
+time_step = 0.0021
+minimum_iterations = 5
+maximum_iterations = 5
+density_tolerance = 0.01
+"""
+
+_SPHERE = 'shape = "sphere"\ncentre = [0.2, 0.45, 0.12]\nradius = 0.1'
+_UPPER = "upper = [0.25, 0.25, 0.25]"
+_CONTAINER = GOOD_SCENE[GOOD_SCENE.index("[container]") : GOOD_SCENE.index("[forces]")]
+_FLUIDS = GOOD_SCENE[GOOD_SCENE.index("[[fluid]]") : GOOD_SCENE.index("[container]")]
+_PHASE = GOOD_SCENE[GOOD_SCENE.index("[[phase]]") : GOOD_SCENE.index("[[fluid]]")]
+
+
+def _drop(x: float) -> str:
+    return f'[[fluid]]\nshape = "sphere"\ncentre = [{x}, 0.2, 0.12]\nradius = 0.03\nphase = "water"\n'
+
+
+BAD_SCENES = [
+    ("broken syntax", "dimension = 3", "dimension = = 3", "line 2"),
+    ("key twice", "dimension = 3", "dimension = 3\ndimension = 3", "line 3"),
+    ("nested without end", "dimension = 3", "dimension = " + 5000 * "[", "TOML"),
+    ("negative spacing", "spacing = 0.05", "spacing = -0.05", "discretisation.spacing"),
+    ("spacing of zero", "spacing = 0.05", "spacing = 0", "discretisation.spacing"),
+    ("tiny spacing", "spacing = 0.05", "spacing = 1e-12", "discretisation.spacing"),
+    ("vanishing spacing", "spacing = 0.05", "spacing = 1e-300", "discretisation.spacing"),
+    ("spacing that is text", "spacing = 0.05", 'spacing = "0.05"', "discretisation.spacing"),
+    ("spacing that is a date", "spacing = 0.05", "spacing = 2020-01-01", "discretisation.spacing"),
+    ("no spacing", "spacing = 0.05\n", "", "discretisation.spacing"),
+    ("spacing wider than the fluid", "spacing = 0.05", "spacing = 0.3", "fluid[0]"),
+    ("support of zero", "support = 2.0", "support = 0", "discretisation.support"),
+    ("short support", "support = 2.0", "support = 1.1", "discretisation.support"),
+    ("wide support", "support = 2.0", "support = 4.5", "discretisation.support"),
+    ("unknown kernel", '"cubic_spline"', '"gaussian"', "discretisation.kernel"),
+    ("kernel that is a number", '"cubic_spline"', "3", "discretisation.kernel"),
+    ("no discretisation", 'spacing = 0.05\nsupport = 2.0\nkernel = "cubic_spline"', "", "discretisation.spacing"),
+    ("four dimensions", "dimension = 3", "dimension = 4", "dimension"),
+    ("dimension with a fraction", "dimension = 3", "dimension = 2.5", "dimension"),
+    ("dimension that is true", "dimension = 3", "dimension = true", "dimension"),
+    ("no dimension", "dimension = 3", "", "dimension"),
+    ("plane with vectors of space", "dimension = 3", "dimension = 2", "fluid[0]"),
+    ("empty name", '"two blocks"', '""', "name"),
+    ("negative density", "1000.0", "-1000.0", "phase[0].rest_density"),
+    ("infinite density", "1000.0", "inf", "phase[0].rest_density"),
+    ("density that is true", "1000.0", "true", "phase[0].rest_density"),
+    ("huge density", "1000.0", "1" + 400 * "0", "phase[0].rest_density"),
+    ("very huge density", "1000.0", "0x" + 9000 * "f", "phase[0].rest_density"),
+    ("negative viscosity", "viscosity = 0.05", "viscosity = -1", "phase[0].viscosity"),
+    ("viscosity that is no number", "viscosity = 0.05", "viscosity = nan", "phase[0].viscosity"),
+    ("colour out of range", "[0.1, 0.3, 0.8]", "[0.1, 1.3, 0.8]", "phase[0].colour[1]"),
+    ("colour of two", "[0.1, 0.3, 0.8]", "[0.1, 0.8]", "phase[0].colour"),
+    ("phases of one name", _PHASE, _PHASE + _PHASE, "phase[1].name"),
+    ("no phase", _PHASE, "", "phase"),
+    ("phase that is one table", "[[phase]]", "[phase]", "phase"),
+    ("unknown phase", 'phase = "water"', 'phase = "oil"', "fluid[0].phase"),
+    ("two phases in use", _FLUIDS, _FLUIDS + _PHASE.replace("water", "oil") + "[[fluid]]\n" + _SPHERE.replace(
+        "0.45", "0.1") + '\nphase = "oil"\n', "fluid[2].phase"),
+    ("fluid without phase", 'radius = 0.1\nphase = "water"', "radius = 0.1", "fluid[1].phase"),
+    ("no fluid", _FLUIDS, "", "fluid"),
+    ("fluid that is text", _FLUIDS + _CONTAINER, _CONTAINER + "[[fluid]]\n", "fluid[0].shape"),
+    ("unknown shape", 'shape = "sphere"', 'shape = "cone"', "fluid[1].shape"),
+    ("shape that is a list", 'shape = "sphere"', 'shape = ["sphere"]', "fluid[1].shape"),
+    ("upper below lower", _UPPER, "upper = [0.25, -0.25, 0.25]", "fluid[0].upper"),
+    ("upper at lower", _UPPER, "upper = [0.25, 0.0, 0.25]", "fluid[0].upper"),
+    ("upper of two", _UPPER, "upper = [0.25, 0.25]", "fluid[0].upper"),
+    ("upper of none", _UPPER, "upper = []", "fluid[0].upper"),
+    ("upper that is a number", _UPPER, "upper = 0.25", "fluid[0].upper"),
+    ("upper with text", _UPPER, 'upper = [0.25, "0.25", 0.25]', "fluid[0].upper[1]"),
+    ("upper left out", _UPPER, "", "fluid[0].upper"),
+    ("velocity of two", "velocity = [0.0, 0.0, 0.0]", "velocity = [0.0, 0.0]", "fluid[0].velocity"),
+    ("thin box", _UPPER, "upper = [0.25, 0.25, 0.04]", "fluid[0]"),
+    ("box outside", _UPPER, "upper = [0.25, 0.25, 0.35]", "fluid[0]"),
+    ("far away", _UPPER, "upper = [1e20, 0.25, 0.25]", "discretisation.spacing"),
+    ("sphere outside", "0.45, 0.12", "0.55, 0.12", "fluid[1]"),
+    ("overlapping sphere", "0.45, 0.12", "0.30, 0.12", "fluid[1]"),
+    ("overlapping across the period", _FLUIDS, _drop(0.01) + _drop(0.39), "fluid[1]"),
+    ("small sphere", "radius = 0.1", "radius = 0.02", "fluid[1]"),
+    ("sphere without size", "radius = 0.1", "radius = 0", "fluid[1].radius"),
+    ("missing points", _SPHERE, 'shape = "points"\nfile = "absent.npy"', "fluid[1].file"),
+    ("points of no name", _SPHERE, 'shape = "points"\nfile = ""', "fluid[1].file"),
+    ("points with a null", _SPHERE, 'shape = "points"\nfile = "a\\u0000.npy"', "fluid[1].file"),
+    ("points in text", _SPHERE, 'shape = "points"\nfile = "scene.toml"', "fluid[1].file"),
+    ("container upside down", "upper = [0.4, 0.6, 0.25]", "upper = [0.4, -0.6, 0.25]", "container.upper"),
+    ("period of four", "[true, false, false]", "[true, false, false, false]", "container.periodic"),
+    ("period that is a number", "[true, false, false]", "[1, 0, 0]", "container.periodic[0]"),
+    ("short period", "support = 2.0", "support = 4.0", "container.periodic[0]"),
+    ("period of nothing", _CONTAINER, '[container]\nshape = "none"\nperiodic = [true, false, false]\n', "periodic"),
+    ("container without shape", 'shape = "box"\nlower = [0.0, 0.0, 0.0]\nupper = [0.4', "upper = [0.4", "container.shape"),
+    ("cup too small", _CONTAINER, '[container]\nshape = "cylinder"\nbase = [0, 0, 0]\nradius = 0.2\nheight = 1\n', "fluid[0]"),
+    ("unknown slip", 'slip = "no"', 'slip = "some"', "container.slip"),
+    ("gravity of two", "[0.0, -9.81, 0.0]", "[0.0, -9.81]", "forces.gravity"),
+    ("gravity that is a number", "[0.0, -9.81, 0.0]", "-9.81", "forces.gravity"),
+    ("unknown viscosity", '"pairwise"', '"turbulent"', "forces.viscosity"),
+    ("pressure that is text", "pressure = true", 'pressure = "yes"', "forces.pressure"),
+    ("unknown solver", '"pcisph"', '"iisph"', "solver.kind"),
+    ("time step of zero", "time_step = 0.0021", "time_step = 0.0", "solver.time_step"),
+    ("misspelt key", "time_step = 0.0021", "timestep = 0.0021", "solver.timestep"),
+    ("fewest above most", "minimum_iterations = 5", "minimum_iterations = 6", "solver.minimum_iterations"),
+    ("part of an iteration", "minimum_iterations = 5", "minimum_iterations = 4.5", "solver.minimum_iterations"),
+    ("no iterations", "minimum_iterations = 5", "minimum_iterations = 0", "solver.minimum_iterations"),
+    ("negative tolerance", "0.01", "-0.01", "solver.density_tolerance"),
+    ("key in two lines", 'name = "two', '"a\\nb" = 1\nname = "two', "'a\\nb'"),
+    ("unknown table", "[solver]", "[viewer]\nwidth = 3\n[solver]", "viewer"),
+]  # fmt: skip

@@ -1,0 +1,36 @@
+"""Scenes that the tests share."""
+
+from typing import Any
+
+from cortado import Scene
+
+
+def splash(**solver: Any) -> Scene:
+    """125 particles that fall from rest and splash in a box (the report's gradient analysis)."""
+    return scene(solver={"time_step": 0.0021, "minimum_iterations": 5, "maximum_iterations": 5, **solver})
+
+
+def scene(**changes: Any) -> Scene:
+    """The splash with tables replaced."""
+    tables: dict[str, Any] = {
+        "name": "splash",
+        "dimension": 3,
+        "discretisation": {"spacing": 0.05, "support": 2.0, "kernel": "cubic_spline"},
+        "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.05}],
+        "fluid": [{"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.25, 0.25, 0.25], "phase": "water"}],
+        "container": {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.4, 0.6, 0.25]},
+        "forces": {"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise", "pressure": True},
+        "solver": {"time_step": 0.0021, "minimum_iterations": 5, "maximum_iterations": 5, "density_tolerance": 0.01},
+    }
+    return Scene(**{**tables, **changes})
+
+
+def plane(**changes: Any) -> Scene:
+    """The same in two dimensions: 8 x 8 particles."""
+    tables: dict[str, Any] = {
+        "dimension": 2,
+        "fluid": [{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "water"}],
+        "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.8]},
+        "forces": {"gravity": [0.0, -9.81]},
+    }
+    return scene(**{**tables, **changes})

@@ -1,0 +1,89 @@
+"""Laws that hold exactly: momentum, free fall, the same bits twice, what does not matter does not matter."""
+
+import numpy as np
+import pytest
+from scenes import plane, scene, splash
+
+from cortado import Problem, Simulation, losses
+
+FREE = {"container": {"shape": "none"}}
+
+
+def stirred(simulation, seed=0):
+    """Velocities that swirl and squeeze the fluid, so that every force acts."""
+    random = np.random.default_rng(seed)
+    centred = simulation.positions - simulation.positions.mean(axis=0)
+    swirl = np.zeros_like(centred)
+    swirl[:, 0], swirl[:, 1] = -centred[:, 1], centred[:, 0]
+    return 3.0 * swirl - 2.0 * centred + 0.05 * random.standard_normal(centred.shape)
+
+
+def angular_momentum(x, v):
+    return np.cross(np.pad(x, ((0, 0), (0, 3 - x.shape[1]))), np.pad(v, ((0, 0), (0, 3 - v.shape[1])))).sum(axis=0)
+
+
+@pytest.mark.parametrize("make", [scene, plane])
+def test_momentum_is_kept_in_free_space(make):
+    gravity = [0.0] * (2 if make is plane else 3)
+    made = make(**FREE, forces={"gravity": gravity, "viscosity": "pairwise"})
+    simulation = Simulation(made, precision="float64")
+    rollout = simulation.rollout(200)
+    rollout.initial.set(simulation.positions, stirred(simulation))
+    x_0, v_0 = rollout.initial.numpy(simulation.dimension)
+    x, v = rollout.forward().numpy(simulation.dimension)
+    assert np.linalg.norm(v - v_0) > 0.05 * np.linalg.norm(v_0)  # forces did act
+    assert np.linalg.norm(v.sum(0) - v_0.sum(0)) < 1e-10 * np.abs(v_0).sum()
+    spin = angular_momentum(x_0, v_0)
+    assert np.linalg.norm(angular_momentum(x, v) - spin) < 1e-10 * np.linalg.norm(spin)
+
+
+def test_free_fall_depends_on_gravity_exactly():
+    steps = 40
+    simulation = Simulation(scene(**FREE), precision="float64")
+    height = losses.Recorded(lambda x, v, loss: None)
+    height.value = lambda end: float(end.positions[:, 1].mean())
+    height.adjoint = lambda end: (np.tile([0.0, 1 / 125, 0.0], (125, 1)), np.zeros((125, 3)))
+    problem = Problem(simulation, steps, height)
+    gravity = {"gravity": np.array([0.0, -9.81, 0.0])}
+    exact = 0.0021**2 * steps * (steps + 1) / 2
+    _, gradient = problem.value_and_gradient(gravity)
+    np.testing.assert_allclose(gradient["gravity"], [0.0, exact, 0.0], rtol=1e-13, atol=1e-18)
+    assert problem.tangent(gravity, {"gravity": np.array([0.0, 1.0, 0.0])}) == pytest.approx(exact, rel=1e-13)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_same_bits_twice(precision):
+    def once():
+        simulation = Simulation(splash(), precision=precision)
+        problem = Problem(simulation, 100, losses.FinalPositions(simulation.positions))
+        point = {"gravity": np.array([0.5, -9.81, 0.2]), "initial_positions": simulation.positions, "viscosity": 0.05}
+        loss, gradient = problem.value_and_gradient(point)
+        return [problem.end(point).positions, np.array(loss), *gradient.values()]
+
+    for first, second in zip(once(), once(), strict=True):
+        assert first.tobytes() == second.tobytes()
+
+
+def test_rest_density_alone_does_not_matter_without_viscosity():
+    """Masses, pressures and walls all scale with it."""
+    made = splash(**{}).model_dump()
+    made["forces"]["viscosity"] = "none"
+    simulation = Simulation(scene(forces=made["forces"]), precision="float64")
+    problem = Problem(simulation, 60, losses.FinalPositions(simulation.positions))
+    _, gradient = problem.value_and_gradient({"rest_density": 1000.0, "time_step": 0.0021})
+    assert abs(1000.0 * gradient["rest_density"]) < 1e-9 * abs(0.0021 * gradient["time_step"])
+
+
+def test_particles_keep_the_order_of_the_scene():
+    simulation = Simulation(splash(), precision="float64")
+    trajectory = simulation.run(steps=60)
+    moved = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=2)
+    assert moved.max() < 0.02  # a particle that changed places would jump
+    np.testing.assert_array_equal(trajectory.positions[0], simulation.positions)
+
+
+def test_frames_and_records():
+    trajectory = Simulation(splash()).run(steps=10, record_every=4)
+    np.testing.assert_array_equal(trajectory.steps, [0, 4, 8, 10])
+    assert trajectory.positions.shape == (4, 125, 3)
+    np.testing.assert_array_equal(trajectory.iterations, np.full(10, 5))

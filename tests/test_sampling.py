@@ -1,0 +1,199 @@
+"""From scenes to particles: where they are, how many, and that none is there twice."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from cortado.sampling import boundary_particles, boundary_volumes, fluid_particles, period
+from cortado.scene import Scene
+
+SPACING = 0.05
+
+
+def scene_of(dimension: int, fluid, container=None, spacing: float = SPACING) -> Scene:
+    phases = [{"name": name, "rest_density": 1000, "viscosity": 0.0} for name in ("oil", "water")]
+    fluids = [{"phase": "water"} | body for body in fluid]
+    data = {"dimension": dimension, "discretisation": {"spacing": spacing}, "phase": phases, "fluid": fluids}
+    if container is not None:
+        data["container"] = container
+    return Scene(**data, solver={"time_step": 1e-4})
+
+
+def box(lower, upper, **more) -> dict:
+    return {"shape": "box", "lower": lower, "upper": upper, **more}
+
+
+def nearest(points: np.ndarray) -> float:
+    return cKDTree(points).query(points, k=2)[0][:, 1].min()
+
+
+def hat(distances: np.ndarray) -> np.ndarray:
+    """A smoothing kernel to sum by hand, of support 2 spacings."""
+    return np.maximum(1.0 - distances / (2.0 * SPACING), 0.0)
+
+
+# ---- fluid -------------------------------------------------------------------------------------------------------
+
+
+def test_a_box_is_filled_from_its_lower_corner():
+    sample = fluid_particles(scene_of(3, [box([0.1, 0.0, -0.1], [0.35, 0.1, 0.05])]))
+    indices = np.array(list(product(range(5), range(2), range(3))))
+    np.testing.assert_allclose(sample.positions, [0.1, 0.0, -0.1] + (indices + 0.5) * SPACING, atol=1e-14)
+
+
+@pytest.mark.parametrize("lower", [0.0, 0.1, 0.7, -3.3, 100.1])
+@pytest.mark.parametrize("cells", [1, 3, 5, 7])
+def test_round_off_neither_adds_nor_loses_a_layer(lower, cells):
+    scene = scene_of(2, [box([lower, 0.0], [lower + cells * SPACING, SPACING])])
+    assert len(fluid_particles(scene).positions) == cells
+
+
+def test_no_particle_is_beyond_a_box_that_is_no_multiple_of_the_spacing():
+    positions = fluid_particles(scene_of(2, [box([0.0, 0.0], [0.24, 0.17])])).positions
+    assert len(positions) == 4 * 3 and (positions < [0.24, 0.17]).all()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("radius", [0.1, 0.23, 0.3])
+def test_a_sphere_is_filled_symmetrically(dimension, radius):
+    centre = np.array([0.3, -0.2, 1.0])[:dimension]
+    fluid = {"shape": "sphere", "centre": centre.tolist(), "radius": radius}
+    from_centre = fluid_particles(scene_of(dimension, [fluid])).positions - centre
+    assert np.linalg.norm(from_centre, axis=1).max() <= radius
+    np.testing.assert_allclose(nearest(from_centre), SPACING)
+    mirrored = cKDTree(from_centre).query(-from_centre)[0]
+    assert mirrored.max() < 1e-12
+    volume = np.pi * radius**2 if dimension == 2 else 4.0 / 3.0 * np.pi * radius**3
+    assert len(from_centre) * SPACING**dimension == pytest.approx(volume, rel=0.35 if radius == 0.1 else 0.1)
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_a_cylinder_stands_on_its_base(axis):
+    base, along = np.array([0.1, 0.2, 0.3]), "xyz".index(axis)
+    fluid = {"shape": "cylinder", "base": base.tolist(), "radius": 0.2, "height": 0.1, "axis": axis}
+    from_base = fluid_particles(scene_of(3, [fluid])).positions - base
+    np.testing.assert_allclose(np.unique(from_base[:, along].round(9)), [0.025, 0.075])
+    across = np.delete(from_base, along, axis=1)
+    assert 0.15 < np.linalg.norm(across, axis=1).max() <= 0.2
+    assert len(from_base) * SPACING**3 == pytest.approx(np.pi * 0.2**2 * 0.1, rel=0.1)
+
+
+def test_particles_come_in_the_order_of_the_fluids(tmp_path):
+    np.save(tmp_path / "three.npy", [[3.0, 3.0], [2.0, 2.0], [4.0, 4.0]])
+    fluids = [
+        box([0.5, 0.5], [0.6, 0.6], velocity=[1.0, 2.0]),
+        {"shape": "points", "file": str(tmp_path / "three.npy"), "velocity": [3.0, 4.0]},
+        box([0.0, 0.0], [0.05, 0.05]),
+    ]
+    sample = fluid_particles(scene_of(2, fluids))
+    np.testing.assert_allclose(sample.positions[[0, 4, 5, 7]], [[0.525, 0.525], [3, 3], [2, 2], [0.025, 0.025]])
+    np.testing.assert_array_equal(sample.velocities, np.repeat([[1, 2], [3, 4], [0, 0]], [4, 3, 1], axis=0))
+    assert sample.phase.tolist() == 8 * [1] and sample.positions.dtype == np.float64
+
+
+def test_fluids_that_touch_do_not_overlap():
+    fluids = [box([0.0, 0.0], [0.5, 0.5]), box([0.5, 0.0], [1.0, 0.5]), box([0.0, 0.5], [1.0, 1.0])]
+    container = box([0.0, 0.0], [1.0, 1.0], periodic=[True, True])
+    assert nearest(fluid_particles(scene_of(2, fluids, container)).positions) == pytest.approx(SPACING)
+
+
+# ---- walls -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("layers", [1, 2, 3])
+@pytest.mark.parametrize("cells", [(4, 3), (4, 3, 2)])
+def test_a_box_has_each_wall_particle_once(cells, layers):
+    upper = SPACING * np.array(cells)
+    dimension = len(cells)
+    scene = scene_of(dimension, [box([0.0] * dimension, upper)], box([0.0] * dimension, upper))
+    walls = boundary_particles(scene, layers)
+    lattice = np.array(list(product(*[range(-layers, n + layers) for n in cells])))
+    wanted = lattice[((lattice < 0) | (lattice >= cells)).any(axis=1)]
+    found = walls / SPACING - 0.5
+    np.testing.assert_allclose(found[np.lexsort(found.round().T[::-1])], wanted, atol=1e-9)
+
+
+def test_a_box_between_multiples_of_the_spacing_is_stretched():
+    scene = scene_of(2, [box([0.0, 0.0], [0.1, 0.1])], box([0.0, 0.0], [0.23, 0.26]))
+    walls = boundary_particles(scene)
+    assert len(walls) == 7 * 7 - 5 * 5
+    inner = np.unique(walls[:, 0].round(12))
+    np.testing.assert_allclose(inner, [-0.025, 0.023, 0.069, 0.115, 0.161, 0.207, 0.255])
+
+
+def test_a_periodic_axis_has_no_wall():
+    container = box([0.1, 0.0], [0.5, 0.2], periodic=[True, False])
+    scene = scene_of(2, [box([0.1, 0.0], [0.5, 0.2])], container)
+    walls = boundary_particles(scene, layers=2)
+    np.testing.assert_allclose(np.unique(walls[:, 0].round(9)), 0.1 + SPACING * (np.arange(8) + 0.5))
+    np.testing.assert_allclose(np.unique(walls[:, 1].round(9)), [-0.075, -0.025, 0.225, 0.275])
+    lower, lengths = period(scene)
+    np.testing.assert_allclose((lower, lengths), ([0.1, 0.0], [0.4, 0.0]))
+    everywhere = scene_of(2, [box([0.1, 0.0], [0.5, 0.2])], container | {"upper": [0.5, 0.3], "periodic": [True, True]})
+    assert boundary_particles(everywhere).shape == (0, 2)
+
+
+def test_free_space_has_no_walls():
+    scene = scene_of(3, [box([0, 0, 0], [0.1, 0.1, 0.1])])
+    assert boundary_particles(scene).shape == (0, 3)
+    np.testing.assert_array_equal(period(scene), np.zeros((2, 3)))
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+@pytest.mark.parametrize("lid", [True, False])
+@pytest.mark.parametrize("layers", [1, 2])
+def test_a_cup_is_lined_all_round(axis, lid, layers):
+    base, radius, height, along = np.array([0.1, 0.2, 0.3]), 0.21, 0.32, "xyz".index(axis)
+    cup = {"shape": "cylinder", "base": base, "radius": radius, "height": height, "axis": axis, "lid": lid}
+    fluid = {"shape": "cylinder", "base": base, "radius": radius, "height": height, "axis": axis}
+    scene = scene_of(3, [fluid], cup)
+    walls = boundary_particles(scene, layers) - base
+    levels = walls[:, along]
+    from_axis = np.linalg.norm(np.delete(walls, along, axis=1), axis=1)
+    below, above = levels < 0, levels > height
+    side = ~below & ~above
+    np.testing.assert_allclose(levels[below].max(), -0.5 * SPACING)
+    assert above.any() == lid and below.sum() == (above.sum() if lid else below.sum())
+    np.testing.assert_allclose(np.unique(from_axis[side].round(9)), radius + (np.arange(layers) + 0.5) * SPACING)
+    assert nearest(walls) > 0.8 * SPACING
+    surface = cKDTree(walls).query(fluid_particles(scene).positions - base)[0]
+    assert 0.5 * SPACING <= surface.min() < 1.1 * SPACING
+
+
+# ---- volumes of wall particles ------------------------------------------------------------------------------------
+
+
+def test_volumes_on_a_flat_lattice_are_a_closed_sum():
+    axis = SPACING * np.arange(9)
+    plate = np.stack([*np.meshgrid(axis, axis, indexing="ij"), np.zeros((9, 9))], axis=-1).reshape(-1, 3)
+    volumes = boundary_volumes(plate, hat, 2.0 * SPACING).reshape(9, 9)
+    middle = 1.0 + 4 * 0.5 + 4 * (1.0 - np.sqrt(0.5))
+    corner = 1.0 + 2 * 0.5 + (1.0 - np.sqrt(0.5))
+    np.testing.assert_allclose(volumes[2:-2, 2:-2], 1.0 / middle)
+    np.testing.assert_allclose(volumes[[0, 0, -1, -1], [0, -1, 0, -1]], 1.0 / corner)
+
+
+def test_volumes_see_across_the_period():
+    line = np.array([0.3, 0.0]) + SPACING * np.stack([np.arange(8) + 0.5, np.zeros(8)], axis=-1)
+    lower, lengths = np.array([0.3, 0.0]), np.array([8 * SPACING, 0.0])
+    np.testing.assert_allclose(boundary_volumes(line, hat, 2 * SPACING, lower, lengths), np.full(8, 0.5))
+    np.testing.assert_allclose(boundary_volumes(line, hat, 2 * SPACING), [1 / 1.5, *(6 * [0.5]), 1 / 1.5])
+    moved = line - [0.3 + 0.5 * SPACING + 1e-18, 0.0]  # a position just below 0 wraps onto the length itself
+    np.testing.assert_allclose(boundary_volumes(moved, hat, 2 * SPACING, 0.0, lengths), np.full(8, 0.5))
+
+
+def test_volumes_of_many_particles_are_those_of_all_pairs(monkeypatch):
+    points = np.random.default_rng(3).uniform(0.0, 1.0, (300, 3))
+    lengths = np.array([1.0, 0.0, 1.0])
+    apart = points[:, None] - points
+    apart -= lengths * np.round(apart)
+    wanted = 1.0 / hat(np.linalg.norm(apart, axis=-1)).sum(axis=1)
+    monkeypatch.setattr("cortado.sampling.CHUNK", 70)
+    np.testing.assert_allclose(boundary_volumes(points, hat, 2 * SPACING, np.zeros(3), lengths), wanted)
+    assert wanted.min() < 0.9  # some have neighbours
+
+
+def test_no_walls_have_no_volumes():
+    assert boundary_volumes(np.zeros((0, 3)), hat, 0.1, np.zeros(3), np.zeros(3)).shape == (0,)

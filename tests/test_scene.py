@@ -1,0 +1,343 @@
+"""Scenes: good ones load and keep what they say; bad ones end in one sentence, and in nothing else."""
+
+import copy
+import pickle
+import tomllib
+import warnings
+from math import sqrt
+
+import numpy as np
+import pytest
+from bad_scenes import BAD_SCENES, GOOD_SCENE
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from cortado.errors import CortadoWarning, DivergedError, SceneError
+from cortado.scene import (
+    BoxFluid,
+    Discretisation,
+    Scene,
+    load_scene,
+    read_toml,
+    scene_from_dict,
+    stability_limit,
+)
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(GOOD_SCENE)
+    return path
+
+
+def good_data() -> dict:
+    return tomllib.loads(GOOD_SCENE)
+
+
+def plane(**changes) -> dict:
+    """The least that a scene in 2-D needs."""
+    data = {
+        "dimension": 2,
+        "discretisation": {"spacing": 0.1},
+        "phase": [{"name": "water", "rest_density": 1000, "viscosity": 0.001}],
+        "fluid": [{"shape": "box", "lower": [0, 0], "upper": [1, 0.5], "phase": "water"}],
+        "solver": {"time_step": 1e-3},
+    }
+    return data | changes
+
+
+def assert_one_sentence(text: str) -> None:
+    assert text.splitlines() == [text] and text[-1] in ".?" and len(text) < 500
+    assert "\x00" not in text and ".." not in text.replace("...", "")
+
+
+# ---- good scenes -------------------------------------------------------------------------------------------------
+
+
+def test_a_scene_keeps_what_its_file_says(scene_file):
+    scene = load_scene(scene_file)
+    assert scene.dimension == 3 and scene.discretisation.support_radius == 0.1
+    assert [fluid.shape for fluid in scene.fluid] == ["box", "sphere"]
+    assert scene.fluid[1].velocity == (0.0, 0.0, 0.0) and scene.fluid[0].upper == (0.25, 0.25, 0.25)
+    assert scene.container.periodic == (True, False, False) and scene.container.slip == "no"
+    assert scene.forces.gravity == (0.0, -9.81, 0.0) and scene.forces.pressure is True
+    assert (scene.solver.minimum_iterations, scene.solver.maximum_density_tolerance) == (5, None)
+
+
+def test_what_is_left_out_has_a_default():
+    scene = Scene(**plane())
+    assert scene.forces.gravity == (0.0, -9.81) and scene.container.shape == "none"
+    assert scene.fluid[0].velocity == (0.0, 0.0)
+    assert (scene.solver.minimum_iterations, scene.solver.maximum_iterations) == (3, 50)
+    assert scene.discretisation == Discretisation(spacing=0.1, support=2.0, kernel="cubic_spline")
+
+
+def test_a_scene_can_be_built_from_parts():
+    fluid = BoxFluid(lower=np.zeros(2), upper=(np.float32(1.0), 0.5), phase="water")
+    scene = Scene(**plane(fluid=[fluid], discretisation=Discretisation(spacing=0.1)))
+    assert scene == Scene(**plane()) and fluid.velocity == ()
+
+
+@pytest.mark.parametrize("data", [good_data(), plane()])
+def test_json_brings_the_scene_back(data):
+    scene = scene_from_dict(data)
+    assert Scene.from_json(scene.to_json()) == scene
+    assert Scene.from_json(scene.to_json()).to_json() == scene.to_json()
+
+
+def test_a_scene_is_frozen():
+    scene = Scene(**plane())
+    with pytest.raises(ValueError, match="frozen"):
+        scene.dimension = 3
+    assert hash(scene) == hash(Scene(**plane()))
+
+
+def test_the_tables_of_others_are_ignored(scene_file):
+    scene_file.write_text(GOOD_SCENE + "\n[problem]\nsteps = 3\n[optimise]\nrate = 1\n")
+    assert load_scene(scene_file).name == "two blocks"
+    assert read_toml(scene_file)["problem"] == {"steps": 3}
+
+
+def test_positions_are_read_from_beside_the_scene(scene_file, monkeypatch):
+    points = np.array([[0.1, 0.4, 0.1], [0.2, 0.45, 0.1], [0.2, 0.45, 0.15]])
+    np.save(scene_file.parent / "drop.npy", points)
+    monkeypatch.chdir("/")
+    scene = load_scene(scene_file, ['fluid.1={shape="points", file="drop.npy", phase="water"}'])
+    np.testing.assert_array_equal(scene.fluid[1].particles(0.05), points)
+    np.testing.assert_array_equal(Scene.from_json(scene.to_json()).fluid[1].particles(0.05), points)
+    np.save(scene_file.parent / "drop.npy", points[:2])  # a file that changes is read again
+    assert len(scene.fluid[1].particles(0.05)) == 2
+
+
+@pytest.mark.parametrize("suffix", [".vtk", ".vtp"])
+def test_positions_are_read_from_vtk(tmp_path, suffix):
+    vtk = pytest.importorskip("vtk")
+    points, data = vtk.vtkPoints(), vtk.vtkPolyData()
+    points.SetDataTypeToDouble()
+    for x in (0.0, 0.1, 0.25):
+        points.InsertNextPoint(x, 0.5 * x, 0.0)
+    data.SetPoints(points)
+    writer = vtk.vtkPolyDataWriter() if suffix == ".vtk" else vtk.vtkXMLPolyDataWriter()
+    writer.SetFileName(str(tmp_path / f"drop{suffix}"))
+    writer.SetInputData(data)
+    writer.Write()
+    fluid = {"shape": "points", "file": str(tmp_path / f"drop{suffix}"), "phase": "water"}
+    particles = Scene(**plane(fluid=[fluid])).fluid[0].particles(0.1)
+    np.testing.assert_allclose(particles, [[0.0, 0.0], [0.1, 0.05], [0.25, 0.125]], atol=1e-12)
+
+
+# ---- overrides ---------------------------------------------------------------------------------------------------
+
+
+def test_overrides_replace_values(scene_file):
+    overrides = ["solver.time_step=0.002", "forces.gravity=[0,-5,0]", "fluid.0.upper=[0.1,0.1,0.1]"]
+    overrides += ["fluid[1].radius = 0.08", "name=a drop", "container.periodic[0]=false"]
+    scene = load_scene(scene_file, overrides)
+    assert (scene.solver.time_step, scene.forces.gravity) == (0.002, (0.0, -5.0, 0.0))
+    assert (scene.fluid[0].upper, scene.fluid[1].radius) == ((0.1, 0.1, 0.1), 0.08)
+    assert (scene.name, scene.container.periodic[0]) == ("a drop", False)
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["solver.time_step", "=3", "", "fluid.2.radius=1", "fluid.x.radius=1", "name.x=1", "solver.timestep=1", "a b=1"],
+)
+def test_a_bad_override_is_a_sentence(scene_file, override):
+    with pytest.raises(SceneError) as caught:
+        load_scene(scene_file, [override])
+    assert_one_sentence(str(caught.value))
+
+
+# ---- bad scenes --------------------------------------------------------------------------------------------------
+
+
+def test_there_are_enough_bad_scenes():
+    assert len({name for name, *_ in BAD_SCENES}) == len(BAD_SCENES) >= 40
+
+
+@pytest.mark.parametrize("old, new, field", [bad[1:] for bad in BAD_SCENES], ids=[bad[0] for bad in BAD_SCENES])
+def test_a_bad_scene_is_a_sentence(scene_file, old, new, field):
+    assert old in GOOD_SCENE
+    scene_file.write_text(GOOD_SCENE.replace(old, new, 1))
+    with pytest.raises(SceneError) as caught:
+        load_scene(scene_file)
+    text = str(caught.value)
+    assert_one_sentence(text)
+    assert text.startswith(f"{scene_file}: ") and field in text
+    assert caught.value.file == str(scene_file) and (field in caught.value.field or not caught.value.field)
+    assert str(pickle.loads(pickle.dumps(caught.value))) == text
+
+
+def test_a_sentence_says_what_was_found_and_wanted():
+    data = good_data()
+    data["phase"][0]["rest_density"] = -1000.0
+    with pytest.raises(SceneError) as caught:
+        scene_from_dict(data, "scene.toml")
+    error = caught.value
+    assert str(error) == "scene.toml: phase[0].rest_density is -1000.0, but must be greater than 0 kg/m3."
+    found = (error.file, error.field, error.found, error.wanted)
+    assert found == ("scene.toml", "phase[0].rest_density", -1000.0, "greater than 0 kg/m3")
+
+
+def test_a_misspelt_key_is_told_the_right_one():
+    data = good_data()
+    data["solver"]["timestep"] = 0.1
+    with pytest.raises(SceneError) as caught:
+        scene_from_dict(data, "scene.toml")
+    wanted = "scene.toml: solver.timestep is not a key of [solver]; did you mean time_step?"
+    assert str(caught.value) == wanted
+
+
+def test_parts_built_in_python_raise_the_same_error():
+    with pytest.raises(SceneError, match=r"^spacing is -1, but must be greater than 0 m\.$"):
+        Discretisation(spacing=-1)
+    with pytest.raises(SceneError, match=r"^discretisation\.spacing is -1, but must be greater than 0 m\.$"):
+        Scene(**plane(discretisation={"spacing": -1}))
+
+
+@pytest.mark.parametrize("shape", ["fluid", "container"])
+def test_a_cylinder_needs_space(shape):
+    cylinder = {"shape": "cylinder", "base": [0, 0], "radius": 1.0, "height": 1.0}
+    changes = {"fluid": [cylinder | {"phase": "water"}]} if shape == "fluid" else {"container": cylinder}
+    with pytest.raises(SceneError, match=rf"{shape}.*shape is 'cylinder'.*2-D"):
+        Scene(**plane(**changes))
+
+
+@pytest.mark.parametrize(
+    "array, trouble",
+    [
+        (np.zeros(3), "shape"),
+        (np.zeros((4, 3)), "shape"),
+        (np.zeros((0, 2)), "cannot be used"),
+        (np.array([["a", "b"]]), "shape"),
+        (np.array([[0.0, np.nan]]), "finite"),
+        (np.array([[None, 1.0]], dtype=object), "NumPy"),
+        (np.zeros((1000, 2)), "overlapping itself"),
+        (np.array([[0.0, 0.0], [0.0, 0.04], [0.0, 1.0]]), "overlapping itself"),
+        (np.array([[0.0, 1e20]]), "origin"),
+    ],
+)
+def test_bad_positions_are_a_sentence(tmp_path, array, trouble):
+    np.save(tmp_path / "bad.npy", array)
+    fluid = {"shape": "points", "file": str(tmp_path / "bad.npy"), "phase": "water"}
+    with pytest.raises(SceneError, match=trouble) as caught:
+        Scene(**plane(fluid=[fluid]))
+    assert_one_sentence(str(caught.value))
+
+
+@pytest.mark.parametrize("name", ["bad.npy", "bad.vtk", "bad.vtp", "bad.vtkhdf"])
+def test_files_of_rubbish_are_a_sentence(tmp_path, name, capfd):
+    (tmp_path / name).write_bytes(b"rubbish\n\x00\xff")
+    fluid = {"shape": "points", "file": str(tmp_path / name), "phase": "water"}
+    with pytest.raises(SceneError, match="cannot be used") as caught:
+        Scene(**plane(fluid=[fluid]))
+    assert_one_sentence(str(caught.value))
+    assert capfd.readouterr().err == ""
+
+
+def test_unreadable_files_are_a_sentence(tmp_path):
+    (tmp_path / "latin.toml").write_bytes(b'dimension = 3\nname = "caf\xe9"\n')
+    for path, reason in [
+        (tmp_path / "absent.toml", "No such file"),
+        (tmp_path, "directory"),
+        (tmp_path / "latin.toml", "line 2"),
+    ]:
+        with pytest.raises(SceneError, match=reason) as caught:
+            load_scene(path)
+        assert_one_sentence(str(caught.value))
+
+
+@pytest.mark.parametrize("text", ["", "[]", "3", "{", '{"dimension": NaN}', 3000 * "["])
+def test_bad_json_is_a_sentence(text):
+    with pytest.raises(SceneError) as caught:
+        Scene.from_json(text)
+    assert_one_sentence(str(caught.value))
+
+
+# ---- any scene ---------------------------------------------------------------------------------------------------
+
+ODD_VALUES = st.one_of(
+    st.sampled_from([None, True, "", "box", "none", "water", "\n", [], {}, [[]], [{}], {"shape": "box"}, b"x", 10**400]),
+    st.sampled_from([0, -1, 1, 2, 3, 0.1, 1e-12, 1e-300, 1e300, -1e300, 1e20, float("nan"), float("inf")]),
+    st.lists(st.sampled_from([0, 0.0, 0.2, 0.5, -0.5, 1e300, "x", True]), max_size=4),
+)
+
+
+def places(data) -> list[tuple]:
+    """Every path into a scene's dictionary."""
+    items = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    return [(key, *rest) for key, value in items for rest in [(), *places(value)]]
+
+
+def mutated(data: dict, place: tuple, action: str, value) -> dict:
+    data = copy.deepcopy(data)
+    table = data
+    for key in place[:-1]:
+        table = table[key]
+    if action == "delete":
+        del table[place[-1]]
+    elif action == "replace":
+        table[place[-1]] = value
+    elif isinstance(table, dict):
+        table[repr(value)] = value
+    else:
+        table.append(value)
+    return data
+
+
+CUP = plane(
+    dimension=3,
+    fluid=[{"shape": "cylinder", "base": [0, 0.1, 0], "radius": 0.5, "height": 0.5, "phase": "water"}],
+    container={"shape": "cylinder", "base": [0, 0, 0], "radius": 0.5, "height": 1.0},
+)
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(draw=st.data())
+def test_any_change_loads_or_is_a_sentence(draw):
+    data = draw.draw(st.sampled_from([good_data(), plane(), CUP]))
+    for _ in range(draw.draw(st.integers(1, 3))):
+        place = draw.draw(st.sampled_from(places(data) or [("x",)]))
+        action = draw.draw(st.sampled_from(["delete", "replace", "replace", "add"]))
+        data = mutated(data, place, action, draw.draw(ODD_VALUES)) if places(data) else data
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CortadoWarning)
+        try:
+            scene = scene_from_dict(data, "scene.toml")
+        except SceneError as error:
+            assert_one_sentence(str(error))
+            assert str(error).startswith("scene.toml: ")
+        else:
+            assert Scene.from_json(scene.to_json()) == scene
+
+
+# ---- stability ---------------------------------------------------------------------------------------------------
+
+
+def test_the_stability_limit_is_the_smallest_of_three():
+    fast = plane(forces={"gravity": [0, 0], "viscosity": "none"})
+    fast["fluid"][0]["velocity"] = [3.0, 4.0]
+    assert stability_limit(Scene(**fast)) == pytest.approx(0.4 * 0.2 / 5.0)
+    falling = Scene(**plane(container={"shape": "box", "lower": [0, 0], "upper": [1, 2]}))
+    assert stability_limit(falling) == pytest.approx(0.4 * 0.2 / sqrt(2 * 9.81 * 2))
+    shallow = plane(fluid=[{"shape": "box", "lower": [0, 0], "upper": [1, 0.1], "phase": "water"}])
+    assert stability_limit(Scene(**shallow)) == pytest.approx(0.25 * sqrt(0.2 / 9.81))
+    thick = plane(phase=[{"name": "water", "rest_density": 500, "viscosity": 5000}], solver={"time_step": 1e-4})
+    assert stability_limit(Scene(**thick)) == pytest.approx(0.125 * 0.2**2 * 500 / 5000)
+    assert stability_limit(Scene(**plane(forces={"gravity": [0, 0], "viscosity": "none"}))) == np.inf
+
+
+def test_a_large_time_step_is_a_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        limit = stability_limit(Scene(**plane()))
+        Scene(**plane(solver={"time_step": limit}))
+    with pytest.warns(CortadoWarning, match=r"solver\.time_step is .* s, but the limit of stability is .* s\."):
+        Scene(**plane(solver={"time_step": 1.01 * limit}))
+
+
+def test_divergence_is_a_sentence():
+    error = pickle.loads(pickle.dumps(DivergedError(step=3, particle=7, advice="try a smaller time step")))
+    assert (error.step, error.particle, error.advice) == (3, 7, "try a smaller time step")
+    assert_one_sentence(str(error))
