@@ -1,4 +1,4 @@
-"""Scenes that are wrong in one way each: (name, what to replace in the good scene, by what, the field to be named)."""
+"""A good scene, and bad ones: (name, what to replace in the good one, by what, the field that the sentence names)."""
 
 GOOD_SCENE = """\
 name = "two blocks"
@@ -47,6 +47,24 @@ minimum_iterations = 5
 maximum_iterations = 5
 density_tolerance = 0.01
 """
+
+
+def plane(**changes) -> dict:
+    """The least that a scene in 2-D needs."""
+    data = {
+        "dimension": 2,
+        "discretisation": {"spacing": 0.1},
+        "phase": [{"name": "water", "rest_density": 1000, "viscosity": 0.001}],
+        "fluid": [{"shape": "box", "lower": [0, 0], "upper": [1, 0.5], "phase": "water"}],
+        "solver": {"time_step": 1e-3},
+    }
+    return data | changes
+
+
+def assert_one_sentence(text: str) -> None:
+    assert text.splitlines() == [text] and text[-1] in ".?" and len(text) < 500
+    assert "\x00" not in text and ".." not in text.replace("...", "")
+
 
 _SPHERE = 'shape = "sphere"\ncentre = [0.2, 0.45, 0.12]\nradius = 0.1'
 _UPPER = "upper = [0.25, 0.25, 0.25]"
@@ -128,8 +146,10 @@ BAD_SCENES = [
     ("period that is a number", "[true, false, false]", "[1, 0, 0]", "container.periodic[0]"),
     ("short period", "support = 2.0", "support = 4.0", "container.periodic[0]"),
     ("period of nothing", _CONTAINER, '[container]\nshape = "none"\nperiodic = [true, false, false]\n', "periodic"),
-    ("container without shape", 'shape = "box"\nlower = [0.0, 0.0, 0.0]\nupper = [0.4', "upper = [0.4", "container.shape"),
-    ("cup too small", _CONTAINER, '[container]\nshape = "cylinder"\nbase = [0, 0, 0]\nradius = 0.2\nheight = 1\n', "fluid[0]"),
+    ("container without shape",
+     'shape = "box"\nlower = [0.0, 0.0, 0.0]\nupper = [0.4', "upper = [0.4", "container.shape"),
+    ("cup too small", _CONTAINER,
+     '[container]\nshape = "cylinder"\nbase = [0, 0, 0]\nradius = 0.2\nheight = 1\n', "fluid[0]"),
     ("unknown slip", 'slip = "no"', 'slip = "some"', "container.slip"),
     ("gravity of two", "[0.0, -9.81, 0.0]", "[0.0, -9.81]", "forces.gravity"),
     ("gravity that is a number", "[0.0, -9.81, 0.0]", "-9.81", "forces.gravity"),

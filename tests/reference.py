@@ -38,7 +38,7 @@ class Pcisph:
         self.walls, self.wall_weights = walls, wall_weights
         self.viscosity_form = options.get("viscosity", "pairwise")
         self.friction = options.get("friction", 0.0)
-        self.reach = options["reach"]
+        self.reach, self.rigidity = options["reach"], options["rigidity"]
 
     def _pairs(self, x, y):
         s = x[:, None, :] - y[None, :, :]
@@ -65,7 +65,8 @@ class Pcisph:
         g, g_walls = self.gradient(x, x), self.gradient(x, self.walls)
         acceleration = gravity + self.viscous(x, v, rho, g, g_walls, mass, viscosity)
         p, push = np.zeros(n, dtype=x.dtype), np.zeros_like(x)
-        delta = self.stiffness / time_step**2
+        pull = (self.wall_weights[None, :, None] * near_walls[..., None] * g_walls).sum(1)
+        delta = self.stiffness / time_step**2 / (1 + (pull * pull).sum(1) / self.rigidity)
         for _ in range(iterations):
             v_star = v + time_step * (acceleration + push)
             x_star = x + time_step * v_star

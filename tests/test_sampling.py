@@ -102,14 +102,13 @@ def test_fluids_that_touch_do_not_overlap():
 # ---- walls -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("layers", [1, 2, 3])
 @pytest.mark.parametrize("cells", [(4, 3), (4, 3, 2)])
-def test_a_box_has_each_wall_particle_once(cells, layers):
+def test_a_box_has_each_wall_particle_once(cells):
     upper = SPACING * np.array(cells)
     dimension = len(cells)
     scene = scene_of(dimension, [box([0.0] * dimension, upper)], box([0.0] * dimension, upper))
-    walls = boundary_particles(scene, layers)
-    lattice = np.array(list(product(*[range(-layers, n + layers) for n in cells])))
+    walls = boundary_particles(scene, 0.5 * SPACING)
+    lattice = np.array(list(product(*[range(-1, n + 1) for n in cells])))
     wanted = lattice[((lattice < 0) | (lattice >= cells)).any(axis=1)]
     found = walls / SPACING - 0.5
     np.testing.assert_allclose(found[np.lexsort(found.round().T[::-1])], wanted, atol=1e-9)
@@ -117,7 +116,7 @@ def test_a_box_has_each_wall_particle_once(cells, layers):
 
 def test_a_box_between_multiples_of_the_spacing_is_stretched():
     scene = scene_of(2, [box([0.0, 0.0], [0.1, 0.1])], box([0.0, 0.0], [0.23, 0.26]))
-    walls = boundary_particles(scene)
+    walls = boundary_particles(scene, 0.025)
     assert len(walls) == 7 * 7 - 5 * 5
     inner = np.unique(walls[:, 0].round(12))
     np.testing.assert_allclose(inner, [-0.025, 0.023, 0.069, 0.115, 0.161, 0.207, 0.255])
@@ -126,40 +125,43 @@ def test_a_box_between_multiples_of_the_spacing_is_stretched():
 def test_a_periodic_axis_has_no_wall():
     container = box([0.1, 0.0], [0.5, 0.2], periodic=[True, False])
     scene = scene_of(2, [box([0.1, 0.0], [0.5, 0.2])], container)
-    walls = boundary_particles(scene, layers=2)
+    walls = boundary_particles(scene, 0.03)
     np.testing.assert_allclose(np.unique(walls[:, 0].round(9)), 0.1 + SPACING * (np.arange(8) + 0.5))
-    np.testing.assert_allclose(np.unique(walls[:, 1].round(9)), [-0.075, -0.025, 0.225, 0.275])
+    np.testing.assert_allclose(np.unique(walls[:, 1].round(9)), [-0.03, 0.23])
     lower, lengths = period(scene)
     np.testing.assert_allclose((lower, lengths), ([0.1, 0.0], [0.4, 0.0]))
     everywhere = scene_of(2, [box([0.1, 0.0], [0.5, 0.2])], container | {"upper": [0.5, 0.3], "periodic": [True, True]})
-    assert boundary_particles(everywhere).shape == (0, 2)
+    assert boundary_particles(everywhere, 0.025).shape == (0, 2)
 
 
 def test_free_space_has_no_walls():
     scene = scene_of(3, [box([0, 0, 0], [0.1, 0.1, 0.1])])
-    assert boundary_particles(scene).shape == (0, 3)
+    assert boundary_particles(scene, 0.025).shape == (0, 3)
     np.testing.assert_array_equal(period(scene), np.zeros((2, 3)))
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "z"])
 @pytest.mark.parametrize("lid", [True, False])
-@pytest.mark.parametrize("layers", [1, 2])
-def test_a_cup_is_lined_all_round(axis, lid, layers):
+@pytest.mark.parametrize("depth", [0.5 * SPACING, 0.8 * SPACING])
+def test_a_cup_is_lined_all_round(axis, lid, depth):
     base, radius, height, along = np.array([0.1, 0.2, 0.3]), 0.21, 0.32, "xyz".index(axis)
     cup = {"shape": "cylinder", "base": base, "radius": radius, "height": height, "axis": axis, "lid": lid}
     fluid = {"shape": "cylinder", "base": base, "radius": radius, "height": height, "axis": axis}
     scene = scene_of(3, [fluid], cup)
-    walls = boundary_particles(scene, layers) - base
+    walls = boundary_particles(scene, depth) - base
     levels = walls[:, along]
     from_axis = np.linalg.norm(np.delete(walls, along, axis=1), axis=1)
     below, above = levels < 0, levels > height
     side = ~below & ~above
-    np.testing.assert_allclose(levels[below].max(), -0.5 * SPACING)
+    np.testing.assert_allclose(levels[below].max(), -depth)
     assert above.any() == lid and below.sum() == (above.sum() if lid else below.sum())
-    np.testing.assert_allclose(np.unique(from_axis[side].round(9)), radius + (np.arange(layers) + 0.5) * SPACING)
+    np.testing.assert_allclose(np.unique(from_axis[side].round(9)), [radius + depth])
+    np.testing.assert_allclose(from_axis[below].max(), radius + depth)
+    base_disc = np.linspace(0.0, radius + depth, 50)[:, None]
+    assert cKDTree(from_axis[below][:, None]).query(base_disc)[0].max() < 0.55 * SPACING  # no gap between rings
     assert nearest(walls) > 0.8 * SPACING
     surface = cKDTree(walls).query(fluid_particles(scene).positions - base)[0]
-    assert 0.5 * SPACING <= surface.min() < 1.1 * SPACING
+    assert depth <= surface.min() < depth + 0.6 * SPACING
 
 
 # ---- volumes of wall particles ------------------------------------------------------------------------------------
@@ -180,7 +182,8 @@ def test_volumes_see_across_the_period():
     lower, lengths = np.array([0.3, 0.0]), np.array([8 * SPACING, 0.0])
     np.testing.assert_allclose(boundary_volumes(line, hat, 2 * SPACING, lower, lengths), np.full(8, 0.5))
     np.testing.assert_allclose(boundary_volumes(line, hat, 2 * SPACING), [1 / 1.5, *(6 * [0.5]), 1 / 1.5])
-    moved = line - [0.3 + 0.5 * SPACING + 1e-18, 0.0]  # a position just below 0 wraps onto the length itself
+    moved = line - line[0]
+    moved[0, 0] = -1e-18  # just below 0: its remainder is the length itself
     np.testing.assert_allclose(boundary_volumes(moved, hat, 2 * SPACING, 0.0, lengths), np.full(8, 0.5))
 
 

@@ -8,10 +8,10 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from bad_scenes import BAD_SCENES, GOOD_SCENE
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence, plane
 from cortado.errors import CortadoWarning, DivergedError, SceneError
 from cortado.scene import (
     BoxFluid,
@@ -33,23 +33,6 @@ def scene_file(tmp_path):
 
 def good_data() -> dict:
     return tomllib.loads(GOOD_SCENE)
-
-
-def plane(**changes) -> dict:
-    """The least that a scene in 2-D needs."""
-    data = {
-        "dimension": 2,
-        "discretisation": {"spacing": 0.1},
-        "phase": [{"name": "water", "rest_density": 1000, "viscosity": 0.001}],
-        "fluid": [{"shape": "box", "lower": [0, 0], "upper": [1, 0.5], "phase": "water"}],
-        "solver": {"time_step": 1e-3},
-    }
-    return data | changes
-
-
-def assert_one_sentence(text: str) -> None:
-    assert text.splitlines() == [text] and text[-1] in ".?" and len(text) < 500
-    assert "\x00" not in text and ".." not in text.replace("...", "")
 
 
 # ---- good scenes -------------------------------------------------------------------------------------------------
@@ -97,34 +80,6 @@ def test_the_tables_of_others_are_ignored(scene_file):
     scene_file.write_text(GOOD_SCENE + "\n[problem]\nsteps = 3\n[optimise]\nrate = 1\n")
     assert load_scene(scene_file).name == "two blocks"
     assert read_toml(scene_file)["problem"] == {"steps": 3}
-
-
-def test_positions_are_read_from_beside_the_scene(scene_file, monkeypatch):
-    points = np.array([[0.1, 0.4, 0.1], [0.2, 0.45, 0.1], [0.2, 0.45, 0.15]])
-    np.save(scene_file.parent / "drop.npy", points)
-    monkeypatch.chdir("/")
-    scene = load_scene(scene_file, ['fluid.1={shape="points", file="drop.npy", phase="water"}'])
-    np.testing.assert_array_equal(scene.fluid[1].particles(0.05), points)
-    np.testing.assert_array_equal(Scene.from_json(scene.to_json()).fluid[1].particles(0.05), points)
-    np.save(scene_file.parent / "drop.npy", points[:2])  # a file that changes is read again
-    assert len(scene.fluid[1].particles(0.05)) == 2
-
-
-@pytest.mark.parametrize("suffix", [".vtk", ".vtp"])
-def test_positions_are_read_from_vtk(tmp_path, suffix):
-    vtk = pytest.importorskip("vtk")
-    points, data = vtk.vtkPoints(), vtk.vtkPolyData()
-    points.SetDataTypeToDouble()
-    for x in (0.0, 0.1, 0.25):
-        points.InsertNextPoint(x, 0.5 * x, 0.0)
-    data.SetPoints(points)
-    writer = vtk.vtkPolyDataWriter() if suffix == ".vtk" else vtk.vtkXMLPolyDataWriter()
-    writer.SetFileName(str(tmp_path / f"drop{suffix}"))
-    writer.SetInputData(data)
-    writer.Write()
-    fluid = {"shape": "points", "file": str(tmp_path / f"drop{suffix}"), "phase": "water"}
-    particles = Scene(**plane(fluid=[fluid])).fluid[0].particles(0.1)
-    np.testing.assert_allclose(particles, [[0.0, 0.0], [0.1, 0.05], [0.25, 0.125]], atol=1e-12)
 
 
 # ---- overrides ---------------------------------------------------------------------------------------------------
@@ -204,38 +159,6 @@ def test_a_cylinder_needs_space(shape):
         Scene(**plane(**changes))
 
 
-@pytest.mark.parametrize(
-    "array, trouble",
-    [
-        (np.zeros(3), "shape"),
-        (np.zeros((4, 3)), "shape"),
-        (np.zeros((0, 2)), "cannot be used"),
-        (np.array([["a", "b"]]), "shape"),
-        (np.array([[0.0, np.nan]]), "finite"),
-        (np.array([[None, 1.0]], dtype=object), "NumPy"),
-        (np.zeros((1000, 2)), "overlapping itself"),
-        (np.array([[0.0, 0.0], [0.0, 0.04], [0.0, 1.0]]), "overlapping itself"),
-        (np.array([[0.0, 1e20]]), "origin"),
-    ],
-)
-def test_bad_positions_are_a_sentence(tmp_path, array, trouble):
-    np.save(tmp_path / "bad.npy", array)
-    fluid = {"shape": "points", "file": str(tmp_path / "bad.npy"), "phase": "water"}
-    with pytest.raises(SceneError, match=trouble) as caught:
-        Scene(**plane(fluid=[fluid]))
-    assert_one_sentence(str(caught.value))
-
-
-@pytest.mark.parametrize("name", ["bad.npy", "bad.vtk", "bad.vtp", "bad.vtkhdf"])
-def test_files_of_rubbish_are_a_sentence(tmp_path, name, capfd):
-    (tmp_path / name).write_bytes(b"rubbish\n\x00\xff")
-    fluid = {"shape": "points", "file": str(tmp_path / name), "phase": "water"}
-    with pytest.raises(SceneError, match="cannot be used") as caught:
-        Scene(**plane(fluid=[fluid]))
-    assert_one_sentence(str(caught.value))
-    assert capfd.readouterr().err == ""
-
-
 def test_unreadable_files_are_a_sentence(tmp_path):
     (tmp_path / "latin.toml").write_bytes(b'dimension = 3\nname = "caf\xe9"\n')
     for path, reason in [
@@ -258,7 +181,9 @@ def test_bad_json_is_a_sentence(text):
 # ---- any scene ---------------------------------------------------------------------------------------------------
 
 ODD_VALUES = st.one_of(
-    st.sampled_from([None, True, "", "box", "none", "water", "\n", [], {}, [[]], [{}], {"shape": "box"}, b"x", 10**400]),
+    st.sampled_from(
+        [None, True, "", "box", "none", "water", "\n", [], {}, [[]], [{}], {"shape": "box"}, b"x", 10**400]
+    ),
     st.sampled_from([0, -1, 1, 2, 3, 0.1, 1e-12, 1e-300, 1e300, -1e300, 1e20, float("nan"), float("inf")]),
     st.lists(st.sampled_from([0, 0.0, 0.2, 0.5, -0.5, 1e300, "x", True]), max_size=4),
 )

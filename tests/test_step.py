@@ -34,6 +34,7 @@ def twin(simulation, viscosity, friction):
         viscosity=viscosity,
         friction=friction,
         reach=1.03 * lattice.support,
+        rigidity=lattice.rigidity,
     )
 
 

@@ -38,9 +38,9 @@ def fluid_particles(scene: Scene) -> FluidSample:
     )
 
 
-def boundary_particles(scene: Scene, layers: int = 1) -> Points:
-    """(b, d) the wall particles of a scene's container [m], in layers half a spacing and more outside of it."""
-    return scene.container.walls(scene.dimension, scene.discretisation.spacing, layers)
+def boundary_particles(scene: Scene, depth: float) -> Points:
+    """(b, d) the wall particles of a scene's container [m], in one layer that lies ``depth`` [m] outside of it."""
+    return scene.container.walls(scene.dimension, scene.discretisation.spacing, depth)
 
 
 def period(scene: Scene) -> tuple[Points, Points]:

@@ -16,20 +16,10 @@ from cortado.errors import CortadoWarning, SceneError
 from cortado.scene_checks import check_scene
 from cortado.scene_containers import AnyContainer, BoxContainer, CylinderContainer, NoContainer
 from cortado.scene_fluids import AnyFluid, BoxFluid, CylinderFluid, PointsFluid, SphereFluid
+from cortado.scene_kinds import Choice, Components, Count, Flag, Quantity, Tables, Text, wrong
 from cortado.scene_stability import stability_limit
+from cortado.scene_tables import Table, sentences
 from cortado.scene_toml import read_toml
-from cortado.scene_values import (
-    Choice,
-    Components,
-    Count,
-    Flag,
-    Quantity,
-    Table,
-    Tables,
-    Text,
-    sentences,
-    wrong,
-)
 
 __all__ = [
     "BoxContainer",

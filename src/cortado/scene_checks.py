@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cortado.errors import InputError, Phrase
+from cortado.errors import InputError, Phrase, shown
 from cortado.scene_containers import check_length
 from cortado.scene_fluids import Fluid, PointsFluid
-from cortado.scene_values import wrong
+from cortado.scene_kinds import wrong
 from cortado.shapes import Points
 
 if TYPE_CHECKING:
@@ -45,9 +45,9 @@ def _check_phases(scene: "Scene") -> None:
             raise wrong(("phase", index, "name"), name, f"different from that of phase[{names.index(name)}]")
     for index, fluid in enumerate(scene.fluid):
         if fluid.phase not in names:
-            raise wrong(("fluid", index, "phase"), fluid.phase, f"the name of a phase: {_or(names)}")
+            raise wrong(("fluid", index, "phase"), fluid.phase, f"the name of a phase, of {shown(names)}")
         if fluid.phase != scene.fluid[0].phase:
-            wanted = f"{scene.fluid[0].phase!r} as for fluid[0], as only one phase in a scene is supported so far"
+            wanted = f"{shown(scene.fluid[0].phase)} as for fluid[0], as only one phase in a scene is supported so far"
             raise wrong(("fluid", index, "phase"), fluid.phase, wanted)
 
 
@@ -152,7 +152,3 @@ def _nearer(spacing: float) -> str:
 
 def _place(point: Points) -> str:
     return f"({', '.join(f'{value:g}' for value in point)})"
-
-
-def _or(names: list[str]) -> str:
-    return " or ".join(repr(name) for name in names)

@@ -8,7 +8,8 @@ from pydantic import Field, model_validator
 
 from cortado.errors import Phrase
 from cortado.scene_fluids import INDEX_OF_AXIS, LENGTH, check_order, refuse_plane
-from cortado.scene_values import Choice, Components, FieldPath, Flag, Quantity, Shaped, Table, wrong
+from cortado.scene_kinds import Choice, Components, FieldPath, Flag, Quantity, Shaped, wrong
+from cortado.scene_tables import Table
 from cortado.shapes import Points, box_walls, cup_walls
 
 
@@ -24,7 +25,7 @@ class Container(Table):
         """(n,) whether points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
 
     @abstractmethod
-    def walls(self, dimension: int, spacing: float, layers: int) -> Points:
+    def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         """(b, d) wall particles [m]"""
 
     def wall_count(self, spacing: float) -> float:
@@ -51,7 +52,7 @@ class NoContainer(Container):
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
         return np.ones(len(points), dtype=bool)
 
-    def walls(self, dimension: int, spacing: float, layers: int) -> Points:
+    def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         return np.zeros((0, dimension))
 
 
@@ -80,8 +81,8 @@ class BoxContainer(Container):
         lower, upper = self.extent()
         return np.asarray(((points >= lower - tolerance) & (points <= upper + tolerance)).all(axis=1))
 
-    def walls(self, dimension: int, spacing: float, layers: int) -> Points:
-        return box_walls(*self.extent(), self.periodic, spacing, layers)
+    def walls(self, dimension: int, spacing: float, depth: float) -> Points:
+        return box_walls(*self.extent(), self.periodic, spacing, depth)
 
     def periods(self, dimension: int) -> tuple[Points, Points]:
         lower, upper = self.extent()
@@ -123,8 +124,8 @@ class CylinderContainer(Container):
         within = (from_axis <= self.radius + tolerance, along >= -tolerance, along <= top)
         return np.logical_and.reduce(within)
 
-    def walls(self, dimension: int, spacing: float, layers: int) -> Points:
-        upright = cup_walls(self.radius, self.height, self.lid, spacing, layers)
+    def walls(self, dimension: int, spacing: float, depth: float) -> Points:
+        upright = cup_walls(self.radius, self.height, self.lid, spacing, depth)
         return self.base + np.roll(upright, INDEX_OF_AXIS[self.axis] + 1, axis=1)
 
 
@@ -144,12 +145,12 @@ def check_length(container: Container, spacing: float, support_radius: float) ->
         return
     lengths = ends[1] - ends[0]
     if lengths.min() < spacing * (1.0 - 1e-6):
-        raise wrong(("container",), Phrase(f"only {lengths.min():g} m wide"), f"at least one spacing, {spacing:g} m, wide")
+        found = Phrase(f"only {lengths.min():g} m wide")
+        raise wrong(("container",), found, f"at least one spacing, {spacing:g} m, wide")
     periods = container.periods(len(lengths))[1]
     short = (periods > 0.0) & (periods <= 2.0 * support_radius)
     if short.any():
         axis = int(np.argmax(short))
-        wanted = f"false, as the {periods[axis]:g} m of this axis are not longer than two support radii, " + (
-            f"{2.0 * support_radius:g} m"
-        )
+        reason = f"the {periods[axis]:g} m of this axis are not more than two support radii, {2.0 * support_radius:g} m"
+        wanted = f"false, as {reason}"
         raise wrong(("container", "periodic", axis), True, wanted)

@@ -7,8 +7,9 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from cortado.scene_kinds import Choice, Components, FieldPath, Quantity, Shaped, Text, wrong
 from cortado.scene_points import read_points
-from cortado.scene_values import Choice, Components, FieldPath, Quantity, Shaped, Table, Text, wrong
+from cortado.scene_tables import Table
 from cortado.shapes import Block, Points, block_about, block_between, corners
 
 LENGTH = Quantity("m")

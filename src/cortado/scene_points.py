@@ -59,16 +59,19 @@ def _read_vtk(path: str) -> Any:
     except ImportError:
         raise InputError(f"{path!r} needs the package vtk to be read; install it with: pip install vtk.") from None
     terminal, messages = vtk.vtkOutputWindow.GetInstance(), vtk.vtkStringOutputWindow()
-    vtk.vtkOutputWindow.SetInstance(messages)  # VTK has no exceptions: it prints
+    verbosity = vtk.vtkLogger.GetCurrentVerbosityCutoff()
+    vtk.vtkOutputWindow.SetInstance(messages)  # VTK has no exceptions: it prints, here and to its log
+    vtk.vtkLogger.SetStderrVerbosity(vtk.vtkLogger.VERBOSITY_OFF)
     try:
         reader = getattr(vtk, _VTK_READERS[Path(path).suffix])()
         reader.SetFileName(path)
         reader.Update()
+        output = reader.GetOutput()
     finally:
+        vtk.vtkLogger.SetStderrVerbosity(verbosity)
         vtk.vtkOutputWindow.SetInstance(terminal)
-    output = reader.GetOutput()
     points = output.GetPoints() if hasattr(output, "GetPoints") else None
-    if messages.GetOutput() or points is None or not points.GetNumberOfPoints():
+    if "ERROR" in messages.GetOutput() or points is None or not points.GetNumberOfPoints():
         raise InputError(f"{path!r} holds no points that VTK can read.")
     return vtk_to_numpy(points.GetData())
 

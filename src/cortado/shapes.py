@@ -76,37 +76,34 @@ def corners(lower: Points, upper: Points) -> Points:
 # ---- walls -------------------------------------------------------------------------------------------------------
 
 
-def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, layers: int) -> Points:
-    """(n, d) the lattice of a box continued outside of it: faces, edges and corners, each point once.
+def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, depth: float) -> Points:
+    """(n, d) one layer around a box, ``depth`` outside of it: faces, edges and corners, each point once.
 
-    An axis whose length is no multiple of the spacing is stretched a little between its walls. A periodic axis has no
-    wall. Axis by axis: outside on this axis, inside on those before it, either on those after it.
+    Along a face the points continue the lattice inside; an axis whose length is no multiple of the spacing is stretched
+    a little between its walls. A periodic axis has no wall. Axis by axis: outside on this axis, inside on those before
+    it, either on those after it.
     """
     inside = [_cells(a, b, nearest_cells(b - a, spacing)) for a, b in zip(lower, upper, strict=True)]
-    depths = (np.arange(layers) + 0.5) * spacing
     outside = [
-        np.zeros(0) if open_axis else np.concatenate([a - depths[::-1], b + depths])
+        np.zeros(0) if open_axis else np.array([a - depth, b + depth])
         for a, b, open_axis in zip(lower, upper, periodic, strict=True)
     ]
     both = [np.sort(np.concatenate(pair)) for pair in zip(inside, outside, strict=True)]
     return np.concatenate([grid([*inside[:axis], outside[axis], *both[axis + 1 :]]) for axis in range(len(inside))])
 
 
-def cup_walls(radius: float, height: float, lid: bool, spacing: float, layers: int) -> Points:
+def cup_walls(radius: float, height: float, lid: bool, spacing: float, depth: float) -> Points:
     """(n, 3) the walls of an upright cup whose base is centred on the origin, the third axis along its height.
 
-    The side: rings at ``radius + spacing / 2``, about a spacing apart along and across. The base, and the lid if there
-    is one: concentric rings half a spacing outside, the outermost continuing the side.
+    The side: rings ``depth`` outside of the radius, about a spacing apart along and across. The base, and the lid if
+    there is one: concentric rings ``depth`` outside, the outermost continuing the side.
     """
-    depths = (np.arange(layers) + 0.5) * spacing
     levels = _cells(0.0, height, nearest_cells(height, spacing))
-    side = np.concatenate([ring(radius + depth, spacing) for depth in depths])
-    rim = radius + depths[0]
+    rim = radius + depth
     rings = nearest_cells(rim, spacing)
-    radii = [*(rim * np.arange(rings + 1) / rings), *(radius + depths[1:])]
-    disc = np.concatenate([ring(value, spacing) for value in radii])
-    ends = [*(-depths), *(height + depths if lid else [])]
-    return np.concatenate([_stacked(side, levels), _stacked(disc, np.array(ends))])
+    disc = np.concatenate([ring(value, spacing) for value in rim * np.arange(rings + 1) / rings])
+    ends = [-depth, height + depth] if lid else [-depth]
+    return np.concatenate([_stacked(ring(rim, spacing), levels), _stacked(disc, np.array(ends))])
 
 
 def ring(radius: float, spacing: float) -> Points:

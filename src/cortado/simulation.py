@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.calibration import pressure_stiffness, rest_volume, wall_factor
+from cortado.calibration import WallLayer, pressure_stiffness, rest_volume, wall_layer, wall_rigidity
 from cortado.errors import CortadoWarning, InputError
 from cortado.neighbours import SKIN, Grid, NeighbourSearch
 from cortado.particles import State
@@ -39,9 +39,13 @@ class Simulation:
         """(n, d) first velocities [m / s]."""
         self.particles = len(sample.positions)
         self.phase = scene.phase[int(sample.phase[0])]
-        self.walls = boundary_particles(scene)
+        self.smoothing = smoothing_kernel(scene.discretisation.kernel)
+        layer = wall_layer(
+            self.smoothing, scene.discretisation.spacing, scene.discretisation.support_radius, scene.dimension
+        )
+        self.walls = boundary_particles(scene, layer.depth)
         """(b, d) wall particles [m]."""
-        self.solver = self._solver()
+        self.solver = self._solver(layer)
 
     @property
     def dimension(self) -> int:
@@ -115,15 +119,14 @@ class Simulation:
         average, greatest = rollout.errors.T
         return (average <= solve.tolerance) & (greatest <= solve.greatest_tolerance)
 
-    def _solver(self) -> Pcisph:
+    def _solver(self, layer: WallLayer) -> Pcisph:
         scene, dimension = self.scene, self.scene.dimension
-        kernel = smoothing_kernel(scene.discretisation.kernel)
+        kernel = self.smoothing
         spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
         discretisation = Discretisation(kernel, self.precision)
         lower, lengths = period(scene)
         volume = rest_volume(kernel, spacing, support, dimension)
-        factor = wall_factor(kernel, spacing, support, dimension)
-        volumes = boundary_volumes(self.walls, lambda r: kernel.weight(r, dimension, support), support, lower, lengths)
+        volumes = layer.factor * boundary_volumes(self.walls, lambda r: kernel.weight(r, dimension, support), support, lower, lengths)
         everything = np.concatenate([self.positions, self.walls])
         grid = Grid.around(
             everything.min(axis=0),
@@ -136,7 +139,7 @@ class Simulation:
             discretisation,
             grid,
             _padded(self.walls),
-            factor * volumes / volume,
+            volumes / volume,
             self.particles,
             first_capacity(support / spacing, dimension),
             self.device,
@@ -147,6 +150,7 @@ class Simulation:
             self_weight=float(kernel.weight(np.zeros(1), dimension, support)[0]),
             volume=volume,
             stiffness=pressure_stiffness(kernel, spacing, support, dimension),
+            rigidity=wall_rigidity(kernel, spacing, support, dimension),
         )
         periods = [*lengths, *np.zeros(3 - dimension)]
         return Pcisph(discretisation, lattice, search, self._terms(discretisation), self._pressure(), periods)

@@ -137,6 +137,7 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         v_bar: wp.array(dtype=vector),
         push_bar: wp.array(dtype=vector),
         rho_bar: wp.array(dtype=real),
+        y_bar: wp.array(dtype=real),
         p_bar: wp.array(dtype=real),
     ):
         """From the adjoint of the new state, in scene order, to that of the last prediction."""
@@ -148,6 +149,7 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         v_bar[i] = speed_bar
         push_bar[i] = dt * speed_bar
         rho_bar[i] = real(0.0)
+        y_bar[i] = real(0.0)
         p_bar[i] = real(0.0)
         scalars_bar[i] = scalars_bar[i] + adjoin_prediction(x_star_bar, speed_bar, v[i], v_star[i], dt)
 

@@ -1,11 +1,11 @@
 """One predictive-corrective iteration (Solenthaler and Pajarola 2009; report eqs. 6 and 9, put right):
 
-    p_i  = max(p_i + delta (rho*_i - rho_0), 0),   delta = k / dt^2
+    p_i  = max(p_i + delta y_i (rho*_i - rho_0), 0),   delta = k / dt^2
     c_i  = p_i / rho_i^2
     ap_i = -m (sum_j (c_i + c_j) G_ij + sum_b (psi_b / m) c_i G_ib)
     v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
 
-G is taken at x(t), rho* at the predicted positions over the neighbours of x(t). After the last iteration
+y is the yield beside walls (`cortado.physics.walls`). G is taken at x(t), rho* at the predicted positions over the neighbours of x(t). After the last iteration
 (x*, v*) is the new state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
 """
 
@@ -39,6 +39,7 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         rest_density: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
         rho: wp.array(dtype=real),
+        y: wp.array(dtype=real),
         x_star: wp.array(dtype=vector),
         p_in: wp.array(dtype=real),
         # out
@@ -51,7 +52,7 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         total = weights(i, x_star, s)
         rho_0 = rest_density[0]
         excess = rho_0 * s.volume * (s.self_weight + total) - rho_0
-        delta = stiffness / (time_step[0] * time_step[0])
+        delta = y[i] * stiffness / (time_step[0] * time_step[0])
         p_i = wp.max(p_in[i] + delta * excess, real(0.0))
         compression = wp.max(excess / rho_0, real(0.0))
         p_out[i] = p_i
@@ -68,6 +69,8 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         time_step_dot: wp.array(dtype=real),
         rho: wp.array(dtype=real),
         rho_dot: wp.array(dtype=real),
+        y: wp.array(dtype=real),
+        y_dot: wp.array(dtype=real),
         x_star: wp.array(dtype=vector),
         x_star_dot: wp.array(dtype=vector),
         p_in: wp.array(dtype=real),
@@ -82,10 +85,10 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         p_i = p_out[i]
         p_dot_i = real(0.0)
         if p_i > real(0.0):
-            delta = stiffness / (time_step[0] * time_step[0])
+            delta = y[i] * stiffness / (time_step[0] * time_step[0])
             excess = (p_i - p_in[i]) / delta
             excess_dot = rest_density[0] * s.volume * total + excess * rest_density_dot[0] / rest_density[0]
-            delta_dot = real(-2.0) * delta * time_step_dot[0] / time_step[0]
+            delta_dot = delta * (y_dot[i] / y[i] - real(2.0) * time_step_dot[0] / time_step[0])
             p_dot_i = p_in_dot[i] + delta * excess_dot + delta_dot * excess
         rho_i = rho[i]
         p_out_dot[i] = p_dot_i
@@ -227,6 +230,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         rho: wp.array(dtype=real),
+        y: wp.array(dtype=real),
         p_in: wp.array(dtype=real),
         p_out: wp.array(dtype=real),
         c: wp.array(dtype=real),
@@ -234,6 +238,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         # in and out
         x_bar: wp.array(dtype=vector),
         rho_bar: wp.array(dtype=real),
+        y_bar: wp.array(dtype=real),
         p_bar: wp.array(dtype=real),
         scalars_bar: wp.array(dtype=vector),
         # out
@@ -260,7 +265,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         mass = rest_density[0] * s.volume
         rho_i = rho[i]
         p_i = p_out[i]
-        delta = stiffness / (time_step[0] * time_step[0])
+        delta = y[i] * stiffness / (time_step[0] * time_step[0])
         c_bar = -mass * stretch
         p_bar_i = real(0.0)
         if p_i > real(0.0):
@@ -269,6 +274,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         excess = (p_i - p_in[i]) / delta
         x_bar[i] = x_bar[i] - mass * bend
         rho_bar[i] = rho_bar[i] - real(2.0) * c_i / rho_i * c_bar
+        y_bar[i] = y_bar[i] + r_i * excess / y[i]
         p_bar[i] = p_bar_i
         r[i] = r_i
         scalars_bar[i] = scalars_bar[i] + vector(

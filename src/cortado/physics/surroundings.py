@@ -39,7 +39,7 @@ def surroundings_type(precision: Precision) -> Any:
         wall_positions: wp.array(dtype=vector)
         """[m]"""
         wall_weights: wp.array(dtype=real)
-        """psi_b / m [-]: the mass of a wall particle over that of a fluid particle (Akinci et al. 2012)."""
+        """psi_b / m [-]: the mass of a wall particle over that of a fluid particle (after Akinci et al. 2012)."""
         support: real
         """Support radius h [m]."""
         reach: real
@@ -48,6 +48,8 @@ def surroundings_type(precision: Precision) -> Any:
         """sigma of the kernel [1 / m^d]."""
         self_weight: real
         """W(0) [1 / m^d]."""
+        rigidity: real
+        """2 sum_j G_j . G_j of a filled neighbourhood [1 / m^(2 d + 2)], see `cortado.physics.walls`."""
         volume: real
         """Rest volume of a particle [m^d]: with it the lattice of the rest spacing has the rest density."""
         periodic: wp.int32

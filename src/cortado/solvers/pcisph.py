@@ -19,6 +19,7 @@ from cortado.physics.density import density_kernels
 from cortado.physics.integration import integration_kernels
 from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
 from cortado.physics.surroundings import Discretisation, surroundings_type
+from cortado.physics.walls import wall_kernels
 from cortado.solvers.forces import ForceTerm, Moment
 
 
@@ -35,7 +36,9 @@ class Lattice:
     volume: float
     """Rest volume V_0 of a particle [m^d]."""
     stiffness: float
-    """k [kg / m3 -> Pa s2]: delta = k / dt^2 (report eq. 7, put right) for a filled neighbourhood."""
+    """k [m2]: delta = k / dt^2 [Pa m3 / kg] (report eq. 7, put right) for a filled neighbourhood."""
+    rigidity: float
+    """[1 / m^(2 d + 2)], see `cortado.physics.walls`."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ class Pcisph:
         self.terms, self.pressure, self.periods = tuple(terms), pressure, tuple(periods)
         self.launch = Launcher(particles, device)
         self._density = density_kernels(discretisation)
+        self._walls = wall_kernels(discretisation)
         self._pressure = pressure_kernels(discretisation)
         self._force = pressure_force_kernels(discretisation)
         self._integration = integration_kernels(precision)
@@ -104,6 +108,7 @@ class Pcisph:
             return wp.full(1, value, dtype=wp.int32, device=device)
 
         self.fields = Fields.zeros(particles, precision, device, requires_grad)
+        self.wall_yield = wp.zeros(particles, dtype=precision.real, device=device, requires_grad=requires_grad)
         self.accelerations = [vectors() for _ in range(len(self.terms) + 1)]
         """``accelerations[t]``: of the first t terms; the first is 0 and never written."""
         self.iterates = Iterates(particles, precision, device, requires_grad)
@@ -125,7 +130,7 @@ class Pcisph:
         s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
         s.support, s.reach = lattice.support, (1.0 + SKIN) * lattice.support
         s.normalisation = lattice.normalisation
-        s.self_weight, s.volume = lattice.self_weight, lattice.volume
+        s.self_weight, s.volume, s.rigidity = lattice.self_weight, lattice.volume, lattice.rigidity
         s.periodic = int(any(self.periods))
         s.period = precision.vector(*self.periods)
         s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in self.periods))
@@ -189,6 +194,7 @@ class Pcisph:
         self.launch(self._integration.sort, [self.search.order, state.positions, state.velocities], [f.x, f.v])
         self.search.fill(s, f.x)
         self.launch(self._density.forward, [s, parameters.rest_density, f.x], [f.rho])
+        self.launch(self._walls.forward, [s, f.x], [self.wall_yield])
         moment = self.moment(parameters)
         for t, term in enumerate(self.terms):
             term.accelerate(moment, self.accelerations[t], self.accelerations[t + 1])
@@ -229,7 +235,8 @@ class Pcisph:
         pressure = it.p[max(slot, 1)]
         self.launch(
             self._pressure.forward,
-            [s, self.lattice.stiffness, p.rest_density, p.time_step, f.rho, it.x_star[before], pressure_before],
+            [s, self.lattice.stiffness, p.rest_density, p.time_step, f.rho, self.wall_yield]
+            + [it.x_star[before], pressure_before],
             [pressure, it.c[before], self._errors],
         )
         self.launch(

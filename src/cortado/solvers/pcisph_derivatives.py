@@ -9,6 +9,7 @@ from cortado.particles import Fields, Parameters, State
 from cortado.physics.density import density_kernels
 from cortado.physics.integration import integration_kernels
 from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
+from cortado.physics.walls import wall_kernels
 from cortado.solvers.forces import Adjoints
 from cortado.solvers.pcisph import Pcisph
 
@@ -38,13 +39,14 @@ class PcisphAdjoint:
         precision, particles, device = discretisation.precision, solver.search.particles, solver.search.device
         self._solver = solver
         self._density = density_kernels(discretisation)
+        self._walls = wall_kernels(discretisation)
         self._pressure = pressure_kernels(discretisation)
         self._force = pressure_force_kernels(discretisation)
         self._integration = integration_kernels(precision)
         self._bar = Fields.zeros(particles, precision, device)
-        scratch = _scratch(solver, 3, 2)
+        scratch = _scratch(solver, 3, 3)
         self._push_bar, self._acceleration_bar, self.scalars_bar = scratch.vectors
-        self._p_bar, self._r = scratch.scalars
+        self._p_bar, self._y_bar, self._r = scratch.scalars
         self._sum = vector_sum(particles, precision, device)
 
     def clear(self) -> None:
@@ -65,14 +67,14 @@ class PcisphAdjoint:
         launch(
             self._integration.begin_adjoint,
             [order, time_step, f.v, it.v_star[iterations], new_state_bar.positions, new_state_bar.velocities],
-            [self.scalars_bar, b.x, b.v, self._push_bar, b.rho, self._p_bar],
+            [self.scalars_bar, b.x, b.v, self._push_bar, b.rho, self._y_bar, self._p_bar],
         )
         for k in reversed(range(iterations)):
             launch(
                 self._force.adjoint,
-                [s, solver.lattice.stiffness, rest_density, time_step, f.x, f.rho]
+                [s, solver.lattice.stiffness, rest_density, time_step, f.x, f.rho, solver.wall_yield]
                 + [it.p[k], it.p[k + 1], it.c[k], self._push_bar],
-                [b.x, b.rho, self._p_bar, self.scalars_bar, self._r],
+                [b.x, b.rho, self._y_bar, self._p_bar, self.scalars_bar, self._r],
             )
             launch(
                 self._pressure.adjoint,
@@ -83,6 +85,7 @@ class PcisphAdjoint:
         moment, adjoints = solver.moment(parameters), Adjoints(b, bar, self.scalars_bar)
         for term in reversed(solver.terms):
             term.adjoint(moment, self._acceleration_bar, adjoints)
+        launch(self._walls.adjoint, [s, f.x, solver.wall_yield, self._y_bar], [b.x])
         launch(self._density.adjoint, [s, rest_density, f.x, f.rho, b.rho], [b.x, self.scalars_bar])
         launch(self._integration.unsort, [order, b.x, b.v], [state_bar.positions, state_bar.velocities])
 
@@ -95,13 +98,14 @@ class PcisphTangent:
         precision, particles, device = discretisation.precision, solver.search.particles, solver.search.device
         self._solver = solver
         self._density = density_kernels(discretisation)
+        self._walls = wall_kernels(discretisation)
         self._pressure = pressure_kernels(discretisation)
         self._force = pressure_force_kernels(discretisation)
         self._integration = integration_kernels(precision)
         self._dot = Fields.zeros(particles, precision, device)
-        scratch = _scratch(solver, len(solver.terms) + 3, 4)
+        scratch = _scratch(solver, len(solver.terms) + 3, 5)
         self._x_star_dot, self._v_star_dot, *self._accelerations_dot = scratch.vectors
-        self._zero_pressure, *self._p_dot, self._c_dot = scratch.scalars
+        self._zero_pressure, *self._p_dot, self._c_dot, self._y_dot = scratch.scalars
 
     def step(
         self, iterations: int, state_dot: State, new_state_dot: State, parameters: Parameters, dot: Parameters
@@ -113,6 +117,7 @@ class PcisphTangent:
         acceleration, acceleration_dot = solver.accelerations[-1], self._accelerations_dot[-1]
         launch(self._integration.sort, [order, state_dot.positions, state_dot.velocities], [d.x, d.v])
         launch(self._density.tangent, [s, rest_density, dot.rest_density, f.x, d.x, f.rho], [d.rho])
+        launch(self._walls.tangent, [s, f.x, d.x, solver.wall_yield], [self._y_dot])
         for t, term in enumerate(solver.terms):
             before, after = self._accelerations_dot[t], self._accelerations_dot[t + 1]
             term.tangent(solver.moment(parameters), d, dot, before, after)
@@ -127,7 +132,8 @@ class PcisphTangent:
             launch(
                 self._pressure.tangent,
                 [s, solver.lattice.stiffness, rest_density, dot.rest_density, time_step, dot.time_step]
-                + [f.rho, d.rho, it.x_star[k], self._x_star_dot, it.p[k], p_dot_before, it.p[k + 1]],
+                + [f.rho, d.rho, solver.wall_yield, self._y_dot, it.x_star[k], self._x_star_dot]
+                + [it.p[k], p_dot_before, it.p[k + 1]],
                 [p_dot, self._c_dot],
             )
             launch(

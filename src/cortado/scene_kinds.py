@@ -1,31 +1,25 @@
-"""The kinds of value that a scene holds, and how a wrong one becomes a sentence.
+"""The kinds of value that a scene holds.
 
-A kind is put beside the type of a field, ``Annotated[float, Quantity("kg/m3", above=0.0)]``: it checks the value and
-says what was wanted. A wrong value ends in a `SceneError`, whether the scene comes from a file or is built in Python.
+A kind is put beside the type of a field, ``Annotated[float, Quantity("kg/m3", above=0.0)]``: it checks the value, and
+says what was wanted.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from numbers import Real
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError, model_validator
+from pydantic import BaseModel, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from cortado.errors import Phrase, SceneError
+from cortado.errors import Phrase
 
 GREATEST = 1e50
 """No number of a scene is larger, as its cube must fit into a float64, and no positive one smaller than its inverse."""
 MISSING = Phrase("missing")
-SHAPES = ("box", "cylinder", "sphere", "points", "none")
 FieldPath = Sequence[str | int]
-
-
-# ---- sentences ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, repr=False)
@@ -41,90 +35,6 @@ class Trouble:
 def wrong(path: FieldPath, found: Any, wanted: str, sentence: str | None = None) -> PydanticCustomError:
     """What a check raises; the path (names and indices) starts at the model that is being checked."""
     return PydanticCustomError("scene", "wrong value", {"trouble": Trouble(tuple(path), found, wanted, sentence)})
-
-
-@contextmanager
-def sentences() -> Iterator[None]:
-    """Turn the first trouble that pydantic reports into a `SceneError`."""
-    try:
-        yield
-    except ValidationError as error:
-        raise _scene_error(error) from None
-
-
-def field_name(path: FieldPath) -> str:
-    """``("fluid", 0, "upper")`` as ``fluid[0].upper``."""
-    text = ""
-    for part in path:
-        if isinstance(part, int):
-            text += f"[{part}]"
-        else:
-            name = part if part.replace("-", "_").isidentifier() else repr(part)
-            text += f".{name}" if text else name
-    return text
-
-
-def _scene_error(error: ValidationError) -> SceneError:
-    first = error.errors(include_url=False)[0]
-    path = [part for part in first["loc"] if part not in SHAPES]  # pydantic names the member of a union
-    if first["type"] != "scene":
-        return SceneError(None, field_name(path), first["input"], f"valid ({first['msg']})")
-    trouble = first["ctx"]["trouble"]
-    path += trouble.path
-    sentence = trouble.sentence
-    if sentence:
-        sentence = sentence.replace("{table}", f"[{field_name(path[:-1])}]" if path[1:] else "the scene")
-    return SceneError(None, field_name(path), trouble.found, trouble.wanted, sentence)
-
-
-# ---- tables ------------------------------------------------------------------------------------------------------
-
-
-class Table(BaseModel):
-    """A table of the scene: frozen, without unknown keys, and with a `SceneError` for whatever is wrong."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    def __init__(self, /, **data: Any):
-        with sentences():
-            super().__init__(**data)
-
-    # Tells pydantic to build nested tables without this method, so that an error carries its whole path.
-    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
-
-    @model_validator(mode="before")
-    @classmethod
-    def _check_keys(cls, data: Any) -> Any:
-        if isinstance(data, cls):
-            return data
-        if not isinstance(data, Mapping):
-            raise wrong((), data, "a table")
-        for key in data:
-            if key not in cls.model_fields:
-                raise _unknown_key(str(key), list(cls.model_fields))
-        for name, field in cls.model_fields.items():
-            if field.is_required() and name not in data:
-                kinds = [kind.wanted for kind in field.metadata if isinstance(kind, Kind)]
-                raise wrong((name,), MISSING, kinds[0] if kinds else "a table")
-        return data
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """This table, at a path, with its vectors checked, and those left out filled in, for 2 or 3 dimensions."""
-        filled = {}
-        for name, field in type(self).model_fields.items():
-            for kind in field.metadata:
-                if isinstance(kind, Components):
-                    filled[name] = kind.in_dimension((*path, name), getattr(self, name), dimension)
-        return self.model_copy(update=filled)
-
-
-def _unknown_key(key: str, known: list[str]) -> PydanticCustomError:
-    close = get_close_matches(key, known, n=1)
-    advice = f"did you mean {close[0]}?" if close else f"its keys are {', '.join(known)}."
-    return wrong((key,), Phrase("unknown"), f"one of {', '.join(known)}", f"is not a key of {{table}}; {advice}")
-
-
-# ---- kinds -------------------------------------------------------------------------------------------------------
 
 
 class Kind:
@@ -293,7 +203,7 @@ class Shaped(Kind):
             shape = value.get("shape", MISSING)
             if isinstance(shape, Phrase) or not isinstance(shape, str) or shape not in self.shapes:
                 raise wrong(("shape",), shape, choice.wanted)
-        elif not isinstance(value, Table):
+        elif not isinstance(value, BaseModel):
             raise wrong((), value, self.wanted)
         return value
 

@@ -1,0 +1,82 @@
+"""How much a particle beside a wall may be pushed by one pressure iteration.
+
+delta is made for a particle with a filled neighbourhood. Beside a wall the same pressure moves a particle's own density
+further, by |S_i|^2 / (2 sum_j G_j . G_j of the prototype) with S_i = sum_b (psi_b / m) G_ib, and where that is above 2 the
+iteration overshoots and kicks it away. So delta is multiplied by the yield
+
+    y_i = 1 / (1 + |S_i|^2 / rigidity),
+
+which is 1 away from walls, and smooth.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
+
+
+@cache
+def wall_kernels(discretisation: Discretisation) -> SimpleNamespace:
+    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the yield."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    surroundings = surroundings_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    separation, gradient, hessian_product = pair.separation, pair.gradient, pair.hessian_product
+
+    @wp.func
+    def wall_gradient(i: int, x: wp.array(dtype=vector), s: surroundings) -> vector:
+        total = vector()
+        for k in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[k, i]
+            total += s.wall_weights[b] * gradient(separation(x[i], s.wall_positions[b], s), s)
+        return total
+
+    @wp.func
+    def wall_hessian_product(i: int, x: wp.array(dtype=vector), u: vector, s: surroundings) -> vector:
+        total = vector()
+        for k in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[k, i]
+            total += s.wall_weights[b] * hessian_product(separation(x[i], s.wall_positions[b], s), u, s)
+        return total
+
+    @wp.kernel(module=discretisation.module(True))
+    def wall_yield(
+        s: surroundings,
+        x: wp.array(dtype=vector),
+        # out
+        y: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        total = wall_gradient(i, x, s)
+        y[i] = s.rigidity / (s.rigidity + wp.dot(total, total))
+
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    def wall_yield_tangent(
+        s: surroundings,
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        y: wp.array(dtype=real),
+        # out
+        y_dot: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        total = wall_gradient(i, x, s)
+        total_dot = wall_hessian_product(i, x, x_dot[i], s)
+        y_dot[i] = real(-2.0) * y[i] * y[i] / s.rigidity * wp.dot(total, total_dot)
+
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    def wall_yield_adjoint(
+        s: surroundings,
+        x: wp.array(dtype=vector),
+        y: wp.array(dtype=real),
+        y_bar: wp.array(dtype=real),
+        # in and out
+        x_bar: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        total_bar = (real(-2.0) * y_bar[i] * y[i] * y[i] / s.rigidity) * wall_gradient(i, x, s)
+        x_bar[i] = x_bar[i] + wall_hessian_product(i, x, total_bar, s)
+
+    return SimpleNamespace(forward=wall_yield, tangent=wall_yield_tangent, adjoint=wall_yield_adjoint)

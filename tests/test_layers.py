@@ -1,0 +1,193 @@
+"""Data flows down one list: a module imports only from modules above it. And who may launch, and what stays light."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import cortado
+
+ROOT = Path(cortado.__file__).parent
+
+LAYERS = """
+    errors
+    precision smoothing calibration
+    physics.surroundings physics.density physics.integration physics.pressure physics.viscosity
+    physics.convergence physics.reduction
+    neighbours launching particles
+    shapes scene_values scene_kinds scene_tables scene_toml scene_points
+    scene_fluids scene_containers scene_stability scene_checks scene sampling
+    vtkhdf trajectory
+    solvers.forces solvers.pcisph solvers.pcisph_derivatives
+    rollout policies losses simulation problem
+    evaluations optimisers optimisation
+    run_folder progress figures report
+    task certificate bench
+    commands.* cli
+"""
+"""From the foundations to the command line; ``package.*`` stands for modules that do not import one another.
+
+The package itself, ``cortado``, has no place in it: it imports nothing of its own before a name is used.
+"""
+ORDER = LAYERS.split()
+
+
+def rank(module: str) -> int | None:
+    """The place of a module in the list, None where it has none."""
+    names = [module, f"{module.split('.')[0]}.*"]
+    return next((ORDER.index(name) for name in names if name in ORDER), None)
+
+
+def modules() -> dict[str, Path]:
+    """Every module by its name within the package."""
+    found = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        if parts[-1] != "__init__":
+            found[".".join(parts)] = path
+    return found
+
+
+def is_for_types_only(node: ast.AST) -> bool:
+    """Whether this is ``if TYPE_CHECKING``."""
+    return isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING")
+
+
+def statements(node: ast.AST):
+    """Every node that can run, also inside functions."""
+    for child in ast.iter_child_nodes(node):
+        if is_for_types_only(child):
+            for other in child.orelse:
+                yield other
+                yield from statements(other)
+            continue
+        yield child
+        yield from statements(child)
+
+
+def imports(source: str, module: str, known: set[str]) -> set[str]:
+    """Modules of the package that a module's source imports, by their names within the package."""
+    found = set()
+    for node in statements(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            package = ["cortado", *module.split(".")][: -node.level] if node.level else []
+            base = ".".join(package + ([node.module] if node.module else []))
+            names = [f"{base}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for name in names:
+            if name == "cortado" or not name.startswith("cortado."):
+                continue
+            inner = name.removeprefix("cortado.")
+            parent = inner.rpartition(".")[0]
+            found.add(inner if inner in known else parent or inner)
+    return found
+
+
+MODULES = modules()
+FREE = {"__version__"}
+"""Names of the package itself that any module may import."""
+
+
+def complaints(module: str, source: str, known: set[str]) -> list[str]:
+    """Sentences about the imports of a module that run the wrong way."""
+    own = rank(module)
+    if own is None:
+        return [f"{module} is not in the list of modules: give it its place in ORDER."]
+    found = []
+    for other in sorted(imports(source, module, known) - FREE):
+        place = rank(other)
+        if place is None:
+            found.append(f"{module} imports {other}, which is no module of ORDER (import a name from its own module).")
+        elif other != module and place >= own:
+            found.append(f"{module} imports {other}, which comes after it.")
+    return found
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_imports_run_one_way(module):
+    found = complaints(module, MODULES[module].read_text(), set(MODULES))
+    assert not found, "\n".join(found)
+
+
+def test_the_list_names_nothing_twice():
+    assert len(set(ORDER)) == len(ORDER)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from cortado.problem import Problem",
+        "from cortado import problem",
+        "import cortado.problem",
+        "from .. import problem",
+        "from ..problem import Problem",
+        "def f():\n    from cortado.problem import Problem",
+        "if TYPE_CHECKING:\n    pass\nelse:\n    import cortado.problem",
+        "from cortado import Problem",
+    ],
+)
+def test_an_import_upwards_is_found(source):
+    assert complaints("physics.density", source, {"problem", "physics.density"})
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from cortado.errors import InputError",
+        "from cortado import errors, __version__",
+        "from ..errors import InputError",
+        "from .surroundings import Discretisation",
+        "if TYPE_CHECKING:\n    from cortado.problem import Problem",
+        "import numpy, warp as wp",
+    ],
+)
+def test_an_import_downwards_is_allowed(source):
+    assert not complaints("physics.density", source, {"errors", "problem", "physics.density", "physics.surroundings"})
+
+
+def test_a_new_module_needs_a_place():
+    assert complaints("somewhere", "", {"somewhere"})
+
+
+def warp_names(path: Path) -> set[str]:
+    """Names of Warp that a file uses: ``kernel`` for ``wp.kernel`` and for ``from warp import kernel``."""
+    tree = ast.parse(path.read_text())
+    found = {
+        node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in ("wp", "warp")
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "warp":
+            found |= {alias.name for alias in node.names}
+    return found
+
+
+def files_of(package: str) -> list[Path]:
+    return sorted((ROOT / package).glob("*.py"))
+
+
+@pytest.mark.parametrize("path", files_of("physics"), ids=lambda path: path.stem)
+def test_physics_never_launches(path):
+    assert not warp_names(path) & {"launch", "launch_tiled", "Tape", "capture_begin", "ScopedCapture"}
+
+
+@pytest.mark.parametrize("path", files_of("solvers"), ids=lambda path: path.stem)
+def test_solvers_define_no_kernels(path):
+    assert not warp_names(path) & {"kernel", "func", "func_grad", "func_replay", "func_native", "struct"}
+
+
+def test_there_are_kernels_and_launches_to_speak_of():
+    assert all("kernel" in warp_names(ROOT / "physics" / f"{name}.py") for name in ("density", "pressure"))
+    assert "launch" in warp_names(ROOT / "launching.py")
+
+
+def test_import_is_light():
+    program = "import sys, cortado; print(*(n for n in ('warp', 'matplotlib', 'scipy') if n in sys.modules))"
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert not found, f"import cortado alone imports {', '.join(found)}"

@@ -1,0 +1,299 @@
+"""Neighbour lists against all pairs: whatever the dimension, the periods, the precision and the place."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cortado.neighbours import SKIN, Grid, NeighbourSearch
+from cortado.physics.surroundings import Discretisation, surroundings_type
+from cortado.precision import FLOAT32, FLOAT64, Precision
+from cortado.smoothing import CUBIC_SPLINE
+
+SUPPORT = 0.1
+REACH = (1 + SKIN) * SUPPORT
+CPU = wp.get_device("cpu")
+GUARD = -7
+
+precisions = pytest.mark.parametrize("precision", [FLOAT32, FLOAT64], ids=lambda precision: precision.name)
+
+
+def padded(vectors: np.ndarray) -> np.ndarray:
+    return np.hstack([vectors, np.zeros((len(vectors), 3 - vectors.shape[1]))])
+
+
+def around(search: NeighbourSearch, period: np.ndarray, precision: Precision) -> Any:
+    """What `NeighbourSearch.fill` reads of the surroundings, as `Pcisph.grow` sets it."""
+    s = surroundings_type(precision)()
+    s.neighbours, s.fluid_count, s.count = search.neighbours, search.fluid_count, search.count
+    s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
+    s.support, s.reach = SUPPORT, REACH
+    s.periodic = int(any(period))
+    s.period = precision.vector(*padded(period[None])[0])
+    s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in padded(period[None])[0]))
+    return s
+
+
+@dataclass(frozen=True)
+class Found:
+    """Lists of a search, in the order in which the particles were given."""
+
+    search: NeighbourSearch
+    grid: Grid
+    order: np.ndarray
+    fluid: list[np.ndarray]
+    """For each particle its fluid neighbours, as they stand in the list."""
+    walls: list[np.ndarray]
+    """The same for wall particles, named as they were given."""
+    needed: int
+    rows: np.ndarray
+    """(n, capacity + guard) the memory of the sorted lists."""
+
+
+def lists(
+    positions: np.ndarray,
+    period: Any = 0.0,
+    walls: np.ndarray | None = None,
+    precision: Precision = FLOAT64,
+    capacity: int = 400,
+    grid_over: tuple[np.ndarray, np.ndarray] | None = None,
+    most: int = 4096,
+) -> Found:
+    """Neighbours of positions (n, d) by the engine; the memory behind the lists is guarded."""
+    n, dimension = positions.shape
+    period = np.broadcast_to(np.asarray(period, dtype=np.float64), dimension)
+    walls = np.zeros((0, dimension)) if walls is None else walls
+    everything = np.concatenate([positions, walls])
+    lower, upper = grid_over or (everything.min(axis=0), everything.max(axis=0))
+    lower = np.where(period > 0, 0.0, lower)
+    grid = Grid.around(lower, upper, period, REACH, most)
+    discretisation = Discretisation(CUBIC_SPLINE, precision)
+    names = np.arange(len(walls), dtype=np.float64)  # as weights, so that sorted walls tell who they were
+    search = NeighbourSearch(discretisation, grid, padded(walls), names, n, capacity, CPU)
+    memory = wp.full((n, capacity + 8), GUARD, dtype=wp.int32, device=CPU)
+    search.neighbours = memory[:, :capacity].transpose((1, 0))
+    surroundings = around(search, period, precision)
+    given_positions = padded(positions).astype(precision.numpy)
+    search.sort(wp.array(given_positions, dtype=precision.vector, device=CPU))
+    order = search.order.numpy()[:n]
+    search.fill(surroundings, wp.array(given_positions[order], dtype=precision.vector, device=CPU))
+    rows, fluid_count, count = memory.numpy(), search.fluid_count.numpy(), search.count.numpy()
+    wall_names = search.wall_weights.numpy().astype(int)
+    fluid: list[np.ndarray] = [np.zeros(0)] * n
+    near_walls: list[np.ndarray] = [np.zeros(0)] * n
+    for i in range(n):
+        fluid[order[i]] = order[rows[i, : fluid_count[i]]]
+        near_walls[order[i]] = wall_names[rows[i, fluid_count[i] : count[i]]]
+    return Found(search, grid, order, fluid, near_walls, int(search.needed.numpy()[0]), rows)
+
+
+def distances(x: np.ndarray, y: np.ndarray, period: Any, precision: Precision) -> np.ndarray:
+    """(n, m) of the nearest image, in float64 from positions as the engine holds them."""
+    x, y = (v.astype(precision.numpy).astype(np.float64) for v in (x, y))
+    separation = x[:, None] - y[None, :]
+    period = np.broadcast_to(np.asarray(period, dtype=np.float64), separation.shape[-1:])
+    turns = np.round(separation / np.where(period > 0, period, np.inf))
+    return np.linalg.norm(separation - turns * period, axis=-1)
+
+
+def compare(found: list[np.ndarray], r: np.ndarray, tolerance: float) -> None:
+    """Each list holds everybody within reach once and nobody else; pairs at the reach itself may go either way."""
+    for i, listed in enumerate(found):
+        assert len(np.unique(listed)) == len(listed), f"particle {i} lists a neighbour twice"
+        surely, perhaps = (set(np.flatnonzero(r[i] < REACH * (1 + sign * tolerance))) for sign in (-1, 1))
+        assert surely <= set(listed), f"particle {i} misses {surely - set(listed)}"
+        assert set(listed) <= perhaps, f"particle {i} lists {set(listed) - perhaps}, which are too far away"
+
+
+def check(positions: np.ndarray, period: Any = 0.0, walls: np.ndarray | None = None, **options: Any) -> Found:
+    """All that must hold for the lists of these positions."""
+    precision = options.get("precision", FLOAT64)
+    found = lists(positions, period, walls, **options)
+    size = max(np.abs(positions).max(), REACH) / REACH
+    tolerance = 8 * size * np.finfo(precision.numpy).eps
+    r = distances(positions, positions, period, precision)
+    np.fill_diagonal(r, np.inf)
+    compare(found.fluid, r, tolerance)
+    pairs = {(i, int(j)) for i, listed in enumerate(found.fluid) for j in listed}
+    assert pairs == {(j, i) for i, j in pairs}, "the lists are not symmetric"
+    if walls is not None:
+        compare(found.walls, distances(positions, walls, period, precision), tolerance)
+    longest = max(len(a) + len(b) for a, b in zip(found.fluid, found.walls, strict=True))
+    assert found.needed == longest <= found.search.capacity
+    assert (found.rows[:, found.search.capacity :] == GUARD).all()
+    check_order(found, positions, precision)
+    return found
+
+
+def check_order(found: Found, positions: np.ndarray, precision: Precision) -> None:
+    """Cells in ascending order, and within a cell the order that was given."""
+    real, grid = precision.numpy, found.grid
+    s = (padded(positions).astype(real) - grid.origin.astype(real)) * (1.0 / grid.cell).astype(real)
+    c = np.floor(s).astype(np.int64) % np.array(grid.shape)
+    cells = (c[:, 2] * grid.shape[1] + c[:, 1]) * grid.shape[0] + c[:, 0]
+    np.testing.assert_array_equal(found.order, np.argsort(cells, kind="stable"))
+
+
+def cloud(n: int, dimension: int, size: Any, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.0, 1.0, (n, dimension)) * size
+
+
+@precisions
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_free_space(dimension, precision):
+    found = check(cloud(300, dimension, 0.6), precision=precision)
+    assert found.needed > 4
+
+
+@precisions
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_walls(dimension, precision):
+    walls = cloud(150, dimension, 0.7, seed=1) - 0.05
+    found = check(cloud(200, dimension, 0.6), walls=walls, precision=precision)
+    assert any(len(near) for near in found.walls)
+
+
+@precisions
+@pytest.mark.parametrize(
+    "axes",
+    [(1, 0), (0, 1), (1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (0, 1, 1), (1, 1, 1)],
+    ids=lambda axes: "".join("xyz"[k] if on else "-" for k, on in enumerate(axes)),
+)
+def test_periods(axes, precision):
+    size = np.array([0.52, 0.43, 0.37])[: len(axes)]
+    walls = cloud(60, len(axes), size, seed=1)
+    check(cloud(200, len(axes), size), period=size * axes, walls=walls, precision=precision)
+
+
+@precisions
+@pytest.mark.parametrize("reaches", [1.0, 1.4, 2.0, 2.2, 3.0, 3.5])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_short_periods(dimension, reaches, precision):
+    """With one, two and three cells along an axis no cell is visited twice, and none is left out."""
+    size = np.array([reaches, 3.3, reaches])[:dimension] * REACH
+    walls = cloud(40, dimension, size, seed=1)
+    found = check(cloud(120, dimension, size), period=size, walls=walls, precision=precision)
+    assert found.grid.shape[0] == int(reaches)
+
+
+@precisions
+def test_particles_that_went_around_many_times(precision):
+    size = np.array([0.52, 0.31, 0.4])
+    turns = np.random.default_rng(2).integers(-5, 6, (200, 3))
+    check(cloud(200, 3, size) + turns * size, period=size, precision=precision)
+
+
+@precisions
+@pytest.mark.parametrize("most", [27, 64, 4096])
+def test_far_outside_of_the_grid(most, precision):
+    """The grid wraps around: particles a long way off find one another, and nobody else."""
+    positions = cloud(240, 3, 0.4)
+    positions[80:160] += [7.3, 0.0, -2.0]
+    positions[160:] -= [0.0, 31.7, 0.0]
+    check(positions, walls=cloud(30, 3, 0.4, seed=1), grid_over=(np.zeros(3), np.full(3, 0.4)), most=most)
+
+
+def test_lost_particles_harm_nobody():
+    """Not a number, infinite, and too large for an integer: no list of the others changes."""
+    positions = cloud(100, 3, 0.4)
+    grid_over = (np.zeros(3), np.full(3, 0.4))
+    before = lists(positions, grid_over=grid_over)
+    lost = np.array([[np.nan, 0.1, 0.2], [np.inf, 0.1, 0.2], [0.1, -1e30, 0.2], [3e9, 3e9, -3e9]])
+    with np.errstate(all="ignore"):
+        after = lists(np.concatenate([positions, lost]), grid_over=grid_over)
+    for i in range(100):
+        assert set(before.fluid[i]) == set(after.fluid[i])
+    assert all(len(after.fluid[i]) == 0 for i in range(100, 104))
+
+
+@precisions
+def test_coincident_particles(precision):
+    """They list one another, and not themselves."""
+    positions = np.repeat(cloud(20, 3, 0.2), 4, axis=0)
+    found = check(positions, walls=positions[:8].copy(), precision=precision)
+    assert all({4 * (i // 4) + k for k in range(4)} - {i} <= set(listed) for i, listed in enumerate(found.fluid))
+
+
+@precisions
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_lists_reach_beyond_the_support(dimension, precision):
+    """On a lattice with pairs at exactly the support radius those are listed, whatever the round-off."""
+    spacing, n = SUPPORT / 2, 6
+    lattice = spacing * np.stack(np.meshgrid(*[np.arange(n)] * dimension, indexing="ij"), -1).reshape(-1, dimension)
+    found = check(lattice, precision=precision)
+    assert SKIN > 0
+    r = distances(lattice, lattice, 0.0, FLOAT64)
+    for i, listed in enumerate(found.fluid):
+        assert set(np.flatnonzero(r[i] < 1.001 * SUPPORT)) - {i} == set(listed)
+
+
+@pytest.mark.parametrize(
+    "distance, listed", [(0.5, True), (1.0, True), (1 + 0.99 * SKIN, True), (1 + 1.01 * SKIN, False)]
+)
+@precisions
+def test_how_far_the_lists_reach(distance, listed, precision):
+    found = check(np.array([[0.2, 0.2], [0.2 + distance * SUPPORT, 0.2]]), precision=precision)
+    assert (len(found.fluid[0]) == 1) is listed
+
+
+def test_one_particle_alone():
+    assert check(np.array([[0.3, 0.2, 0.1]])).needed == 0
+
+
+@pytest.mark.parametrize("capacity", [1, 3, 10, 25])
+@precisions
+def test_lists_that_are_too_short_say_how_long_they_must_be(capacity, precision):
+    positions, walls = cloud(200, 3, 0.35), cloud(80, 3, 0.35, seed=1)
+    full = check(positions, walls=walls, precision=precision)
+    short = lists(positions, walls=walls, precision=precision, capacity=capacity)
+    assert short.needed == full.needed > capacity
+    assert (short.rows[:, capacity:] == GUARD).all(), "something was written behind the end of a list"
+    for i in range(200):
+        length = len(full.fluid[i]) + len(full.walls[i])
+        assert len(short.fluid[i]) + len(short.walls[i]) == min(length, capacity)
+        together = [*full.fluid[i], *(-1 - full.walls[i])]
+        np.testing.assert_array_equal([*short.fluid[i], *(-1 - short.walls[i])], together[:capacity])
+
+
+def test_room_can_be_made():
+    discretisation = Discretisation(CUBIC_SPLINE, FLOAT64)
+    grid = Grid.around(np.zeros(3), np.ones(3), np.zeros(3), REACH, 1000)
+    search = NeighbourSearch(discretisation, grid, np.zeros((0, 3)), np.zeros(0), 10, 4, CPU)
+    search.allocate(9)
+    assert search.capacity == 9
+    assert search.neighbours.shape == (9, 10)
+
+
+@settings(max_examples=40, deadline=None, database=None, derandomize=True)
+@given(
+    seed=st.integers(0, 2**31),
+    n=st.integers(1, 120),
+    periodic=st.lists(st.booleans(), min_size=2, max_size=3),
+    reaches=st.lists(st.floats(1.0, 9.0), min_size=3, max_size=3),
+    walls=st.integers(0, 40),
+    single=st.booleans(),
+    most=st.sampled_from([1, 30, 4096]),
+)
+def test_random_clouds(seed, n, periodic, reaches, walls, single, most):
+    dimension = len(periodic)
+    size = np.array(reaches[:dimension]) * REACH
+    check(
+        cloud(n, dimension, size, seed),
+        period=size * periodic,
+        walls=cloud(walls, dimension, size, seed + 1),
+        precision=FLOAT32 if single else FLOAT64,
+        most=most,
+    )
+
+
+def test_a_grid_covers_its_region():
+    grid = Grid.around(np.array([-1.0, 0.0]), np.array([2.0, 1.05]), np.array([0.0, 1.05]), 0.1, 10**6)
+    assert grid.shape[2] == 1
+    assert (grid.cell[:2] >= 0.1 * (1 - 1e-9)).all()
+    assert grid.shape[1] * grid.cell[1] == pytest.approx(1.05)
+    assert grid.origin[0] <= -1.0 and grid.origin[0] + grid.shape[0] * grid.cell[0] >= 2.0
+    assert Grid.around(np.zeros(3), np.full(3, 1e6), np.zeros(3), 0.1, 1000).cells <= 1000

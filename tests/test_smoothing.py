@@ -1,0 +1,354 @@
+"""Smoothing kernels against formulae derived here, finite differences, and the integral that they must have."""
+
+import itertools
+from functools import cache
+from math import factorial, pi
+
+import numpy as np
+import pytest
+import warp as wp
+
+from cortado.calibration import (
+    RATE_LIMIT,
+    SLACK,
+    greatest_rate,
+    lattice_offsets,
+    pressure_stiffness,
+    rest_volume,
+    wall_factor,
+)
+from cortado.errors import InputError
+from cortado.precision import FLOAT32, FLOAT64
+from cortado.smoothing import KERNELS, smoothing_functions, smoothing_kernel
+
+SUPPORT = 0.13
+SPACING = 0.05
+
+# Pieces of W as coefficients in q = r / h, lowest power first: w(q) on [from, to], written out by hand.
+PIECES = {
+    "cubic_spline": [(0.0, 0.5, [1, 0, -6, 6]), (0.5, 1.0, [2, -6, 6, -2])],
+    "wendland_c2": [(0.0, 1.0, [1, 0, -10, 20, -15, 4])],
+    "wendland_c4": [(0.0, 1.0, [1, 0, -28 / 3, 0, 70, -448 / 3, 140, -64, 35 / 3])],
+}
+ACCURACY = {"float32": 2e-5, "float64": 1e-12}
+
+kernels = pytest.mark.parametrize("name", KERNELS)
+dimensions = pytest.mark.parametrize("dimension", [2, 3])
+precisions = pytest.mark.parametrize("precision", [FLOAT32, FLOAT64], ids=lambda precision: precision.name)
+
+
+def radial(name, r, derivative=0):
+    """w(q) of a kernel at distances r [m], or a derivative with respect to q."""
+    q = np.asarray(r, dtype=np.float64) / SUPPORT
+    found = np.zeros_like(q)
+    for lower, upper, coefficients in PIECES[name]:
+        piece = np.polynomial.Polynomial(coefficients)
+        for _ in range(derivative):
+            piece = piece.deriv()
+        found = np.where((q >= lower) & (q < upper), piece(q), found)
+    return found
+
+
+def sigma(name, dimension):
+    """1 over the integral of w over the support, by exact integration of its polynomials."""
+    sphere = 2 * pi if dimension == 2 else 4 * pi
+    total = 0.0
+    for lower, upper, coefficients in PIECES[name]:
+        for power, coefficient in enumerate(coefficients):
+            n = power + dimension
+            total += coefficient * (upper**n - lower**n) / n
+    return 1.0 / (sphere * total * SUPPORT**dimension)
+
+
+def normals(x):
+    r = np.linalg.norm(x, axis=-1)
+    return r, x / np.where(r > 0, r, 1.0)[:, None]
+
+
+def expected_gradient(name, dimension, x):
+    r, n = normals(x)
+    return (sigma(name, dimension) / SUPPORT * radial(name, r, 1))[:, None] * n
+
+
+def expected_hessian(name, dimension, x):
+    """W'' n n^T + (W' / r) (I - n n^T), and W''(0) I at r = 0."""
+    r, n = normals(x)
+    scale = sigma(name, dimension) / SUPPORT**2
+    bend = scale * radial(name, r, 2)
+    across = np.where(r > 0, scale * radial(name, r, 1) * SUPPORT / np.where(r > 0, r, 1.0), bend)
+    along = n[:, :, None] * n[:, None, :]
+    return bend[:, None, None] * along + across[:, None, None] * (np.eye(3) - along)
+
+
+@cache
+def evaluator(kernel, precision):
+    functions = smoothing_functions(kernel, precision)
+    weight, gradient, hessian_product = functions.weight, functions.gradient, functions.hessian_product
+    real, vector = precision.real, precision.vector
+    module = wp.get_module(f"test_smoothing_{kernel.name}_{precision.name}")
+    module.options.update({"enable_backward": False, "optimization_level": 1})
+
+    @wp.kernel(module=module, enable_backward=False)
+    def evaluate(
+        x: wp.array(dtype=vector),
+        u: wp.array(dtype=vector),
+        h: real,
+        sigma: real,
+        w: wp.array(dtype=real),
+        g: wp.array(dtype=vector),
+        hu: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        w[i] = weight(x[i], h, sigma)
+        g[i] = gradient(x[i], h, sigma)
+        hu[i] = hessian_product(x[i], u[i], h, sigma)
+
+    return evaluate
+
+
+def evaluate(name, precision, dimension, x, u):
+    """W, grad W and H u by the Warp functions, at separations (n, 3)."""
+    n, kernel = len(x), KERNELS[name]
+    inputs = [wp.array(values, dtype=precision.vector, device="cpu") for values in (x, u)]
+    outputs = [wp.zeros(n, dtype=dtype, device="cpu") for dtype in (precision.real, precision.vector, precision.vector)]
+    normalisation = kernel.normalisation(dimension, SUPPORT)
+    wp.launch(evaluator(kernel, precision), n, inputs + [SUPPORT, normalisation], outputs, device="cpu")
+    return [out.numpy() for out in outputs]
+
+
+def separations(dimension, n=400, furthest=1.4, seed=0):
+    """(n, 3) separations up to beyond the support, and directions of size 1."""
+    random = np.random.default_rng(seed)
+    x, u = random.standard_normal((2, n, 3))
+    x[:, dimension:], u[:, dimension:] = 0.0, 0.0
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return x * random.uniform(0.0, furthest * SUPPORT, (n, 1)), u / np.linalg.norm(u, axis=1, keepdims=True)
+
+
+@kernels
+@dimensions
+def test_the_integral_is_one_on_a_lattice(name, dimension):
+    cells = {2: 100, 3: 40}[dimension]
+    axis = (np.arange(-cells, cells) + 0.5) / cells * SUPPORT
+    r = np.sqrt(sum(a * a for a in np.meshgrid(*[axis] * dimension, sparse=True)))
+    total = KERNELS[name].weight(r, dimension, SUPPORT).sum() * (SUPPORT / cells) ** dimension
+    assert total == pytest.approx(1.0, abs=1e-8)
+
+
+@kernels
+@dimensions
+def test_the_normalisation_is_exact(name, dimension):
+    assert KERNELS[name].normalisation(dimension, SUPPORT) == pytest.approx(sigma(name, dimension), rel=1e-12)
+
+
+@kernels
+@dimensions
+def test_numpy_forms(name, dimension):
+    x, _ = separations(dimension)
+    r, x_d = np.linalg.norm(x, axis=1), x[:, :dimension]
+    size = sigma(name, dimension)
+    np.testing.assert_allclose(KERNELS[name].weight(r, dimension, SUPPORT), size * radial(name, r), atol=1e-12 * size)
+    expected = expected_gradient(name, dimension, x)[:, :dimension]
+    np.testing.assert_allclose(KERNELS[name].gradient(x_d, SUPPORT), expected, atol=1e-12 * size / SUPPORT)
+
+
+@kernels
+@dimensions
+@precisions
+def test_warp_forms_against_the_formulae(name, dimension, precision):
+    x, u = separations(dimension)
+    w, g, hu = evaluate(name, precision, dimension, x, u)
+    size, accuracy = sigma(name, dimension), ACCURACY[precision.name]
+    r = np.linalg.norm(x, axis=1)
+    assert (r < SUPPORT).sum() > 200
+    expected = np.einsum("nij,nj->ni", expected_hessian(name, dimension, x), u)
+    np.testing.assert_allclose(w, size * radial(name, r), atol=accuracy * size)
+    np.testing.assert_allclose(g, expected_gradient(name, dimension, x), atol=accuracy * size / SUPPORT)
+    np.testing.assert_allclose(hu, expected, atol=20 * accuracy * size / SUPPORT**2)
+
+
+def away_from_joints(name, x, margin=0.02):
+    """Without separations near a joint of pieces, where W'' or W''' jumps."""
+    q = np.linalg.norm(x, axis=1) / SUPPORT
+    joints = np.array([0.0] + [upper for _, upper, _ in PIECES[name]])
+    return (np.abs(q[:, None] - joints) > margin).all(axis=1)
+
+
+@kernels
+@dimensions
+def test_warp_forms_against_central_differences(name, dimension):
+    x, u = separations(dimension)
+    _, g, hu = evaluate(name, FLOAT64, dimension, x, u)
+    smooth = away_from_joints(name, x)
+    slopes, bends = [], []
+    for h in SUPPORT * 10.0 ** -np.arange(2.5, 6.0, 0.5):
+        ahead, behind = (evaluate(name, FLOAT64, dimension, x + sign * h * u, u) for sign in (1, -1))
+        slope, bend = ((a - b) / (2 * h) for a, b in zip(ahead[:2], behind[:2], strict=True))
+        slopes.append(np.abs(slope - (g * u).sum(axis=1))[smooth].max())
+        bends.append(np.abs(bend - hu)[smooth].max())
+    assert min(slopes) < 1e-8 * np.abs(g).max()
+    assert min(bends) < 1e-8 * np.abs(hu).max()
+
+
+@kernels
+@dimensions
+@precisions
+def test_coincident_particles(name, dimension, precision):
+    u = np.array([[1.0, 0.0, 0.0], [0.3, -0.4, 0.0], [0.0, 0.0, 0.0]])
+    w, g, hu = evaluate(name, precision, dimension, np.zeros((3, 3)), u)
+    size = sigma(name, dimension)
+    np.testing.assert_allclose(w, size, rtol=ACCURACY[precision.name])
+    np.testing.assert_array_equal(g, 0.0)
+    bend = size / SUPPORT**2 * radial(name, 0.0, 2)
+    assert bend < 0.0
+    np.testing.assert_allclose(hu, bend * u, rtol=ACCURACY[precision.name])
+
+
+@kernels
+@precisions
+@pytest.mark.parametrize("exponent", [-6, -12, -20, -30, -100, -250])
+def test_nearly_coincident_particles(name, precision, exponent):
+    """Down to numbers that underflow: all is finite, and near the limit at r = 0."""
+    x = np.array([[1.0, -2.0, 0.5]]) * 10.0**exponent
+    u = np.array([[0.3, 0.4, -0.6]])
+    w, g, hu = evaluate(name, precision, 3, x, u)
+    size = sigma(name, 3)
+    np.testing.assert_allclose(w, size, rtol=1e-4)
+    np.testing.assert_allclose(g, 0.0, atol=2e-3 * size / SUPPORT)
+    np.testing.assert_allclose(hu, size / SUPPORT**2 * radial(name, 0.0, 2) * u, rtol=2e-3)
+
+
+@kernels
+@dimensions
+@precisions
+def test_beyond_the_support_all_is_zero(name, dimension, precision):
+    x, u = separations(dimension)
+    directions = x / np.linalg.norm(x, axis=1, keepdims=True)
+    for q in (1.00001, 1.03, 1.5, 10.0, 1e6):
+        for found in evaluate(name, precision, dimension, q * SUPPORT * directions, u):
+            np.testing.assert_array_equal(found, 0.0)
+
+
+def test_a_kernel_by_name():
+    assert smoothing_kernel("wendland_c2") is KERNELS["wendland_c2"]
+    with pytest.raises(InputError, match=r"'gauss'.*cubic_spline, wendland_c2, wendland_c4"):
+        smoothing_kernel("gauss")
+
+
+# ---- calibration
+
+
+def block(dimension, n=9):
+    """(n^d, d) a block of the lattice of the rest spacing, and the index of its middle."""
+    points = SPACING * np.array(list(itertools.product(range(n), repeat=dimension)), dtype=np.float64)
+    return points, len(points) // 2
+
+
+def lowered(name, support, dimension):
+    """What is left of the prototype's stiffness where the pressure iteration would diverge with it."""
+    return min(1.0, RATE_LIMIT / greatest_rate(KERNELS[name], SPACING, support, dimension))
+
+
+supports = pytest.mark.parametrize("support", [2.0, 2.5, 3.0])
+
+
+@kernels
+@dimensions
+@supports
+def test_the_lattice_has_the_rest_density_less_the_slack(name, dimension, support):
+    support *= SPACING
+    points, middle = block(dimension)
+    volume = rest_volume(KERNELS[name], SPACING, support, dimension)
+    distances = np.linalg.norm(points - points[middle], axis=1)
+    density = volume * KERNELS[name].weight(distances, dimension, support).sum()
+    assert density == pytest.approx(1.0 - SLACK, rel=1e-12)
+    assert volume == pytest.approx(SPACING**dimension, rel=0.2)
+    assert 0.0 < SLACK <= 1e-3
+
+
+@kernels
+@dimensions
+@supports
+def test_pressure_stiffness_is_what_the_sums_say(name, dimension, support):
+    """delta = 1 / (beta (S . S + sum G . G)) with beta = 2 m^2 dt^2 / rho_0^2, summed particle by particle."""
+    support *= SPACING
+    rest_density, time_step = 870.0, 0.0021
+    mass = rest_density * rest_volume(KERNELS[name], SPACING, support, dimension)
+    points, middle = block(dimension)
+    total, squares = np.zeros(dimension), 0.0
+    for j, point in enumerate(points):
+        if j == middle:
+            continue
+        g = KERNELS[name].gradient((points[middle] - point)[None], support)[0]
+        total += g
+        squares += g @ g
+    beta = 2 * mass**2 * time_step**2 / rest_density**2
+    delta = 1.0 / (beta * (total @ total + squares))
+    stiffness = pressure_stiffness(KERNELS[name], SPACING, support, dimension)
+    assert stiffness == pytest.approx(delta * time_step**2 * lowered(name, support, dimension), rel=1e-12)
+    assert stiffness > 0.0
+
+
+@kernels
+@dimensions
+@supports
+def test_the_pressure_iteration_converges_on_the_lattice(name, dimension, support):
+    """p <- p + delta (rho* - rho_0) linearised on a periodic lattice, as a matrix: its eigenvalues stay below 2."""
+    support, n = support * SPACING, {2: 12, 3: 6}[dimension]
+    points = np.array(list(itertools.product(range(n), repeat=dimension)))
+    steps = points[:, None] - points[None, :]
+    separation = SPACING * (steps - n * np.rint(steps / n))
+    kernel, volume = KERNELS[name], rest_volume(KERNELS[name], SPACING, support, dimension)
+    g = kernel.gradient(separation.reshape(-1, dimension), support).reshape(separation.shape)
+    # x moves by -V sum_j (p_i + p_j) G_ij, the density by V sum_j G_ij . (x_i - x_j); the lattice has sum_j G_ij = 0.
+    response = volume**2 * np.einsum("ija,jka->ik", g, g)
+    rates = -pressure_stiffness(kernel, SPACING, support, dimension) * np.linalg.eigvalsh(response)
+    assert rates.min() > -1e-9
+    assert 0.5 < rates.max() < 1.01 * RATE_LIMIT < 2.0
+    rate = greatest_rate(kernel, SPACING, support, dimension) * lowered(name, support, dimension)
+    assert 0.8 * rate < rates.max() < 1.01 * rate
+
+
+@kernels
+@dimensions
+@supports
+def test_pressure_stiffness_answers_an_error_with_its_correction(name, dimension, support):
+    """What delta means (Solenthaler and Pajarola 2009): one pressure p at a particle and its neighbours, acting from it
+    on them and back, moves them so that its density falls by p / delta."""
+    support *= SPACING
+    kernel, time_step = KERNELS[name], 1e-3
+    volume = rest_volume(kernel, SPACING, support, dimension)  # rho_0 = 1
+    points, middle = block(dimension)
+    p = 1e-9
+    gradients = kernel.gradient(points[middle] - points, support)
+    moved = time_step**2 * 2 * p * volume * gradients
+    moved[middle] = -time_step**2 * 2 * p * volume * gradients.sum(axis=0)
+    change = volume * (gradients * (moved[middle] - moved)).sum()
+    stiffness = pressure_stiffness(kernel, SPACING, support, dimension) / lowered(name, support, dimension)
+    delta = stiffness / time_step**2
+    assert change == pytest.approx(-p / delta, rel=1e-9)
+
+
+@kernels
+@dimensions
+@supports
+def test_a_flat_wall_of_one_layer_completes_the_lattice(name, dimension, support):
+    """Akinci volumes on the layer, times the factor, add what the missing half of the lattice had."""
+    support *= SPACING
+    kernel, volume = KERNELS[name], rest_volume(KERNELS[name], SPACING, support, dimension)
+    offsets = lattice_offsets(SPACING, support, dimension)
+    weights = kernel.weight(np.linalg.norm(offsets, axis=1), dimension, support)
+    layer = np.rint(offsets[:, 0] / SPACING)
+    wall_volume = 1.0 / weights[layer == 0].sum()
+    psi = wall_factor(kernel, SPACING, support, dimension) * wall_volume / volume
+    density = volume * (weights[layer >= 0].sum() + psi * weights[layer == -1].sum())
+    slack = SLACK * weights[layer >= 0].sum() / weights.sum()  # only the fluid's part has it
+    assert density == pytest.approx(1.0 - slack, rel=1e-12)
+    assert density < 1.0
+
+
+def test_the_polynomials_of_this_file_have_their_textbook_normalisations():
+    """They were expanded by hand; Beta integrals of (1 - q)^4 (1 + 4 q) know nothing of that."""
+    beta = factorial(4) * factorial(1) / factorial(6) + 4 * factorial(4) * factorial(2) / factorial(7)
+    assert sigma("wendland_c2", 2) * SUPPORT**2 == pytest.approx(1 / (2 * pi * beta), rel=1e-14)
+    assert sigma("cubic_spline", 3) * SUPPORT**3 == pytest.approx(8 / pi, rel=1e-14)

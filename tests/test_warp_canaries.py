@@ -1,0 +1,577 @@
+"""What Cortado knows about Warp's adjoints, row by row: where they are right, and where they are silently wrong.
+
+Every kernel below is a small neighbour sum in float64. Its tape gradient is compared with central differences, and the
+verdict that the engine was written around must still hold. A failure is not a bug of Cortado's: it says that a row of
+knowledge has changed with the Warp that is installed. Where a trap is gone, the engine may become simpler; where a
+right row is wrong, it has become incorrect.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+wp.set_module_options({"optimization_level": 0, "fast_math": False})
+
+N = 12
+NEIGHBOURS = 8
+SCALE = wp.constant(wp.float64(3.0))
+CUT = wp.constant(wp.float64(1.0))
+"""Between the least and the greatest neighbour sum, so that some particles lie on each side."""
+real = wp.float64
+reals = wp.array(dtype=wp.float64)
+integers = wp.array(dtype=wp.int32)
+lists = wp.array2d(dtype=wp.int32)
+
+
+@wp.func
+def weight(r: real) -> real:
+    return wp.exp(-r * r)
+
+
+# ---- the adjoint of a kernel with a neighbour loop: x (n,) positions, t (n,) a field, near lists of count neighbours
+
+
+@wp.kernel
+def raw_sum(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for k in range(count[i]):
+        s += weight(x[i] - x[near[i, k]])
+    out[i] = s
+
+
+@wp.kernel
+def constant_times_sum(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for k in range(count[i]):
+        s += t[near[i, k]] * weight(x[i] - x[near[i, k]])
+    out[i] = SCALE * s
+
+
+@wp.kernel
+def vector_sum(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = wp.vec2d()
+    for k in range(count[i]):
+        j = near[i, k]
+        s += weight(x[i] - x[j]) * wp.vec2d(t[j], x[j])
+    out[i] = s[0] + SCALE * s[1]
+
+
+@wp.kernel
+def if_in_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for k in range(count[i]):
+        j = near[i, k]
+        if x[j] > x[i]:
+            s += t[j] * weight(x[i] - x[j])
+        else:
+            s += weight(x[i] - x[j])
+    out[i] = s
+
+
+@wp.kernel
+def continue_before_sum(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for k in range(count[i]):
+        j = near[i, k]
+        if x[j] > x[i]:
+            continue
+        s += t[j] * weight(x[i] - x[j])
+    out[i] = s
+
+
+@wp.func
+def sum_of(i: int, x: reals, near: lists, count: integers) -> real:
+    s = real(0.0)
+    for k in range(count[i]):
+        s += weight(x[i] - x[near[i, k]])
+    return s
+
+
+@wp.kernel
+def function_returns_raw_sum(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = sum_of(i, x, near, count)
+    out[i] = t[i] / s + wp.pow(s, real(3.0)) + wp.max(s - CUT, real(0.0))
+
+
+@wp.kernel
+def square_after_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for k in range(count[i]):
+        s += weight(x[i] - x[near[i, k]])
+    out[i] = s * s
+
+
+@wp.kernel
+def power_after_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for k in range(count[i]):
+        s += weight(x[i] - x[near[i, k]])
+    out[i] = wp.pow(s, real(7.0))
+
+
+@wp.kernel
+def clamp_after_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for k in range(count[i]):
+        s += weight(x[i] - x[near[i, k]])
+    out[i] = wp.max(s - CUT, real(0.0))
+
+
+@wp.kernel
+def quotient_after_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for k in range(count[i]):
+        s += weight(x[i] - x[near[i, k]])
+    out[i] = t[i] / s
+
+
+@wp.kernel
+def factor_times_sum(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    factor = -t[i]
+    s = real(0.0)
+    for k in range(count[i]):
+        s += weight(x[i] - x[near[i, k]])
+    out[i] = factor * s
+
+
+@wp.func
+def square_of_sum(i: int, x: reals, near: lists, count: integers) -> real:
+    s = real(0.0)
+    for k in range(count[i]):
+        s += weight(x[i] - x[near[i, k]])
+    return s * s
+
+
+@wp.kernel
+def function_returns_square(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    out[i] = square_of_sum(i, x, near, count)
+
+
+@wp.kernel
+def second_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for k in range(count[i]):
+        s += weight(x[i] - x[near[i, k]])
+    total = real(0.0)
+    for k in range(count[i]):
+        total += s * t[near[i, k]]
+    out[i] = total
+
+
+@wp.kernel
+def if_after_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for k in range(count[i]):
+        s += weight(x[i] - x[near[i, k]])
+    if s > CUT:
+        out[i] = s
+
+
+@wp.kernel
+def continue_after_sum(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for k in range(count[i]):
+        j = near[i, k]
+        s += weight(x[i] - x[j])
+        if x[j] > x[i]:
+            continue
+        s += t[j]
+    out[i] = s
+
+
+@wp.kernel
+def break_after_counter(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    found = int(0)  # noqa: RUF046 - a variable, not a constant, to Warp
+    for k in range(count[i]):
+        s += weight(x[i] - x[near[i, k]])
+        found += 1
+        if found == 3:
+            break
+    out[i] = s
+
+
+@wp.kernel
+def recurrence(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.3)
+    for k in range(count[i]):
+        s = s * s + weight(x[i] - x[near[i, k]])
+    out[i] = s
+
+
+@wp.kernel
+def fixed_point(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for _k in range(count[i]):
+        s = wp.cos(s * x[i])
+    out[i] = s
+
+
+@wp.kernel
+def plain_assignment(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for k in range(count[i]):
+        s = s + weight(x[i] - x[near[i, k]])
+    out[i] = s
+
+
+@wp.kernel
+def vector_plain_assignment(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = wp.vec2d()
+    for k in range(count[i]):
+        j = near[i, k]
+        s = s + weight(x[i] - x[j]) * wp.vec2d(t[j], x[j])
+    out[i] = s[0] + SCALE * s[1]
+
+
+@wp.kernel
+def component_assignment(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = wp.vec2d()
+    for k in range(count[i]):
+        s[0] = s[0] + weight(x[i] - x[near[i, k]])
+    out[i] = s[0]
+
+
+@wp.kernel
+def component_increment(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = wp.vec2d()
+    for k in range(count[i]):
+        s[0] += weight(x[i] - x[near[i, k]])
+    out[i] = s[0]
+
+
+@wp.kernel
+def static_loop(x: reals, t: reals, near: lists, count: integers, out: reals):
+    i = wp.tid()
+    s = real(0.0)
+    for k in range(8):
+        s = s + weight(x[i] - x[near[i, k]])
+    out[i] = t[i] * s * s
+
+
+# ---- arrays on the tape
+
+
+@wp.kernel
+def copy_to(a: reals, b: reals):
+    i = wp.tid()
+    b[i] = a[i]
+
+
+@wp.kernel
+def multiply_in_place(a: reals, b: reals):
+    i = wp.tid()
+    b[i] *= a[i]
+
+
+@wp.kernel
+def square_in_place(b: reals):
+    i = wp.tid()
+    b[i] = b[i] * b[i]
+
+
+@wp.kernel
+def square_to(a: reals, b: reals):
+    i = wp.tid()
+    b[i] = a[i] * a[i]
+
+
+@wp.kernel
+def add_square_to(a: reals, b: reals):
+    i = wp.tid()
+    b[i] += a[i] * a[i]
+
+
+@wp.kernel
+def length_to(a: reals, b: reals):
+    i = wp.tid()
+    b[i] = wp.length(wp.vec3d(a[i], a[i], a[i]))
+
+
+@wp.kernel
+def guarded_root_where(a: reals, b: reals):
+    i = wp.tid()
+    b[i] = wp.where(a[i] > real(0.0), wp.sqrt(a[i]), real(0.0))
+
+
+@wp.kernel
+def guarded_root_if(a: reals, b: reals):
+    i = wp.tid()
+    if a[i] > real(0.0):
+        b[i] = wp.sqrt(a[i])
+
+
+# ---- integers
+
+
+@wp.kernel(enable_backward=False)
+def find_first(keys: integers, count: int, found: integers):
+    v = wp.tid()
+    found[v] = wp.lower_bound(keys, 0, count, v)
+
+
+# ---- the harness
+
+
+def array(values: Any, grad: bool = True) -> Any:
+    return wp.array(np.asarray(values, dtype=np.float64), dtype=wp.float64, device="cpu", requires_grad=grad)
+
+
+def launch(kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+    wp.launch(kernel, outputs[0].shape[0], inputs=inputs, outputs=outputs, device="cpu")
+
+
+Program = Callable[[Any, Any], Any]
+"""From Warp arrays x, t to an output array, by launches."""
+
+
+def neighbour_program(kernel: Any) -> Program:
+    random = np.random.default_rng(1)
+    near = [random.permutation(np.delete(np.arange(N), i))[:NEIGHBOURS] for i in range(N)]
+    near = wp.array(np.array(near, dtype=np.int32), dtype=wp.int32, device="cpu")
+    count = wp.array(random.integers(4, NEIGHBOURS + 1, N).astype(np.int32), dtype=wp.int32, device="cpu")
+
+    def program(x: Any, t: Any) -> Any:
+        out = array(np.zeros(N))
+        launch(kernel, [x, t, near, count], [out])
+        return out
+
+    return program
+
+
+def values() -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(2)
+    return random.uniform(-1.5, 1.5, N), random.uniform(0.5, 1.5, N)
+
+
+LOSS_WEIGHTS = np.random.default_rng(3).uniform(0.5, 1.5, N)
+
+
+def tape_gradient(program: Program) -> np.ndarray:
+    x, t = (array(v) for v in values())
+    with wp.Tape() as tape:
+        out = program(x, t)
+    tape.backward(grads={out: array(LOSS_WEIGHTS, grad=False)})
+    return np.stack([x.grad.numpy(), t.grad.numpy()])
+
+
+def difference_gradient(program: Program, h: float = 1e-5) -> np.ndarray:
+    start, gradient = np.stack(values()), np.zeros((2, N))
+    for index in np.ndindex(2, N):
+        ends = []
+        for sign in (1, -1):
+            moved = start.copy()
+            moved[index] += sign * h
+            ends.append(program(array(moved[0]), array(moved[1])).numpy() @ LOSS_WEIGHTS)
+        gradient[index] = (ends[0] - ends[1]) / (2 * h)
+    return gradient
+
+
+def errors(program: Program) -> np.ndarray:
+    """Relative error of the tape's gradient with respect to x and to t."""
+    tape, difference = tape_gradient(program), difference_gradient(program)
+    return np.linalg.norm(tape - difference, axis=1) / np.maximum(np.linalg.norm(difference, axis=1), 1e-8)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of knowledge: what was written, what became of its gradient."""
+
+    name: str
+    program: Program
+    what: str
+    right: bool
+
+    def check(self) -> None:
+        worst = errors(self.program).max()
+        verdict, limit = ("right", "below 1e-7") if self.right else ("wrong", "above 1e-3")
+        held = worst < 1e-7 if self.right else not worst < 1e-3  # a NaN is wrong
+        assert held, (
+            f"Warp {wp.config.version} changed what we know: the gradient of «{self.what}» was {verdict} "
+            f"(relative error {limit}), now its relative error is {worst:.2e}."
+        )
+
+
+def loops(right: bool, what: str, *kernels: Any) -> list[Row]:
+    return [Row(kernel.key.split(".")[-1], neighbour_program(kernel), what, right) for kernel in kernels]
+
+
+def in_place_product(x: Any, t: Any) -> Any:
+    out = array(np.zeros(N))
+    launch(copy_to, [x], [out])
+    launch(multiply_in_place, [t], [out])
+    return out
+
+
+def in_place_square(x: Any, t: Any) -> Any:
+    out = array(np.zeros(N))
+    launch(copy_to, [x], [out])
+    launch(square_in_place, [], [out])
+    return out
+
+
+def scratch_reused(x: Any, t: Any) -> Any:
+    scratch, out = array(np.zeros(N)), array(np.zeros(N))
+    launch(copy_to, [x], [scratch])
+    launch(add_square_to, [scratch], [out])
+    launch(copy_to, [t], [scratch])
+    launch(add_square_to, [scratch], [out])
+    return out
+
+
+def scratch_of_its_own(x: Any, t: Any) -> Any:
+    out = array(np.zeros(N))
+    for source in (x, t):
+        scratch = array(np.zeros(N))
+        launch(copy_to, [source], [scratch])
+        launch(add_square_to, [scratch], [out])
+    return out
+
+
+def zeroed_between_launches(x: Any, t: Any) -> Any:
+    out = array(np.zeros(N))
+    launch(add_square_to, [x], [out])
+    out.zero_()
+    launch(add_square_to, [t], [out])
+    return out
+
+
+def filled_between_launches(x: Any, t: Any) -> Any:
+    out = array(np.zeros(N))
+    launch(add_square_to, [x], [out])
+    out.fill_(1.0)
+    launch(add_square_to, [t], [out])
+    return out
+
+
+def intermediate_without_gradient(x: Any, t: Any) -> Any:
+    between, out = array(np.zeros(N), grad=False), array(np.zeros(N))
+    launch(square_to, [x], [between])
+    launch(square_to, [between], [out])
+    return out
+
+
+ROWS = [
+    *loops(True, "s += W, then out = s or constant * s", raw_sum, constant_times_sum),
+    *loops(
+        True,
+        "vector sum; if inside the loop; continue before any accumulation",
+        vector_sum,
+        if_in_loop,
+        continue_before_sum,
+    ),
+    *loops(True, "a wp.func returns the raw sum, the kernel uses it non-linearly", function_returns_raw_sum),
+    *loops(
+        False,
+        "s * s, pow(s, 7), max(s - c, 0), f / s after the loop",
+        square_after_loop,
+        power_after_loop,
+        clamp_after_loop,
+        quotient_after_loop,
+    ),
+    *loops(False, "t * s after the loop with t read before it", factor_times_sum),
+    *loops(False, "sum and non-linear use in the same wp.func", function_returns_square),
+    *loops(False, "a second loop uses the first one's sum; if s > c after the loop", second_loop, if_after_loop),
+    *loops(
+        False,
+        "continue after an accumulation; break after a counter; s = s * s + W; fixed-point iteration",
+        continue_after_sum,
+        break_after_counter,
+        recurrence,
+        fixed_point,
+    ),
+    *loops(True, "s = s + W on a scalar or a whole vector", plain_assignment, vector_plain_assignment),
+    *loops(False, "v[0] = v[0] + W on a local vector", component_assignment),
+    *loops(True, "v[0] += W on a local vector", component_increment),
+    *loops(True, "static loops, non-linear use included", static_loop),
+    Row("in_place_product", in_place_product, "y[i] *= a[i] in place", False),
+    Row("in_place_square", in_place_square, "y[i] = y[i] * y[i] in place", False),
+    Row("scratch_reused", scratch_reused, "a scratch array that a later launch overwrites", False),
+    Row("scratch_of_its_own", scratch_of_its_own, "a scratch array for each launch", True),
+    Row("zeroed_between_launches", zeroed_between_launches, "array.zero_() between launches", False),
+    Row("filled_between_launches", filled_between_launches, "array.fill_() between launches", False),
+    Row("intermediate_without_gradient", intermediate_without_gradient, "intermediate without requires_grad", False),
+]
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
+def test_verdict_still_holds(row):
+    row.check()
+
+
+def test_factor_before_the_loop_has_gradient_zero():
+    program = neighbour_program(factor_times_sum)
+    np.testing.assert_array_equal(tape_gradient(program)[1], 0.0, "t * s after the loop: d/dt was exactly 0 in Warp")
+    assert errors(program)[0] < 1e-7, "t * s after the loop: d/dx was right in Warp"
+
+
+def test_intermediate_without_gradient_is_silently_zero():
+    gradient = tape_gradient(intermediate_without_gradient)[0]
+    np.testing.assert_array_equal(gradient, 0.0, "an intermediate without requires_grad gave the gradient 0 in Warp")
+
+
+def derivative_at(kernel: Any, value: float) -> float:
+    a, b = array([value]), array([0.0])
+    with wp.Tape() as tape:
+        launch(kernel, [a], [b])
+    tape.backward(grads={b: array([1.0], grad=False)})
+    return float(a.grad.numpy()[0])
+
+
+def test_length_has_derivative_zero_at_zero():
+    assert derivative_at(length_to, 2.0) == pytest.approx(3**0.5)
+    assert derivative_at(length_to, 0.0) == 0.0, "wp.length(0) had the adjoint 0 in Warp"
+
+
+def test_guarded_root_needs_an_if():
+    assert derivative_at(guarded_root_where, 4.0) == derivative_at(guarded_root_if, 4.0) == 0.25
+    assert np.isnan(derivative_at(guarded_root_where, 0.0)), "wp.where(x > 0, sqrt(x), 0) had the derivative NaN at 0"
+    assert derivative_at(guarded_root_if, 0.0) == 0.0, "if x > 0: sqrt(x) had the derivative 0 at 0"
+
+
+def test_lower_bound_names_the_last_element_where_every_key_is_smaller():
+    """`neighbours.find_starts` steps over that element."""
+    keys = np.array([1, 1, 3, 3, 3, 4], dtype=np.int32)
+    padded = wp.array(np.append(keys, [0, 9]).astype(np.int32), dtype=wp.int32, device="cpu")
+    found = wp.zeros(7, dtype=wp.int32, device="cpu")
+    launch(find_first, [padded, len(keys)], [found])
+    expected = np.searchsorted(keys, np.arange(7))
+    expected[5:] = len(keys) - 1
+    np.testing.assert_array_equal(found.numpy(), expected)
+
+
+def test_radix_sort_is_stable():
+    """`NeighbourSearch.sort` lets ties keep the given order."""
+    count, random = 1000, np.random.default_rng(4)
+    keys = random.integers(0, 32, count).astype(np.int32)
+    pair_keys = wp.array(np.concatenate([keys, keys]), dtype=wp.int32, device="cpu")
+    order = wp.array(np.tile(np.arange(count, dtype=np.int32), 2), dtype=wp.int32, device="cpu")
+    wp.utils.radix_sort_pairs(pair_keys, order, count, 0, 5)
+    np.testing.assert_array_equal(order.numpy()[:count], np.argsort(keys, kind="stable"))
+    np.testing.assert_array_equal(pair_keys.numpy()[:count], np.sort(keys))
