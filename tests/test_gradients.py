@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from scenes import plane, scene, splash
 
-from cortado import Problem, Simulation, losses, policies
-from cortado.policies import Exact, Tape
+from cortado import Problem, Simulation, losses
+from scenes import splash
 
 SCALES = {
     "gravity": 1.0,
@@ -56,7 +55,9 @@ ITERATIONS = {"fixed": {}, "tolerance": {"minimum_iterations": 2, "maximum_itera
 
 @pytest.mark.parametrize("iterations", ITERATIONS)
 @pytest.mark.parametrize("steps", [50, 100, 200])
-@pytest.mark.parametrize("what", ["gravity", "gravity over time", "initial_positions", "initial_velocities", "viscosity"])
+@pytest.mark.parametrize(
+    "what", ["gravity", "gravity over time", "initial_positions", "initial_velocities", "viscosity"]
+)
 def test_splash(what, steps, iterations):
     problem = problem_of(splash(**ITERATIONS[iterations]), steps)
     name, point, direction = point_and_direction(problem, what)

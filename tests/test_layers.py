@@ -14,10 +14,10 @@ ROOT = Path(cortado.__file__).parent
 LAYERS = """
     errors
     precision smoothing calibration
-    physics.surroundings physics.density physics.integration physics.pressure physics.viscosity
-    physics.convergence physics.reduction
+    physics.surroundings physics.density physics.walls physics.integration physics.pressure
+    physics.viscosity physics.convergence physics.reduction
     neighbours launching particles
-    shapes scene_values scene_kinds scene_tables scene_toml scene_points
+    shapes scene_kinds scene_tables scene_toml scene_points
     scene_fluids scene_containers scene_stability scene_checks scene sampling
     vtkhdf trajectory
     solvers.forces solvers.pcisph solvers.pcisph_derivatives

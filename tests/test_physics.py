@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scenes import plane, scene, splash
 
 from cortado import Problem, Simulation, losses
+from scenes import plane, scene, splash
 
 FREE = {"container": {"shape": "none"}}
 

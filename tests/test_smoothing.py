@@ -11,11 +11,12 @@ import warp as wp
 from cortado.calibration import (
     RATE_LIMIT,
     SLACK,
+    STANDOFF,
     greatest_rate,
-    lattice_offsets,
     pressure_stiffness,
     rest_volume,
-    wall_factor,
+    wall_layer,
+    wall_rigidity,
 )
 from cortado.errors import InputError
 from cortado.precision import FLOAT32, FLOAT64
@@ -322,29 +323,58 @@ def test_pressure_stiffness_answers_an_error_with_its_correction(name, dimension
     p = 1e-9
     gradients = kernel.gradient(points[middle] - points, support)
     moved = time_step**2 * 2 * p * volume * gradients
-    moved[middle] = -time_step**2 * 2 * p * volume * gradients.sum(axis=0)
+    moved[middle] = -(time_step**2) * 2 * p * volume * gradients.sum(axis=0)
     change = volume * (gradients * (moved[middle] - moved)).sum()
     stiffness = pressure_stiffness(kernel, SPACING, support, dimension) / lowered(name, support, dimension)
     delta = stiffness / time_step**2
     assert change == pytest.approx(-p / delta, rel=1e-9)
 
 
+def flat_wall(name, support, dimension):
+    """The layer, and rho / rho_0 of a particle in the lowest of some layers of fluid, or alone, at a height [m]."""
+    kernel, volume = KERNELS[name], rest_volume(KERNELS[name], SPACING, support, dimension)
+    layer = wall_layer(kernel, SPACING, support, dimension)
+    plane = SPACING * np.array(list(itertools.product(range(-4, 5), repeat=dimension - 1)), dtype=np.float64)
+    across = np.linalg.norm(plane, axis=1)
+    wall_volume = layer.factor / kernel.weight(across, dimension, support).sum()  # Akinci et al. (2012), scaled
+
+    def density(fluid_layers, height):
+        fluid = sum(kernel.weight(np.hypot(SPACING * k, across), dimension, support).sum() for k in range(fluid_layers))
+        fluid = fluid or float(kernel.weight(np.zeros(1), dimension, support)[0])  # none: the particle is alone
+        wall = kernel.weight(np.hypot(height + layer.depth, across), dimension, support).sum()
+        return volume * fluid + wall_volume * wall
+
+    return layer, density
+
+
 @kernels
 @dimensions
 @supports
 def test_a_flat_wall_of_one_layer_completes_the_lattice(name, dimension, support):
-    """Akinci volumes on the layer, times the factor, add what the missing half of the lattice had."""
-    support *= SPACING
-    kernel, volume = KERNELS[name], rest_volume(KERNELS[name], SPACING, support, dimension)
-    offsets = lattice_offsets(SPACING, support, dimension)
-    weights = kernel.weight(np.linalg.norm(offsets, axis=1), dimension, support)
-    layer = np.rint(offsets[:, 0] / SPACING)
-    wall_volume = 1.0 / weights[layer == 0].sum()
-    psi = wall_factor(kernel, SPACING, support, dimension) * wall_volume / volume
-    density = volume * (weights[layer >= 0].sum() + psi * weights[layer == -1].sum())
-    slack = SLACK * weights[layer >= 0].sum() / weights.sum()  # only the fluid's part has it
-    assert density == pytest.approx(1.0 - slack, rel=1e-12)
-    assert density < 1.0
+    _, density = flat_wall(name, support * SPACING, dimension)
+    assert 1.0 - SLACK <= density(5, 0.5 * SPACING) < 1.0
+
+
+@kernels
+@dimensions
+@supports
+def test_a_flat_wall_stops_a_particle_alone(name, dimension, support):
+    """It has the rest density, and from there on a pressure, before it reaches the surface of the container."""
+    layer, density = flat_wall(name, support * SPACING, dimension)
+    assert 0.5 * SPACING <= layer.depth < support * SPACING
+    assert density(0, STANDOFF * SPACING) > 1.0 - 1.01 * SLACK
+    assert density(0, 0.0) > 1.0
+
+
+@kernels
+@dimensions
+@supports
+def test_wall_rigidity(name, dimension, support):
+    """2 sum_j G_j . G_j, particle by particle."""
+    points, middle = block(dimension)
+    g = KERNELS[name].gradient(points[middle] - points, support * SPACING)
+    expected = 2.0 * sum(float(row @ row) for row in g)
+    assert wall_rigidity(KERNELS[name], SPACING, support * SPACING, dimension) == pytest.approx(expected, rel=1e-12)
 
 
 def test_the_polynomials_of_this_file_have_their_textbook_normalisations():

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-import reference
-from scenes import plane, scene
 
+import reference
 from cortado import Simulation
 from cortado.particles import Parameters, State
 from cortado.smoothing import KERNELS
+from scenes import plane, scene
 
 GRAVITY, DENSITY, VISCOSITY, TIME_STEP, STEPS = np.array([0.3, -9.81, 0.1]), 1000.0, 5.0, 0.0021, 3
 
@@ -75,7 +75,12 @@ def test_tangents_equal_complex_steps_of_the_twin(make, kernel, viscosity, slip)
     rollout.forward()
     random = np.random.default_rng(1)
     x_dot, v_dot = random.standard_normal((2, *positions.shape))
-    rates = {"gravity": random.standard_normal(gravity.shape), "rest_density": 10.0, "viscosity": 0.3, "time_step": 1e-4}
+    rates = {
+        "gravity": random.standard_normal(gravity.shape),
+        "rest_density": 10.0,
+        "viscosity": 0.3,
+        "time_step": 1e-4,
+    }
     dot = State.zeros(len(positions), simulation.precision, simulation.device)
     dot.set(x_dot, v_dot)
     parameters = Parameters.zeros(STEPS, simulation.precision, simulation.device)

@@ -202,7 +202,7 @@ def continue_after_sum(x: reals, t: reals, near: lists, count: integers, out: re
 def break_after_counter(x: reals, t: reals, near: lists, count: integers, out: reals):
     i = wp.tid()
     s = real(0.0)
-    found = int(0)  # noqa: RUF046 - a variable, not a constant, to Warp
+    found = int(0)
     for k in range(count[i]):
         s += weight(x[i] - x[near[i, k]])
         found += 1

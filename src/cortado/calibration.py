@@ -25,7 +25,7 @@ round-off would choose the pressure's derivative, and no finite difference could
 
 
 def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """V_0 = (1 - SLACK) / sum_j W_ij [m^d]: with the mass rho_0 V_0 the lattice has the rest density, less the slack."""
+    """V_0 = (1 - SLACK) / sum_j W_ij [m^d]: with the mass rho_0 V_0 the lattice has the rest density less the slack."""
     distances = np.linalg.norm(lattice_offsets(spacing, support, dimension), axis=1)
     return float((1.0 - SLACK) / kernel.weight(distances, dimension, support).sum())
 

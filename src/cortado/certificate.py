@@ -14,6 +14,8 @@ AGREEMENT = 1e-8
 """How near reverse and forward mode must be, relative, in float64; both are exact to round-off."""
 PLATEAU = 1e-3
 """Two neighbouring differences this near to each other, relative, are believed; and so near must the adjoint be."""
+ROUND_OFF = 1e-13
+"""Derivatives along a direction below so much of the loss are taken as 0."""
 
 
 @dataclass(frozen=True)
@@ -25,30 +27,37 @@ class Comparison:
     tangent: float
     differences: tuple[float, ...]
     """Central differences at `STEPS`."""
+    floor: float
+    """Derivatives below it are 0 up to round-off."""
 
     @property
     def disagreement(self) -> float:
         """Relative distance of reverse and forward mode."""
-        return _relative(self.adjoint, self.tangent)
+        return self._distance(self.adjoint, self.tangent)
 
     @property
     def best_difference(self) -> float:
         """Relative distance of the adjoint and the central difference that is nearest to it."""
-        return min(_relative(self.adjoint, difference) for difference in self.differences)
+        return min(self._distance(self.adjoint, difference) for difference in self.differences)
 
     @property
     def plateau(self) -> float | None:
         """The central difference where two neighbouring steps agree best; None where none agree (chaos, round-off)."""
         pairs = list(zip(self.differences, self.differences[1:], strict=False))
-        a, b = min(pairs, key=lambda pair: _relative(*pair))
-        return a if _relative(a, b) < PLATEAU else None
+        a, b = min(pairs, key=lambda pair: self._distance(*pair))
+        return a if self._distance(a, b) < PLATEAU else None
 
     @property
     def right(self) -> bool:
         """Whether nothing speaks against the adjoint."""
         believed = self.plateau
-        near = believed is None or min(self.best_difference, _relative(self.adjoint, believed)) < PLATEAU
+        near = believed is None or min(self.best_difference, self._distance(self.adjoint, believed)) < PLATEAU
         return bool(self.disagreement < AGREEMENT and near)
+
+    def _distance(self, a: float, b: float) -> float:
+        """Relative; 0 where both numbers are below the floor."""
+        size = max(abs(a), abs(b))
+        return abs(a - b) / size if size > self.floor else 0.0
 
 
 @dataclass(frozen=True)
@@ -98,7 +107,7 @@ def certify(problem: Problem, seed: int = 0, policy: Policy | None = None) -> Ce
             / (2.0 * h)
             for h in STEPS
         )
-        compared.append(Comparison(name, float((gradient[parameter] * direction).sum()), tangent, differences))
+        compared.append(Comparison(name, float((gradient[parameter] * direction).sum()), tangent, differences, ROUND_OFF * abs(loss)))
     return Certificate(problem.steps, problem.simulation.particles, loss, tuple(compared))
 
 
@@ -119,8 +128,3 @@ def _points(problem: Problem) -> list[tuple[str, np.ndarray, float]]:
         ("initial_velocities", simulation.velocities, 0.1),
         *((name, np.array(value, dtype=np.float64), 0.1 * value) for name, value in numbers.items()),
     ]
-
-
-def _relative(a: float, b: float) -> float:
-    size = max(abs(a), abs(b))
-    return abs(a - b) / size if size > 0 else 0.0

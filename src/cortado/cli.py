@@ -18,7 +18,7 @@ from cortado.errors import ComputationError, CortadoError, CortadoWarning
 
 app = SubcommandApp()
 gradients = SubcommandApp()
-app.add(gradients, name="gradients", help="Judge gradients.")
+app.command(gradients, name="gradients")
 
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Overrides = Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")]
@@ -108,7 +108,9 @@ def check(
 
 
 @app.command
-def bench(particles: int = 8000, steps: int = 20, device: str = "cpu", precision: str = "float32", json: bool = False) -> None:
+def bench(
+    particles: int = 8000, steps: int = 20, device: str = "cpu", precision: str = "float32", json: bool = False
+) -> None:
     """Time a dam break, forward and with its gradient.
 
     Args:

@@ -85,7 +85,7 @@ class Recorded:
         with wp.Tape() as tape:
             loss, positions, velocities = self._run(end)
         tape.backward(loss)
-        return tuple(array.grad.numpy()[:, : end.dimension].astype(np.float64) for array in (positions, velocities))  # type: ignore[return-value]
+        return tuple(array.grad.numpy()[:, : end.dimension].astype(np.float64) for array in (positions, velocities))
 
     def _run(self, end: TrajectoryEnd) -> tuple[wp.array, wp.array, wp.array]:
         copies = [wp.clone(a, requires_grad=True) for a in (end.state.positions, end.state.velocities)]

@@ -11,7 +11,7 @@ from cortado.precision import Precision
 
 def to_device(values: np.ndarray, precision: Precision, device: Any, requires_grad: bool = False) -> wp.array:
     """Vectors (n, 2) or (n, 3) as a Warp array of vectors (n,)."""
-    padded = np.zeros((len(values), 3), dtype=precision.numpy)
+    padded: np.ndarray = np.zeros((len(values), 3), dtype=precision.numpy)
     padded[:, : values.shape[1]] = values
     return wp.array(padded, dtype=precision.vector, device=device, requires_grad=requires_grad)
 

@@ -24,7 +24,7 @@ class Problem:
     """A simulation of a number of steps, judged by a loss.
 
     Parameters, any of them together: ``gravity`` (d,) or (steps, d) [m / s2]; ``initial_positions`` [m] and
-    ``initial_velocities`` [m / s], (n, d); ``viscosity`` [Pa s], ``rest_density`` [kg / m3], ``time_step`` [s], numbers.
+    ``initial_velocities`` [m / s], (n, d); ``viscosity`` [Pa s], ``rest_density`` [kg / m3], ``time_step`` [s].
     What is not given is the scene's. n counts fluid particles in the order in which the scene lists them.
     """
 

@@ -126,7 +126,9 @@ class Simulation:
         discretisation = Discretisation(kernel, self.precision)
         lower, lengths = period(scene)
         volume = rest_volume(kernel, spacing, support, dimension)
-        volumes = layer.factor * boundary_volumes(self.walls, lambda r: kernel.weight(r, dimension, support), support, lower, lengths)
+        volumes = layer.factor * boundary_volumes(
+            self.walls, lambda r: kernel.weight(r, dimension, support), support, lower, lengths
+        )
         everything = np.concatenate([self.positions, self.walls])
         grid = Grid.around(
             everything.min(axis=0),

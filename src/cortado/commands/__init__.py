@@ -1,1 +1,5 @@
-"""The commands of the command line, one a file: arguments in, files and an exit code out."""
+"""The commands of the command line, one a file: arguments in, files and a sentence out."""
+
+import warp as wp
+
+wp.config.quiet = True

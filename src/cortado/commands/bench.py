@@ -10,7 +10,7 @@ import warp as wp
 
 from cortado.losses import FinalPositions
 from cortado.problem import Problem
-from cortado.scene import Scene
+from cortado.scene import BoxContainer, BoxFluid, Discretisation, Forces, Phase, Scene, Solver
 from cortado.simulation import Simulation
 
 REPEATS = 3
@@ -24,12 +24,12 @@ def dam_break(particles: int) -> Scene:
     return Scene(
         name="dam break",
         dimension=3,
-        discretisation={"spacing": spacing},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.05}],
-        fluid=[{"shape": "box", "lower": [0, 0, 0], "upper": [1, 1, 1], "phase": "water"}],
-        container={"shape": "box", "lower": [0, 0, 0], "upper": [2, 1.5, 1]},
-        forces={"gravity": [0.0, -9.81, 0.0]},
-        solver={"time_step": 0.02 * spacing, "minimum_iterations": 5, "maximum_iterations": 5},
+        discretisation=Discretisation(spacing=spacing),
+        phase=(Phase(name="water", rest_density=1000.0, viscosity=0.05),),
+        fluid=(BoxFluid(lower=(0.0, 0.0, 0.0), upper=(1.0, 1.0, 1.0), phase="water"),),
+        container=BoxContainer(lower=(0.0, 0.0, 0.0), upper=(2.0, 1.5, 1.0)),
+        forces=Forces(gravity=(0.0, -9.81, 0.0)),
+        solver=Solver(time_step=0.02 * spacing, minimum_iterations=5, maximum_iterations=5),
     )
 
 
@@ -56,7 +56,9 @@ def bench_dam_break(particles: int, steps: int, device: str, precision: str, as_
         rows["bytes_per_particle"] = wp.get_mempool_used_mem_high(simulation.device) / simulation.particles
     if as_json:
         return json.dumps(rows, indent=2)
-    return "\n".join(f"{name:24} {value:.4g}" if isinstance(value, float) else f"{name:24} {value}" for name, value in rows.items())
+    return "\n".join(
+        f"{name:24} {value:.4g}" if isinstance(value, float) else f"{name:24} {value}" for name, value in rows.items()
+    )
 
 
 def _best(work: Callable[[], object], device: Any) -> float:

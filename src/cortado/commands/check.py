@@ -35,9 +35,7 @@ def _table(certificate: Certificate) -> str:
         verdict = "right" if c.right else "WRONG"
         if c.right and c.plateau is None:
             verdict = "right (no difference is reliable here)"
-        table.add_row(
-            c.parameter, f"{c.adjoint:.6e}", f"{c.disagreement:.1e}", f"{c.best_difference:.1e}", verdict
-        )
+        table.add_row(c.parameter, f"{c.adjoint:.6e}", f"{c.disagreement:.1e}", f"{c.best_difference:.1e}", verdict)
     text = StringIO()
     Console(file=text, width=110).print(table)
     return text.getvalue().rstrip()

@@ -36,7 +36,9 @@ def run_scene(
     try:
         _write_trajectory(simulation, rollout, folder, max(record_every, 1))
     except DivergedError as error:
-        raise DivergedError(error.step, error.particle, f"{error.advice}; the frames so far are in {folder.path}") from error
+        raise DivergedError(
+            error.step, error.particle, f"{error.advice}; the frames so far are in {folder.path}"
+        ) from error
     finally:
         _write_pictures(scene, simulation, folder)
     converged = simulation.converged(rollout)
@@ -103,4 +105,3 @@ def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder) -> 
         ("precision", simulation.precision.name),
     ]
     write_report(folder, scene.name, rows, figures)
-

@@ -5,8 +5,9 @@
     ap_i = -m (sum_j (c_i + c_j) G_ij + sum_b (psi_b / m) c_i G_ib)
     v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
 
-y is the yield beside walls (`cortado.physics.walls`). G is taken at x(t), rho* at the predicted positions over the neighbours of x(t). After the last iteration
-(x*, v*) is the new state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
+y is the yield beside walls (`cortado.physics.walls`). G is taken at x(t), rho* at the predicted positions over the
+neighbours of x(t). After the last iteration (x*, v*) is the new state. The clamp at 0 (no suction at a free surface)
+has the derivative [p > 0].
 """
 
 from functools import cache

@@ -1,0 +1,552 @@
+"""Every derivative kernel by itself, in float64 on random data: <J v, w> = <v, J^T w>, and J v against differences.
+
+Kernels are launched directly, their arguments found by name: inputs as given, tangents with ``_dot``, adjoints with
+``_bar``. Data are of size 1, so that no term hides behind another.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+from cortado.launching import TreeSum, sum_and_maximum, vector_sum
+from cortado.neighbours import Grid, NeighbourSearch
+from cortado.physics.density import density_kernels
+from cortado.physics.integration import gravity_kernels, integration_kernels
+from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
+from cortado.physics.surroundings import Discretisation, surroundings_type
+from cortado.physics.viscosity import laminar_functions, pairwise_functions, viscosity_kernels
+from cortado.physics.walls import wall_kernels
+from cortado.precision import FLOAT32, FLOAT64, Precision
+from cortado.smoothing import CUBIC_SPLINE
+
+N, WALLS = 60, 40
+SUPPORT = 1.0
+CPU = wp.get_device("cpu")
+DISCRETISATION = Discretisation(CUBIC_SPLINE, FLOAT64)
+
+Values = dict[str, np.ndarray]
+
+
+class Kernels:
+    """All kernels at once, so that each Warp module is compiled once."""
+
+    density = density_kernels(DISCRETISATION)
+    walls = wall_kernels(DISCRETISATION)
+    pressure = pressure_kernels(DISCRETISATION)
+    force = pressure_force_kernels(DISCRETISATION)
+    integration = integration_kernels(FLOAT64)
+    gravity = gravity_kernels(FLOAT64)
+    pairwise = viscosity_kernels(DISCRETISATION, pairwise_functions)
+    laminar = viscosity_kernels(DISCRETISATION, laminar_functions)
+
+
+def array(values: np.ndarray) -> Any:
+    """A Warp array of vectors, reals or integers, by the look of the values."""
+    values = np.asarray(values)
+    if values.dtype.kind == "i":
+        return wp.array(values, dtype=wp.int32, device=CPU)
+    return wp.array(values, dtype=wp.vec3d if values.ndim == 2 else wp.float64, device=CPU)
+
+
+def launch(kernel: Any, threads: int = N, **given: Any) -> Values:
+    """Run a kernel on arguments by name and return every array argument after it."""
+    arguments = [
+        array(given[a.label]) if isinstance(given[a.label], np.ndarray) else given[a.label] for a in kernel.adj.args
+    ]
+    wp.launch(kernel, threads, inputs=arguments, device=CPU)
+    return {
+        a.label: value.numpy()
+        for a, value in zip(kernel.adj.args, arguments, strict=True)
+        if isinstance(value, wp.array)
+    }
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Random fluid and wall particles in a small box, with their lists."""
+
+    x: np.ndarray
+    surroundings: Any
+    search: NeighbourSearch
+    dimension: int
+
+    def vectors(self, seed: int, n: int = N) -> np.ndarray:
+        """(n, 3) of size 1; z is 0 in 2-D."""
+        values = np.random.default_rng(seed).standard_normal((n, 3))
+        values[:, self.dimension :] = 0.0
+        return values
+
+
+@cache
+def cloud(name: str) -> Cloud:
+    """``"3-D"``, ``"2-D"`` or ``"periodic"`` (along x)."""
+    dimension = 2 if name == "2-D" else 3
+    side = {2: 3.5, 3: 2.3}[dimension]
+    random = np.random.default_rng(7)
+    x, walls = random.uniform(0.0, side, (N, 3)), random.uniform(0.0, side, (WALLS, 3))
+    walls[:, 1] = random.uniform(-0.4, 0.0, WALLS)
+    x[:, dimension:] = walls[:, dimension:] = 0.0
+    period = np.array([side, 0.0, 0.0]) * (name == "periodic")
+    grid = Grid.around(np.full(3, -0.4)[:dimension], np.full(3, side)[:dimension], period, 1.03 * SUPPORT, 512)
+    search = NeighbourSearch(DISCRETISATION, grid, walls, random.uniform(0.5, 1.5, WALLS), N, 100, CPU)
+    s = surroundings_type(FLOAT64)()
+    s.neighbours, s.fluid_count, s.count = search.neighbours, search.fluid_count, search.count
+    s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
+    s.support, s.reach = SUPPORT, 1.03 * SUPPORT
+    s.normalisation = CUBIC_SPLINE.normalisation(dimension, SUPPORT)
+    s.self_weight = float(CUBIC_SPLINE.weight(np.zeros(1), dimension, SUPPORT)[0])
+    s.volume, s.rigidity = 0.11, 30.0
+    s.periodic, s.period = int(period.any()), wp.vec3d(*period)
+    s.frequency = wp.vec3d(1.0 / side if period.any() else 0.0, 0.0, 0.0)
+    search.sort(array(x))
+    x = x[search.order.numpy()[:N]]
+    search.fill(s, array(x))
+    count, fluid_count = search.count.numpy(), search.fluid_count.numpy()
+    assert search.needed.numpy()[0] < 100
+    assert fluid_count.mean() > 8 and (count - fluid_count).mean() > 1
+    return Cloud(x, s, search, dimension)
+
+
+class Operation:
+    """A differentiable piece of the step on one cloud: values in, values out."""
+
+    inputs: Sequence[str]
+    outputs: Sequence[str]
+
+    def __init__(self, cloud: Cloud):
+        self.cloud = cloud
+        random = np.random.default_rng(11)
+        self.s = cloud.surroundings
+        self.start: Values = {
+            "x": cloud.x,
+            "v": cloud.vectors(1),
+            "acceleration": cloud.vectors(2),
+            "rho": random.uniform(0.6, 1.6, N),
+            "y": random.uniform(0.4, 1.0, N),
+            "p_in": random.uniform(0.0, 1.0, N) * (random.uniform(0.0, 1.0, N) < 0.6),
+            "rest_density": np.array([1.3]),
+            "mu": np.array([0.7]),
+            "time_step": np.array([0.2]),
+            "table": cloud.vectors(3, n=4),
+        }
+
+    def directions(self, seed: int, names: Sequence[str] | None = None) -> Values:
+        """A random tangent, 0 but for ``names``."""
+        random = np.random.default_rng(seed)
+        found = {}
+        for name in self.inputs:
+            value = random.standard_normal(self.start[name].shape)
+            if value.ndim == 2:
+                value[:, self.cloud.dimension :] = 0.0
+            found[name] = value if names is None or name in names else np.zeros_like(value)
+        return found
+
+    def weights(self, seed: int) -> Values:
+        """Random adjoints of the outputs."""
+        random = np.random.default_rng(seed)
+        forward = self.forward(self.start)
+        return {name: random.standard_normal(forward[name].shape) for name in self.outputs}
+
+    def forward(self, values: Values) -> Values:
+        raise NotImplementedError
+
+    def tangent(self, values: Values, dots: Values) -> Values:
+        raise NotImplementedError
+
+    def adjoint(self, values: Values, bars: Values) -> Values:
+        raise NotImplementedError
+
+
+def dotted(dots: Values) -> Values:
+    return {f"{name}_dot": value for name, value in dots.items()}
+
+
+def zeros(*names: str) -> Values:
+    """Empty adjoints: vectors for x, v, scalars and pushes, reals for the rest."""
+    vectors = ("x_bar", "v_bar", "scalars_bar", "push_bar", "acceleration_bar")
+    return {name: np.zeros((N, 3) if name in vectors else N) for name in names}
+
+
+class Density(Operation):
+    inputs, outputs = ("x", "rest_density"), ("rho",)
+
+    def forward(self, values):
+        return launch(Kernels.density.forward, s=self.s, **{**values, "rho": np.zeros(N)})
+
+    def tangent(self, values, dots):
+        values = {**values, "rho": self.forward(values)["rho"]}
+        found = launch(Kernels.density.tangent, s=self.s, **values, **dotted(dots), rho_dot=np.zeros(N))
+        return {"rho": found["rho_dot"]}
+
+    def adjoint(self, values, bars):
+        values = {**values, "rho": self.forward(values)["rho"]}
+        found = launch(
+            Kernels.density.adjoint, s=self.s, **values, rho_bar=bars["rho"], **zeros("x_bar", "scalars_bar")
+        )
+        return {"x": found["x_bar"], "rest_density": found["scalars_bar"][:, 0].sum(keepdims=True)}
+
+
+class WallYield(Operation):
+    inputs, outputs = ("x",), ("y",)
+
+    def forward(self, values):
+        return launch(Kernels.walls.forward, s=self.s, **{**values, "y": np.zeros(N)})
+
+    def tangent(self, values, dots):
+        values = {**values, "y": self.forward(values)["y"]}
+        return {"y": launch(Kernels.walls.tangent, s=self.s, **values, **dotted(dots), y_dot=np.zeros(N))["y_dot"]}
+
+    def adjoint(self, values, bars):
+        values = {**values, "y": self.forward(values)["y"]}
+        return {"x": launch(Kernels.walls.adjoint, s=self.s, **values, y_bar=bars["y"], **zeros("x_bar"))["x_bar"]}
+
+
+class Viscosity(Operation):
+    inputs, outputs = ("x", "v", "rho", "acceleration_in", "rest_density", "mu"), ("acceleration",)
+    kernels: Any = None
+    friction = 0.0
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.start["acceleration_in"] = self.start.pop("acceleration")
+        self.given = {"s": self.s, "kappa": 10.0, "friction": self.friction}
+
+    def forward(self, values):
+        return launch(self.kernels.forward, **self.given, **values, acceleration=np.zeros((N, 3)))
+
+    def tangent(self, values, dots):
+        found = launch(self.kernels.tangent, **self.given, **values, **dotted(dots), acceleration_dot=np.zeros((N, 3)))
+        return {"acceleration": found["acceleration_dot"]}
+
+    def adjoint(self, values, bars):
+        given = {**self.given, **values, "acceleration_bar": bars["acceleration"]}
+        found = launch(self.kernels.adjoint, **given, **zeros("x_bar", "v_bar", "rho_bar", "scalars_bar"))
+        return {
+            **{name: found[f"{name}_bar"] for name in ("x", "v", "rho")},
+            "acceleration_in": bars["acceleration"],
+            "rest_density": found["scalars_bar"][:, 0].sum(keepdims=True),
+            "mu": found["scalars_bar"][:, 1].sum(keepdims=True),
+        }
+
+
+class Pairwise(Viscosity):
+    kernels = Kernels.pairwise
+
+
+class PairwiseWithFriction(Pairwise):
+    friction = 0.7
+
+
+class Laminar(Viscosity):
+    kernels = Kernels.laminar
+
+
+class LaminarWithFriction(Laminar):
+    friction = 0.7
+
+
+class GravityTable(Operation):
+    inputs, outputs = ("table", "acceleration_in"), ("acceleration",)
+    step = np.array([2], dtype=np.int32)
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.start["acceleration_in"] = self.start.pop("acceleration")
+
+    def forward(self, values):
+        return launch(Kernels.gravity.forward, **values, step=self.step, acceleration=np.zeros((N, 3)))
+
+    def tangent(self, values, dots):
+        return launch(Kernels.gravity.tangent, **dots, step=self.step, acceleration=np.zeros((N, 3)))
+
+    def adjoint(self, values, bars):
+        total = vector_sum(N, FLOAT64, CPU)(array(bars["acceleration"])).numpy()
+        found = launch(Kernels.gravity.adjoint, 1, total=total, step=self.step, table_bar=np.zeros((4, 3)))
+        return {"table": found["table_bar"], "acceleration_in": bars["acceleration"]}
+
+
+class Pressure(Operation):
+    """The pressure alone; its adjoint is fused with what comes before and after it, see `Iterations`."""
+
+    inputs = ("x_star", "rho", "y", "p_in", "rest_density", "time_step")
+    outputs = ("p_out", "c")
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.start["x_star"] = self.start.pop("x") + 0.05 * cloud.vectors(4)
+
+    def forward(self, values):
+        out = {"p_out": np.zeros(N), "c": np.zeros(N), "error": wp.zeros(N, dtype=wp.vec2d, device=CPU)}
+        return launch(Kernels.pressure.forward, s=self.s, stiffness=0.1, **values, **out)
+
+    def tangent(self, values, dots):
+        given = {**values, "p_out": self.forward(values)["p_out"], **dotted(dots)}
+        out = {"p_out_dot": np.zeros(N), "c_dot": np.zeros(N)}
+        found = launch(Kernels.pressure.tangent, s=self.s, stiffness=0.1, **given, **out)
+        return {"p_out": found["p_out_dot"], "c": found["c_dot"]}
+
+
+class PressureForce(Operation):
+    """The pressure force and the prediction that follows it, alone."""
+
+    inputs = ("x", "v", "acceleration", "c", "rest_density", "time_step")
+    outputs = ("x_star", "v_star")
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.start["c"] = self.start["p_in"]
+
+    def forward(self, values):
+        return launch(Kernels.force.forward, s=self.s, **values, x_star=np.zeros((N, 3)), v_star=np.zeros((N, 3)))
+
+    def tangent(self, values, dots):
+        given = {**values, "v_star": self.forward(values)["v_star"], **dotted(dots)}
+        out = {"x_star_dot": np.zeros((N, 3)), "v_star_dot": np.zeros((N, 3))}
+        found = launch(Kernels.force.tangent, s=self.s, **given, **out)
+        return {"x_star": found["x_star_dot"], "v_star": found["v_star_dot"]}
+
+
+class Iterations(Operation):
+    """A prediction and then so many pressure iterations, in the order of the solver; the new state in scene order."""
+
+    inputs = ("x", "v", "acceleration", "rho", "y", "p_in", "rest_density", "time_step")
+    outputs = ("x_new", "v_new", "p_new")
+    iterations = 1
+    stiffness = 0.03
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.order = np.random.default_rng(13).permutation(N).astype(np.int32)
+
+    def record(self, values):
+        """(x*, v*), p and c of every iteration."""
+        out = {"x_star": np.zeros((N, 3)), "v_star": np.zeros((N, 3))}
+        first = launch(Kernels.integration.predict, **{**values, **out})
+        states, pressures, cs = [first], [values["p_in"]], []
+        for _ in range(self.iterations):
+            given = {**values, "x_star": states[-1]["x_star"], "p_in": pressures[-1]}
+            found = launch(
+                Kernels.pressure.forward,
+                s=self.s,
+                stiffness=self.stiffness,
+                **given,
+                p_out=np.zeros(N),
+                c=np.zeros(N),
+                error=wp.zeros(N, dtype=wp.vec2d, device=CPU),
+            )
+            pressures.append(found["p_out"])
+            cs.append(found["c"])
+            states.append(launch(Kernels.force.forward, s=self.s, **values, c=cs[-1], **out))
+        return states, pressures, cs
+
+    def in_scene_order(self, state):
+        found = np.zeros((2, N, 3))
+        found[0, self.order], found[1, self.order] = state["x_star"], state["v_star"]
+        return {"x_new": found[0], "v_new": found[1]}
+
+    def forward(self, values):
+        states, pressures, _ = self.record(values)
+        return {**self.in_scene_order(states[-1]), "p_new": pressures[-1]}
+
+    def tangent(self, values, dots):
+        states, pressures, cs = self.record(values)
+        dot, out = dotted(dots), {"x_star_dot": np.zeros((N, 3)), "v_star_dot": np.zeros((N, 3))}
+        state = launch(Kernels.integration.predict_tangent, **values, **dot, v_star=states[0]["v_star"], **out)
+        p_dot = dots["p_in"]
+        for k in range(self.iterations):
+            given = {**values, "x_star": states[k]["x_star"], "p_in": pressures[k], "p_out": pressures[k + 1]}
+            given_dot = {**dot, "x_star_dot": state["x_star_dot"], "p_in_dot": p_dot}
+            reals = {"p_out_dot": np.zeros(N), "c_dot": np.zeros(N)}
+            found = launch(Kernels.pressure.tangent, s=self.s, stiffness=self.stiffness, **given, **given_dot, **reals)
+            p_dot = found["p_out_dot"]
+            given = {**values, "c": cs[k], "v_star": states[k + 1]["v_star"]}
+            state = launch(Kernels.force.tangent, s=self.s, **given, **dot, c_dot=found["c_dot"], **out)
+        new = {"x_star": state["x_star_dot"], "v_star": state["v_star_dot"]}
+        return {**self.in_scene_order(new), "p_new": p_dot}
+
+    def adjoint(self, values, bars):
+        states, pressures, cs = self.record(values)
+        bar = launch(
+            Kernels.integration.begin_adjoint,
+            order=self.order,
+            **values,
+            v_star=states[-1]["v_star"],
+            x_scene_bar=bars["x_new"],
+            v_scene_bar=bars["v_new"],
+            **zeros("scalars_bar", "x_bar", "v_bar", "push_bar", "rho_bar", "y_bar", "p_bar"),
+        )
+        bar = {name: value for name, value in bar.items() if name.endswith("_bar")}
+        bar["p_bar"] = bars["p_new"]
+        for k in reversed(range(self.iterations)):
+            given = {**values, "p_in": pressures[k], "p_out": pressures[k + 1], "c": cs[k], "r": np.zeros(N)}
+            found = launch(Kernels.force.adjoint, s=self.s, stiffness=self.stiffness, **given, **bar)
+            bar |= {name: found[name] for name in bar if name in found}
+            given = {**values, **{name: states[k][name] for name in ("x_star", "v_star")}, "r": found["r"]}
+            found = launch(Kernels.pressure.adjoint, s=self.s, **given, **bar)
+            bar |= {name: found[name] for name in bar if name in found}
+        found = launch(Kernels.integration.acceleration_adjoint, **values, **bar, acceleration_bar=np.zeros((N, 3)))
+        return {
+            **{name: bar[f"{name}_bar"] for name in ("x", "v", "rho", "y")},
+            "acceleration": found["acceleration_bar"],
+            "p_in": bar["p_bar"],
+            "rest_density": bar["scalars_bar"][:, 0].sum(keepdims=True),
+            "time_step": bar["scalars_bar"][:, 2].sum(keepdims=True),
+        }
+
+
+class TwoIterations(Iterations):
+    iterations = 2
+
+
+class FiveIterations(Iterations):
+    iterations = 5
+
+
+ADJOINT = [
+    Density,
+    WallYield,
+    Pairwise,
+    PairwiseWithFriction,
+    Laminar,
+    LaminarWithFriction,
+    GravityTable,
+    Iterations,
+    TwoIterations,
+    FiveIterations,
+]
+TANGENT = [*ADJOINT, Pressure, PressureForce]
+
+clouds = pytest.mark.parametrize("where", ["3-D", "2-D", "periodic"])
+
+
+def by_input(operations: Sequence[type[Operation]]) -> Callable:
+    """One test for each input of each operation, so that a wrong term cannot hide, and one for all together."""
+    cases = [(operation, name) for operation in operations for name in (*operation.inputs, "all")]
+    ids = [f"{operation.__name__}-{name}" for operation, name in cases]
+    return pytest.mark.parametrize("operation, name", cases, ids=ids)
+
+
+def inner(a: Values, b: Values, names: Sequence[str]) -> float:
+    return float(sum((a[name] * b[name]).sum() for name in names))
+
+
+def norm(a: Values, names: Sequence[str]) -> float:
+    return inner(a, a, names) ** 0.5
+
+
+@clouds
+@by_input(ADJOINT)
+def test_adjoint_is_the_transpose_of_the_tangent(operation, name, where):
+    op = operation(cloud(where))
+    directions = op.directions(21, None if name == "all" else [name])
+    tangent = op.tangent(op.start, directions)
+    assert norm(tangent, op.outputs) > 1e-3
+    for outputs in (*([output] for output in op.outputs), op.outputs):
+        weights = {k: w if k in outputs else np.zeros_like(w) for k, w in op.weights(22).items()}
+        adjoint = op.adjoint(op.start, weights)
+        forward, backward = inner(tangent, weights, op.outputs), inner(adjoint, directions, op.inputs)
+        assert abs(forward - backward) <= 1e-12 * norm(tangent, outputs) * norm(weights, outputs)
+
+
+@clouds
+@by_input(TANGENT)
+def test_tangent_is_the_limit_of_central_differences(operation, name, where):
+    op = operation(cloud(where))
+    directions = op.directions(31, None if name == "all" else [name])
+    tangent = op.tangent(op.start, directions)
+    for output in op.outputs:
+        size = norm(tangent, [output])
+        found = []
+        for h in 10.0 ** -np.arange(3.5, 6.6, 0.5):
+            ahead, behind = (
+                op.forward({k: v + sign * h * directions.get(k, 0.0) for k, v in op.start.items()})[output]
+                for sign in (1, -1)
+            )
+            found.append(np.linalg.norm((ahead - behind) / (2 * h) - tangent[output]))
+        assert min(found) < 1e-7 * size or max(found) == size == 0.0, f"{output}: {min(found) / size:.1e}"
+
+
+@clouds
+def test_some_pressures_are_active_and_some_are_not(where):
+    """Else the clamp would not be tested."""
+    op = FiveIterations(cloud(where))
+    for p in op.record(op.start)[1]:
+        assert 0.1 < (p > 0).mean() < 0.95
+
+
+@clouds
+@pytest.mark.parametrize("operation", [Density, WallYield, PairwiseWithFriction, LaminarWithFriction])
+def test_adjoints_are_added(operation, where, monkeypatch):
+    """What other terms left in the adjoints of x, v, rho and the scalars stays."""
+    op = operation(cloud(where))
+    bars = op.weights(41)
+    alone = op.adjoint(op.start, bars)
+    monkeypatch.setitem(globals(), "zeros", lambda *names, make=zeros: {k: v + 1.0 for k, v in make(*names).items()})
+    added = op.adjoint(op.start, bars)
+    for name in set(op.inputs) - {"acceleration_in"}:
+        one = N if op.start[name].shape == (1,) else 1.0
+        np.testing.assert_allclose(added[name], alone[name] + one, rtol=1e-12, atol=1e-12)
+
+
+@clouds
+@pytest.mark.parametrize("operation", ADJOINT)
+def test_same_bits_twice(operation, where):
+    op = operation(cloud(where))
+    bars = op.weights(51)
+    first, second = (op.adjoint(op.start, bars) for _ in range(2))
+    assert all(first[name].tobytes() == second[name].tobytes() for name in op.inputs)
+
+
+def test_sort_and_unsort_are_inverses():
+    there = cloud("3-D")
+    order = np.random.default_rng(61).permutation(N).astype(np.int32)
+    x, v = there.vectors(62), there.vectors(63)
+    given = {"order": order, "x_scene": x, "v_scene": v}
+    found = launch(Kernels.integration.sort, **given, x=np.zeros((N, 3)), v=np.zeros((N, 3)))
+    np.testing.assert_array_equal(found["x"], x[order])
+    np.testing.assert_array_equal(found["v"], v[order])
+    given = {"order": order, "x": found["x"], "v": found["v"]}
+    back = launch(Kernels.integration.unsort, **given, x_scene=np.zeros((N, 3)), v_scene=np.zeros((N, 3)))
+    np.testing.assert_array_equal(back["x_scene"], x)
+    np.testing.assert_array_equal(back["v_scene"], v)
+
+
+SIZES = [1, 2, 63, 64, 65, 128, 4096, 4097, 5000]
+precisions = pytest.mark.parametrize("precision", [FLOAT32, FLOAT64], ids=lambda precision: precision.name)
+
+
+def summed(tree: TreeSum, values: np.ndarray, dtype: Any) -> np.ndarray:
+    return tree(wp.array(values, dtype=dtype, device=CPU)).numpy()
+
+
+@precisions
+@pytest.mark.parametrize("size", SIZES)
+def test_vector_sum(size, precision: Precision):
+    values = np.random.default_rng(size).standard_normal((size, 3)).astype(precision.numpy)
+    tree = vector_sum(size, precision, CPU)
+    first, second = (summed(tree, values, precision.vector).copy() for _ in range(2))
+    again = summed(vector_sum(size, precision, CPU), values, precision.vector)
+    assert first.shape == (1, 3)
+    assert first.tobytes() == second.tobytes() == again.tobytes()
+    error = 20 * np.finfo(precision.numpy).eps * np.abs(values).sum()
+    np.testing.assert_allclose(first[0], values.astype(np.float64).sum(axis=0), rtol=0, atol=error)
+    whole = np.arange(3 * size).reshape(size, 3) % 7  # every partial sum is exact
+    np.testing.assert_array_equal(summed(tree, whole.astype(precision.numpy), precision.vector)[0], whole.sum(axis=0))
+
+
+@precisions
+@pytest.mark.parametrize("size", SIZES)
+def test_sum_and_maximum(size, precision: Precision):
+    values = np.random.default_rng(size).uniform(-2.0, -1.0, (size, 2)).astype(precision.numpy)
+    tree, error = sum_and_maximum(size, precision, CPU), 20 * float(np.finfo(precision.numpy).eps)
+    for place in {0, size // 2, size - 1}:
+        values[place, 1] = -0.5
+        (found,) = summed(tree, values, precision.pair)
+        assert found[0] == pytest.approx(values[:, 0].astype(np.float64).sum(), rel=error)
+        assert found[1] == -0.5
+        values[place, 1] = -1.5
