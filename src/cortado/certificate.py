@@ -107,7 +107,11 @@ def certify(problem: Problem, seed: int = 0, policy: Policy | None = None) -> Ce
             / (2.0 * h)
             for h in STEPS
         )
-        compared.append(Comparison(name, float((gradient[parameter] * direction).sum()), tangent, differences, ROUND_OFF * abs(loss)))
+        compared.append(
+            Comparison(
+                name, float((gradient[parameter] * direction).sum()), tangent, differences, ROUND_OFF * abs(loss)
+            )
+        )
     return Certificate(problem.steps, problem.simulation.particles, loss, tuple(compared))
 
 

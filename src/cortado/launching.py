@@ -1,6 +1,6 @@
 """Launches over particles, and sums over particles in a fixed order."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import warp as wp
@@ -20,6 +20,28 @@ class Launcher:
 
     def __call__(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any], threads: int | None = None) -> None:
         wp.launch(kernel, threads or self.particles, inputs=inputs, outputs=outputs, device=self.device)
+
+
+class Replayed:
+    """Work that is done over and over with the same arrays: on a GPU a captured graph from the second time on.
+
+    The first time loads modules and allocates what a capture must not.
+    """
+
+    def __init__(self, work: Callable[[], None], device: Any):
+        self._work, self._device = work, device
+        self._warm, self._graph = False, None
+
+    def __call__(self) -> None:
+        if self._device.is_cpu or not self._warm:
+            self._work()
+            self._warm = True
+            return
+        if self._graph is None:
+            with wp.ScopedCapture(device=self._device) as capture:
+                self._work()
+            self._graph = capture.graph
+        wp.capture_launch(self._graph)
 
 
 class TreeSum:

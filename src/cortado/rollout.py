@@ -7,12 +7,13 @@ On a GPU a step is a captured graph.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import warp as wp
 
 from cortado.errors import DivergedError
+from cortado.launching import Replayed
 from cortado.particles import Parameters, State
 from cortado.physics.convergence import NO_PARTICLE
 from cortado.solvers.pcisph import Pcisph
@@ -58,8 +59,8 @@ class Rollout:
         state_bytes = 2 * 3 * np.dtype(self._precision.numpy).itemsize * self._particles
         self._interval = max(1, -(-steps * state_bytes // memory_budget))
         self._states: dict[int, State] = {}
-        self._buffer, self._bar, self._graph = self._new_state(), self._new_state(), None
-        self._backward_graphs: dict[tuple[StepDerivative, int], Any] = {}
+        self._buffer, self._bar = self._new_state(), self._new_state()
+        self._forget_graphs()
         self.iterations = np.zeros(0, dtype=int)
         """(steps,) pressure iterations of the last forward run."""
         self.errors = np.zeros((0, 2))
@@ -97,30 +98,12 @@ class Rollout:
     def _advance(self, state: State, first: int, last: int) -> list[State]:
         self.solver.step_number.fill_(first)
         chunk = []
+        self._buffer.assign(state)
         for _ in range(first, last):
-            new_state = self._new_state()
-            if self._device.is_cpu:
-                self.solver.step(state, new_state, self.parameters, self._records)
-            else:
-                self._buffer.assign(state)
-                self._launch_graph()
-                new_state.assign(self._buffer)
-            chunk.append(new_state)
-            state = new_state
+            self._step()
+            chunk.append(self._new_state())
+            chunk[-1].assign(self._buffer)
         return chunk
-
-    def _launch_graph(self) -> None:
-        if self._graph is None:
-            self._graph = self._capture(
-                lambda: self.solver.step(self._buffer, self._buffer, self.parameters, self._records)
-            )
-        wp.capture_launch(self._graph)
-
-    def _capture(self, work: Callable[[], None]) -> Any:
-        wp.load_module(device=self._device)
-        with wp.ScopedCapture(device=self._device) as capture:
-            work()
-        return capture.graph
 
     def _grow_lists(self) -> bool:
         """Whether the neighbour lists were too short; they are longer now, and what used them must be repeated."""
@@ -128,10 +111,16 @@ class Rollout:
         if needed <= self.solver.search.capacity:
             return False
         self.solver.grow(needed + needed // 8 + 1)
-        self._graph, self._backward_graphs = None, {}
+        self._forget_graphs()
         self.solver.bad_particle.fill_(NO_PARTICLE)
         self.solver.bad_step.fill_(-1)
         return True
+
+    def _forget_graphs(self) -> None:
+        """After arrays of the solver were replaced."""
+        step = partial(self.solver.step, self._buffer, self._buffer, self.parameters, self._records)
+        self._step = Replayed(step, self._device)
+        self._steps_back: dict[tuple[StepDerivative, int], Replayed] = {}
 
     def _diverged(self, step: int) -> DivergedError:
         particle = int(self.solver.bad_particle.numpy()[0])
@@ -150,23 +139,24 @@ class Rollout:
 
     def backward(self, derivative: StepDerivative, bar: State) -> None:
         """Replace ``bar``, the adjoint of the last state, by that of the first; `forward` has run."""
-        graphs = self._backward_graphs if derivative.capturable and not self._device.is_cpu else None
         derivative.begin()
+        self._bar.assign(bar)
         for n in reversed(range(self.steps)):
-            state, iterations = self._restore(n), int(self.iterations[n])
+            self._buffer.assign(self._restore(n))
             self.solver.step_number.fill_(n)
-            if graphs is None:
-                derivative.step(state, iterations, bar)
-                continue
-            self._buffer.assign(state)
-            self._bar.assign(bar)
-            key = (derivative, iterations)
-            if key not in graphs:
-                self.solver.iterates.reserve(iterations)
-                work = partial(derivative.step, self._buffer, iterations, self._bar)
-                graphs[key] = self._capture(work)
-            wp.capture_launch(graphs[key])
-            bar.assign(self._bar)
+            self._step_back(derivative, int(self.iterations[n]))
+        bar.assign(self._bar)
+
+    def _step_back(self, derivative: StepDerivative, iterations: int) -> None:
+        work = partial(derivative.step, self._buffer, iterations, self._bar)
+        if not derivative.capturable:
+            work()
+            return
+        key = (derivative, iterations)
+        if key not in self._steps_back:
+            self.solver.iterates.reserve(iterations)
+            self._steps_back[key] = Replayed(work, self._device)
+        self._steps_back[key]()
 
     def tangent(self, dot: State, parameters_dot: Parameters) -> None:
         """Replace ``dot``, the tangent of the first state, by that of the last; `forward` has run."""
