@@ -9,8 +9,11 @@ import numpy as np
 import warp as wp
 
 from cortado.errors import InputError
-from cortado.particles import State
-from cortado.precision import FLOAT32, FLOAT64
+from cortado.launching import TreeSum
+from cortado.particles import State, to_device
+from cortado.physics.matching import matching_kernels
+from cortado.physics.reduction import number_sum_kernel
+from cortado.precision import FLOAT32, FLOAT64, Precision
 
 
 @dataclass(frozen=True)
@@ -20,6 +23,11 @@ class TrajectoryEnd:
     state: State
     """Warp arrays of vectors (n,): positions [m] and velocities [m / s]."""
     dimension: int
+
+    @property
+    def precision(self) -> Precision:
+        """Of the Warp arrays."""
+        return FLOAT64 if self.state.positions.dtype == FLOAT64.vector else FLOAT32
 
     @cached_property
     def positions(self) -> np.ndarray:
@@ -38,8 +46,8 @@ class Loss(Protocol):
     def value(self, end: TrajectoryEnd) -> float:
         """The loss."""
 
-    def adjoint(self, end: TrajectoryEnd) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of the loss with respect to positions and velocities, (n, d) each."""
+    def adjoint(self, end: TrajectoryEnd) -> State | tuple[np.ndarray, np.ndarray]:
+        """Derivatives of the loss with respect to positions and velocities, (n, d) each, or as Warp arrays."""
 
 
 class FinalPositions:
@@ -50,17 +58,32 @@ class FinalPositions:
         self.target = np.asarray(target, dtype=np.float64)
         if self.target.ndim != 2 or not np.isfinite(self.target).all():
             raise InputError(f"target has shape {self.target.shape}, but must be (particles, dimension) and finite.")
+        self._on_device: dict[Any, wp.array] = {}
 
     def value(self, end: TrajectoryEnd) -> float:
-        return float((self._miss(end) ** 2).sum() / len(self.target))
+        x, target, device = self._positions_and_target(end)
+        squares = wp.empty(len(x), dtype=wp.float64, device=device)
+        kernels = matching_kernels(end.precision)
+        wp.launch(kernels.squared_distance, len(x), inputs=[x, target], outputs=[squares], device=device)
+        total = TreeSum(number_sum_kernel(), wp.float64, len(x), device)(squares)
+        return float(total.numpy()[0]) / len(x)
 
-    def adjoint(self, end: TrajectoryEnd) -> tuple[np.ndarray, np.ndarray]:
-        return 2.0 / len(self.target) * self._miss(end), np.zeros_like(self.target)
+    def adjoint(self, end: TrajectoryEnd) -> State:
+        x, target, device = self._positions_and_target(end)
+        bar = State.zeros(len(x), end.precision, device)
+        kernels = matching_kernels(end.precision)
+        factor = 2.0 / len(x)
+        wp.launch(kernels.difference, len(x), inputs=[factor, x, target], outputs=[bar.positions], device=device)
+        return bar
 
-    def _miss(self, end: TrajectoryEnd) -> np.ndarray:
-        if end.positions.shape != self.target.shape:
-            raise InputError(f"target has shape {self.target.shape}, but must be {end.positions.shape}.")
-        return end.positions - self.target
+    def _positions_and_target(self, end: TrajectoryEnd) -> tuple[wp.array, wp.array, Any]:
+        x = end.state.positions
+        if (len(x), end.dimension) != self.target.shape:
+            raise InputError(f"target has shape {self.target.shape}, but must be {(len(x), end.dimension)}.")
+        key = (str(x.device), end.precision)
+        if key not in self._on_device:
+            self._on_device[key] = to_device(self.target, end.precision, x.device)
+        return x, self._on_device[key], x.device
 
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
@@ -89,7 +112,6 @@ class Recorded:
 
     def _run(self, end: TrajectoryEnd) -> tuple[wp.array, wp.array, wp.array]:
         copies = [wp.clone(a, requires_grad=True) for a in (end.state.positions, end.state.velocities)]
-        precision = FLOAT64 if copies[0].dtype == FLOAT64.vector else FLOAT32
-        loss = wp.zeros(1, dtype=precision.real, device=copies[0].device, requires_grad=True)
+        loss = wp.zeros(1, dtype=end.precision.real, device=copies[0].device, requires_grad=True)
         self.function(copies[0], copies[1], loss)
         return loss, copies[0], copies[1]

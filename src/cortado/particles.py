@@ -35,6 +35,11 @@ class State:
             )
         )
 
+    @classmethod
+    def empty(cls, particles: int, precision: Precision, device: Any) -> "State":
+        """A state that is still to be written."""
+        return cls(*(wp.empty(particles, dtype=precision.vector, device=device) for _ in fields(cls)))
+
     def assign(self, other: "State") -> None:
         """Copy another state of the same device and size, without a host round trip."""
         wp.copy(self.positions, other.positions)

@@ -50,17 +50,14 @@ class Problem:
         """The loss and its derivatives: for each parameter given, an array of its shape (float64)."""
         values = self._checked(parameters)
         end = self.end(values, keep=True)
-        bar = self._state(*self.loss.adjoint(end))
+        bar = self._adjoint(end)
         derivative = self._derivative(policy or Exact())
         self._rollout.backward(derivative, bar)
         gravity, scalars = derivative.parameters()
-        positions, velocities = bar.numpy(self.simulation.dimension)
-        found = {
-            "gravity": gravity[:, : self.simulation.dimension],
-            "initial_positions": positions.astype(np.float64),
-            "initial_velocities": velocities.astype(np.float64),
-            **dict(zip(SCALARS, scalars, strict=True)),
-        }
+        found = {"gravity": gravity[:, : self.simulation.dimension], **dict(zip(SCALARS, scalars, strict=True))}
+        if not values.keys().isdisjoint(STATES):
+            states = (array.astype(np.float64) for array in bar.numpy(self.simulation.dimension))
+            found |= dict(zip(STATES, states, strict=True))
         if "gravity" in values and values["gravity"].ndim == 1:
             found["gravity"] = found["gravity"].sum(axis=0)
         return self.loss.value(end), {name: np.asarray(found[name]) for name in values}
@@ -70,13 +67,16 @@ class Problem:
         end = self.end(parameters, keep=False)
         dot, parameters_dot = self._directions(self._checked(directions, "direction"))
         self._rollout.tangent(dot, parameters_dot)
-        dimension = self.simulation.dimension
-        bars = self.loss.adjoint(end)
-        return float(sum((bar * d).sum() for bar, d in zip(bars, dot.numpy(dimension), strict=True)))
+        pairs = zip(self._adjoint(end).numpy(3), dot.numpy(3), strict=True)
+        return float(sum((bar.astype(np.float64) * d).sum() for bar, d in pairs))
 
     def iterations(self) -> np.ndarray:
         """(steps,) pressure iterations of the last evaluation."""
         return self._rollout.iterations
+
+    def _adjoint(self, end: TrajectoryEnd) -> State:
+        bar = self.loss.adjoint(end)
+        return bar if isinstance(bar, State) else self._state(*bar)
 
     def _derivative(self, policy: Policy) -> StepDerivative:
         if policy not in self._derivatives:
@@ -104,10 +104,12 @@ class Problem:
 
     def _set(self, values: dict[str, np.ndarray]) -> None:
         simulation, phase = self.simulation, self.simulation.phase
-        self._rollout.initial.set(
-            values.get("initial_positions", simulation.positions),
-            values.get("initial_velocities", simulation.velocities),
-        )
+        self._rollout.initial.assign(simulation.state)
+        if not values.keys().isdisjoint(STATES):
+            self._rollout.initial.set(
+                values.get("initial_positions", simulation.positions),
+                values.get("initial_velocities", simulation.velocities),
+            )
         self._rollout.parameters.set(
             simulation.gravity_table(values.get("gravity"), self.steps),
             float(values.get("rest_density", phase.rest_density)),

@@ -60,7 +60,8 @@ class Rollout:
         self._interval = max(1, -(-steps * state_bytes // memory_budget))
         self._states: dict[int, State] = {}
         self._buffer, self._bar = self._new_state(), self._new_state()
-        self._forget_graphs()
+        self._growth = -1
+        self._forget_stale_graphs()
         self.iterations = np.zeros(0, dtype=int)
         """(steps,) pressure iterations of the last forward run."""
         self.errors = np.zeros((0, 2))
@@ -73,6 +74,7 @@ class Rollout:
         back. Raises `DivergedError` after the good states were observed."""
         self._states = {0: self.initial}
         state, step = self.initial, 0
+        self._forget_stale_graphs()
         self.solver.bad_particle.fill_(NO_PARTICLE)
         self.solver.bad_step.fill_(-1)
         self._read_records(0)
@@ -111,13 +113,16 @@ class Rollout:
         if needed <= self.solver.search.capacity:
             return False
         self.solver.grow(needed + needed // 8 + 1)
-        self._forget_graphs()
+        self._forget_stale_graphs()
         self.solver.bad_particle.fill_(NO_PARTICLE)
         self.solver.bad_step.fill_(-1)
         return True
 
-    def _forget_graphs(self) -> None:
-        """After arrays of the solver were replaced."""
+    def _forget_stale_graphs(self) -> None:
+        """Begin anew with graphs where arrays of the solver were replaced, by this rollout or by another."""
+        if self._growth == self.solver.growth:
+            return
+        self._growth = self.solver.growth
         step = partial(self.solver.step, self._buffer, self._buffer, self.parameters, self._records)
         self._step = Replayed(step, self._device)
         self._steps_back: dict[tuple[StepDerivative, int], Replayed] = {}
@@ -140,6 +145,7 @@ class Rollout:
     def backward(self, derivative: StepDerivative, bar: State) -> None:
         """Replace ``bar``, the adjoint of the last state, by that of the first; `forward` has run."""
         derivative.begin()
+        self._forget_stale_graphs()
         self._bar.assign(bar)
         for n in reversed(range(self.steps)):
             self._buffer.assign(self._restore(n))
@@ -184,4 +190,4 @@ class Rollout:
         return self._states[n]
 
     def _new_state(self) -> State:
-        return State.zeros(self._particles, self._precision, self._device)
+        return State.empty(self._particles, self._precision, self._device)

@@ -46,6 +46,9 @@ class Simulation:
         self.walls = boundary_particles(scene, layer.depth)
         """(b, d) wall particles [m]."""
         self.solver = self._solver(layer)
+        self.state = State.empty(self.particles, self.precision, self.device)
+        """The first state on the device."""
+        self.state.set(self.positions, self.velocities)
 
     @property
     def dimension(self) -> int:
@@ -93,7 +96,7 @@ class Simulation:
 
     def begin(self, rollout: Rollout, gravity: Any = None) -> None:
         """Give a rollout the scene's first state and parameters."""
-        rollout.initial.set(self.positions, self.velocities)
+        rollout.initial.assign(self.state)
         rollout.parameters.set(
             self.gravity_table(gravity, rollout.steps),
             self.phase.rest_density,

@@ -2,6 +2,7 @@
 
 from functools import cache
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -34,3 +35,20 @@ def reduction_kernels(precision: Precision) -> SimpleNamespace:
         partial[t] = pair(total, largest)
 
     return SimpleNamespace(sum=vector_sum, sum_and_maximum=sum_and_maximum)
+
+
+@cache
+def number_sum_kernel() -> Any:
+    """The same for numbers in float64."""
+    module = wp.get_module("cortado_reduction_numbers")
+    module.options["enable_backward"] = False
+
+    @wp.kernel(module=module, enable_backward=False)
+    def number_sum(count: int, stride: int, values: wp.array(dtype=wp.float64), partial: wp.array(dtype=wp.float64)):
+        t = wp.tid()
+        total = wp.float64(0.0)
+        for k in range(t, count, stride):
+            total += values[k]
+        partial[t] = total
+
+    return number_sum

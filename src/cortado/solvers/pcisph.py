@@ -118,12 +118,15 @@ class Pcisph:
         self._iteration, self._active = count(), count()
         self.bad_particle, self.bad_step = count(NO_PARTICLE), count(-1)
         self._surroundings: Any = None
+        self.growth = 0
+        """How often arrays were replaced by longer ones; what was captured before is stale."""
         self.grow(search.capacity)
 
     def grow(self, capacity: int) -> None:
         """Make room for neighbour lists of that length."""
         if capacity != self.search.capacity:
             self.search.allocate(capacity)
+            self.growth += 1
         search, lattice, precision = self.search, self.lattice, self.discretisation.precision
         s = surroundings_type(precision)()
         s.neighbours, s.fluid_count, s.count = search.neighbours, search.fluid_count, search.count
