@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
-from cortado import Problem, Simulation, losses
-from scenes import splash
+from cortado import Problem, Simulation, losses, policies
+from scenes import plane, scene, splash
 
 SCALES = {
     "gravity": 1.0,
@@ -41,11 +42,14 @@ def point_and_direction(problem, what, seed=0):
     return name, point, SCALES[what] * direction / np.linalg.norm(direction)
 
 
-def best_difference(problem, name, point, direction, derivative):
+def best_difference(problem, point, directions, derivative):
     """Relative distance of the derivative from the nearest central difference."""
     found = []
     for h in 10.0 ** -np.arange(2.0, 10.0):
-        ahead, behind = (problem.value({name: point + sign * h * direction}) for sign in (1, -1))
+        ahead, behind = (
+            problem.value({name: value + sign * h * directions[name] for name, value in point.items()})
+            for sign in (1, -1)
+        )
         found.append(abs((ahead - behind) / (2 * h) - derivative) / abs(derivative))
     return min(found)
 
@@ -66,4 +70,88 @@ def test_splash(what, steps, iterations):
     tangent = problem.tangent({name: point}, {name: direction})
     assert abs(adjoint - tangent) < 1e-10 * abs(tangent)
     limit = 1e-3 if steps == 200 else 1e-6  # at 200 steps chaos limits the difference
-    assert best_difference(problem, name, point, direction, tangent) < limit
+    assert best_difference(problem, {name: point}, {name: direction}, tangent) < limit
+
+
+SHAPES = {
+    "cubic spline": splash(),
+    "wendland_c2": scene(discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"}),
+    "wendland_c4, laminar, no slip": scene(
+        discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c4"},
+        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "laminar"},
+        container={"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"},
+    ),
+    "plane": plane(),
+    "periodic": plane(
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]},
+        forces={"gravity": [1.0, -9.81]},
+    ),
+    "free space": scene(container={"shape": "none"}),
+    "without pressure": scene(forces={"gravity": [0.0, -9.81, 0.0], "pressure": False}),
+    "iterations by tolerance": splash(**ITERATIONS["tolerance"]),
+}
+
+
+@pytest.mark.parametrize("made", SHAPES.values(), ids=SHAPES)
+def test_gather_adjoint_equals_warps_tape(made):
+    problem = problem_of(made, 30)
+    point = dict(point_and_direction(problem, what)[:2] for what in SCALES if what != "gravity")
+    loss, gathered = problem.value_and_gradient(point, policies.Exact())
+    taped_loss, taped = problem.value_and_gradient(point, policies.Tape())
+    assert loss == taped_loss
+    for name, gradient in gathered.items():
+        assert np.linalg.norm(gradient - taped[name]) <= 1e-9 * np.linalg.norm(gradient), name
+
+
+@pytest.mark.parametrize("made", SHAPES.values(), ids=SHAPES)
+def test_all_parameters_at_once(made):
+    """One reverse sweep against one forward sweep, along a direction in all parameters together."""
+    problem = problem_of(made, 40)
+    point, directions = {}, {}
+    for what in SCALES:
+        name, point[name], directions[name] = point_and_direction(problem, what)
+    _, gradient = problem.value_and_gradient(point)
+    adjoint = sum((gradient[name] * directions[name]).sum() for name in point)
+    tangent = problem.tangent(point, directions)
+    assert abs(adjoint - tangent) < 1e-10 * abs(tangent)
+    assert best_difference(problem, point, directions, tangent) < 1e-6
+
+
+def test_checkpoints_under_a_budget_give_the_same_bits():
+    problem, frugal = problem_of(splash(), 50), problem_of(splash(), 50)
+    frugal._rollout = type(frugal._rollout)(frugal.simulation.solver, 50, memory_budget=7 * 48 * 125)
+    point = {"gravity": np.array([0.0, -9.81, 0.0]), "initial_positions": problem.simulation.positions}
+    for (_, wanted), (_, found) in [(problem.value_and_gradient(point), frugal.value_and_gradient(point))]:
+        for name, gradient in wanted.items():
+            assert gradient.tobytes() == found[name].tobytes()
+    assert len(frugal._rollout._states) < 12
+
+
+def test_float32_gradient_is_near_the_float64_one():
+    point = {"gravity": np.array([0.0, -9.81, 0.0])}
+    found = []
+    for precision in ("float32", "float64"):
+        simulation = Simulation(splash(), precision=precision)
+        problem = Problem(simulation, 50, losses.FinalPositions(simulation.positions))
+        found.append(problem.value_and_gradient(point)[1]["gravity"])
+    assert np.linalg.norm(found[0] - found[1]) < 1e-3 * np.linalg.norm(found[1])
+
+
+def test_a_function_of_warp_arrays_is_a_loss():
+    simulation = Simulation(splash(), precision="float64")
+    recorded = Problem(simulation, 20, mean_square)
+    written = Problem(simulation, 20, losses.FinalPositions(np.zeros_like(simulation.positions)))
+    point = {"gravity": np.array([0.0, -9.81, 0.0])}
+    (loss, gradient), (wanted, exact) = recorded.value_and_gradient(point), written.value_and_gradient(point)
+    assert loss == pytest.approx(wanted, rel=1e-13)
+    np.testing.assert_allclose(gradient["gravity"], exact["gravity"], rtol=1e-12)
+
+
+@wp.kernel
+def add_square(x: wp.array(dtype=wp.vec3d), count: wp.float64, loss: wp.array(dtype=wp.float64)):
+    i = wp.tid()
+    wp.atomic_add(loss, 0, wp.dot(x[i], x[i]) / count)
+
+
+def mean_square(positions, velocities, loss):
+    wp.launch(add_square, len(positions), inputs=[positions, float(len(positions))], outputs=[loss])

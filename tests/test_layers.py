@@ -15,7 +15,7 @@ LAYERS = """
     errors
     precision smoothing calibration
     physics.surroundings physics.density physics.walls physics.integration physics.pressure
-    physics.viscosity physics.convergence physics.reduction
+    physics.viscosity physics.convergence physics.reduction physics.matching
     neighbours launching particles
     shapes scene_kinds scene_tables scene_toml scene_points
     scene_fluids scene_containers scene_stability scene_checks scene sampling

@@ -4,6 +4,7 @@ Exit codes: 0 done, 1 the computation failed (or a check did), 2 the input is wr
 sentence on stderr, never a traceback.
 """
 
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -14,11 +15,11 @@ import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from cortado.errors import ComputationError, CortadoError, CortadoWarning
+from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
 
 app = SubcommandApp()
 gradients = SubcommandApp()
-app.command(gradients, name="gradients")
+app.command(gradients, name="gradients", help="Check the gradients of a scene.")
 
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Overrides = Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")]
@@ -47,13 +48,12 @@ def run(
         record_every: Steps from one frame of the trajectory to the next.
         overwrite: Replace an earlier run in the same folder.
     """
+    _require_at_least(1, record_every, "--record-every")
+    _start_warp()
     from cortado.commands.run import run_scene
 
-    print(
-        run_scene(
-            scene, steps, out, list(overrides), device, precision, record_every, overwrite, ["cortado", *sys.argv[1:]]
-        )
-    )
+    command = ["cortado", *sys.argv[1:]]
+    print(run_scene(scene, steps, out, list(overrides), device, precision, record_every, overwrite, command))
 
 
 @app.command
@@ -77,6 +77,9 @@ def optimise(
         resume: Go on with the run in the folder, bit for bit.
         overwrite: Replace an earlier run in the same folder.
     """
+    if resume and overwrite:
+        raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
+    _start_warp()
     from cortado.commands.optimise import optimise_task
 
     command = ["cortado", *sys.argv[1:]]
@@ -102,6 +105,8 @@ def check(
         json: Print JSON for machines instead of a table.
         seed: Of the random directions.
     """
+    _require_at_least(0, seed, "--seed")
+    _start_warp()
     from cortado.commands.check import check_scene
 
     print(check_scene(scene, steps, list(overrides), device, json, seed))
@@ -120,23 +125,52 @@ def bench(
         precision: "float32" or "float64".
         json: Print JSON for machines instead of a table.
     """
+    _require_at_least(1, particles, "--particles")
+    _start_warp()
     from cortado.commands.bench import bench_dam_break
 
     print(bench_dam_break(particles, steps, device, precision, json))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command and exit with its code."""
-    warnings.showwarning = _show_warning  # type: ignore[assignment]
+    """Run a command; exits with its code unless that is 0."""
     try:
-        app.cli(prog="cortado", args=arguments, config=(tyro.conf.OmitArgPrefixes,))
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning  # type: ignore[assignment]
+            app.cli(
+                prog="cortado",
+                description="A differentiable SPH fluid simulator.",
+                args=arguments,
+                config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+            )
     except ComputationError as error:
         sys.exit(_say(error, 1))
     except CortadoError as error:
         sys.exit(_say(error, 2))
     except KeyboardInterrupt:
-        print("Interrupted; what was computed is on disk.", file=sys.stderr)
+        print("Interrupted; the frames and the evaluations so far are in the run folder.", file=sys.stderr)
         sys.exit(130)
+
+
+def _require_at_least(least: int, value: int, option: str) -> None:
+    if value < least:
+        raise InputError(f"{option} is {value}, but must be at least {least}.")
+
+
+def _start_warp() -> None:
+    """Start Warp without its greeting, and without the line that its C code prints where there is no CUDA driver."""
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR
+    sys.stderr.flush()
+    stderr, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nothing, 2)
+        wp.init()
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(nothing)
 
 
 def _say(error: CortadoError, code: int) -> int:

@@ -19,6 +19,8 @@ PALETTE = ("#3d6b8e", "#c0763b", "#5b8a5a", "#8c5f7d", "#a89a4b", "#6b7a80", "#a
 _INK, _FAINT = "#2b2a28", "#8a857c"
 _FAR, _NEAR = "#c9d9e4", "#27506f"
 _MOST_DRAWN = 150_000
+_SHOWN_RANGE = (0.0, 99.5)
+"""Percentiles at the ends of a colour scale, so that a few fast drops do not darken all the others."""
 _DASHED: dict[str, Any] = {"linestyle": (0, (5, 4)), "linewidth": 1.2}
 _STYLE = {
     "font.size": 11,
@@ -103,7 +105,9 @@ def particles(
             axes.grid(False)
         panels[0].set_ylabel("y [m]")
         if scale.mappable is not None:
-            figure.colorbar(scale.mappable, ax=panels, label=colour_label, shrink=0.8, aspect=30, pad=0.015)
+            extend = "max" if scale.clips else "neither"
+            style = {"shrink": 0.8, "aspect": 30, "pad": 0.015, "extend": extend}
+            figure.colorbar(scale.mappable, ax=panels, label=colour_label, **style)
     return Path(path)
 
 
@@ -227,7 +231,8 @@ class _ColourScale:
         depths = [_depth(points) for points in sets]
         values = np.concatenate(numbers or depths)
         values = values[np.isfinite(values)]
-        low, high = (values.min(), values.max()) if len(values) else (0.0, 1.0)
+        low, high = np.percentile(values, _SHOWN_RANGE) if len(values) else (0.0, 1.0)
+        self.clips = bool(len(values) and values.max() > high)
         flat = high - low <= 1e-12 * max(abs(high), abs(low))  # one value, or plane: the near colour
         shades = LinearSegmentedColormap.from_list("depth", [_FAR, _NEAR])
         self._map = ScalarMappable(

@@ -9,9 +9,10 @@ import numpy as np
 
 from cortado.errors import Phrase, SceneError
 from cortado.optimisers import LBFGS, Adam, GradientDescent, Optimiser
-from cortado.problem import NAMES
+from cortado.problem import NAMES, STATES
+from cortado.sampling import fluid_particles
 from cortado.scene import Scene, read_toml, scene_from_dict
-from cortado.scene_kinds import MISSING, Choice, Count, Kind, Quantity, wrong
+from cortado.scene_kinds import MISSING, Choice, Count, Kind, Quantity, as_number, wrong
 from cortado.scene_tables import Table, sentences
 
 OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
@@ -20,6 +21,8 @@ OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
     "lbfgs": lambda scale: LBFGS(scale=scale),
 }
 """By the names in a file; each is made from the learning rate (for L-BFGS the size of its first step)."""
+POSITIVE = ("rest_density", "time_step")
+"""Parameters that must be greater than 0."""
 
 
 @dataclass(frozen=True)
@@ -30,19 +33,26 @@ class Values(Kind):
 
     def check(self, value: Any) -> dict[str, np.ndarray]:
         if not isinstance(value, Mapping) or not value:
-            raise wrong((), value, self.wanted)
+            raise wrong((), Phrase("empty") if value == {} else value, self.wanted)
         return {name: self._array(name, entry) for name, entry in value.items()}
 
     def _array(self, name: str, value: Any) -> np.ndarray:
         if name not in NAMES:
             raise wrong((name,), Phrase("unknown"), f"one of {', '.join(NAMES)}")
+        wanted = "made of finite numbers: one, a list of them, or a list of lists of one length"
+        if not _is_numeric(value):
+            raise wrong((name,), value, wanted)
         try:
-            array = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            array = np.array(np.nan)
-        if isinstance(value, (str, bool)) or not np.isfinite(array).all():
-            raise wrong((name,), value, "a number, or a list of numbers")
-        return array
+            return np.array(value, dtype=np.float64)
+        except ValueError:
+            raise wrong((name,), value, wanted) from None
+
+
+def _is_numeric(value: Any) -> bool:
+    """Whether there is a finite number, or nothing else in a list that is not empty."""
+    if isinstance(value, list):
+        return bool(value) and all(map(_is_numeric, value))
+    return as_number(value) is not None
 
 
 class ProblemTable(Table):
@@ -109,6 +119,29 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
         for name in tables.optimise.start:
             if name not in tables.problem.target:
                 raise SceneError(None, f"problem.target.{name}", MISSING, "given, as optimise.start has it")
+        _check_shapes("problem.target", tables.problem.target, scene, tables.problem.steps)
+        _check_shapes("optimise.start", tables.optimise.start, scene, tables.problem.steps)
     except SceneError as error:
         raise error.in_file(file) from None
     return Task(scene, tables.problem, tables.optimise)
+
+
+def _check_shapes(table: str, values: Mapping[str, np.ndarray], scene: Scene, steps: int) -> None:
+    """Raise `SceneError` for a parameter that does not fit the scene."""
+    for name, array in values.items():
+        shapes = _shapes(name, scene, steps)
+        if array.shape not in shapes:
+            raise SceneError(None, f"{table}.{name}", Phrase(_in_words([array.shape])), _in_words(shapes))
+        if name in POSITIVE and array <= 0.0:
+            raise SceneError(None, f"{table}.{name}", float(array), "greater than 0")
+
+
+def _shapes(name: str, scene: Scene, steps: int) -> list[tuple[int, ...]]:
+    """The shapes that a parameter may have; () is a number."""
+    if name == "gravity":
+        return [(scene.dimension,), (steps, scene.dimension)]
+    return [fluid_particles(scene).positions.shape] if name in STATES else [()]
+
+
+def _in_words(shapes: Sequence[tuple[int, ...]]) -> str:
+    return f"of shape {' or '.join(map(str, shapes))}" if all(shapes) else "a number"

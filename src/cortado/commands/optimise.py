@@ -1,11 +1,13 @@
 """``cortado optimise``: find the hidden parameters of a task, resume it, and judge the result."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from cortado.errors import ComputationError
+from cortado.errors import ComputationError, DivergedError
 from cortado.figures import loss_curve, parameters, particles
 from cortado.losses import FinalPositions
 from cortado.optimisation import Record, Result, optimise
@@ -26,9 +28,9 @@ class Verdict:
     """What an optimisation reached, against what the task asks for."""
 
     reduction: float
-    """First loss / best loss."""
+    """First loss / best loss; infinite where the best is 0."""
     errors: dict[str, float]
-    """By parameter: relative distance (L2) from the hidden one."""
+    """By parameter: distance (L2) from the hidden one, relative to its size unless that is 0."""
     failures: list[str]
     """Sentences about what was not reached."""
 
@@ -53,7 +55,11 @@ def optimise_task(
         folder = RunFolder.resume(out, text, command, device=name)
     else:
         folder = RunFolder.create(out, text, command, device=name, overwrite=overwrite)
-    result = _search(task, problem, folder, resume)
+    try:
+        result = _search(task, problem, folder, resume)
+    except DivergedError as error:
+        advice = f"{error.advice}, or a smaller learning rate; the evaluations so far are in {folder.checkpoint}"
+        raise DivergedError(error.step, error.particle, advice) from error
     verdict = judge(task, result)
     _write_pictures(task, problem, result, verdict, folder, target.positions)
     if verdict.failures:
@@ -63,21 +69,24 @@ def optimise_task(
 
 def judge(task: Task, result: Result) -> Verdict:
     """Hold a result against the task's [optimise.check]."""
-    check, target = task.optimise.check, task.problem.target
-    reduction = result.history[0].loss / max(result.loss, np.finfo(float).tiny)
-    errors = {
-        name: float(np.linalg.norm(found - target[name]) / max(np.linalg.norm(target[name]), np.finfo(float).tiny))
-        for name, found in result.parameters.items()
-    }
+    check = task.optimise.check
+    reduction = result.history[0].loss / result.loss if result.loss > 0.0 else math.inf
+    errors = {name: _distance(found, task.problem.target[name]) for name, found in result.parameters.items()}
     failures = []
     if reduction < check.loss_reduction:
         failures.append(f"The loss fell {reduction:.3g} times, but the task asks for {check.loss_reduction:g} times.")
     failures += [
-        f"The parameter {name} is {error:.2%} off, but the task asks for {check.parameter_error:.2%}."
+        f"The parameter {name} is {100 * error:.3g}% off, but the task asks for {100 * check.parameter_error:.3g}%."
         for name, error in errors.items()
         if error > check.parameter_error
     ]
     return Verdict(reduction, errors, failures)
+
+
+def _distance(found: ArrayLike, hidden: ArrayLike) -> float:
+    """|found - hidden| / |hidden|, each repeated over the steps where only the other one changes with time."""
+    found, hidden = np.broadcast_arrays(found, hidden)
+    return float(np.linalg.norm(found - hidden) / (np.linalg.norm(hidden) or 1.0))
 
 
 def _search(task: Task, problem: Problem, folder: RunFolder, resume: bool) -> Result:
@@ -102,7 +111,7 @@ def _search(task: Task, problem: Problem, folder: RunFolder, resume: bool) -> Re
 
 
 def _summary(result: Result, verdict: Verdict) -> str:
-    found = ", ".join(f"{name} within {error:.2%} of the hidden one" for name, error in verdict.errors.items())
+    found = ", ".join(f"{name} within {100 * error:.3g}% of the hidden one" for name, error in verdict.errors.items())
     return f"The loss fell {verdict.reduction:.3g} times in {len(result.history) - 1} iterations; {found}."
 
 
@@ -111,9 +120,11 @@ def _write_pictures(
 ) -> None:
     losses = [record.loss for record in result.history]
     figures = [("The loss.", loss_curve(losses, folder.figures / "loss.png", label="loss [m²]"))]
-    for name, hidden in task.problem.target.items():
-        if name in result.parameters and hidden.size <= MOST_CURVES:
-            history = [record.parameters[name] for record in result.history]
+    for name, found in result.parameters.items():
+        hidden = task.problem.target[name]
+        if max(np.size(found), hidden.size) <= MOST_CURVES:
+            history = [np.broadcast_arrays(record.parameters[name], hidden)[0] for record in result.history]
+            hidden = np.broadcast_to(hidden, history[0].shape)
             path = parameters(history, hidden, folder.figures / f"{name}.png", title=name)
             figures.append((f"The parameter {name} during the optimisation, and the hidden one.", path))
     before = problem.end(task.optimise.start).positions

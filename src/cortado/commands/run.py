@@ -34,13 +34,12 @@ def run_scene(
     rollout = simulation.rollout(check_steps(steps))
     folder = RunFolder.create(out, scene.to_json(), command, device=str(simulation.device), overwrite=overwrite)
     try:
-        _write_trajectory(simulation, rollout, folder, max(record_every, 1))
+        _write_trajectory(simulation, rollout, folder, record_every)
     except DivergedError as error:
-        raise DivergedError(
-            error.step, error.particle, f"{error.advice}; the frames so far are in {folder.path}"
-        ) from error
-    finally:
         _write_pictures(scene, simulation, folder)
+        advice = f"{error.advice}; the frames so far are in {folder.path}"
+        raise DivergedError(error.step, error.particle, advice) from error
+    _write_pictures(scene, simulation, folder)
     converged = simulation.converged(rollout)
     warning = "" if converged.all() else f"Mind that {not_converged_sentence(converged)} "
     return f"{warning}The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
@@ -90,6 +89,7 @@ def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder) -> 
                 folder.figures / "particles.png",
                 colours=speeds,
                 colour_label="speed [m/s]",
+                container=scene.container.extent(),
             ),
         )
     ]

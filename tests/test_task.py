@@ -1,0 +1,130 @@
+"""Tasks: good ones load, bad ones end in one sentence, and a result is judged as its task asks."""
+
+import math
+
+import numpy as np
+import pytest
+
+from bad_scenes import assert_one_sentence
+from bad_tasks import BAD_TASKS, GOOD_TASK
+from cortado.commands.optimise import judge
+from cortado.errors import SceneError
+from cortado.optimisation import Record, Result
+from cortado.optimisers import LBFGS, Adam, GradientDescent
+from cortado.task import load_task
+
+
+@pytest.fixture
+def task_file(tmp_path):
+    path = tmp_path / "task.toml"
+    path.write_text(GOOD_TASK)
+    return path
+
+
+# ---- loading -----------------------------------------------------------------------------------------------------
+
+
+def test_a_task_keeps_what_its_file_says(task_file):
+    task = load_task(task_file)
+    assert task.scene.name == "tiny" and task.problem.steps == 5
+    np.testing.assert_array_equal(task.problem.target["gravity"], [1.5, -9.81])
+    np.testing.assert_array_equal(task.optimise.start["gravity"], [0.0, -7.0])
+    assert task.optimise.algorithm() == Adam(learning_rate=0.5) and task.optimise.iterations == 6
+    assert (task.optimise.check.loss_reduction, task.optimise.check.parameter_error) == (2.0, 0.5)
+
+
+def test_a_task_without_a_check_asks_for_nothing(task_file):
+    task_file.write_text(GOOD_TASK[: GOOD_TASK.index("[optimise.check]")].replace('optimiser = "adam"', ""))
+    task = load_task(task_file)
+    assert judge(task, result({"gravity": [900.0, 0.0]}, [1.0, 1.0])).failures == []
+    assert isinstance(task.optimise.algorithm(), Adam)
+
+
+def test_overrides_replace_values(task_file):
+    task = load_task(task_file, ["optimise.iterations=3", "problem.target.viscosity=0.1", "solver.time_step=0.001"])
+    assert (task.optimise.iterations, task.scene.solver.time_step) == (3, 0.001)
+    assert task.problem.target["viscosity"].shape == () and task.problem.target["viscosity"] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted"),
+    [("adam", Adam(0.5)), ("gradient_descent", GradientDescent(0.5)), ("lbfgs", LBFGS(scale=0.5))],
+)
+def test_an_optimiser_is_chosen_by_name(task_file, name, wanted):
+    assert load_task(task_file, [f"optimise.optimiser={name}"]).optimise.algorithm() == wanted
+
+
+def test_gravity_may_change_with_time(task_file):
+    table = [[0.0, -float(step)] for step in range(5)]
+    task = load_task(task_file, [f"problem.target.gravity={table}", f"optimise.start.gravity={table}"])
+    assert task.problem.target["gravity"].shape == task.optimise.start["gravity"].shape == (5, 2)
+
+
+# ---- bad tasks ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("old, new, field", [bad[1:] for bad in BAD_TASKS], ids=[bad[0] for bad in BAD_TASKS])
+def test_a_bad_task_is_a_sentence(task_file, old, new, field):
+    assert old in GOOD_TASK
+    task_file.write_text(GOOD_TASK.replace(old, new, 1))
+    with pytest.raises(SceneError) as caught:
+        load_task(task_file)
+    assert caught.value.field == field
+    assert_one_sentence(str(caught.value))
+    assert str(caught.value).startswith(f"{task_file}: {field} ")
+
+
+def test_a_missing_file_is_a_sentence(tmp_path):
+    with pytest.raises(SceneError, match="cannot be read") as caught:
+        load_task(tmp_path / "absent.toml")
+    assert_one_sentence(str(caught.value))
+
+
+# ---- judging -----------------------------------------------------------------------------------------------------
+
+
+def result(parameters, losses):
+    """What an optimisation with these losses would give back."""
+    found = {name: np.asarray(value, dtype=float) for name, value in parameters.items()}
+    history = tuple(Record(k, loss, 0.0, found, replayed=False) for k, loss in enumerate(losses))
+    return Result(found, min(losses), found, history, len(losses), "done", converged=False)
+
+
+def test_what_is_reached_passes(task_file):
+    verdict = judge(load_task(task_file), result({"gravity": [1.5, -9.81]}, [1.0, 0.25]))
+    assert (verdict.reduction, verdict.errors, verdict.failures) == (4.0, {"gravity": 0.0}, [])
+
+
+def test_what_is_not_reached_is_said(task_file):
+    task = load_task(task_file, ["problem.target.gravity=[3,4]", "optimise.check.parameter_error=0.1"])
+    verdict = judge(task, result({"gravity": [3.0, 5.0]}, [3.0, 4.0, 2.0]))
+    assert verdict.errors == {"gravity": pytest.approx(0.2)}
+    assert verdict.failures == [
+        "The loss fell 1.5 times, but the task asks for 2 times.",
+        "The parameter gravity is 20% off, but the task asks for 10%.",
+    ]
+
+
+@pytest.mark.parametrize("losses", [[0.0], [1.0, 0.0]])
+def test_a_loss_of_zero_cannot_be_lowered(task_file, losses):
+    verdict = judge(load_task(task_file), result({"gravity": [1.5, -9.81]}, losses))
+    assert verdict.reduction == math.inf and verdict.failures == []
+
+
+def test_next_to_a_hidden_zero_the_distance_counts(task_file):
+    task = load_task(task_file, ["problem.target.gravity=[0,0]"])
+    assert judge(task, result({"gravity": [0.3, 0.4]}, [4.0, 1.0])).errors == {"gravity": pytest.approx(0.5)}
+
+
+@pytest.mark.parametrize("over_time", ["target", "found"])
+def test_constant_gravity_is_compared_with_gravity_over_time(task_file, over_time):
+    target, found = np.array([3.0, 4.0]), np.array([3.0, 5.0])
+    table = np.tile(target, (5, 1)).tolist() if over_time == "target" else target.tolist()
+    task = load_task(task_file, [f"problem.target.gravity={table}"])
+    guess = np.tile(found, (5, 1)) if over_time == "found" else found
+    assert judge(task, result({"gravity": guess}, [4.0, 1.0])).errors == {"gravity": pytest.approx(0.2)}
+
+
+def test_a_target_that_is_not_optimised_is_not_judged(task_file):
+    task = load_task(task_file, ["problem.target.viscosity=0.1"])
+    assert judge(task, result({"gravity": [1.5, -9.81]}, [4.0, 1.0])).errors == {"gravity": 0.0}

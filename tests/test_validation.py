@@ -1,0 +1,361 @@
+"""The physics against published measurements and closed forms; `validation/README.md` says what was found and why.
+
+A comparison that does not hold is marked as an expected failure with its reason, and fails the day that it does hold.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from cortado import Scene, Simulation
+
+DATA = Path(__file__).parent / "data"
+GRAVITY = 9.81
+WATER = {"name": "water", "rest_density": 1000.0}
+
+
+def published(name: str) -> np.ndarray:
+    """A table of published values (points, columns); the first line of the file cites its source."""
+    return np.loadtxt(DATA / name, delimiter=",", skiprows=2)
+
+
+KOSHIZUKA_OKA = "dam_break_koshizuka_oka_1996.csv"
+MARTIN_MOYCE = "dam_break_martin_moyce_1952_2.25in.csv"
+MORRIS = "poiseuille_morris_1997.csv"
+
+
+# ---- water at rest -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Rest:
+    """A column 1 m high, averaged per particle over the last half second."""
+
+    positions: np.ndarray
+    """(n, 2) [m]"""
+    pressures: np.ndarray
+    """(n,) in rho g H"""
+    interior: np.ndarray
+    """(n,) bool: a support radius or more from the walls and from the surface at y = H"""
+
+    @property
+    def errors(self) -> np.ndarray:
+        """(n,) p / (rho g H) - (1 - y / H)"""
+        return self.pressures - (1.0 - self.positions[:, 1])
+
+    @property
+    def error(self) -> float:
+        """Root mean square over the interior."""
+        return float(np.sqrt(np.mean(self.errors[self.interior] ** 2)))
+
+
+def column_at_rest(
+    across: int = 20,
+    kernel: str = "wendland_c4",
+    support: float = 3.0,
+    tolerance: float = 0.001,
+    settling: float = 1.0,
+    precision: str = "float32",
+) -> Rest:
+    """p = rho g (H - y) in a box 0.8 H wide, H = 1 m, ``across`` particles high; 5 Pa s let it settle."""
+    width, spacing = 0.8, 1.0 / across
+    time_step = 0.08 * spacing
+    simulation = Simulation(
+        Scene(
+            dimension=2,
+            discretisation={"spacing": spacing, "support": support, "kernel": kernel},
+            phase=[{**WATER, "viscosity": 5.0}],
+            fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [width, 1.0], "phase": "water"}],
+            container={"shape": "box", "lower": [0.0, 0.0], "upper": [width, 1.5]},
+            forces={"gravity": [0.0, -GRAVITY]},
+            solver={"time_step": time_step, "maximum_iterations": 100, "density_tolerance": tolerance},
+        ),
+        precision=precision,
+    )
+    first, count = round(settling / time_step), round(0.5 / time_step)
+    pressures, positions = np.zeros(simulation.particles), np.zeros((simulation.particles, 2))
+
+    def observe(step: int, state: Any) -> None:
+        if step > first:
+            order = simulation.solver.search.order.numpy()[: simulation.particles]
+            pressures[order] += simulation.solver.iterates.p[1].numpy() / count
+            positions[:] += state.numpy(2)[0] / count
+
+    simulation.rollout(first + count).forward(observe, keep=False)
+    x, y = positions.T
+    margin = support * spacing
+    interior = (x > margin) & (x < width - margin) & (y > margin) & (y < 1.0 - margin)
+    return Rest(positions, pressures / (WATER["rest_density"] * GRAVITY), interior)
+
+
+@pytest.mark.parametrize(("across", "tolerance"), [(20, 0.001), (20, 0.01), (30, 0.001)])
+def test_water_at_rest_has_the_hydrostatic_pressure(across, tolerance):
+    """Root mean square below 3 % of rho g H over the interior."""
+    rest = column_at_rest(across, tolerance=tolerance)
+    assert rest.interior.sum() > 100
+    assert rest.error < 0.03
+
+
+@pytest.mark.xfail(strict=True, reason="walls push back too weakly: beside them the pressure is 40 % too high")
+def test_water_at_rest_has_the_hydrostatic_pressure_with_the_cubic_spline():
+    """As above; the pressures of the columns beside a wall alternate, and that reaches into the interior."""
+    assert column_at_rest(kernel="cubic_spline", support=2.0).error < 0.03
+
+
+@pytest.mark.xfail(strict=True, reason="walls push back too weakly: beside them the pressure is 40 % too high")
+def test_water_at_rest_has_the_hydrostatic_pressure_beside_walls():
+    """As above, over all particles."""
+    assert np.sqrt(np.mean(column_at_rest().errors ** 2)) < 0.03
+
+
+# ---- a dam breaks ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Front:
+    """Z = front / L at the times T = t sqrt(2 g / L)."""
+
+    times: np.ndarray
+    """(steps + 1,)"""
+    places: np.ndarray
+    """(steps + 1,) Z: the largest x of the particles less than two spacings above the floor, and half a spacing"""
+
+    def errors(self, measured: np.ndarray, lag: float = 0.0) -> np.ndarray:
+        """Z / measured - 1 at the measured points (T, Z), of a column that is released ``lag`` after T = 0."""
+        return np.interp(measured[:, 0] - lag, self.times, self.places) / measured[:, 1] - 1.0
+
+    def lag(self, measured: np.ndarray) -> float:
+        """The lag whose greatest error is least."""
+        lags = np.arange(0.0, 0.6, 0.005)
+        return float(min(lags, key=lambda lag: np.abs(self.errors(measured, lag)).max()))
+
+
+def dam_break(across: int = 20, length: float = 4.0, until: float = 3.15, **changes: Any) -> Front:
+    """A column L = 0.146 m wide and 2 L high of water, in a box ``length`` L long whose walls are without friction."""
+    wide = 0.146
+    spacing = wide / across
+    unit = np.sqrt(wide / (2.0 * GRAVITY))
+    time_step = 0.074 * spacing  # a quarter of a spacing at 3.4 m/s, faster than the front
+    scene = {
+        "dimension": 2,
+        "discretisation": {"spacing": spacing},
+        "phase": [{**WATER, "viscosity": 0.001}],
+        "fluid": [{"shape": "box", "lower": [0.0, 0.0], "upper": [wide, 2.0 * wide], "phase": "water"}],
+        "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [length * wide, 3.0 * wide]},
+        "forces": {"gravity": [0.0, -GRAVITY]},
+        "solver": {"time_step": time_step},
+    }
+    steps = int(np.ceil(until * unit / time_step))
+    places = [wide]
+
+    def observe(step: int, state: Any) -> None:
+        x, y = state.numpy(2)[0].T
+        places.append(x[y < 2.0 * spacing].max() + 0.5 * spacing)
+
+    Simulation(Scene(**{**scene, **changes})).rollout(steps).forward(observe, keep=False)
+    return Front(np.arange(steps + 1) * time_step / unit, np.array(places) / wide)
+
+
+@pytest.fixture(scope="module")
+def front():
+    return dam_break()
+
+
+def test_front_of_a_dam_break_with_the_release_of_the_gate(front):
+    """Koshizuka and Oka (1996): within 10 % at every point, with one lag for the gate, fitted: 0.23, or 19 ms."""
+    measured = published(KOSHIZUKA_OKA)
+    lag = front.lag(measured)
+    assert lag < 0.3
+    assert np.abs(front.errors(measured, lag)).max() < 0.1
+
+
+@pytest.mark.xfail(strict=True, reason="the experiment's gate takes time to release the water; the front is 20 % ahead")
+def test_front_of_a_dam_break(front):
+    """Koshizuka and Oka (1996): within 10 % at every point, with T = 0 when the gate begins to move."""
+    assert np.abs(front.errors(published(KOSHIZUKA_OKA))).max() < 0.1
+
+
+def test_front_of_a_longer_dam_break():
+    """Martin and Moyce (1952), n^2 = 2: within 3 % up to T = 3.3 and 6 % up to T = 5.1, with one lag each."""
+    measured = published(MARTIN_MOYCE)
+    front = dam_break(length=8.0, until=5.2)
+    for points, most in (5, 0.03), (8, 0.06):
+        lag = front.lag(measured[:points])
+        assert lag < 0.4
+        assert np.abs(front.errors(measured[:points], lag)).max() < most
+
+
+def test_front_of_a_dam_break_has_converged(front):
+    """With 1,800 particles instead of 800 it is within 2 %, until it meets the wall at Z = 4."""
+    fine = dam_break(across=30)
+    before = front.times < 2.9
+    change = np.interp(front.times, fine.times, fine.places) / front.places - 1.0
+    assert np.abs(change[before]).max() < 0.02
+
+
+# ---- a channel ---------------------------------------------------------------------------------------------------
+
+CHANNEL, KINEMATIC, PUSH = 1e-3, 1e-6, 2e-4
+"""Width [m], kinematic viscosity [m2/s] and body force [m/s2] of Morris et al. (1997)."""
+FASTEST = PUSH * CHANNEL**2 / (8.0 * KINEMATIC)
+"""[m/s] in the middle, at last."""
+
+
+def poiseuille_series(y: np.ndarray, time: float) -> np.ndarray:
+    """Morris, Fox and Zhu (1997), eq. 21 [m/s]."""
+    odd = 2.0 * np.arange(200)[:, None] + 1.0
+    wave = odd * np.pi / CHANNEL
+    series = 4.0 * PUSH * CHANNEL**2 / (KINEMATIC * np.pi**3 * odd**3)
+    late = (series * np.sin(wave * np.asarray(y)) * np.exp(-(wave**2) * KINEMATIC * time)).sum(axis=0)
+    return PUSH / (2.0 * KINEMATIC) * y * (CHANNEL - y) - late
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Velocities along a channel."""
+
+    heights: np.ndarray
+    """(rows,) [m]"""
+    speeds: np.ndarray
+    """(times, rows) [m/s]"""
+
+    def at(self, *shares: float) -> np.ndarray:
+        """(times, shares) [m/s] at shares of the width."""
+        return CubicSpline(self.heights, self.speeds, axis=1)(CHANNEL * np.array(shares))
+
+    @property
+    def parabola(self) -> tuple[float, float]:
+        """Of the last time: the curvature in that of the closed form, and by how much it is wider [m]."""
+        a, b, c = np.polyfit(self.heights - 0.5 * CHANNEL, self.speeds[-1], 2)
+        return -2.0 * a * KINEMATIC / PUSH, float(np.sqrt(b * b - 4.0 * a * c) / -a - CHANNEL)
+
+
+def poiseuille(times: np.ndarray, across: int, kernel: str = "cubic_spline", support: float = 2.0) -> Channel:
+    """Water that starts from rest between plates without slip, pushed along; periodic along the plates."""
+    spacing = CHANNEL / across
+    length = (2 * int(support) + 4) * spacing
+    interval = 0.0225
+    time_step = interval / np.ceil(interval / (0.12 * spacing**2 / KINEMATIC))
+    simulation = Simulation(
+        Scene(
+            dimension=2,
+            discretisation={"spacing": spacing, "support": support, "kernel": kernel},
+            phase=[{**WATER, "viscosity": 1000.0 * KINEMATIC}],
+            fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [length, CHANNEL], "phase": "water"}],
+            container={
+                "shape": "box",
+                "lower": [0.0, 0.0],
+                "upper": [length, CHANNEL],
+                "periodic": [True, False],
+                "slip": "no",
+            },
+            forces={"gravity": [PUSH, 0.0], "viscosity": "laminar"},
+            solver={"time_step": time_step, "density_tolerance": 0.001},
+        ),
+        precision="float64",
+    )
+    wanted = np.rint(np.asarray(times) / time_step).astype(int)
+    heights = np.unique(simulation.positions[:, 1])
+    row = np.searchsorted(heights, simulation.positions[:, 1])
+    speeds = []
+
+    def observe(step: int, state: Any) -> None:
+        if step in wanted:
+            x, v = state.numpy(2)
+            assert np.abs(x[:, 1] - heights[row]).max() < 0.01 * spacing  # the flow stays laminar
+            speeds.append(np.bincount(row, v[:, 0]) / np.bincount(row))
+
+    simulation.rollout(int(wanted[-1])).forward(observe, keep=False)
+    return Channel(heights, np.array(speeds))
+
+
+STEADY = 0.7875
+"""[s] By then the slowest part has decayed to 0.0004."""
+
+
+def test_poiseuille_flow():
+    """Morris et al. (1997), from the start to the parabola: of first order in the spacing, and the limit is theirs.
+
+    A single layer of walls at rest behind the surface leaves the channel 0.88 spacings too wide, and on the lattice the
+    viscous force is 0.979 of what it should be: its sum over x G x / (|x|^2 + 0.01 h^2), whatever the spacing.
+    """
+    table = published(MORRIS)
+    times = np.where(np.isfinite(table[:, 0]), table[:, 0], STEADY)
+    np.testing.assert_allclose(
+        [poiseuille_series(np.array([0.5, 0.25]) * CHANNEL, time) for time in times], table[:, 1:], rtol=1e-3
+    )
+    coarse, fine = poiseuille(times, 10), poiseuille(times, 20)
+    coarse_errors = (coarse.at(0.5, 0.25) - table[:, 1:]) / FASTEST
+    fine_errors = (fine.at(0.5, 0.25) - table[:, 1:]) / FASTEST
+    assert np.abs(2.0 * fine_errors - coarse_errors).max() < 0.03  # extrapolated to a spacing of nothing
+    for channel, errors, across in (coarse, coarse_errors, 10), (fine, fine_errors, 20):
+        curvature, wider = channel.parabola
+        assert curvature == pytest.approx(1.0, abs=0.025)
+        assert abs(wider) < 0.9 * CHANNEL / across
+        assert np.abs(errors).max() < 1.02 * (1.0 + 0.9 / across) ** 2 - 1.0  # what these two amount to
+
+
+# ---- vortices decay ----------------------------------------------------------------------------------------------
+
+
+def taylor_green(
+    folder: Path,
+    across: int = 20,
+    reynolds: float = 10.0,
+    room: float = 0.01,
+    kernel: str = "cubic_spline",
+    support: float = 2.0,
+    until: float = 0.1,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times and kinetic energies, in the first one, of four vortices in a periodic square: exp(-16 pi^2 t / Re).
+
+    ``room``: by how much the particles' spacing is smaller than that of the lattice that they start on. Without it a
+    full periodic square has no room for any arrangement that is not the lattice.
+    """
+    lattice = (np.arange(across) + 0.5) / across
+    points = np.stack(np.meshgrid(lattice, lattice, indexing="ij"), axis=-1).reshape(-1, 2)
+    file = folder / f"lattice_{across}.npy"
+    np.save(file, points)
+    steps = int(np.ceil(until / (min(0.05, 1.0 / across) / across)))
+    simulation = Simulation(
+        Scene(
+            dimension=2,
+            discretisation={"spacing": (1.0 - room) / across, "support": support, "kernel": kernel},
+            phase=[{**WATER, "viscosity": 1000.0 / reynolds}],
+            fluid=[{"shape": "points", "file": str(file), "phase": "water"}],
+            container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0], "periodic": [True, True]},
+            forces={"gravity": [0.0, 0.0], "viscosity": "laminar"},
+            solver={"time_step": until / steps, "maximum_iterations": 100, "density_tolerance": 0.001},
+        ),
+        precision="float64",
+    )
+    x, y = 2.0 * np.pi * points.T
+    velocities = np.column_stack([-np.cos(x) * np.sin(y), np.sin(x) * np.cos(y)])
+    rollout = simulation.rollout(steps)
+    rollout.initial.set(points, velocities)
+    energies = [np.sum(velocities**2)]
+    rollout.forward(lambda step, state: energies.append(np.sum(state.numpy(2)[1] ** 2)), keep=False)
+    return np.arange(steps + 1) * until / steps, np.array(energies) / energies[0]
+
+
+def taylor_green_error(times: np.ndarray, energies: np.ndarray, reynolds: float = 10.0) -> float:
+    """The greatest, as a part of the first energy."""
+    return float(np.abs(energies - np.exp(-16.0 * np.pi**2 * times / reynolds)).max())
+
+
+def test_taylor_green_vortices_decay(tmp_path):
+    """Re = 10, until a fifth of the energy is left: within 1 % of the first energy, and worse with fewer particles."""
+    error = taylor_green_error(*taylor_green(tmp_path, 20))
+    assert error < 0.01
+    assert error < taylor_green_error(*taylor_green(tmp_path, 10)) < 0.025
+    assert taylor_green_error(*taylor_green(tmp_path, 40)) < 0.01
+
+
+@pytest.mark.xfail(strict=True, reason="a full periodic square cannot be rearranged without compression")
+def test_taylor_green_vortices_decay_in_a_full_square(tmp_path):
+    """As above, with the particles' own spacing."""
+    assert taylor_green_error(*taylor_green(tmp_path, 20, room=0.0)) < 0.01
