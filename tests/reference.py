@@ -38,7 +38,7 @@ class Pcisph:
         self.walls, self.wall_weights = walls, wall_weights
         self.viscosity_form = options.get("viscosity", "pairwise")
         self.friction = options.get("friction", 0.0)
-        self.reach, self.rigidity = options["reach"], options["rigidity"]
+        self.reach, self.rigidity, self.push = options["reach"], options["rigidity"], options["push"]
 
     def _pairs(self, x, y):
         s = x[:, None, :] - y[None, :, :]
@@ -75,7 +75,7 @@ class Pcisph:
             p = np.where(p.real > 0, p, 0)
             c = p / rho**2
             push = -mass * ((c[:, None] + c[None, :])[..., None] * g).sum(1)
-            push = push - mass * (c[:, None, None] * self.wall_weights[None, :, None] * g_walls).sum(1)
+            push = push - mass * self.push * (c[:, None, None] * self.wall_weights[None, :, None] * g_walls).sum(1)
         v_new = v + time_step * (acceleration + push)
         return x + time_step * v_new, v_new
 

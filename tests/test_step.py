@@ -20,9 +20,10 @@ def disturbed(simulation, seed=0):
     return positions, 0.3 * random.standard_normal(positions.shape)
 
 
-def twin(simulation, viscosity, friction):
+def twin(simulation, viscosity):
     """The slow twin of a simulation, in the simulation's own dimension."""
     lattice, search, d = simulation.solver.lattice, simulation.solver.search, simulation.dimension
+    terms = [term for term in simulation.solver.terms if hasattr(term, "_friction")]
     return reference.Pcisph(
         simulation.solver.discretisation.smoothing,
         d,
@@ -32,9 +33,10 @@ def twin(simulation, viscosity, friction):
         search.wall_positions.numpy()[:, :d].astype(np.float64),
         search.wall_weights.numpy().astype(np.float64),
         viscosity=viscosity,
-        friction=friction,
+        friction=terms[0]._friction if terms else 0.0,
         reach=1.03 * lattice.support,
         rigidity=lattice.rigidity,
+        push=lattice.wall_push,
     )
 
 
@@ -56,7 +58,7 @@ def test_steps_equal_those_of_the_twin(make, kernel, viscosity, slip, precision)
     rollout.initial.set(positions, velocities)
     rollout.parameters.set(gravity, DENSITY, VISCOSITY, TIME_STEP)
     found = rollout.forward().numpy(simulation.dimension)
-    slow = twin(simulation, viscosity, float(slip == "no"))
+    slow = twin(simulation, viscosity)
     for _ in range(STEPS):
         x, v = slow.step(x, v, gravity, DENSITY, VISCOSITY, TIME_STEP, 5)
     tolerance = 1e-13 if precision == "float64" else 2e-5
@@ -86,7 +88,7 @@ def test_tangents_equal_complex_steps_of_the_twin(make, kernel, viscosity, slip)
     parameters = Parameters.zeros(STEPS, simulation.precision, simulation.device)
     parameters.set(**rates)
     rollout.tangent(dot, parameters)
-    slow = twin(simulation, viscosity, float(slip == "no"))
+    slow = twin(simulation, viscosity)
 
     def steps(x, v, *parameters):
         for _ in range(STEPS):

@@ -100,9 +100,9 @@ def test_water_at_rest_has_the_hydrostatic_pressure(across, tolerance):
     assert rest.error < 0.03
 
 
-@pytest.mark.xfail(strict=True, reason="walls push back too weakly: beside them the pressure is 40 % too high")
+@pytest.mark.xfail(strict=True, reason="measured 6 %: particles near the floor are in disorder, the cause is not known")
 def test_water_at_rest_has_the_hydrostatic_pressure_with_the_cubic_spline():
-    """As above; the pressures of the columns beside a wall alternate, and that reaches into the interior."""
+    """As above."""
     assert column_at_rest(kernel="cubic_spline", support=2.0).error < 0.03
 
 
@@ -166,14 +166,14 @@ def front():
 
 
 def test_front_of_a_dam_break_with_the_release_of_the_gate(front):
-    """Koshizuka and Oka (1996): within 10 % at every point, with one lag for the gate, fitted: 0.23, or 19 ms."""
+    """Koshizuka and Oka (1996): within 10 % at every point, with one lag for the gate, fitted: 0.23, or 20 ms."""
     measured = published(KOSHIZUKA_OKA)
     lag = front.lag(measured)
     assert lag < 0.3
     assert np.abs(front.errors(measured, lag)).max() < 0.1
 
 
-@pytest.mark.xfail(strict=True, reason="the experiment's gate takes time to release the water; the front is 20 % ahead")
+@pytest.mark.xfail(strict=True, reason="measured: 20 % ahead of the experiment; gate and bed friction are not modelled")
 def test_front_of_a_dam_break(front):
     """Koshizuka and Oka (1996): within 10 % at every point, with T = 0 when the gate begins to move."""
     assert np.abs(front.errors(published(KOSHIZUKA_OKA))).max() < 0.1
@@ -325,7 +325,7 @@ def taylor_green(
         Scene(
             dimension=2,
             discretisation={"spacing": (1.0 - room) / across, "support": support, "kernel": kernel},
-            phase=[{**WATER, "viscosity": 1000.0 / reynolds}],
+            phase=[{**WATER, "viscosity": 1000.0 * (1.0 - room) ** 2 / reynolds}],  # the density is less by that
             fluid=[{"shape": "points", "file": str(file), "phase": "water"}],
             container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0], "periodic": [True, True]},
             forces={"gravity": [0.0, 0.0], "viscosity": "laminar"},

@@ -1,4 +1,4 @@
-"""Redraw the comparisons of tests/test_validation.py: ``python validation/figures.py OUT`` writes PNGs (2 minutes).
+"""Redraw the comparisons of tests/test_validation.py: ``python validation/figures.py OUT`` writes PNGs (1 minute).
 
 ``python validation/figures.py --containment`` instead prints what happens in a dam break with 8,000 particles.
 """

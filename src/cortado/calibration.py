@@ -70,6 +70,10 @@ class WallLayer:
     """Distance behind the surface of the container [m]."""
     factor: float
     """What the volumes of Akinci et al. (2012) are multiplied with."""
+    push: float
+    """What the pressure force of a wall is multiplied with: as if a wall had push - 1 times the particle's pressure."""
+    friction: float
+    """What the laminar viscous force of a wall without slip is multiplied with."""
 
 
 STANDOFF = 0.1
@@ -77,11 +81,13 @@ STANDOFF = 0.1
 
 
 def wall_layer(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> WallLayer:
-    """The layer that meets two conditions at a flat wall:
+    """The layer that meets four conditions at a flat wall, with fluid that is a lattice half a spacing from the surface:
 
-    - fluid that starts as a lattice half a spacing from the surface has the rest density, so that it does not jump off
-      (Band et al. 2018 scale wall volumes for that; with a layer half a spacing deep the factor is their 0.7);
-    - a particle alone reaches the rest density, and with it a pressure, before it reaches the surface.
+    - the fluid has the rest density, so that it does not jump off at the start (Band et al. 2018 scale wall volumes for
+      that; with a layer half a spacing deep the factor is their 0.7);
+    - a particle alone reaches the rest density, and with it a pressure, before it reaches the surface;
+    - a uniform pressure pushes no particle;
+    - a uniform shear, at rest at the surface, drags no particle (laminar viscosity, no slip).
     """
     offsets = lattice_offsets(spacing, support, dimension)
     weights = kernel.weight(np.linalg.norm(offsets, axis=1), dimension, support)
@@ -103,7 +109,24 @@ def wall_layer(kernel: SmoothingKernel, spacing: float, support: float, dimensio
 
     shallow = 0.5 * spacing
     depth = shallow if excess(shallow) >= 0.0 else brentq(excess, shallow, support - 0.55 * spacing)
-    return WallLayer(depth, weight(depth) * plane(0.0))
+    to_wall = np.hstack([np.full((len(in_plane), 1), depth + 0.5 * spacing), in_plane])
+    pull_of_wall = weight(depth) * kernel.gradient(to_wall, support)[:, 0].sum()
+    pull_of_fluid = -kernel.gradient(offsets[beyond], support)[:, 0].sum()
+    below = offsets[beyond]
+    drag_of_wall = weight(depth) * 0.5 * spacing * shear_factor(kernel, to_wall, support).sum()
+    drag_of_fluid = -(below[:, 0] * shear_factor(kernel, below, support)).sum()
+    return WallLayer(
+        depth,
+        weight(depth) * plane(0.0),
+        push=float(2.0 * pull_of_fluid / pull_of_wall) if pull_of_wall else 1.0,
+        friction=float(drag_of_fluid / drag_of_wall) if drag_of_wall else 1.0,
+    )
+
+
+def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: float) -> np.ndarray:
+    """F = x . G / (|x|^2 + 0.01 h^2) of the laminar viscosity at separations (m, d) [m], (m,)."""
+    squares = (separations**2).sum(axis=1)
+    return (separations * kernel.gradient(separations, support)).sum(axis=1) / (squares + 0.01 * support**2)
 
 
 def wall_rigidity(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
+from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
 from cortado.precision import Precision
 
 SKIN = 0.03
@@ -198,6 +198,7 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
         x: wp.array(dtype=vector),
         # out
         fluid_count: wp.array(dtype=wp.int32),
+        filling: wp.array(dtype=wp.int32),
         count: wp.array(dtype=wp.int32),
         needed: wp.array(dtype=wp.int32),
     ):
@@ -213,6 +214,11 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
             for o_y in range(below(n_y), above(n_y)):
                 row = (wrap(c[2] + o_z, n_z) * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]
                 found = scan_row(i, i, row, c[0], found, x_i, x, grid.starts, grid, s)
+        filled = (found + wp.static(UNROLL - 1)) // wp.static(UNROLL) * wp.static(UNROLL)
+        for k in range(found, wp.min(filled, capacity)):
+            s.neighbours[k, i] = i
+        filling[i] = filled - found
+        found = filled
         fluid_count[i] = wp.min(found, capacity)
         if s.wall_positions.shape[0] > 0:
             for o_z in range(below(n_z), above(n_z)):
@@ -251,6 +257,7 @@ class NeighbourSearch:
         self._keys = wp.empty(2 * particles, dtype=wp.int32, device=device)
         self.order = wp.empty(2 * particles, dtype=wp.int32, device=device)
         self.fluid_count = wp.zeros(particles, dtype=wp.int32, device=device)
+        self.filling = wp.zeros(particles, dtype=wp.int32, device=device)
         self.count = wp.zeros(particles, dtype=wp.int32, device=device)
         self.needed = wp.zeros(1, dtype=wp.int32, device=device)
         self._grid = _grid_type(precision)()
@@ -265,9 +272,9 @@ class NeighbourSearch:
         self.allocate(capacity)
 
     def allocate(self, capacity: int) -> None:
-        """Make room for lists of that length."""
-        self.capacity = capacity
-        shape = (self.particles, capacity)
+        """Make room for lists of that length, rounded up to a multiple of `UNROLL`."""
+        self.capacity = -(-capacity // UNROLL) * UNROLL
+        shape = (self.particles, self.capacity)
         if self.device.is_cpu:
             self.neighbours = wp.empty(shape, dtype=wp.int32, device=self.device).transpose((1, 0))
         else:
@@ -283,7 +290,7 @@ class NeighbourSearch:
             self._fill,
             self.particles,
             inputs=[self._grid, surroundings, positions],
-            outputs=[self.fluid_count, self.count, self.needed],
+            outputs=[self.fluid_count, self.filling, self.count, self.needed],
             device=self.device,
             record_tape=False,
         )

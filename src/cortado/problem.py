@@ -1,12 +1,13 @@
 """Parameters in, loss out; loss and gradient; and the derivative along a direction."""
 
 from collections.abc import Callable, Mapping
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
 from cortado.errors import InputError
-from cortado.losses import Loss, Recorded, TrajectoryEnd
+from cortado.losses import FinalPositions, Loss, Recorded, TrajectoryEnd
 from cortado.particles import Parameters, State
 from cortado.policies import Exact, Policy
 from cortado.rollout import Rollout, StepDerivative
@@ -69,6 +70,13 @@ class Problem:
         self._rollout.tangent(dot, parameters_dot)
         pairs = zip(self._adjoint(end).numpy(3), dot.numpy(3), strict=True)
         return float(sum((bar.astype(np.float64) * d).sum() for bar, d in pairs))
+
+    @property
+    def fingerprint(self) -> str:
+        """Which problem this is: scene, precision, steps and loss, in a checksum."""
+        loss = self.loss.target.tobytes() if isinstance(self.loss, FinalPositions) else type(self.loss).__name__.encode()
+        text = f"{self.simulation.scene.to_json()} {self.simulation.precision.name} {self.steps} "
+        return sha256(text.encode() + loss).hexdigest()
 
     def iterations(self) -> np.ndarray:
         """(steps,) pressure iterations of the last evaluation."""

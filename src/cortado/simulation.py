@@ -155,17 +155,17 @@ class Simulation:
             self_weight=float(kernel.weight(np.zeros(1), dimension, support)[0]),
             volume=volume,
             stiffness=pressure_stiffness(kernel, spacing, support, dimension),
-            rigidity=wall_rigidity(kernel, spacing, support, dimension),
+            rigidity=wall_rigidity(kernel, spacing, support, dimension) / layer.push,
+            wall_push=layer.push,
         )
         periods = [*lengths, *np.zeros(3 - dimension)]
-        return Pcisph(discretisation, lattice, search, self._terms(discretisation), self._pressure(), periods)
+        return Pcisph(discretisation, lattice, search, self._terms(discretisation, layer), self._pressure(), periods)
 
-    def _terms(self, discretisation: Discretisation) -> list[ForceTerm]:
+    def _terms(self, discretisation: Discretisation, layer: WallLayer) -> list[ForceTerm]:
         terms: list[ForceTerm] = [Gravity(discretisation, self.particles, self.device)]
         if self.scene.forces.viscosity in VISCOSITIES:
-            friction = 1.0 if getattr(self.scene.container, "slip", "free") == "no" else 0.0
-            make = VISCOSITIES[self.scene.forces.viscosity]
-            terms.append(make(discretisation, self.dimension, friction))
+            wall = layer if getattr(self.scene.container, "slip", "free") == "no" else None
+            terms.append(VISCOSITIES[self.scene.forces.viscosity](discretisation, self.dimension, wall))
         return terms
 
     def _pressure(self) -> PressureSolve | None:

@@ -8,12 +8,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
+from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
 
 
 @cache
 def density_sums(discretisation: Discretisation) -> SimpleNamespace:
-    """Raw neighbour sums: ``weights`` (sum of W, without the particle itself), ``weights_tangent`` and
+    """Raw neighbour sums: ``weights`` (sum of W, with what fills the list up), ``weights_tangent`` and
     ``weights_adjoint`` (sum_j (r_i + r_j) G_ij + sum_b (psi_b / m) r_i G_ib: the adjoint of positions for an
     adjoint r of the sum of every particle)."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
@@ -25,8 +25,9 @@ def density_sums(discretisation: Discretisation) -> SimpleNamespace:
     def weights(i: int, x: wp.array(dtype=vector), s: surroundings) -> real:
         x_i = x[i]
         total = real(0.0)
-        for k in range(s.fluid_count[i]):
-            total += weight(separation(x_i, x[s.neighbours[k, i]], s), s)
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for u in range(UNROLL):
+                total += weight(separation(x_i, x[s.neighbours[k + u, i]], s), s)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             total += s.wall_weights[b] * weight(separation(x_i, s.wall_positions[b], s), s)
@@ -37,9 +38,10 @@ def density_sums(discretisation: Discretisation) -> SimpleNamespace:
         x_i = x[i]
         x_dot_i = x_dot[i]
         total = real(0.0)
-        for k in range(s.fluid_count[i]):
-            j = s.neighbours[k, i]
-            total += wp.dot(gradient(separation(x_i, x[j], s), s), x_dot_i - x_dot[j])
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for u in range(UNROLL):
+                j = s.neighbours[k + u, i]
+                total += wp.dot(gradient(separation(x_i, x[j], s), s), x_dot_i - x_dot[j])
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             g_ib = gradient(separation(x_i, s.wall_positions[b], s), s)
@@ -51,9 +53,10 @@ def density_sums(discretisation: Discretisation) -> SimpleNamespace:
         x_i = x[i]
         r_i = r[i]
         total = vector()
-        for k in range(s.fluid_count[i]):
-            j = s.neighbours[k, i]
-            total += (r_i + r[j]) * gradient(separation(x_i, x[j], s), s)
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for u in range(UNROLL):
+                j = s.neighbours[k + u, i]
+                total += (r_i + r[j]) * gradient(separation(x_i, x[j], s), s)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             total += (s.wall_weights[b] * r_i) * gradient(separation(x_i, s.wall_positions[b], s), s)
@@ -80,7 +83,7 @@ def density_kernels(discretisation: Discretisation) -> SimpleNamespace:
     ):
         i = wp.tid()
         total = weights(i, x, s)
-        rho[i] = rest_density[0] * s.volume * (s.self_weight + total)
+        rho[i] = rest_density[0] * s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def density_tangent(

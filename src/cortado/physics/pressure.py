@@ -2,10 +2,10 @@
 
     p_i  = max(p_i + delta y_i (rho*_i - rho_0), 0),   delta = k / dt^2
     c_i  = p_i / rho_i^2
-    ap_i = -m (sum_j (c_i + c_j) G_ij + sum_b (psi_b / m) c_i G_ib)
+    ap_i = -m (sum_j (c_i + c_j) G_ij + push sum_b (psi_b / m) c_i G_ib)
     v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
 
-y is the yield beside walls (`cortado.physics.walls`). G is taken at x(t), rho* at the predicted positions over the
+y is the yield and push the factor beside walls (`cortado.physics.walls`, `cortado.calibration.WallLayer`). G is taken at x(t), rho* at the predicted positions over the
 neighbours of x(t). After the last iteration (x*, v*) is the new state. The clamp at 0 (no suction at a free surface)
 has the derivative [p > 0].
 """
@@ -17,7 +17,7 @@ import warp as wp
 
 from cortado.physics.density import density_sums
 from cortado.physics.integration import prediction_functions
-from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
+from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
 
 
 @cache
@@ -52,7 +52,7 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         i = wp.tid()
         total = weights(i, x_star, s)
         rho_0 = rest_density[0]
-        excess = rho_0 * s.volume * (s.self_weight + total) - rho_0
+        excess = rho_0 * s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - rho_0
         delta = y[i] * stiffness / (time_step[0] * time_step[0])
         p_i = wp.max(p_in[i] + delta * excess, real(0.0))
         compression = wp.max(excess / rho_0, real(0.0))
@@ -138,12 +138,13 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         x_i = x[i]
         c_i = c[i]
         total = vector()
-        for k in range(s.fluid_count[i]):
-            j = s.neighbours[k, i]
-            total += (c_i + c[j]) * gradient(separation(x_i, x[j], s), s)
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for u in range(UNROLL):
+                j = s.neighbours[k + u, i]
+                total += (c_i + c[j]) * gradient(separation(x_i, x[j], s), s)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
-            total += (s.wall_weights[b] * c_i) * gradient(separation(x_i, s.wall_positions[b], s), s)
+            total += (s.wall_push * s.wall_weights[b] * c_i) * gradient(separation(x_i, s.wall_positions[b], s), s)
         return total
 
     @wp.func
@@ -160,16 +161,17 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         c_i = c[i]
         c_dot_i = c_dot[i]
         total = vector()
-        for k in range(s.fluid_count[i]):
-            j = s.neighbours[k, i]
-            x_ij = separation(x_i, x[j], s)
-            total += (c_dot_i + c_dot[j]) * gradient(x_ij, s)
-            total += (c_i + c[j]) * hessian_product(x_ij, x_dot_i - x_dot[j], s)
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for u in range(UNROLL):
+                j = s.neighbours[k + u, i]
+                x_ij = separation(x_i, x[j], s)
+                total += (c_dot_i + c_dot[j]) * gradient(x_ij, s)
+                total += (c_i + c[j]) * hessian_product(x_ij, x_dot_i - x_dot[j], s)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             x_ib = separation(x_i, s.wall_positions[b], s)
-            total += (s.wall_weights[b] * c_dot_i) * gradient(x_ib, s)
-            total += (s.wall_weights[b] * c_i) * hessian_product(x_ib, x_dot_i, s)
+            total += (s.wall_push * s.wall_weights[b] * c_dot_i) * gradient(x_ib, s)
+            total += (s.wall_push * s.wall_weights[b] * c_i) * hessian_product(x_ib, x_dot_i, s)
         return total
 
     @wp.kernel(module=discretisation.module(True))
@@ -252,17 +254,18 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         push_bar_i = push_bar[i]
         stretch = real(0.0)
         bend = vector()
-        for k in range(s.fluid_count[i]):
-            j = s.neighbours[k, i]
-            x_ij = separation(x_i, x[j], s)
-            u_ij = push_bar_i - push_bar[j]
-            stretch += wp.dot(gradient(x_ij, s), u_ij)
-            bend += (c_i + c[j]) * hessian_product(x_ij, u_ij, s)
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for u in range(UNROLL):
+                j = s.neighbours[k + u, i]
+                x_ij = separation(x_i, x[j], s)
+                u_ij = push_bar_i - push_bar[j]
+                stretch += wp.dot(gradient(x_ij, s), u_ij)
+                bend += (c_i + c[j]) * hessian_product(x_ij, u_ij, s)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             x_ib = separation(x_i, s.wall_positions[b], s)
-            stretch += s.wall_weights[b] * wp.dot(gradient(x_ib, s), push_bar_i)
-            bend += (s.wall_weights[b] * c_i) * hessian_product(x_ib, push_bar_i, s)
+            stretch += s.wall_push * s.wall_weights[b] * wp.dot(gradient(x_ib, s), push_bar_i)
+            bend += (s.wall_push * s.wall_weights[b] * c_i) * hessian_product(x_ib, push_bar_i, s)
         mass = rest_density[0] * s.volume
         rho_i = rho[i]
         p_i = p_out[i]

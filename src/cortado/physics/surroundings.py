@@ -11,6 +11,11 @@ from cortado.precision import Precision
 from cortado.smoothing import SmoothingKernel, smoothing_functions
 
 
+UNROLL = 4
+"""Fluid neighbours that a loop takes at a time, so that their loads overlap; lists are filled up to a multiple of it
+with the particle itself, which adds nothing to a sum but W(0) to the density's."""
+
+
 @dataclass(frozen=True)
 class Discretisation:
     """A smoothing kernel in a precision: what a kernel factory is asked for."""
@@ -33,13 +38,18 @@ def surroundings_type(precision: Precision) -> Any:
 
     class Surroundings:
         neighbours: wp.array2d(dtype=wp.int32)
-        """First the fluid neighbours of a particle (without itself), then its wall neighbours."""
+        """First the fluid neighbours of a particle, filled up with itself, then its wall neighbours."""
         fluid_count: wp.array(dtype=wp.int32)
+        """Of the filled list, a multiple of `UNROLL`."""
+        filling: wp.array(dtype=wp.int32)
+        """How many of them are the particle itself."""
         count: wp.array(dtype=wp.int32)
         wall_positions: wp.array(dtype=vector)
         """[m]"""
         wall_weights: wp.array(dtype=real)
         """psi_b / m [-]: the mass of a wall particle over that of a fluid particle (after Akinci et al. 2012)."""
+        wall_push: real
+        """Factor of a wall's pressure force [-], see `cortado.calibration.WallLayer`."""
         support: real
         """Support radius h [m]."""
         reach: real

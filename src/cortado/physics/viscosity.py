@@ -5,7 +5,7 @@ a_i = (kappa mu / rho_i) (sum_j (m / rho_j) phi(x_ij, v_ij) + friction sum_b V_b
 pairwise:  phi = B G,  B = v . x / (|x|^2 + 0.01 h^2),  kappa = 2 (d + 2)     (report eq. 10; Monaghan 2005)
 laminar:   phi = F v,  F = x . G / (|x|^2 + 0.01 h^2),  kappa = 2             (Morris, Fox and Zhu 1997)
 
-mu is the dynamic viscosity [Pa s]; friction is 0 for a wall with free slip and 1 for one without slip. phi is odd
+mu is the dynamic viscosity [Pa s]; friction is 0 for a wall with free slip, else about 1 (`WallLayer.friction`). phi is odd
 in (x, v) together, so that momentum is kept; the pairwise form is central and keeps angular momentum too, but
 carries no shear to a wall, which the laminar form does. The 0.01 h^2 covers coincident particles.
 """
@@ -16,7 +16,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
+from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
 
 
 @cache
@@ -119,9 +119,10 @@ def viscosity_kernels(discretisation: Discretisation, form: PairFunctions) -> Si
         x_i = x[i]
         v_i = v[i]
         total = vector()
-        for k in range(s.fluid_count[i]):
-            j = s.neighbours[k, i]
-            total += (mass / rho[j]) * phi_force(separation(x_i, x[j], s), v_i - v[j], s)
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for u in range(UNROLL):
+                j = s.neighbours[k + u, i]
+                total += (mass / rho[j]) * phi_force(separation(x_i, x[j], s), v_i - v[j], s)
         if friction != real(0.0):
             for k in range(s.fluid_count[i], s.count[i]):
                 b = s.neighbours[k, i]
@@ -148,14 +149,15 @@ def viscosity_kernels(discretisation: Discretisation, form: PairFunctions) -> Si
         x_dot_i = x_dot[i]
         v_dot_i = v_dot[i]
         total = vector()
-        for k in range(s.fluid_count[i]):
-            j = s.neighbours[k, i]
-            x_ij = separation(x_i, x[j], s)
-            v_ij = v_i - v[j]
-            volume_j = mass / rho[j]
-            volume_dot_j = (mass_dot - volume_j * rho_dot[j]) / rho[j]
-            total += volume_dot_j * phi_force(x_ij, v_ij, s)
-            total += volume_j * phi_tangent(x_ij, v_ij, x_dot_i - x_dot[j], v_dot_i - v_dot[j], s)
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for u in range(UNROLL):
+                j = s.neighbours[k + u, i]
+                x_ij = separation(x_i, x[j], s)
+                v_ij = v_i - v[j]
+                volume_j = mass / rho[j]
+                volume_dot_j = (mass_dot - volume_j * rho_dot[j]) / rho[j]
+                total += volume_dot_j * phi_force(x_ij, v_ij, s)
+                total += volume_j * phi_tangent(x_ij, v_ij, x_dot_i - x_dot[j], v_dot_i - v_dot[j], s)
         if friction != real(0.0):
             for k in range(s.fluid_count[i], s.count[i]):
                 b = s.neighbours[k, i]
@@ -238,15 +240,16 @@ def viscosity_kernels(discretisation: Discretisation, form: PairFunctions) -> Si
         v_sum = vector()
         fluid_work = real(0.0)
         wall_work = real(0.0)
-        for k in range(s.fluid_count[i]):
-            j = s.neighbours[k, i]
-            x_ij = separation(x_i, x[j], s)
-            v_ij = v_i - v[j]
-            volume_j = mass / rho[j]
-            w_ij = w_i - acceleration_bar[j]
-            x_sum += volume_j * phi_adjoint_x(x_ij, v_ij, w_ij, s)
-            v_sum += volume_j * phi_adjoint_v(x_ij, v_ij, w_ij, s)
-            fluid_work += volume_j * wp.dot(phi_force(x_ij, v_ij, s), w_ij)
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for u in range(UNROLL):
+                j = s.neighbours[k + u, i]
+                x_ij = separation(x_i, x[j], s)
+                v_ij = v_i - v[j]
+                volume_j = mass / rho[j]
+                w_ij = w_i - acceleration_bar[j]
+                x_sum += volume_j * phi_adjoint_x(x_ij, v_ij, w_ij, s)
+                v_sum += volume_j * phi_adjoint_v(x_ij, v_ij, w_ij, s)
+                fluid_work += volume_j * wp.dot(phi_force(x_ij, v_ij, s), w_ij)
         if friction != real(0.0):
             for k in range(s.fluid_count[i], s.count[i]):
                 b = s.neighbours[k, i]

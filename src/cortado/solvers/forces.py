@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import warp as wp
 
+from cortado.calibration import WallLayer
 from cortado.launching import Launcher, TreeSum, vector_sum
 from cortado.particles import Fields, Parameters
 from cortado.physics.integration import gravity_kernels
@@ -79,7 +80,7 @@ class Gravity:
 
 
 class Viscosity:
-    """A viscous force between neighbours, and with walls where they do not slip (``friction`` 1, else 0)."""
+    """A viscous force between neighbours, and with walls (``friction`` 0 where these slip freely)."""
 
     def __init__(self, discretisation: Discretisation, form: PairFunctions, kappa: float, friction: float):
         self._kernels = viscosity_kernels(discretisation, form)
@@ -115,11 +116,11 @@ class Viscosity:
         )
 
 
-def pairwise_viscosity(discretisation: Discretisation, dimension: int, friction: float) -> Viscosity:
-    """The report's eq. 10 (Monaghan 2005): keeps linear and angular momentum."""
-    return Viscosity(discretisation, pairwise_functions, 2.0 * (dimension + 2), friction)
+def pairwise_viscosity(discretisation: Discretisation, dimension: int, wall: WallLayer | None) -> Viscosity:
+    """The report's eq. 10 (Monaghan 2005): keeps linear and angular momentum. ``wall`` None: free slip."""
+    return Viscosity(discretisation, pairwise_functions, 2.0 * (dimension + 2), friction=1.0 if wall else 0.0)
 
 
-def laminar_viscosity(discretisation: Discretisation, dimension: int, friction: float) -> Viscosity:
-    """Morris, Fox and Zhu (1997): carries shear to a wall."""
-    return Viscosity(discretisation, laminar_functions, 2.0, friction)
+def laminar_viscosity(discretisation: Discretisation, dimension: int, wall: WallLayer | None) -> Viscosity:
+    """Morris, Fox and Zhu (1997): carries shear to a wall. ``wall`` None: free slip."""
+    return Viscosity(discretisation, laminar_functions, 2.0, friction=wall.friction if wall else 0.0)

@@ -39,6 +39,8 @@ class Lattice:
     """k [m2]: delta = k / dt^2 [Pa m3 / kg] (report eq. 7, put right) for a filled neighbourhood."""
     rigidity: float
     """[1 / m^(2 d + 2)], see `cortado.physics.walls`."""
+    wall_push: float
+    """[-], see `cortado.calibration.WallLayer`."""
 
 
 @dataclass(frozen=True)
@@ -129,11 +131,17 @@ class Pcisph:
             self.growth += 1
         search, lattice, precision = self.search, self.lattice, self.discretisation.precision
         s = surroundings_type(precision)()
-        s.neighbours, s.fluid_count, s.count = search.neighbours, search.fluid_count, search.count
+        s.neighbours, s.fluid_count, s.filling, s.count = (
+            search.neighbours,
+            search.fluid_count,
+            search.filling,
+            search.count,
+        )
         s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
         s.support, s.reach = lattice.support, (1.0 + SKIN) * lattice.support
         s.normalisation = lattice.normalisation
         s.self_weight, s.volume, s.rigidity = lattice.self_weight, lattice.volume, lattice.rigidity
+        s.wall_push = lattice.wall_push
         s.periodic = int(any(self.periods))
         s.period = precision.vector(*self.periods)
         s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in self.periods))

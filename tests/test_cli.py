@@ -1,0 +1,415 @@
+"""The command line: files, exit codes, sentences; kills and resumes."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cortado.commands.optimise
+import cortado.commands.run
+from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
+from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, TINY_SCENE
+from cortado import Problem, Scene, Trajectory
+from cortado.cli import main
+
+RUN_FILES = {"scene.json", "environment.json", "metrics.jsonl", "trajectory.vtkhdf", "figures", "report.html"}
+OPTIMISE_FILES = {"scene.json", "environment.json", "metrics.jsonl", "checkpoint", "figures", "report.html"}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """A working directory with a scene and a task."""
+    (tmp_path / "scene.toml").write_text(TINY_SCENE)
+    (tmp_path / "task.toml").write_text(GOOD_TASK)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def cortado_command(capfd):
+    """Runs a command in this process: (exit code, stdout, stderr), with what C code writes."""
+
+    def run(*arguments):
+        capfd.readouterr()
+        try:
+            main([str(argument) for argument in arguments])
+            code = 0
+        except SystemExit as end:
+            code = end.code
+        return code, *capfd.readouterr()
+
+    return run
+
+
+def start(*arguments):
+    """A command in a process of its own."""
+    command = [sys.executable, "-c", "from cortado.cli import main; main()", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def assert_refused(result, *words):
+    """Exit code 2, and one sentence on stderr, which holds these words."""
+    code, out, err = result
+    assert (code, out) == (2, ""), err
+    assert_one_sentence(err.removesuffix("\n"))
+    assert all(word in err for word in words), err
+
+
+def assert_nothing_made(folder):
+    assert {path.name for path in folder.iterdir()} == {"scene.toml", "task.toml"}
+
+
+def metrics(run):
+    return [json.loads(line) for line in (Path(run) / "metrics.jsonl").read_text().splitlines()]
+
+
+# ---- run ---------------------------------------------------------------------------------------------------------
+
+
+def test_run_writes_its_folder(cortado_command, folder):
+    code, out, err = cortado_command("run", "scene.toml", "--steps", 4, "--out", "dam")
+    assert (code, err) == (0, "")
+    assert {path.name for path in Path("dam").iterdir()} == RUN_FILES
+    assert out.splitlines()[-1].startswith(f"The results are in {folder / 'dam'}")
+    trajectory = Trajectory.load("dam/trajectory.vtkhdf")
+    assert trajectory.positions.shape == (5, PARTICLES, 2) and trajectory.positions.dtype == np.float32
+    assert [row["step"] for row in metrics("dam")] == [1, 2, 3, 4]
+    assert json.loads(Path("dam/environment.json").read_text())["device"] == "cpu"
+    assert Path("dam/report.html").read_text().count("<img") == 2
+
+
+def test_the_scene_of_a_folder_gives_the_same_run(cortado_command):
+    cortado_command("run", "scene.toml", "--steps", 3, "--out", "dam", "--precision", "float64")
+    scene = Scene.from_json(Path("dam/scene.json").read_text())
+    again = cortado.Simulation(scene, precision="float64").run(3)
+    np.testing.assert_array_equal(again.positions, Trajectory.load("dam/trajectory.vtkhdf").positions)
+
+
+def test_options_of_run(cortado_command):
+    overrides = ["--set", "solver.time_step=0.002", "--set", "forces.gravity=[0,-5]"]
+    code, _, _ = cortado_command("run", "scene.toml", "--steps", 5, "--record-every", 2, "--out", "dam", *overrides)
+    scene = Scene.from_json(Path("dam/scene.json").read_text())
+    assert code == 0 and (scene.solver.time_step, scene.forces.gravity) == (0.002, (0.0, -5.0))
+    trajectory = Trajectory.load("dam/trajectory.vtkhdf")
+    np.testing.assert_array_equal(trajectory.steps, [0, 2, 4, 5])
+    np.testing.assert_allclose(trajectory.times, [0.0, 0.004, 0.008, 0.01])
+    assert len(trajectory.iterations) == len(metrics("dam")) == 5
+
+
+def test_an_earlier_run_is_kept_unless_overwritten(cortado_command):
+    short = ["run", "scene.toml", "--out", "dam", "--steps"]
+    cortado_command(*short, 2)
+    assert_refused(cortado_command(*short, 3), "already holds a run", "--overwrite")
+    assert len(metrics("dam")) == 2
+    assert cortado_command(*short, 3, "--overwrite")[0] == 0
+    assert len(metrics("dam")) == 3 and len(Trajectory.load("dam/trajectory.vtkhdf").times) == 4
+
+
+def test_other_files_are_never_overwritten(cortado_command, folder):
+    (folder / "figures").mkdir()
+    assert_refused(cortado_command("run", "scene.toml", "--out", ".", "--overwrite"), "no run of Cortado")
+    assert_refused(cortado_command("run", "scene.toml", "--out", "task.toml"), "cannot be written")
+    assert Path("task.toml").read_text() == GOOD_TASK
+
+
+def test_steps_that_did_not_converge_are_mentioned(cortado_command):
+    few = ["--set", "solver.maximum_iterations=4", "--set", "solver.density_tolerance=0"]
+    code, out, _ = cortado_command("run", "scene.toml", "--steps", 30, "--out", "dam", *few)
+    assert code == 0 and "did not converge in" in out and len(out.splitlines()) == 1
+
+
+def test_a_run_that_diverges_says_where_and_keeps_its_frames(cortado_command):
+    fast = ["--set", "fluid.0.velocity=[2e7,1e7]"]
+    code, out, err = cortado_command("run", "scene.toml", "--steps", 20, "--out", "dam", *fast)
+    warning, sentence = err.splitlines()
+    assert (code, out) == (1, "") and "limit of stability" in warning
+    assert_one_sentence(sentence)
+    frames = Trajectory.load("dam/trajectory.vtkhdf")
+    lost = len(frames.times)
+    assert 2 <= lost < 20 and np.isfinite(frames.positions).all()
+    assert f"diverged in step {lost}, where particle " in sentence
+    assert "try a smaller time step" in sentence and sentence.endswith("dam.")
+    assert {path.name for path in Path("dam").iterdir()} == RUN_FILES and len(metrics("dam")) == lost
+
+
+def interrupting(after):
+    """A progress bar under which Ctrl-C is pressed after so many steps."""
+
+    @contextmanager
+    def track(total, description):
+        calls = iter(range(after))
+
+        def advance(n=1, **fields):
+            if next(calls, None) is None:
+                raise KeyboardInterrupt
+
+        yield advance
+
+    return track
+
+
+def test_an_interrupted_run_keeps_its_frames(cortado_command, monkeypatch):
+    monkeypatch.setattr(cortado.commands.run, "track", interrupting(after=3))
+    code, out, err = cortado_command("run", "scene.toml", "--steps", 20, "--out", "dam")
+    assert (code, out) == (130, "")
+    assert_one_sentence(err.removesuffix("\n"))
+    assert len(Trajectory.load("dam/trajectory.vtkhdf").times) == 5
+
+
+# ---- wrong input -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("old, new, field", [bad[1:] for bad in BAD_SCENES], ids=[bad[0] for bad in BAD_SCENES])
+def test_a_bad_scene_is_refused(cortado_command, folder, old, new, field):
+    Path("scene.toml").write_text(GOOD_SCENE.replace(old, new, 1))
+    assert_refused(cortado_command("run", "scene.toml", "--out", "dam"), "scene.toml: ", field)
+    assert_nothing_made(folder)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["scene.toml", "--steps", "0"], "steps is 0"),
+        (["scene.toml", "--steps", "-3"], "steps is -3"),
+        (["scene.toml", "--record-every", "0"], "--record-every is 0"),
+        (["scene.toml", "--record-every", "-2"], "--record-every is -2"),
+        (["scene.toml", "--device", "tpu"], "device is 'tpu'"),
+        (["scene.toml", "--device", "cuda:99"], "device is 'cuda:99'"),
+        (["scene.toml", "--precision", "float16"], "precision is 'float16'"),
+        (["scene.toml", "--set", "solver.time_step"], "not an override"),
+        (["scene.toml", "--set", "solver.timestep=0.1"], "did you mean time_step?"),
+        (["absent.toml"], "absent.toml: the scene cannot be read"),
+        (["."], "cannot be read"),
+    ],
+)
+def test_wrong_arguments_of_run_are_refused(cortado_command, folder, arguments, words):
+    assert_refused(cortado_command("run", *arguments, "--out", "dam"), words)
+    assert_nothing_made(folder)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["walk"], ["run"], ["gradients"], ["run", "scene.toml", "--steps", "many"], ["run", "scene.toml", "--no"]],
+)
+def test_wrong_usage_is_refused(cortado_command, folder, arguments):
+    code, out, err = cortado_command(*arguments)
+    assert (code, out) == (2, "") and "--help" in err and "Traceback" not in err
+    assert_nothing_made(folder)
+
+
+@pytest.mark.parametrize("command", [[], ["run"], ["optimise"], ["gradients"], ["gradients", "check"], ["bench"]])
+def test_every_command_has_help(cortado_command, command):
+    code, out, err = cortado_command(*command, "--help")
+    assert (code, err) == (0, "") and out.startswith(" ".join(["usage: cortado", *command]))
+
+
+def test_a_process_of_its_own_says_no_more_than_the_sentence(folder):
+    process = start("run", "scene.toml", "--steps", "0", "--out", "dam")
+    out, err = process.communicate(timeout=60)
+    assert_refused((process.returncode, out, err), "steps is 0")
+    assert_nothing_made(folder)
+
+
+# ---- optimise ----------------------------------------------------------------------------------------------------
+
+
+def test_optimise_writes_its_folder(cortado_command, folder):
+    code, out, err = cortado_command("optimise", "task.toml", "--out", "found")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[-1].endswith(f"The results are in {folder / 'found'}; open report.html.")
+    assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
+    assert {path.name for path in Path("found/figures").iterdir()} == {"loss.png", "gravity.png", "particles.png"}
+    losses = [row["loss"] for row in metrics("found")]
+    assert len(losses) == 7 and losses[-1] < 0.5 * losses[0]
+
+
+def test_an_optimisation_that_falls_short_fails_and_keeps_its_files(cortado_command):
+    hard = ["--set", "optimise.check.loss_reduction=1e9", "--set", "optimise.check.parameter_error=1e-9"]
+    code, out, err = cortado_command("optimise", "task.toml", "--out", "found", *hard)
+    assert (code, out) == (1, "") and len(err.splitlines()) == 1
+    assert "asks for 1e+09 times. The parameter gravity is " in err and err.endswith("found.\n")
+    assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
+
+
+def test_an_optimisation_that_diverges_says_so(cortado_command):
+    code, out, err = cortado_command("optimise", "task.toml", "--out", "found", "--set", "optimise.learning_rate=1e30")
+    assert (code, out) == (1, "") and "a smaller learning rate" in err
+    assert_one_sentence(err.removesuffix("\n"))
+    assert len(metrics("found")) == 1
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["optimise.start.gravity=[[0,-7],[0,-7],[0,-7],[0,-7],[0,-7]]"],
+        ["problem.target.gravity=[[0,-9],[0,-8],[0,-7],[0,-6],[0,-5]]"],
+        ["problem.target.viscosity=0.3", "optimise.start.viscosity=0.1", "optimise.optimiser=lbfgs"],
+    ],
+    ids=["start over time", "target over time", "two parameters"],
+)
+def test_other_parameters_are_optimised_and_drawn(cortado_command, overrides):
+    easy = ["optimise.check.loss_reduction=1", "optimise.check.parameter_error=100", "optimise.iterations=2"]
+    options = [word for override in [*overrides, *easy] for word in ("--set", override)]
+    code, _, err = cortado_command("optimise", "task.toml", "--out", "found", *options)
+    assert (code, err) == (0, "")
+    assert Path("found/figures/gravity.png").exists()
+
+
+@pytest.mark.parametrize("old, new, field", [bad[1:] for bad in BAD_TASKS], ids=[bad[0] for bad in BAD_TASKS])
+def test_a_bad_task_is_refused(cortado_command, folder, old, new, field):
+    Path("task.toml").write_text(GOOD_TASK.replace(old, new, 1))
+    assert_refused(cortado_command("optimise", "task.toml", "--out", "found"), "task.toml: ", field)
+    assert_nothing_made(folder)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["absent.toml"], "cannot be read"),
+        (["task.toml", "--resume"], "no run"),
+        (["task.toml", "--resume", "--overwrite"], "only one of them"),
+        (["task.toml", "--precision", "double"], "precision is 'double'"),
+    ],
+)
+def test_wrong_arguments_of_optimise_are_refused(cortado_command, folder, arguments, words):
+    assert_refused(cortado_command("optimise", *arguments, "--out", "found"), words)
+    assert_nothing_made(folder)
+
+
+# ---- resume ------------------------------------------------------------------------------------------------------
+
+LONG = ["optimise", "task.toml", "--set", "optimise.iterations=60", "--set", "problem.steps=20", "--out"]
+
+
+def wait_for_metrics(run, lines, process):
+    """Until so many evaluations are in the folder."""
+    path, end = Path(run) / "metrics.jsonl", time.monotonic() + 60.0
+    while not path.exists() or path.read_bytes().count(b"\n") < lines:
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.002)
+
+
+def assert_same_optimisation(one, other):
+    for name in ("metrics.jsonl", "checkpoint/evaluations.log"):
+        assert (Path(one) / name).read_bytes() == (Path(other) / name).read_bytes()
+
+
+def test_a_killed_optimisation_resumes_bit_for_bit(cortado_command):
+    process = start(*LONG, "killed")
+    wait_for_metrics("killed", 10, process)
+    process.kill()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL and 10 <= len(metrics("killed")) < 61
+    assert_refused(cortado_command(*LONG, "killed"), "--resume")
+    code, resumed, _ = cortado_command(*LONG, "killed", "--resume")
+    assert code == 0
+    _, whole, _ = cortado_command(*LONG, "whole")
+    assert resumed.partition(" The results")[0] == whole.partition(" The results")[0]
+    assert len(metrics("whole")) == 61
+    assert_same_optimisation("killed", "whole")
+    assert len(json.loads(Path("killed/environment.json").read_text())["resumed"]) == 1
+
+
+def test_an_interrupted_optimisation_resumes_bit_for_bit(cortado_command, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(cortado.commands.optimise, "track", interrupting(after=3))
+        assert cortado_command("optimise", "task.toml", "--out", "stopped")[0] == 130
+    assert len(metrics("stopped")) == 4
+    assert cortado_command("optimise", "task.toml", "--out", "stopped", "--resume")[0] == 0
+    cortado_command("optimise", "task.toml", "--out", "whole")
+    assert_same_optimisation("stopped", "whole")
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("solver.time_step=0.002", "another scene"),
+        ("optimise.learning_rate=0.4", "learning_rate=0.5"),
+        ("optimise.optimiser=lbfgs", "optimiser"),
+        ("optimise.start.gravity=[0,-6]", "another 'gravity'"),
+    ],
+)
+def test_a_changed_task_is_not_resumed(cortado_command, override, words):
+    cortado_command("optimise", "task.toml", "--out", "found", "--set", "optimise.iterations=1")
+    before = metrics("found")
+    code, out, err = cortado_command("optimise", "task.toml", "--out", "found", "--resume", "--set", override)
+    assert (code, out, len(err.splitlines())) == (2, "", 1) and words in err
+    assert metrics("found") == before
+
+
+@pytest.mark.parametrize("override", ["problem.target.gravity=[1,-9]", "problem.steps=6"])
+def test_another_problem_is_not_resumed(cortado_command, override):
+    cortado_command("optimise", "task.toml", "--out", "found", "--set", "optimise.iterations=1")
+    code, out, err = cortado_command("optimise", "task.toml", "--out", "found", "--resume", "--set", override)
+    assert (code, out, len(err.splitlines())) == (2, "", 1) and "cannot be resumed" in err
+
+
+def test_a_finished_optimisation_goes_on(cortado_command):
+    code, _, _ = cortado_command("optimise", "task.toml", "--out", "found")
+    longer = ["--resume", "--set", "optimise.iterations=8"]
+    assert (code, cortado_command("optimise", "task.toml", "--out", "found", *longer)[0]) == (0, 0)
+    assert [row["iteration"] for row in metrics("found")] == list(range(9))
+
+
+# ---- gradients and bench -----------------------------------------------------------------------------------------
+
+
+def test_a_right_gradient_passes_the_check(cortado_command):
+    code, out, err = cortado_command("gradients", "check", "scene.toml", "--steps", 3)
+    assert (code, err) == (0, "") and "64 particles, 3 steps" in out
+    rows = [line for line in out.splitlines() if line.rstrip(" │").endswith("right")]
+    assert len(rows) == 7 and "WRONG" not in out
+
+
+def test_the_check_speaks_json(cortado_command):
+    code, out, _ = cortado_command("gradients", "check", "scene.toml", "--steps", 3, "--json")
+    certificate = json.loads(out)
+    assert code == 0 and certificate["right"] is True
+    assert {row["parameter"] for row in certificate["comparisons"]} >= {"gravity", "initial_positions", "viscosity"}
+
+
+@pytest.mark.parametrize("json_option", [[], ["--json"]])
+def test_a_planted_error_fails_the_check(cortado_command, monkeypatch, json_option):
+    right = Problem.value_and_gradient
+
+    def wrong(self, parameters, policy=None):
+        loss, gradient = right(self, parameters, policy)
+        if "initial_velocities" in gradient:
+            gradient["initial_velocities"][0, 1] *= -1.0
+        return loss, gradient
+
+    monkeypatch.setattr(Problem, "value_and_gradient", wrong)
+    code, out, err = cortado_command("gradients", "check", "scene.toml", "--steps", 3, *json_option)
+    assert (code, err) == (1, "The adjoint is wrong for: initial_velocities.\n")
+    assert json.loads(out)["right"] is False if json_option else out.count("WRONG") == 1
+
+
+def test_bench_speaks_json_and_words(cortado_command):
+    code, out, err = cortado_command("bench", "--particles", 100, "--steps", 2, "--json")
+    numbers = json.loads(out)
+    assert (code, err) == (0, "") and numbers["particles"] == 125 and numbers["steps"] == 2
+    assert 0.0 < numbers["forward_ms_per_step"] < numbers["gradient_ms_per_step"]
+    code, out, _ = cortado_command("bench", "--particles", 100, "--steps", 2)
+    assert code == 0 and "gradient_ms_per_step" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["gradients", "check", "scene.toml", "--steps", "0"], "steps is 0"),
+        (["gradients", "check", "scene.toml", "--seed", "-1"], "--seed is -1"),
+        (["gradients", "check", "absent.toml"], "cannot be read"),
+        (["bench", "--particles", "-5"], "--particles is -5"),
+        (["bench", "--particles", "8", "--steps", "0"], "steps is 0"),
+        (["bench", "--particles", "8", "--device", "tpu"], "device is 'tpu'"),
+    ],
+)
+def test_other_wrong_arguments_are_refused(cortado_command, folder, arguments, words):
+    assert_refused(cortado_command(*arguments), words)
+    assert_nothing_made(folder)

@@ -1,0 +1,75 @@
+"""The README does what it says: its code runs as printed, its commands are commands, its files are there."""
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cortado.commands.bench
+import cortado.commands.check
+import cortado.commands.optimise
+import cortado.commands.run
+from cortado.cli import main
+from cortado.scene import load_scene
+from cortado.task import load_task
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^    cortado (.*)$", README, re.MULTILINE)
+
+
+@pytest.fixture(autouse=True)
+def root(monkeypatch):
+    """The working directory that the README assumes."""
+    monkeypatch.chdir(ROOT)
+
+
+def test_the_code_runs_as_printed(capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert len(code.splitlines()) <= 25
+    names: dict = {}
+    exec(compile(code, "README.md", "exec"), names)
+    shape, ratio, _ = [line for line in capsys.readouterr().out.splitlines() if line[0] in "([0123456789"]
+    assert shape == "(61, 512, 3)" and f"# {shape}" in code
+    assert float(ratio) == pytest.approx(1.0, abs=1e-9)
+    np.testing.assert_allclose(names["result"].parameters["gravity"], [1.5, -9.81, -0.8], atol=1e-3)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_is_one(command, monkeypatch):
+    for module, function in (
+        (cortado.commands.run, "run_scene"),
+        (cortado.commands.optimise, "optimise_task"),
+        (cortado.commands.check, "check_scene"),
+        (cortado.commands.bench, "bench_dam_break"),
+    ):
+        monkeypatch.setattr(module, function, lambda *arguments: "done")
+    words = shlex.split(command)
+    main(words)
+    for word in words:
+        if word.endswith(".toml"):
+            assert (load_task(word) if "optimise" in words else load_scene(word)) is not None
+
+
+def test_there_are_commands():
+    assert {command.split()[0] for command in COMMANDS} == {"run", "optimise", "gradients", "bench"}
+
+
+def test_its_files_are_there():
+    linked = re.findall(r"\]\(([^):]+)\)", README)
+    named = re.findall(r"\b(?:docs|examples|tests|validation)/[\w/.]+\w", README)
+    assert len(linked) >= 3 and len(named) >= 8
+    assert [name for name in [*linked, *named] if not (ROOT / name).exists()] == []
+
+
+def test_its_targets_are_in_the_makefile():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = re.findall(r"^    make (\w+)$", README, re.MULTILINE)
+    assert targets == ["demo", "test"]
+    assert all(f"\n{target}:" in makefile for target in targets)
+
+
+def test_it_names_no_path_of_a_machine():
+    assert re.findall(r"(?<![\w.:/])/(?:home|root|work|tmp|Users|mnt)\b", README) == []
