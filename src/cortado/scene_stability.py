@@ -16,7 +16,7 @@ def stability_limit(scene: "Scene") -> float:
 
     Courant: 0.4 h / v, where v is the largest initial speed and that of a free fall through the container, or through
     the extent of the fluid if there is none (Monaghan 1992). Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity:
-    0.125 h^2 rho / mu (Morris et al. 1997).
+    0.06 h^2 rho / mu (Morris et al. 1997).
     """
     support = scene.discretisation.support_radius
     gravity = np.array(scene.forces.gravity)
@@ -36,7 +36,7 @@ def _viscous_limit(scene: "Scene") -> float:
         return inf
     support, used = scene.discretisation.support_radius, {fluid.phase for fluid in scene.fluid}
     limits = [
-        0.125 * support**2 * phase.rest_density / phase.viscosity
+        0.06 * support**2 * phase.rest_density / phase.viscosity
         for phase in scene.phase
         if phase.name in used and phase.viscosity > 0.0
     ]
