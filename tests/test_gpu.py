@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import warp as wp
-from scenes import plane, splash
 
 from cortado import Problem, Simulation, losses
+from scenes import plane, splash
 
 pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
 

@@ -95,12 +95,13 @@ def cloud(name: str) -> Cloud:
     grid = Grid.around(np.full(3, -0.4)[:dimension], np.full(3, side)[:dimension], period, 1.03 * SUPPORT, 512)
     search = NeighbourSearch(DISCRETISATION, grid, walls, random.uniform(0.5, 1.5, WALLS), N, 100, CPU)
     s = surroundings_type(FLOAT64)()
-    s.neighbours, s.fluid_count, s.count = search.neighbours, search.fluid_count, search.count
+    s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
+    s.filling, s.count = search.filling, search.count
     s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
     s.support, s.reach = SUPPORT, 1.03 * SUPPORT
     s.normalisation = CUBIC_SPLINE.normalisation(dimension, SUPPORT)
     s.self_weight = float(CUBIC_SPLINE.weight(np.zeros(1), dimension, SUPPORT)[0])
-    s.volume, s.rigidity = 0.11, 30.0
+    s.volume, s.rigidity, s.wall_push = 0.11, 30.0, 1.6
     s.periodic, s.period = int(period.any()), wp.vec3d(*period)
     s.frequency = wp.vec3d(1.0 / side if period.any() else 0.0, 0.0, 0.0)
     search.sort(array(x))

@@ -249,7 +249,7 @@ def test_the_stability_limit_is_the_smallest_of_three():
     shallow = plane(fluid=[{"shape": "box", "lower": [0, 0], "upper": [1, 0.1], "phase": "water"}])
     assert stability_limit(Scene(**shallow)) == pytest.approx(0.25 * sqrt(0.2 / 9.81))
     thick = plane(phase=[{"name": "water", "rest_density": 500, "viscosity": 5000}], solver={"time_step": 1e-4})
-    assert stability_limit(Scene(**thick)) == pytest.approx(0.125 * 0.2**2 * 500 / 5000)
+    assert stability_limit(Scene(**thick)) == pytest.approx(0.06 * 0.2**2 * 500 / 5000)
     assert stability_limit(Scene(**plane(forces={"gravity": [0, 0], "viscosity": "none"}))) == np.inf
 
 

@@ -74,7 +74,8 @@ class Problem:
     @property
     def fingerprint(self) -> str:
         """Which problem this is: scene, precision, steps and loss, in a checksum."""
-        loss = self.loss.target.tobytes() if isinstance(self.loss, FinalPositions) else type(self.loss).__name__.encode()
+        matching = isinstance(self.loss, FinalPositions)
+        loss = self.loss.target.tobytes() if matching else type(self.loss).__name__.encode()
         text = f"{self.simulation.scene.to_json()} {self.simulation.precision.name} {self.steps} "
         return sha256(text.encode() + loss).hexdigest()
 

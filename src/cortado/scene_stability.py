@@ -16,7 +16,8 @@ def stability_limit(scene: "Scene") -> float:
 
     Courant: 0.4 h / v, where v is the largest initial speed and that of a free fall through the container, or through
     the extent of the fluid if there is none (Monaghan 1992). Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity:
-    0.06 h^2 rho / mu (Morris et al. 1997).
+    0.06 h^2 rho / mu, the least that a lattice bears of explicit steps with any kernel here (Wendland C4 in 3-D; the
+    form is that of Morris et al. 1997, whose 0.125 is for an h of half the support).
     """
     support = scene.discretisation.support_radius
     gravity = np.array(scene.forces.gravity)

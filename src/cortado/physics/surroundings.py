@@ -10,7 +10,6 @@ import warp as wp
 from cortado.precision import Precision
 from cortado.smoothing import SmoothingKernel, smoothing_functions
 
-
 UNROLL = 4
 """Fluid neighbours that a loop takes at a time, so that their loads overlap; lists are filled up to a multiple of it
 with the particle itself, which adds nothing to a sum but W(0) to the density's."""
