@@ -73,16 +73,12 @@ def test_particles_by_speed_have_a_colour_bar(tmp_path):
     points = block(2)
     speed = np.linalg.norm(points, axis=1)
     plain = figures.particles([points], ["a"], tmp_path / "a.png")
-    coloured = figures.particles(
-        [points], ["a"], tmp_path / "b.png", colours=[speed], colour_label="speed [m/s]"
-    )
+    coloured = figures.particles([points], ["a"], tmp_path / "b.png", colours=[speed], colour_label="speed [m/s]")
     yellow = (254, 232, 56)
     assert share_of(yellow, pixels(coloured)) > 0.002 and share_of(yellow, pixels(plain)) == 0.0
 
 
-@pytest.mark.parametrize(
-    "points", [np.full((3, 2), np.nan), np.zeros((1, 3)), np.zeros((0, 2)), np.zeros((4, 3))]
-)
+@pytest.mark.parametrize("points", [np.full((3, 2), np.nan), np.zeros((1, 3)), np.zeros((0, 2)), np.zeros((4, 3))])
 def test_particles_that_cannot_be_seen_do_not_stop_the_picture(tmp_path, points):
     pixels(figures.particles([points], ["odd"], tmp_path / "a.png"))
 

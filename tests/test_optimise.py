@@ -221,9 +221,7 @@ def test_interrupted_run_resumes_bit_for_bit(optimiser, evaluations, tmp_path):
     with pytest.raises(Interrupted):
         rosenbrock(optimiser, problem=Rosenbrock(fail_at=evaluations), checkpoint=tmp_path / "run")
     rest, records = Rosenbrock(), []
-    resumed = rosenbrock(
-        optimiser, problem=rest, checkpoint=tmp_path / "run", resume=True, on_iteration=records.append
-    )
+    resumed = rosenbrock(optimiser, problem=rest, checkpoint=tmp_path / "run", resume=True, on_iteration=records.append)
     assert bits(resumed) == bits(whole)
     assert resumed.message == whole.message
     assert rest.evaluations == whole.evaluations - evaluations

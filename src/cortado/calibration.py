@@ -81,9 +81,9 @@ STANDOFF = 0.1
 
 
 def wall_layer(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> WallLayer:
-    """The layer that meets four conditions at a flat wall, with fluid that is a lattice half a spacing from the surface:
+    """The layer that meets four conditions at a flat wall, with fluid on the lattice, half a spacing from the surface:
 
-    - the fluid has the rest density, so that it does not jump off at the start (Band et al. 2018 scale wall volumes for
+    - the fluid has the rest density, so that it does not jump off at the start (Band et al. 2018 scale volumes for
       that; with a layer half a spacing deep the factor is their 0.7);
     - a particle alone reaches the rest density, and with it a pressure, before it reaches the surface;
     - a uniform pressure pushes no particle;

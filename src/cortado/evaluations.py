@@ -57,8 +57,7 @@ class Packing:
         """The parameters, by name, of a vector (size,), as copies; scalars are arrays of shape ()."""
         parts = np.split(vector, np.cumsum(self.sizes)[:-1])
         return {
-            name: part.reshape(shape).copy()
-            for name, shape, part in zip(self.names, self.shapes, parts, strict=True)
+            name: part.reshape(shape).copy() for name, shape, part in zip(self.names, self.shapes, parts, strict=True)
         }
 
     def spread(self, values: float | Mapping[str, float]) -> Vector:

@@ -235,9 +235,7 @@ class _ColourScale:
         self.clips = bool(len(values) and values.max() > high)
         flat = high - low <= 1e-12 * max(abs(high), abs(low))  # one value, or plane: the near colour
         shades = LinearSegmentedColormap.from_list("depth", [_FAR, _NEAR])
-        self._map = ScalarMappable(
-            Normalize(low - 1.0 if flat else low, high), "cividis" if numbers else shades
-        )
+        self._map = ScalarMappable(Normalize(low - 1.0 if flat else low, high), "cividis" if numbers else shades)
         self.mappable = self._map if numbers else None
 
     def rgb(self, points: NDArray[Any], tint: NDArray[Any] | None) -> NDArray[Any]:
@@ -266,9 +264,7 @@ def _draw_set(axes: Any, points: NDArray[Any], colours: NDArray[Any], title: str
     kept = kept[np.argsort(_depth(points)[kept], kind="stable")]
     size, fill = np.full(len(kept), _spacing(points[kept])), colours[kept]
     place = {"offsets": points[kept, :2], "offset_transform": axes.transData, "units": "xy"}
-    discs = EllipseCollection(
-        size, size, 0.0 * size, **place, facecolors=fill, edgecolors=0.82 * fill, linewidths=0.25
-    )
+    discs = EllipseCollection(size, size, 0.0 * size, **place, facecolors=fill, edgecolors=0.82 * fill, linewidths=0.25)
     axes.add_collection(discs)
 
 

@@ -15,17 +15,26 @@ BRANCHES = 64
 class Launcher:
     """Launches kernels with one thread a particle on one device."""
 
-    def __init__(self, particles: int, device: Any):
-        self.particles, self.device = particles, device
+    def __init__(self, particles: int, device: Any, record_tape: bool):
+        """``record_tape`` False keeps launches off a tape that a user may have open."""
+        self.particles, self.device, self._record_tape = particles, device, record_tape
 
     def __call__(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any], threads: int | None = None) -> None:
-        wp.launch(kernel, threads or self.particles, inputs=inputs, outputs=outputs, device=self.device)
+        wp.launch(
+            kernel,
+            threads or self.particles,
+            inputs=inputs,
+            outputs=outputs,
+            device=self.device,
+            record_tape=self._record_tape,
+        )
 
 
 class Replayed:
-    """Work that is done over and over with the same arrays: on a GPU a captured graph from the second time on.
+    """Work that is done over and over with the same arrays: a captured graph from the second time on.
 
-    The first time loads modules and allocates what a capture must not.
+    The first time loads modules and allocates what a capture must not. On a CPU a graph saves the packing of arguments:
+    half of the time with a hundred particles.
     """
 
     def __init__(self, work: Callable[[], None], device: Any):
@@ -33,7 +42,7 @@ class Replayed:
         self._warm, self._graph = False, None
 
     def __call__(self) -> None:
-        if self._device.is_cpu or not self._warm:
+        if not self._warm:
             self._work()
             self._warm = True
             return

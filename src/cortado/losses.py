@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from hashlib import sha256
 from typing import Any, Protocol
 
 import numpy as np
@@ -55,9 +56,12 @@ class FinalPositions:
 
     def __init__(self, target: np.ndarray):
         """``target`` (n, d) [m], in the scene's order."""
-        self.target = np.asarray(target, dtype=np.float64)
+        self.target = np.array(target, dtype=np.float64)
         if self.target.ndim != 2 or not np.isfinite(self.target).all():
             raise InputError(f"target has shape {self.target.shape}, but must be (particles, dimension) and finite.")
+        self.target.setflags(write=False)
+        self.fingerprint = sha256(self.target.tobytes()).hexdigest()
+        """Tells one target from another, for checkpoints."""
         self._on_device: dict[Any, wp.array] = {}
 
     def value(self, end: TrajectoryEnd) -> float:

@@ -268,6 +268,8 @@ class NeighbourSearch:
         self._grid.wall_starts = wp.zeros(grid.cells + 1, dtype=wp.int32, device=device)
         self.wall_positions = wp.array(walls, dtype=precision.vector, device=device)
         self.wall_weights = wp.array(wall_weights, dtype=precision.real, device=device)
+        self.origin = self._grid.origin
+        """Lower corner of the grid of cells [m], as a Warp vector."""
         self._sort_walls(walls, wall_weights, precision)
         self.allocate(capacity)
 

@@ -32,9 +32,7 @@ class Differentiable(Protocol):
     The fingerprint is kept in the checkpoint, so that the run of one problem is not resumed with another.
     """
 
-    def value_and_gradient(
-        self, parameters: dict[str, Vector], policy: Any = None
-    ) -> tuple[float, dict[str, Vector]]:
+    def value_and_gradient(self, parameters: dict[str, Vector], policy: Any = None) -> tuple[float, dict[str, Vector]]:
         """The loss, and its gradient by the names and in the shapes of the parameters."""
 
 
@@ -105,8 +103,7 @@ def optimise(
     """
     if not isinstance(optimiser, Optimiser):
         raise InputError(
-            "The optimiser must be an object such as cortado.optimisers.Adam(learning_rate=0.1), not "
-            f"{optimiser!r}."
+            f"The optimiser must be an object such as cortado.optimisers.Adam(learning_rate=0.1), not {optimiser!r}."
         )
     values = _checked_start(start)
     packing = Packing.of(values)
@@ -202,8 +199,7 @@ class _Evaluator:
             return
         if math.isfinite(evaluation.loss):
             what = (
-                f"the gradient with respect to {self._names_of(broken)} is not finite or beyond "
-                f"{GREATEST_GRADIENT:g}"
+                f"the gradient with respect to {self._names_of(broken)} is not finite or beyond {GREATEST_GRADIENT:g}"
             )
         else:
             names = self._names_of(np.ones_like(broken))
@@ -313,6 +309,4 @@ def _as_given(parameters: Mapping[str, Vector], start: Mapping[str, Any]) -> Par
 
 def _copied(parameters: Parameters) -> Parameters:
     """Parameters that share no array with others."""
-    return {
-        name: value.copy() if isinstance(value, np.ndarray) else value for name, value in parameters.items()
-    }
+    return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in parameters.items()}

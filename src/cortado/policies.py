@@ -91,13 +91,19 @@ class _TapeStep:
     def step(self, state: State, iterations: int, bar: State) -> None:
         self._before.assign(state)
         wp.copy(self._solver.step_number, self._step_number)
-        with wp.Tape() as tape:
+        tape = wp.Tape()
+        try:
+            self._back(tape, iterations, bar)
+        finally:
+            self._forget(tape)
+
+    def _back(self, tape: wp.Tape, iterations: int, bar: State) -> None:
+        with tape:
             self._solver.record(self._before, self._parameters, iterations)
             self._solver.recorded(iterations, self._after)
         tape.backward(grads={self._after.positions: bar.positions, self._after.velocities: bar.velocities})
         wp.copy(bar.positions, self._before.positions.grad)
         wp.copy(bar.velocities, self._before.velocities.grad)
-        self._forget(tape)
 
     def _forget(self, tape: Any) -> None:
         """Zero every adjoint but those of the parameters, which add up over the steps."""

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from cortado.errors import InputError
-from cortado.losses import FinalPositions, Loss, Recorded, TrajectoryEnd
+from cortado.losses import Loss, Recorded, TrajectoryEnd
 from cortado.particles import Parameters, State
 from cortado.policies import Exact, Policy
-from cortado.rollout import Rollout, StepDerivative
-from cortado.simulation import Simulation, check_steps
+from cortado.rollout import MEMORY_BUDGET, Rollout, StepDerivative
+from cortado.simulation import Simulation, as_numbers, check_steps
 
 SCALARS = ("rest_density", "viscosity", "time_step")
 """Parameters that are one number, in the order in which the solver adds up their adjoints."""
@@ -29,11 +29,26 @@ class Problem:
     What is not given is the scene's. n counts fluid particles in the order in which the scene lists them.
     """
 
-    def __init__(self, simulation: Simulation, steps: int, loss: Loss | Callable[..., Any]):
-        """``loss``: an object with ``value`` and ``adjoint``, or a function of Warp arrays (see `losses.Recorded`)."""
+    def __init__(
+        self,
+        simulation: Simulation,
+        steps: int,
+        loss: Loss | Callable[..., Any],
+        memory_budget: int = MEMORY_BUDGET,
+    ):
+        """``loss``: an object with ``value`` and ``adjoint``, or a function of Warp arrays (see `losses.Recorded`).
+
+        ``memory_budget``: bytes of states kept on the way forward; with less, states are recomputed on the way back.
+        """
+        if not isinstance(simulation, Simulation):
+            raise InputError(f"simulation is a {type(simulation).__name__}, but must be a cortado.Simulation.")
+        if not hasattr(loss, "adjoint") and not callable(loss):
+            raise InputError(
+                f"loss is a {type(loss).__name__}, but must have a value and an adjoint, or be a function."
+            )
         self.simulation, self.steps = simulation, check_steps(steps)
         self.loss: Loss = loss if hasattr(loss, "adjoint") else Recorded(loss)  # type: ignore[assignment]
-        self._rollout = Rollout(simulation.solver, self.steps)
+        self._rollout = Rollout(simulation.solver, self.steps, memory_budget)
         self._derivatives: dict[Policy, StepDerivative] = {}
 
     def value(self, parameters: Values) -> float:
@@ -52,7 +67,7 @@ class Problem:
         values = self._checked(parameters)
         end = self.end(values, keep=True)
         bar = self._adjoint(end)
-        derivative = self._derivative(policy or Exact())
+        derivative = self._derivative(Exact() if policy is None else policy)
         self._rollout.backward(derivative, bar)
         gravity, scalars = derivative.parameters()
         found = {"gravity": gravity[:, : self.simulation.dimension], **dict(zip(SCALARS, scalars, strict=True))}
@@ -65,19 +80,19 @@ class Problem:
 
     def tangent(self, parameters: Values, directions: Values) -> float:
         """The derivative of the loss along ``directions`` (any of the parameters), by forward mode."""
-        end = self.end(parameters, keep=False)
         dot, parameters_dot = self._directions(self._checked(directions, "direction"))
+        end = self.end(parameters, keep=False)
         self._rollout.tangent(dot, parameters_dot)
         pairs = zip(self._adjoint(end).numpy(3), dot.numpy(3), strict=True)
         return float(sum((bar.astype(np.float64) * d).sum() for bar, d in pairs))
 
     @property
     def fingerprint(self) -> str:
-        """Which problem this is: scene, precision, steps and loss, in a checksum."""
-        matching = isinstance(self.loss, FinalPositions)
-        loss = self.loss.target.tobytes() if matching else type(self.loss).__name__.encode()
-        text = f"{self.simulation.scene.to_json()} {self.simulation.precision.name} {self.steps} "
-        return sha256(text.encode() + loss).hexdigest()
+        """Which problem this is, in a checksum: scene, precision, steps, ``fingerprint`` of the loss; for a loss
+        without one only its type is known."""
+        loss = getattr(self.loss, "fingerprint", type(self.loss).__qualname__)
+        text = f"{self.simulation.scene.to_json()} {self.simulation.precision.name} {self.steps} {loss}"
+        return sha256(text.encode()).hexdigest()
 
     def iterations(self) -> np.ndarray:
         """(steps,) pressure iterations of the last evaluation."""
@@ -85,9 +100,19 @@ class Problem:
 
     def _adjoint(self, end: TrajectoryEnd) -> State:
         bar = self.loss.adjoint(end)
-        return bar if isinstance(bar, State) else self._state(*bar)
+        if isinstance(bar, State):
+            copy = self._state()
+            copy.assign(bar)
+            return copy
+        shape = self.simulation.positions.shape
+        for what, array in zip(("positions", "velocities"), bar, strict=True):
+            if np.shape(array) != shape:
+                raise InputError(f"the loss's adjoint of {what} has shape {np.shape(array)}, but must be {shape}.")
+        return self._state(*bar)
 
     def _derivative(self, policy: Policy) -> StepDerivative:
+        if isinstance(policy, type) or not hasattr(policy, "derivative"):
+            raise InputError(f"policy is {policy!r}, but must be an object such as cortado.policies.Exact().")
         if policy not in self._derivatives:
             self._derivatives[policy] = policy.derivative(self._rollout)
         return self._derivatives[policy]
@@ -98,7 +123,7 @@ class Problem:
         for name, value in values.items():
             if name not in NAMES:
                 raise InputError(f"{what} {name!r} is unknown, but must be one of {', '.join(NAMES)}.")
-            array = np.asarray(value, dtype=np.float64)
+            array = as_numbers(f"{what} {name}", value)
             wanted = {"gravity": array.shape, "initial_positions": shape, "initial_velocities": shape}.get(name, ())
             if array.shape != wanted:
                 raise InputError(f"{what} {name} has shape {array.shape}, but must be {wanted}.")
@@ -108,6 +133,8 @@ class Problem:
                 raise InputError(f"{what} {name} has a value that is not finite, but must be numbers.")
             if what == "parameter" and name in ("rest_density", "time_step") and array <= 0:
                 raise InputError(f"{what} {name} is {array}, but must be greater than 0.")
+            if what == "parameter" and name == "viscosity" and array < 0:
+                raise InputError(f"{what} {name} is {array}, but must be at least 0.")
             checked[name] = array
         return checked
 
@@ -134,7 +161,8 @@ class Problem:
         parameters.set(values.get("gravity", np.zeros(self.simulation.dimension)), **scalars)
         return dot, parameters
 
-    def _state(self, positions: np.ndarray, velocities: np.ndarray) -> State:
+    def _state(self, *arrays: np.ndarray) -> State:
         state = State.zeros(self.simulation.particles, self.simulation.precision, self.simulation.device)
-        state.set(positions, velocities)
+        if arrays:
+            state.set(*arrays)
         return state

@@ -7,6 +7,7 @@ On a GPU a step is a captured graph.
 
 from collections.abc import Callable
 from functools import partial
+from math import isqrt
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +16,6 @@ import warp as wp
 from cortado.errors import DivergedError
 from cortado.launching import Replayed
 from cortado.particles import Parameters, State
-from cortado.physics.convergence import NO_PARTICLE
 from cortado.solvers.pcisph import Pcisph
 from cortado.solvers.pcisph_derivatives import PcisphTangent
 
@@ -43,6 +43,15 @@ class StepDerivative(Protocol):
         """Adjoints of gravity (steps, 3), and of (rest density, viscosity, time step), (3,)."""
 
 
+def checkpoint_interval(steps: int, affordable: int) -> int:
+    """Steps from one checkpoint to the next: the fewest with which no more states than affordable are alive at a time,
+    those between two checkpoints included; about the square root of the steps where that cannot be."""
+    if steps <= affordable:
+        return 1
+    intervals = range(1, isqrt(steps) + 2)
+    return next((n for n in intervals if -(-steps // n) + n <= affordable), isqrt(steps) + 1)
+
+
 class Rollout:
     """A number of steps of a solver from a first state, which can be repeated and differentiated."""
 
@@ -57,7 +66,7 @@ class Rollout:
             wp.zeros(max(steps, 1), dtype=self._precision.pair, device=self._device),
         )
         state_bytes = 2 * 3 * np.dtype(self._precision.numpy).itemsize * self._particles
-        self._interval = max(1, -(-steps * state_bytes // memory_budget))
+        self._interval = checkpoint_interval(steps, memory_budget // state_bytes)
         self._states: dict[int, State] = {}
         self._buffer, self._bar = self._new_state(), self._new_state()
         self._growth = -1
@@ -75,8 +84,7 @@ class Rollout:
         self._states = {0: self.initial}
         state, step = self.initial, 0
         self._forget_stale_graphs()
-        self.solver.bad_particle.fill_(NO_PARTICLE)
-        self.solver.bad_step.fill_(-1)
+        self.solver.reset()
         self._read_records(0)
         while step < self.steps:
             last = min(step + (1 if self._device.is_cpu else CHUNK), self.steps)
@@ -112,10 +120,10 @@ class Rollout:
         needed = int(self.solver.search.needed.numpy()[0])
         if needed <= self.solver.search.capacity:
             return False
-        self.solver.grow(needed + needed // 8 + 1)
+        self.solver.grow(min(needed + needed // 8 + 1, 2 * self.solver.search.capacity))
+        self.solver.search.needed.zero_()
         self._forget_stale_graphs()
-        self.solver.bad_particle.fill_(NO_PARTICLE)
-        self.solver.bad_step.fill_(-1)
+        self.solver.reset()
         return True
 
     def _forget_stale_graphs(self) -> None:

@@ -157,9 +157,7 @@ class RunFolder:
         if not present:
             return
         if not self._holds_run():
-            raise InputError(
-                f"{self.path} holds {', '.join(present)}, but no run of Cortado; choose another --out."
-            )
+            raise InputError(f"{self.path} holds {', '.join(present)}, but no run of Cortado; choose another --out.")
         if not overwrite:
             raise InputError(
                 f"{self.path} already holds a run; choose another --out, or continue it with --resume, or "

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from cortado.calibration import WallLayer, pressure_stiffness, rest_volume, wall_layer, wall_rigidity
-from cortado.errors import CortadoWarning, InputError
+from cortado.errors import CortadoWarning, InputError, shown
 from cortado.neighbours import SKIN, Grid, NeighbourSearch
 from cortado.particles import State
 from cortado.physics.surroundings import Discretisation
@@ -29,6 +29,8 @@ class Simulation:
 
     def __init__(self, scene: Scene, device: str = "cpu", precision: str = "float32"):
         """``device`` as Warp names it ("cpu", "cuda:0"), ``precision`` "float32" or "float64"."""
+        if not isinstance(scene, Scene):
+            raise InputError(f"scene is {shown(scene)}, but must be a cortado.Scene, such as load_scene gives.")
         self.scene = scene
         self.device = _device(device)
         self.precision = precision_named(precision)
@@ -49,6 +51,8 @@ class Simulation:
         self.state = State.empty(self.particles, self.precision, self.device)
         """The first state on the device."""
         self.state.set(self.positions, self.velocities)
+        for array in (self.positions, self.velocities):
+            array.setflags(write=False)
 
     @property
     def dimension(self) -> int:
@@ -106,7 +110,7 @@ class Simulation:
 
     def gravity_table(self, gravity: Any, steps: int) -> np.ndarray:
         """Gravity (d,) or (steps, d) as an array, checked; the scene's where None is given."""
-        table = np.asarray(self.scene.forces.gravity if gravity is None else gravity, dtype=np.float64)
+        table = as_numbers("gravity", self.scene.forces.gravity if gravity is None else gravity)
         if table.shape not in ((self.dimension,), (steps, self.dimension)):
             wanted = f"({self.dimension},) or ({steps}, {self.dimension})"
             raise InputError(f"gravity has shape {table.shape}, but must be {wanted} in m/s2.")
@@ -181,9 +185,17 @@ class Simulation:
         )
 
 
+def as_numbers(what: str, value: Any) -> np.ndarray:
+    """A number or array in float64, or an `InputError` in a sentence."""
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} is {shown(value)}, but must be a number or an array of numbers.") from None
+
+
 def check_steps(steps: int) -> int:
     """The number of steps, or an `InputError` in a sentence."""
-    if int(steps) != steps or steps < 1:
+    if not isinstance(steps, (int, float, np.number)) or not np.isfinite(steps) or int(steps) != steps or steps < 1:
         raise InputError(f"steps is {steps}, but must be a whole number of at least 1.")
     return int(steps)
 

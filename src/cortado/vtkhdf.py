@@ -123,9 +123,7 @@ class TrajectoryWriter:
             os.replace(self._partial, self.path)
         self.frames_written = frame + 1
 
-    def append_steps(
-        self, iterations: ArrayLike, density_errors: ArrayLike, converged: ArrayLike = True
-    ) -> None:
+    def append_steps(self, iterations: ArrayLike, density_errors: ArrayLike, converged: ArrayLike = True) -> None:
         """Writes what the pressure solver reported of one step (scalars) or of several ((k,) each).
 
         Raises:

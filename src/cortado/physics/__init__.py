@@ -1,5 +1,5 @@
-"""Warp kernels only, one physical term a file: each with its tangent and its adjoint. Nothing here launches.
+"""Warp kernels only, one topic a file; those of a physical term with tangents and adjoints. Nothing here launches.
 
-Every factory is cached by (smoothing kernel, precision) and puts its kernels into one Warp module for that pair.
+Factories are cached, and put their kernels into named Warp modules: one for each precision and smoothing kernel.
 Sorted particles are numbered i; a ``_bar`` is an adjoint, a ``_dot`` a tangent.
 """

@@ -40,15 +40,16 @@ def convergence_kernels(precision: Precision) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def check(
         order: wp.array(dtype=wp.int32),
+        origin: vector,
         bound: real,
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         # out
         bad: wp.array(dtype=wp.int32),
     ):
-        """``bad``: the first particle, in scene order, that is not finite or further than ``bound`` [m] away."""
+        """``bad``: the first particle, in scene order, not finite or further than ``bound`` from ``origin`` [m]."""
         i = wp.tid()
-        x_i = x[i]
+        x_i = x[i] - origin
         size = wp.max(wp.max(wp.abs(x_i[0]), wp.abs(x_i[1])), wp.abs(x_i[2]))
         if not (size < bound and wp.isfinite(v[i])):
             wp.atomic_min(bad, 0, order[i])

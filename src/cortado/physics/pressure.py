@@ -5,9 +5,9 @@
     ap_i = -m (sum_j (c_i + c_j) G_ij + push sum_b (psi_b / m) c_i G_ib)
     v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
 
-y is the yield and push the factor beside walls (`cortado.physics.walls`, `cortado.calibration.WallLayer`). G is taken at x(t), rho* at the predicted positions over the
-neighbours of x(t). After the last iteration (x*, v*) is the new state. The clamp at 0 (no suction at a free surface)
-has the derivative [p > 0].
+y is the yield and push the factor beside walls (`cortado.physics.walls`, `cortado.calibration.WallLayer`). G is taken
+at x(t), rho* at the predicted positions over the neighbours of x(t). After the last iteration (x*, v*) is the new
+state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
 """
 
 from functools import cache
@@ -54,7 +54,9 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         rho_0 = rest_density[0]
         excess = rho_0 * s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - rho_0
         delta = y[i] * stiffness / (time_step[0] * time_step[0])
-        p_i = wp.max(p_in[i] + delta * excess, real(0.0))
+        p_i = p_in[i] + delta * excess
+        if p_i < real(0.0):  # not wp.max, which would turn NaN into 0 and hide it
+            p_i = real(0.0)
         compression = wp.max(excess / rho_0, real(0.0))
         p_out[i] = p_i
         c[i] = p_i / (rho[i] * rho[i])

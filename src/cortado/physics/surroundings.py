@@ -57,8 +57,8 @@ def surroundings_type(precision: Precision) -> Any:
         """sigma of the kernel [1 / m^d]."""
         self_weight: real
         """W(0) [1 / m^d]."""
-        rigidity: real
-        """2 sum_j G_j . G_j of a filled neighbourhood [1 / m^(2 d + 2)], see `cortado.physics.walls`."""
+        pliancy: real
+        """(2 sum_j G_j . G_j / push)^(-1/2) of a filled neighbourhood [m^(d + 1)], see `cortado.physics.walls`."""
         volume: real
         """Rest volume of a particle [m^d]: with it the lattice of the rest spacing has the rest density."""
         periodic: wp.int32

@@ -5,8 +5,8 @@ a_i = (kappa mu / rho_i) (sum_j (m / rho_j) phi(x_ij, v_ij) + friction sum_b V_b
 pairwise:  phi = B G,  B = v . x / (|x|^2 + 0.01 h^2),  kappa = 2 (d + 2)     (report eq. 10; Monaghan 2005)
 laminar:   phi = F v,  F = x . G / (|x|^2 + 0.01 h^2),  kappa = 2             (Morris, Fox and Zhu 1997)
 
-mu is the dynamic viscosity [Pa s]; friction is 0 for a wall with free slip, else about 1 (`WallLayer.friction`). phi is odd
-in (x, v) together, so that momentum is kept; the pairwise form is central and keeps angular momentum too, but
+mu is the dynamic viscosity [Pa s]; friction is 0 for a wall with free slip, else about 1 (`WallLayer.friction`). phi is
+odd in (x, v) together, so that momentum is kept; the pairwise form is central and keeps angular momentum too, but
 carries no shear to a wall, which the laminar form does. The 0.01 h^2 covers coincident particles.
 """
 

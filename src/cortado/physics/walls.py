@@ -1,12 +1,13 @@
 """How much a particle beside a wall may be pushed by one pressure iteration.
 
 delta is made for a particle with a filled neighbourhood. Beside a wall the same pressure moves a particle's own
-density further, by push |S_i|^2 / (2 sum_j G_j . G_j of the prototype) with S_i = sum_b (psi_b / m) G_ib, and where that is
-above 2 the iteration overshoots and kicks it away. So delta is multiplied by the yield
+density further, by push |S_i|^2 / (2 sum_j G_j . G_j of the prototype) with S_i = sum_b (psi_b / m) G_ib, and where
+that is above 2 the iteration overshoots and kicks it away. So delta is multiplied by the yield
 
     y_i = 1 / (1 + |S_i|^2 / rigidity),   rigidity = 2 sum_j G_j . G_j / push,
 
-which is 1 away from walls, and smooth.
+which is 1 away from walls, and smooth. Sums are multiplied with the pliancy, rigidity^(-1/2), before they are squared:
+in float32 the square of a gradient overflows where spacings are small.
 """
 
 from functools import cache
@@ -30,7 +31,7 @@ def wall_kernels(discretisation: Discretisation) -> SimpleNamespace:
         total = vector()
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
-            total += s.wall_weights[b] * gradient(separation(x[i], s.wall_positions[b], s), s)
+            total += (s.pliancy * s.wall_weights[b]) * gradient(separation(x[i], s.wall_positions[b], s), s)
         return total
 
     @wp.func
@@ -38,7 +39,7 @@ def wall_kernels(discretisation: Discretisation) -> SimpleNamespace:
         total = vector()
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
-            total += s.wall_weights[b] * hessian_product(separation(x[i], s.wall_positions[b], s), u, s)
+            total += (s.pliancy * s.wall_weights[b]) * hessian_product(separation(x[i], s.wall_positions[b], s), u, s)
         return total
 
     @wp.kernel(module=discretisation.module(True))
@@ -50,7 +51,7 @@ def wall_kernels(discretisation: Discretisation) -> SimpleNamespace:
     ):
         i = wp.tid()
         total = wall_gradient(i, x, s)
-        y[i] = s.rigidity / (s.rigidity + wp.dot(total, total))
+        y[i] = real(1.0) / (real(1.0) + wp.dot(total, total))
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def wall_yield_tangent(
@@ -64,7 +65,7 @@ def wall_kernels(discretisation: Discretisation) -> SimpleNamespace:
         i = wp.tid()
         total = wall_gradient(i, x, s)
         total_dot = wall_hessian_product(i, x, x_dot[i], s)
-        y_dot[i] = real(-2.0) * y[i] * y[i] / s.rigidity * wp.dot(total, total_dot)
+        y_dot[i] = real(-2.0) * y[i] * y[i] * wp.dot(total, total_dot)
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def wall_yield_adjoint(
@@ -76,7 +77,7 @@ def wall_kernels(discretisation: Discretisation) -> SimpleNamespace:
         x_bar: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        total_bar = (real(-2.0) * y_bar[i] * y[i] * y[i] / s.rigidity) * wall_gradient(i, x, s)
+        total_bar = (real(-2.0) * y_bar[i] * y[i] * y[i]) * wall_gradient(i, x, s)
         x_bar[i] = x_bar[i] + wall_hessian_product(i, x, total_bar, s)
 
     return SimpleNamespace(forward=wall_yield, tangent=wall_yield_tangent, adjoint=wall_yield_adjoint)

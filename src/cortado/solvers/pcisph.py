@@ -1,8 +1,7 @@
 """Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009; the report's Algorithm 1, put right).
 
-`Pcisph.step` goes on until the density error is small, `Pcisph.record` repeats a step with a known number of
-iterations and keeps every intermediate value, and `Pcisph.tangent` and `Pcisph.adjoint` differentiate the step that was
-recorded last (the report's Algorithm 2, and its transpose). Nothing here reads from the device.
+`Pcisph.step` goes on until the density error is small; `Pcisph.record` repeats a step with a known number of iterations
+and keeps every intermediate value, for `cortado.solvers.pcisph_derivatives`. Nothing here reads from the device.
 """
 
 from collections.abc import Sequence
@@ -94,7 +93,7 @@ class Pcisph:
         precision, particles, device = discretisation.precision, search.particles, search.device
         self.discretisation, self.lattice, self.search = discretisation, lattice, search
         self.terms, self.pressure, self.periods = tuple(terms), pressure, tuple(periods)
-        self.launch = Launcher(particles, device)
+        self.launch = Launcher(particles, device, record_tape=requires_grad)
         self._density = density_kernels(discretisation)
         self._walls = wall_kernels(discretisation)
         self._pressure = pressure_kernels(discretisation)
@@ -140,7 +139,7 @@ class Pcisph:
         s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
         s.support, s.reach = lattice.support, (1.0 + SKIN) * lattice.support
         s.normalisation = lattice.normalisation
-        s.self_weight, s.volume, s.rigidity = lattice.self_weight, lattice.volume, lattice.rigidity
+        s.self_weight, s.volume, s.pliancy = lattice.self_weight, lattice.volume, lattice.rigidity**-0.5
         s.wall_push = lattice.wall_push
         s.periodic = int(any(self.periods))
         s.period = precision.vector(*self.periods)
@@ -159,6 +158,13 @@ class Pcisph:
             requires_grad=True,
         )
 
+    def reset(self) -> None:
+        """Forget the counts and flags of an earlier run, also of one that was interrupted."""
+        self._iteration.zero_()
+        self.step_number.zero_()
+        self.bad_particle.fill_(NO_PARTICLE)
+        self.bad_step.fill_(-1)
+
     # ---- forward -------------------------------------------------------------------------------------------------
 
     def step(self, state: State, new_state: State, parameters: Parameters, records: tuple[wp.array, wp.array]) -> None:
@@ -169,7 +175,9 @@ class Pcisph:
         self.recorded(0, new_state)
         f, c = self.iterates, self._convergence
         self.launch(
-            c.check, [self.search.order, 1e6 * self.lattice.support, f.x_star[0], f.v_star[0]], [self.bad_particle]
+            c.check,
+            [self.search.order, self.search.origin, 1e6 * self.lattice.support, f.x_star[0], f.v_star[0]],
+            [self.bad_particle],
         )
         self.launch(
             c.finish,
