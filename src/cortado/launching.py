@@ -8,7 +8,7 @@ import warp as wp
 from cortado.physics.reduction import reduction_kernels
 from cortado.precision import Precision
 
-BRANCHES = 64
+BRANCHES = 32
 """Values that one thread of a tree sum adds up."""
 
 

@@ -1,0 +1,176 @@
+"""What a Problem promises besides right derivatives: clean state, clear sentences."""
+
+import numpy as np
+import pytest
+
+from cortado import InputError, Problem, Simulation, losses, policies
+from cortado.certificate import Comparison, certify
+from cortado.particles import State
+from cortado.rollout import checkpoint_interval
+from scenes import plane, splash
+
+GRAVITY = {"gravity": np.array([0.0, -9.81, 0.0])}
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return Simulation(splash(), precision="float64")
+
+
+@pytest.fixture
+def problem(simulation):
+    return Problem(simulation, 60, losses.FinalPositions(simulation.positions))
+
+
+def test_problems_and_runs_share_a_simulation(simulation, problem):
+    point = {**GRAVITY, "initial_velocities": simulation.velocities}
+    wanted = problem.value_and_gradient(point)
+    other = Problem(simulation, 25, losses.FinalPositions(np.zeros_like(simulation.positions)))
+    other.value_and_gradient({"gravity": np.tile([3.0, -5.0, 1.0], (25, 1)), "viscosity": 0.5}, policies.Tape())
+    simulation.run(10)
+    problem.tangent({"viscosity": 0.3}, {"viscosity": 1.0})
+    found = problem.value_and_gradient(point)
+    assert found[0] == wanted[0]
+    for name, gradient in wanted[1].items():
+        assert gradient.tobytes() == found[1][name].tobytes()
+
+
+@pytest.mark.parametrize("policy", [policies.Exact(), policies.Tape()], ids=repr)
+def test_an_interruption_leaves_nothing_behind(simulation, policy, monkeypatch):
+    problem = Problem(simulation, 30, losses.FinalPositions(np.zeros_like(simulation.positions)))
+    point = {**GRAVITY, "initial_positions": simulation.positions}
+    _, wanted = problem.value_and_gradient(point, policy)
+    fresh = Problem(simulation, 30, losses.FinalPositions(np.zeros_like(simulation.positions)))
+    solver = simulation.solver
+    recorded = type(solver).recorded
+    calls = []
+
+    def interrupted(self, *rest):
+        calls.append(1)
+        if len(calls) == 2:  # while a graph is captured
+            raise KeyboardInterrupt
+        recorded(self, *rest)
+
+    monkeypatch.setattr(type(solver), "recorded", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        for _ in range(3):
+            fresh.value_and_gradient(point, policy)
+    monkeypatch.undo()
+    _, found = fresh.value_and_gradient(point, policy)
+    for name, gradient in wanted.items():
+        assert gradient.tobytes() == found[name].tobytes()
+    np.testing.assert_array_equal(fresh.iterations(), np.full(30, 5))
+
+
+def test_an_adjoint_that_a_loss_keeps_is_not_changed(simulation):
+    class Height:
+        kept = None
+
+        def value(self, end):
+            return float(end.positions[:, 1].sum())
+
+        def adjoint(self, end):
+            if self.kept is None:
+                self.kept = State.zeros(125, end.precision, end.state.positions.device)
+                self.kept.set(np.tile([0.0, 1.0, 0.0], (125, 1)), np.zeros((125, 3)))
+            return self.kept
+
+    problem = Problem(simulation, 20, Height())
+    first, second = (problem.value_and_gradient(GRAVITY)[1]["gravity"] for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_targets_and_first_states_cannot_be_changed_behind_the_back(simulation):
+    target = np.zeros_like(simulation.positions)
+    loss = losses.FinalPositions(target)
+    target[:] = 1.0
+    assert loss.target.max() == 0.0
+    for array in (loss.target, simulation.positions, simulation.velocities):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+
+
+def test_fingerprints_tell_problems_apart(simulation, problem):
+    others = [
+        Problem(simulation, 61, problem.loss),
+        Problem(simulation, 60, losses.FinalPositions(simulation.positions + 1.0)),
+        Problem(Simulation(splash()), 60, problem.loss),
+        Problem(Simulation(splash(time_step=0.002), precision="float64"), 60, problem.loss),
+    ]
+    assert len({problem.fingerprint, *(other.fingerprint for other in others)}) == 5
+    assert problem.fingerprint == Problem(simulation, 60, losses.FinalPositions(simulation.positions)).fingerprint
+
+
+MISTAKES = {
+    "unknown name": lambda p: p.value({"gravty": 1.0}),
+    "text": lambda p: p.value({"gravity": "down"}),
+    "ragged": lambda p: p.value({"gravity": [[1.0], [1.0, 2.0]]}),
+    "shape of gravity": lambda p: p.value({"gravity": np.zeros((59, 3))}),
+    "components": lambda p: p.value({"gravity": [0.0, -9.81]}),
+    "NaN": lambda p: p.value({"viscosity": np.nan}),
+    "negative viscosity": lambda p: p.value({"viscosity": -1.0}),
+    "time step 0": lambda p: p.value({"time_step": 0.0}),
+    "density 0": lambda p: p.value({"rest_density": 0.0}),
+    "shape of positions": lambda p: p.value({"initial_positions": np.zeros((3, 3))}),
+    "array for a number": lambda p: p.value({"viscosity": [0.1, 0.2]}),
+    "unknown direction": lambda p: p.tangent(GRAVITY, {"speed": 1.0}),
+    "policy by name": lambda p: p.value_and_gradient(GRAVITY, policy="exact"),
+    "policy class": lambda p: p.value_and_gradient(GRAVITY, policy=policies.Exact),
+    "loss is an array": lambda p: Problem(p.simulation, 10, np.zeros((125, 3))),
+    "steps 0": lambda p: Problem(p.simulation, 0, p.loss),
+    "steps 1.5": lambda p: Problem(p.simulation, 1.5, p.loss),
+    "steps None": lambda p: Problem(p.simulation, None, p.loss),
+    "simulation is a file": lambda p: Problem("scene.toml", 10, p.loss),
+    "scene is a file": lambda p: Simulation("scene.toml"),
+    "device": lambda p: Simulation(p.simulation.scene, device="gpu7"),
+    "precision": lambda p: Simulation(p.simulation.scene, precision="float16"),
+    "target's shape": lambda p: Problem(p.simulation, 2, losses.FinalPositions(np.zeros((7, 3)))).value(GRAVITY),
+    "record_every": lambda p: p.simulation.run(2, record_every=0),
+    "controls": lambda p: p.simulation.run(2, controls={"wind": 1.0}),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_is_a_sentence(problem, mistake):
+    with pytest.raises(InputError) as caught:
+        mistake(problem)
+    sentence = str(caught.value)
+    assert "\n" not in sentence and sentence.endswith(".") and len(sentence) < 300
+
+
+def test_the_shape_of_a_users_adjoint_is_checked(simulation):
+    class Wrong(losses.FinalPositions):
+        def adjoint(self, end):
+            return np.zeros((7, 3)), np.zeros((7, 3))
+
+    problem = Problem(simulation, 5, Wrong(simulation.positions))
+    with pytest.raises(InputError, match=r"adjoint of positions has shape \(7, 3\)"):
+        problem.value_and_gradient(GRAVITY)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 50, 1000])
+def test_checkpoints_fit_where_they_can(steps):
+    for affordable in range(1, steps + 2):
+        interval = checkpoint_interval(steps, affordable)
+        alive = steps if interval == 1 else -(-steps // interval) + interval
+        assert alive <= max(affordable, 2 * np.sqrt(steps) + 3)
+
+
+def test_certificates_of_right_gradients():
+    for made in (splash(), plane()):
+        simulation = Simulation(made, precision="float64")
+        certificate = certify(Problem(simulation, 30, losses.FinalPositions(simulation.positions)))
+        assert certificate.right, certificate.as_dict()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        Comparison("g", np.nan, 1.0, (1.0,) * 8, 1e-13),
+        Comparison("g", 1.05, 1.05, (1.05, *(1.0,) * 7), 1e-13),
+        Comparison("g", 1.0, -1.0, (1.0,) * 8, 1e-13),
+        Comparison("g", 0.0, 1.0, (1.0,) * 8, 1e-13),
+    ],
+)
+def test_certificates_of_wrong_gradients(wrong):
+    assert not wrong.right
