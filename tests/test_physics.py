@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from cortado import Problem, Simulation, losses
+from cortado import DivergedError, Problem, Simulation, losses
+from cortado.errors import CortadoWarning
 from scenes import plane, scene, splash
 
 FREE = {"container": {"shape": "none"}}
@@ -80,6 +81,51 @@ def test_particles_keep_the_order_of_the_scene():
     moved = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=2)
     assert moved.max() < 0.02  # a particle that changed places would jump
     np.testing.assert_array_equal(trajectory.positions[0], simulation.positions)
+
+
+def test_lists_that_are_too_short_grow_and_nothing_changes():
+    simulation = Simulation(splash(), precision="float64")
+    problem = Problem(simulation, 100, losses.FinalPositions(np.zeros_like(simulation.positions)))
+    point = {"gravity": np.array([0.5, -9.81, 0.2])}
+    loss, gradient = problem.value_and_gradient(point)
+    simulation.solver.search.needed.zero_()
+    simulation.solver.grow(8)
+    again, same = problem.value_and_gradient(point)
+    assert simulation.solver.search.capacity > 8
+    assert loss == again and gradient["gravity"].tobytes() == same["gravity"].tobytes()
+
+
+def test_the_greatest_density_error_can_be_bounded_too():
+    loose = Simulation(splash(minimum_iterations=2, maximum_iterations=60, density_tolerance=0.01))
+    loose_rollout = loose.rollout(150)
+    loose_rollout.forward(keep=False)
+    limits = {"density_tolerance": 0.01, "maximum_density_tolerance": 0.01}
+    tight = Simulation(splash(minimum_iterations=2, maximum_iterations=60, **limits))
+    tight_rollout = tight.rollout(150)
+    tight_rollout.forward(keep=False)
+    assert loose_rollout.errors[:, 1].max() > 0.02
+    assert tight.converged(tight_rollout).all()
+    assert tight_rollout.errors[:, 1].max() <= 0.01
+    assert tight_rollout.iterations.max() > loose_rollout.iterations.max()
+
+
+def test_not_converging_is_reported():
+    simulation = Simulation(splash(minimum_iterations=2, maximum_iterations=3, density_tolerance=1e-9))
+    with pytest.warns(CortadoWarning, match=r"did not converge in \d+ of 150 steps"):
+        trajectory = simulation.run(150)
+    assert trajectory.not_converged > 0
+    assert trajectory.iterations.max() == 3
+
+
+def test_a_lost_particle_ends_the_run():
+    simulation = Simulation(splash(), precision="float64")
+    rollout = simulation.rollout(40)
+    velocities = np.zeros_like(simulation.positions)
+    velocities[17] = [1e9, 0.0, 0.0]
+    rollout.initial.set(simulation.positions, velocities)
+    with pytest.raises(DivergedError) as caught:
+        rollout.forward()
+    assert (caught.value.step, caught.value.particle) == (1, 17)
 
 
 def test_frames_and_records():

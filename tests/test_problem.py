@@ -80,6 +80,14 @@ def test_an_adjoint_that_a_loss_keeps_is_not_changed(simulation):
     np.testing.assert_array_equal(first, second)
 
 
+def test_a_run_under_parameters_ends_where_the_loss_looks(simulation, problem):
+    point = {"gravity": [1.0, -5.0, 0.0], "initial_velocities": simulation.velocities + 0.1, "time_step": 0.002}
+    trajectory = problem.run(point, record_every=25)
+    np.testing.assert_array_equal(trajectory.steps, [0, 25, 50, 60])
+    assert trajectory.times[-1] == pytest.approx(0.12)
+    np.testing.assert_array_equal(trajectory.positions[-1], problem.end(point).positions)
+
+
 def test_targets_and_first_states_cannot_be_changed_behind_the_back(simulation):
     target = np.zeros_like(simulation.positions)
     loss = losses.FinalPositions(target)

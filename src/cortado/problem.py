@@ -12,6 +12,7 @@ from cortado.particles import Parameters, State
 from cortado.policies import Exact, Policy
 from cortado.rollout import MEMORY_BUDGET, Rollout, StepDerivative
 from cortado.simulation import Simulation, as_numbers, check_steps
+from cortado.trajectory import Trajectory
 
 SCALARS = ("rest_density", "viscosity", "time_step")
 """Parameters that are one number, in the order in which the solver adds up their adjoints."""
@@ -59,6 +60,11 @@ class Problem:
         """The last state of the rollout under these parameters; ``keep`` checkpoints for a derivative."""
         self._set(self._checked(parameters))
         return TrajectoryEnd(self._rollout.forward(keep=keep), self.simulation.dimension)
+
+    def run(self, parameters: Values, record_every: int = 1) -> Trajectory:
+        """The whole trajectory under these parameters; see `Simulation.run`."""
+        self._set(self._checked(parameters))
+        return self.simulation.collect(self._rollout, record_every)
 
     def value_and_gradient(
         self, parameters: Values, policy: Policy | None = None

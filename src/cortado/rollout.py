@@ -85,24 +85,25 @@ class Rollout:
         state, step = self.initial, 0
         self._forget_stale_graphs()
         self.solver.reset()
-        self._read_records(0)
-        while step < self.steps:
-            last = min(step + (1 if self._device.is_cpu else CHUNK), self.steps)
-            chunk = self._advance(state, step, last)
-            if self._grow_lists():
-                continue
-            bad_step = int(self.solver.bad_step.numpy()[0])
-            good = chunk if bad_step < 0 else chunk[: bad_step - step]
-            for number, new_state in enumerate(good, step + 1):
-                if observe is not None:
-                    observe(number, new_state)
-                if keep and number % self._interval == 0:
-                    self._states[number] = new_state
-            if bad_step >= 0:
-                self._read_records(bad_step + 1)
-                raise self._diverged(bad_step)
-            state, step = chunk[-1], last
-        self._read_records(self.steps)
+        try:
+            while step < self.steps:
+                last = min(step + (1 if self._device.is_cpu else CHUNK), self.steps)
+                chunk = self._advance(state, step, last)
+                if self._grow_lists():
+                    continue
+                bad_step = int(self.solver.bad_step.numpy()[0])
+                good = chunk if bad_step < 0 else chunk[: bad_step - step]
+                for number, new_state in enumerate(good, step + 1):
+                    if observe is not None:
+                        observe(number, new_state)
+                    if keep and number % self._interval == 0:
+                        self._states[number] = new_state
+                if bad_step >= 0:
+                    step = bad_step + 1
+                    raise self._diverged(bad_step)
+                state, step = chunk[-1], last
+        finally:
+            self._read_records(step)
         return state
 
     def _advance(self, state: State, first: int, last: int) -> list[State]:

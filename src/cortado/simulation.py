@@ -65,22 +65,25 @@ class Simulation:
         ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity. Warns when the pressure did
         not converge; raises `DivergedError` when a particle is lost.
         """
+        return self.collect(self.rollout(steps, controls), record_every)
+
+    def collect(self, rollout: Rollout, record_every: int = 1) -> Trajectory:
+        """Run a rollout forward and return its frames; warnings and errors as of `run`."""
         if record_every < 1:
             raise InputError(f"record_every is {record_every}, but must be at least 1.")
-        rollout = self.rollout(steps, controls)
         frames = [(0, *rollout.initial.numpy(self.dimension))]
 
         def keep(step: int, state: State) -> None:
-            if step % record_every == 0 or step == steps:
+            if step % record_every == 0 or step == rollout.steps:
                 frames.append((step, *state.numpy(self.dimension)))
 
         rollout.forward(keep, keep=False)
         converged = self.converged(rollout)
         if not converged.all():
-            warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=2)
+            warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=3)
         numbers, positions, velocities = (np.array(column) for column in zip(*frames, strict=True))
         return Trajectory(
-            times=numbers * self.scene.solver.time_step,
+            times=numbers * float(rollout.parameters.time_step.numpy()[0]),
             steps=numbers,
             positions=positions,
             velocities=velocities,
