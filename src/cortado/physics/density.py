@@ -20,14 +20,16 @@ def density_sums(discretisation: Discretisation) -> SimpleNamespace:
     surroundings = surroundings_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, weight, gradient = pair.separation, pair.weight, pair.gradient
+    vectors, numbers = pair.vectors, pair.numbers
 
     @wp.func
     def weights(i: int, x: wp.array(dtype=vector), s: surroundings) -> real:
         x_i = x[i]
         total = real(0.0)
         for k in range(0, s.fluid_count[i], UNROLL):
+            x_j = vectors(x, k, i, s)
             for u in range(UNROLL):
-                total += weight(separation(x_i, x[s.neighbours[k + u, i]], s), s)
+                total += weight(separation(x_i, x_j[u], s), s)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             total += s.wall_weights[b] * weight(separation(x_i, s.wall_positions[b], s), s)
@@ -54,9 +56,10 @@ def density_sums(discretisation: Discretisation) -> SimpleNamespace:
         r_i = r[i]
         total = vector()
         for k in range(0, s.fluid_count[i], UNROLL):
+            x_j = vectors(x, k, i, s)
+            r_j = numbers(r, k, i, s)
             for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
-                total += (r_i + r[j]) * gradient(separation(x_i, x[j], s), s)
+                total += (r_i + r_j[u]) * gradient(separation(x_i, x_j[u], s), s)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             total += (s.wall_weights[b] * r_i) * gradient(separation(x_i, s.wall_positions[b], s), s)

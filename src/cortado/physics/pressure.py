@@ -134,6 +134,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
     surroundings = surroundings_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, gradient, hessian_product = pair.separation, pair.gradient, pair.hessian_product
+    vectors, numbers = pair.vectors, pair.numbers
 
     @wp.func
     def force_sum(i: int, x: wp.array(dtype=vector), c: wp.array(dtype=real), s: surroundings) -> vector:
@@ -141,9 +142,10 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         c_i = c[i]
         total = vector()
         for k in range(0, s.fluid_count[i], UNROLL):
+            x_j = vectors(x, k, i, s)
+            c_j = numbers(c, k, i, s)
             for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
-                total += (c_i + c[j]) * gradient(separation(x_i, x[j], s), s)
+                total += (c_i + c_j[u]) * gradient(separation(x_i, x_j[u], s), s)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             total += (s.wall_push * s.wall_weights[b] * c_i) * gradient(separation(x_i, s.wall_positions[b], s), s)
@@ -257,12 +259,14 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         stretch = real(0.0)
         bend = vector()
         for k in range(0, s.fluid_count[i], UNROLL):
+            x_j = vectors(x, k, i, s)
+            c_j = numbers(c, k, i, s)
+            push_bar_j = vectors(push_bar, k, i, s)
             for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
-                x_ij = separation(x_i, x[j], s)
-                u_ij = push_bar_i - push_bar[j]
+                x_ij = separation(x_i, x_j[u], s)
+                u_ij = push_bar_i - push_bar_j[u]
                 stretch += wp.dot(gradient(x_ij, s), u_ij)
-                bend += (c_i + c[j]) * hessian_product(x_ij, u_ij, s)
+                bend += (c_i + c_j[u]) * hessian_product(x_ij, u_ij, s)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             x_ib = separation(x_i, s.wall_positions[b], s)

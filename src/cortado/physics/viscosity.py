@@ -101,7 +101,8 @@ def viscosity_kernels(discretisation: Discretisation, form: PairFunctions) -> Si
     """Kernels ``forward``, ``tangent`` and ``adjoint`` of the viscous acceleration with a given pair force phi."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     surroundings = surroundings_type(discretisation.precision)
-    separation = pair_functions(discretisation).separation
+    pair = pair_functions(discretisation)
+    separation, vectors, numbers = pair.separation, pair.vectors, pair.numbers
     phi = form(discretisation)
     phi_force, phi_tangent, phi_adjoint_x, phi_adjoint_v = phi.force, phi.tangent, phi.adjoint_x, phi.adjoint_v
     name = form.__name__.removesuffix("_functions")  # a module for each form: their functions share names
@@ -120,9 +121,11 @@ def viscosity_kernels(discretisation: Discretisation, form: PairFunctions) -> Si
         v_i = v[i]
         total = vector()
         for k in range(0, s.fluid_count[i], UNROLL):
+            x_j = vectors(x, k, i, s)
+            v_j = vectors(v, k, i, s)
+            rho_j = numbers(rho, k, i, s)
             for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
-                total += (mass / rho[j]) * phi_force(separation(x_i, x[j], s), v_i - v[j], s)
+                total += (mass / rho_j[u]) * phi_force(separation(x_i, x_j[u], s), v_i - v_j[u], s)
         if friction != real(0.0):
             for k in range(s.fluid_count[i], s.count[i]):
                 b = s.neighbours[k, i]
@@ -241,12 +244,15 @@ def viscosity_kernels(discretisation: Discretisation, form: PairFunctions) -> Si
         fluid_work = real(0.0)
         wall_work = real(0.0)
         for k in range(0, s.fluid_count[i], UNROLL):
+            x_j = vectors(x, k, i, s)
+            v_j = vectors(v, k, i, s)
+            rho_j = numbers(rho, k, i, s)
+            w_j = vectors(acceleration_bar, k, i, s)
             for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
-                x_ij = separation(x_i, x[j], s)
-                v_ij = v_i - v[j]
-                volume_j = mass / rho[j]
-                w_ij = w_i - acceleration_bar[j]
+                x_ij = separation(x_i, x_j[u], s)
+                v_ij = v_i - v_j[u]
+                volume_j = mass / rho_j[u]
+                w_ij = w_i - w_j[u]
                 x_sum += volume_j * phi_adjoint_x(x_ij, v_ij, w_ij, s)
                 v_sum += volume_j * phi_adjoint_v(x_ij, v_ij, w_ij, s)
                 fluid_work += volume_j * wp.dot(phi_force(x_ij, v_ij, s), w_ij)
