@@ -18,6 +18,7 @@ SCALARS = ("rest_density", "viscosity", "time_step")
 """Parameters that are one number, in the order in which the solver adds up their adjoints."""
 STATES = ("initial_positions", "initial_velocities")
 NAMES = ("gravity", *STATES, *SCALARS)
+UNITS = dict(zip(NAMES, ("m/s²", "m", "m/s", "kg/m³", "Pa s", "s"), strict=True))
 
 Values = Mapping[str, Any]
 

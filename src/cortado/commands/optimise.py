@@ -11,7 +11,7 @@ from cortado.errors import ComputationError, DivergedError
 from cortado.figures import loss_curve, parameters, particles
 from cortado.losses import FinalPositions
 from cortado.optimisation import Record, Result, optimise
-from cortado.problem import Problem
+from cortado.problem import UNITS, Problem
 from cortado.progress import track
 from cortado.report import write_report
 from cortado.run_folder import RunFolder
@@ -125,7 +125,7 @@ def _write_pictures(
         if max(np.size(found), hidden.size) <= MOST_CURVES:
             history = [np.broadcast_arrays(record.parameters[name], hidden)[0] for record in result.history]
             hidden = np.broadcast_to(hidden, history[0].shape)
-            path = parameters(history, hidden, folder.figures / f"{name}.png", title=name)
+            path = parameters(history, hidden, folder.figures / f"{name}.png", title=name, unit=UNITS[name])
             figures.append((f"The parameter {name} during the optimisation, and the hidden one.", path))
     before = problem.end(task.optimise.start).positions
     after = problem.end(result.parameters).positions

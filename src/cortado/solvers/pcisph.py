@@ -6,6 +6,7 @@ and keeps every intermediate value, for `cortado.solvers.pcisph_derivatives`. No
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -54,6 +55,30 @@ class PressureSolve:
     """Bound on the maximum of the same; infinite where none is asked for."""
 
 
+@dataclass(frozen=True)
+class Kernels:
+    """The kernels of a step, each topic with its forward, tangent and adjoint."""
+
+    density: SimpleNamespace
+    walls: SimpleNamespace
+    pressure: SimpleNamespace
+    force: SimpleNamespace
+    integration: SimpleNamespace
+    convergence: SimpleNamespace
+
+    @classmethod
+    def of(cls, discretisation: Discretisation) -> "Kernels":
+        """Those for a smoothing kernel and a precision."""
+        return cls(
+            density_kernels(discretisation),
+            wall_kernels(discretisation),
+            pressure_kernels(discretisation),
+            pressure_force_kernels(discretisation),
+            integration_kernels(discretisation.precision),
+            convergence_kernels(discretisation.precision),
+        )
+
+
 class Iterates:
     """Predicted states and pressures of the iterations of one step; a single slot is overwritten each time."""
 
@@ -94,12 +119,7 @@ class Pcisph:
         self.discretisation, self.lattice, self.search = discretisation, lattice, search
         self.terms, self.pressure, self.periods = tuple(terms), pressure, tuple(periods)
         self.launch = Launcher(particles, device, record_tape=requires_grad)
-        self._density = density_kernels(discretisation)
-        self._walls = wall_kernels(discretisation)
-        self._pressure = pressure_kernels(discretisation)
-        self._force = pressure_force_kernels(discretisation)
-        self._integration = integration_kernels(precision)
-        self._convergence = convergence_kernels(precision)
+        self.kernels = Kernels.of(discretisation)
         self._sum = sum_and_maximum(particles, precision, device)
 
         def vectors() -> wp.array:
@@ -173,7 +193,7 @@ class Pcisph:
         if self.pressure is not None:
             self._solve_pressure(self.pressure, parameters)
         self.recorded(0, new_state)
-        f, c = self.iterates, self._convergence
+        f, c = self.iterates, self.kernels.convergence
         self.launch(
             c.check,
             [self.search.order, self.search.origin, 1e6 * self.lattice.support, f.x_star[0], f.v_star[0]],
@@ -197,7 +217,7 @@ class Pcisph:
         """The new state of the step that was recorded: its last prediction, in the scene's order."""
         it = self.iterates
         self.launch(
-            self._integration.unsort,
+            self.kernels.integration.unsort,
             [self.search.order, it.x_star[iterations], it.v_star[iterations]],
             [new_state.positions, new_state.velocities],
         )
@@ -210,15 +230,15 @@ class Pcisph:
         """Neighbours, density, explicit forces, and the first prediction."""
         f, it, s = self.fields, self.iterates, self._surroundings
         self.search.sort(state.positions)
-        self.launch(self._integration.sort, [self.search.order, state.positions, state.velocities], [f.x, f.v])
+        self.launch(self.kernels.integration.sort, [self.search.order, state.positions, state.velocities], [f.x, f.v])
         self.search.fill(s, f.x)
-        self.launch(self._density.forward, [s, parameters.rest_density, f.x], [f.rho])
-        self.launch(self._walls.forward, [s, f.x], [self.wall_yield])
+        self.launch(self.kernels.density.forward, [s, parameters.rest_density, f.x], [f.rho])
+        self.launch(self.kernels.walls.forward, [s, f.x], [self.wall_yield])
         moment = self.moment(parameters)
         for t, term in enumerate(self.terms):
             term.accelerate(moment, self.accelerations[t], self.accelerations[t + 1])
         self.launch(
-            self._integration.predict,
+            self.kernels.integration.predict,
             [parameters.time_step, f.x, f.v, self.accelerations[-1]],
             [it.x_star[0], it.v_star[0]],
         )
@@ -239,7 +259,7 @@ class Pcisph:
     def _decide(self, solve: PressureSolve, done: int) -> None:
         self._error_sums = self._sum(self._errors)
         self.launch(
-            self._convergence.decide,
+            self.kernels.convergence.decide,
             [done, solve.maximum_iterations, self.search.particles, solve.tolerance, solve.greatest_tolerance]
             + [self._error_sums],
             [self._iteration, self._active],
@@ -253,13 +273,13 @@ class Pcisph:
         pressure_before = it.p[0] if k == 0 else it.p[max(slot - 1, 1)]
         pressure = it.p[max(slot, 1)]
         self.launch(
-            self._pressure.forward,
+            self.kernels.pressure.forward,
             [s, self.lattice.stiffness, p.rest_density, p.time_step, f.rho, self.wall_yield]
             + [it.x_star[before], pressure_before],
             [pressure, it.c[before], self._errors],
         )
         self.launch(
-            self._force.forward,
+            self.kernels.force.forward,
             [s, p.rest_density, p.time_step, f.x, f.v, self.accelerations[-1], it.c[before]],
             [it.x_star[slot], it.v_star[slot]],
         )
