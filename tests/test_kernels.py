@@ -16,7 +16,8 @@ import warp as wp
 from cortado.launching import TreeSum, sum_and_maximum, vector_sum
 from cortado.neighbours import Grid, NeighbourSearch
 from cortado.physics.density import density_kernels
-from cortado.physics.integration import gravity_kernels, integration_kernels
+from cortado.physics.gravity import gravity_kernels
+from cortado.physics.integration import integration_kernels
 from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
 from cortado.physics.surroundings import Discretisation, surroundings_type
 from cortado.physics.viscosity import laminar_functions, pairwise_functions, viscosity_kernels

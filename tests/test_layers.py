@@ -14,7 +14,7 @@ ROOT = Path(cortado.__file__).parent
 LAYERS = """
     errors
     precision smoothing calibration
-    physics.surroundings physics.density physics.walls physics.integration physics.pressure
+    physics.surroundings physics.density physics.walls physics.integration physics.gravity physics.pressure
     physics.viscosity physics.convergence physics.reduction physics.matching
     neighbours launching particles
     shapes scene_kinds scene_tables scene_toml scene_points

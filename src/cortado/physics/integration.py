@@ -1,14 +1,16 @@
-"""Semi-implicit Euler (report eqs. 3 and 4), gravity (eq. 8), and the way between scene order and sorted order."""
+"""Semi-implicit Euler (report eqs. 3 and 4), and the way between scene order and sorted order."""
 
 from functools import cache
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from cortado.precision import Precision
 
 
-def _module(precision: Precision, differentiable: bool):
+def integration_module(precision: Precision, differentiable: bool) -> Any:
+    """The Warp module of kernels that need no smoothing kernel."""
     kind = "forward" if differentiable else "derivative"
     module = wp.get_module(f"cortado_integration_{kind}_{precision.name}")
     module.options["enable_backward"] = differentiable
@@ -29,40 +31,12 @@ def prediction_functions(precision: Precision) -> SimpleNamespace:
 
 
 @cache
-def gravity_kernels(precision: Precision) -> SimpleNamespace:
-    """Kernels ``forward``, ``tangent`` and ``adjoint`` of an acceleration that is the same everywhere."""
-    vector = precision.vector
-
-    @wp.kernel(module=_module(precision, True))
-    def gravity(
-        table: wp.array(dtype=vector),
-        step: wp.array(dtype=wp.int32),
-        acceleration_in: wp.array(dtype=vector),
-        # out
-        acceleration: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        acceleration[i] = acceleration_in[i] + table[step[0]]
-
-    @wp.kernel(module=_module(precision, False), enable_backward=False)
-    def gravity_adjoint(
-        total: wp.array(dtype=vector),
-        step: wp.array(dtype=wp.int32),
-        # out
-        table_bar: wp.array(dtype=vector),
-    ):
-        table_bar[step[0]] = total[0]
-
-    return SimpleNamespace(forward=gravity, tangent=gravity, adjoint=gravity_adjoint)
-
-
-@cache
 def integration_kernels(precision: Precision) -> SimpleNamespace:
     """Kernels of the time step: ``sort`` and ``unsort`` a state, ``predict`` without pressure, and derivatives."""
     real, vector = precision.real, precision.vector
     adjoin_prediction = prediction_functions(precision).adjoint
 
-    @wp.kernel(module=_module(precision, True))
+    @wp.kernel(module=integration_module(precision, True))
     def sort(
         order: wp.array(dtype=wp.int32),
         x_scene: wp.array(dtype=vector),
@@ -75,7 +49,7 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         x[i] = x_scene[order[i]]
         v[i] = v_scene[order[i]]
 
-    @wp.kernel(module=_module(precision, True))
+    @wp.kernel(module=integration_module(precision, True))
     def unsort(
         order: wp.array(dtype=wp.int32),
         x: wp.array(dtype=vector),
@@ -88,7 +62,7 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         x_scene[order[i]] = x[i]
         v_scene[order[i]] = v[i]
 
-    @wp.kernel(module=_module(precision, True))
+    @wp.kernel(module=integration_module(precision, True))
     def predict(
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),
@@ -103,7 +77,7 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         v_star[i] = velocity
         x_star[i] = x[i] + time_step[0] * velocity
 
-    @wp.kernel(module=_module(precision, False), enable_backward=False)
+    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def predict_tangent(
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
@@ -122,7 +96,7 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         v_star_dot[i] = velocity_dot
         x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[0] * v_star[i]
 
-    @wp.kernel(module=_module(precision, False), enable_backward=False)
+    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def begin_adjoint(
         order: wp.array(dtype=wp.int32),
         time_step: wp.array(dtype=real),
@@ -153,7 +127,7 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         p_bar[i] = real(0.0)
         scalars_bar[i] = scalars_bar[i] + adjoin_prediction(x_star_bar, speed_bar, v[i], v_star[i], dt)
 
-    @wp.kernel(module=_module(precision, False), enable_backward=False)
+    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def acceleration_adjoint(
         time_step: wp.array(dtype=real),
         v_bar: wp.array(dtype=vector),

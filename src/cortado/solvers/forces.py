@@ -12,7 +12,7 @@ import warp as wp
 from cortado.calibration import WallLayer
 from cortado.launching import Launcher, TreeSum, vector_sum
 from cortado.particles import Fields, Parameters
-from cortado.physics.integration import gravity_kernels
+from cortado.physics.gravity import gravity_kernels
 from cortado.physics.surroundings import Discretisation
 from cortado.physics.viscosity import (
     PairFunctions,
