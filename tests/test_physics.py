@@ -111,7 +111,7 @@ def test_the_greatest_density_error_can_be_bounded_too():
 
 
 def test_many_iterations_converge_with_a_wide_support():
-    """With the plain delta of Solenthaler and Pajarola they diverge: 19 m/s and errors of 0.6 % here, worse with more."""
+    """With the plain delta of Solenthaler and Pajarola they diverge: 19 m/s here, and worse with more particles."""
     made = dam_break(512).model_dump()
     made["discretisation"] |= {"support": 3.0}
     made["solver"] |= {"time_step": 0.005, "minimum_iterations": 30, "maximum_iterations": 30}

@@ -33,7 +33,7 @@ class Exact:
 class Tape:
     """The exact adjoint again, by Warp's own automatic differentiation of the forward kernels.
 
-    The report's autograd: several times slower than `Exact`, and kept to check it.
+    The report's autograd: slower than `Exact`, with atomics on a GPU, and kept to check it.
     """
 
     def derivative(self, rollout: Rollout) -> StepDerivative:
