@@ -41,7 +41,7 @@ def test_same_bits_twice(precision):
 def test_short_lists_grow():
     simulation = Simulation(splash(), "cuda:0", "float64")
     wanted = simulation.run(40).positions
-    simulation.solver.search.needed.zero_()
+    simulation.solver.search.forget_needed()
     simulation.solver.grow(8)
     np.testing.assert_array_equal(simulation.run(40).positions, wanted)
     assert simulation.solver.search.capacity > 8

@@ -16,7 +16,7 @@ LAYERS = """
     precision smoothing calibration
     physics.surroundings physics.density physics.walls physics.integration physics.gravity physics.pressure
     physics.viscosity physics.convergence physics.reduction physics.matching
-    neighbours launching particles
+    launching neighbours particles
     shapes scene_kinds scene_tables scene_toml scene_points
     scene_fluids scene_containers scene_stability scene_checks scene sampling
     vtkhdf trajectory

@@ -96,7 +96,7 @@ def lists(
             assert fluid_count[i] % UNROLL == 0 <= fluid_count[i] - own[i] < UNROLL
         assert (fluid_count[i] % UNROLL == 0 and 0 <= fluid_count[i] - own[i] < UNROLL) or capacity < 400
         near_walls[order[i]] = wall_names[rows[i, fluid_count[i] : count[i]]]
-    return Found(search, grid, order, fluid, near_walls, int(search.needed.numpy()[0]), rows, count)
+    return Found(search, grid, order, fluid, near_walls, search.needed, rows, count)
 
 
 def distances(x: np.ndarray, y: np.ndarray, period: Any, precision: Precision) -> np.ndarray:

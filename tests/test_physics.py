@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cortado import DivergedError, Problem, Scene, Simulation, losses
+from cortado import DivergedError, Problem, Scene, Simulation, launching, losses
 from cortado.commands.bench import dam_break
 from cortado.errors import CortadoWarning
 from scenes import plane, scene, splash
@@ -89,7 +89,7 @@ def test_lists_that_are_too_short_grow_and_nothing_changes():
     problem = Problem(simulation, 100, losses.FinalPositions(np.zeros_like(simulation.positions)))
     point = {"gravity": np.array([0.5, -9.81, 0.2])}
     loss, gradient = problem.value_and_gradient(point)
-    simulation.solver.search.needed.zero_()
+    simulation.solver.search.forget_needed()
     simulation.solver.grow(8)
     again, same = problem.value_and_gradient(point)
     assert simulation.solver.search.capacity > 8
@@ -144,3 +144,22 @@ def test_frames_and_records():
     np.testing.assert_array_equal(trajectory.steps, [0, 4, 8, 10])
     assert trajectory.positions.shape == (4, 125, 3)
     np.testing.assert_array_equal(trajectory.iterations, np.full(10, 5))
+
+
+def test_any_number_of_threads_gives_the_same_bits(monkeypatch):
+    def once(parts):
+        monkeypatch.setattr(launching, "LEAST_PART", 125 // parts)
+        monkeypatch.setattr(launching.os, "sched_getaffinity", lambda _: range(parts), raising=False)
+        simulation = Simulation(splash(minimum_iterations=2, maximum_iterations=20), precision="float64")
+        assert simulation.solver.launch.capturable == (parts == 1)
+        simulation.solver.grow(8)
+        problem = Problem(simulation, 120, losses.FinalPositions(np.zeros_like(simulation.positions)))
+        point = {"gravity": np.array([0.5, -9.81, 0.2]), "initial_positions": simulation.positions, "viscosity": 0.05}
+        loss, gradient = problem.value_and_gradient(point)
+        tangent = problem.tangent(point, {"gravity": np.ones(3)})
+        return [np.array(loss), np.array(tangent), problem.iterations(), *gradient.values()]
+
+    wanted = once(1)
+    for parts in (2, 5):
+        for found, exact in zip(once(parts), wanted, strict=True):
+            assert found.tobytes() == exact.tobytes()

@@ -1,6 +1,9 @@
 """Launches over particles, and sums over particles in a fixed order."""
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any
 
 import warp as wp
@@ -12,14 +15,40 @@ BRANCHES = 32
 """Values that one thread of a tree sum adds up."""
 
 
+MOST_PARTS = 16
+"""Ranges of particles at most that a launch on a CPU is cut into."""
+LEAST_PART = 2000
+"""Particles at least in such a range: below, starting it costs more than it saves."""
+
+
 class Launcher:
-    """Launches kernels with one thread a particle on one device."""
+    """Launches kernels with one thread a particle on one device.
+
+    On a CPU Warp launches in one thread; a kernel that sums over neighbours, which begins with its surroundings, is cut
+    into ranges of particles for the cores there are. Its sums are gathers, so that the bits do not depend on the cut.
+    """
 
     def __init__(self, particles: int, device: Any, record_tape: bool):
         """``record_tape`` False keeps launches off a tape that a user may have open."""
         self.particles, self.device, self._record_tape = particles, device, record_tape
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        parts = min(cores, MOST_PARTS, particles // LEAST_PART) if device.is_cpu and not record_tape else 1
+        self._bounds = [particles * part // max(parts, 1) for part in range(max(parts, 1) + 1)]
+        self._compiled: set[Any] = set()
+        self._whole: Any = None
+        self._parts: list[Any] = []
+
+    @property
+    def capturable(self) -> bool:
+        """Whether launches may be captured as a graph: those of one thread."""
+        return len(self._bounds) == 2
 
     def __call__(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any], threads: int | None = None) -> None:
+        if not self.capturable and hasattr(inputs[0], "neighbours"):
+            if kernel in self._compiled:
+                self._launch_parts(kernel, inputs, outputs)
+                return
+            self._compiled.add(kernel)  # by the one launch that follows
         wp.launch(
             kernel,
             threads or self.particles,
@@ -30,6 +59,36 @@ class Launcher:
         )
 
 
+    def _launch_parts(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
+        if self._whole is not inputs[0]:
+            self._whole, self._parts = inputs[0], [self._part(inputs[0], n) for n in range(len(self._bounds) - 1)]
+
+        def launch(part: int) -> None:
+            wp.launch(
+                kernel,
+                self._bounds[part + 1] - self._bounds[part],
+                inputs=[self._parts[part], *inputs[1:]],
+                outputs=outputs,
+                device=self.device,
+                record_tape=False,
+            )
+
+        list(_pool().map(launch, range(len(self._parts))))
+
+    def _part(self, surroundings: Any, number: int) -> Any:
+        """The surroundings as one range sees them."""
+        part = surroundings._cls()
+        for name in surroundings._cls.vars:
+            setattr(part, name, getattr(surroundings, name))
+        part.first, part.part = self._bounds[number], number
+        return part
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(MOST_PARTS, thread_name_prefix="cortado")
+
+
 class Replayed:
     """Work that is done over and over with the same arrays: a captured graph from the second time on.
 
@@ -37,17 +96,17 @@ class Replayed:
     half of the time with a hundred particles.
     """
 
-    def __init__(self, work: Callable[[], None], device: Any):
-        self._work, self._device = work, device
+    def __init__(self, work: Callable[[], None], launch: Launcher):
+        self._work, self._launch = work, launch
         self._warm, self._graph = False, None
 
     def __call__(self) -> None:
-        if not self._warm:
+        if not self._warm or not self._launch.capturable:
             self._work()
             self._warm = True
             return
         if self._graph is None:
-            with wp.ScopedCapture(device=self._device) as capture:
+            with wp.ScopedCapture(device=self._launch.device) as capture:
                 self._work()
             self._graph = capture.graph
         wp.capture_launch(self._graph)

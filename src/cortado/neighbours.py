@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.launching import MOST_PARTS, Launcher
 from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
 from cortado.precision import Precision
 
@@ -193,8 +194,8 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
 
     @wp.kernel(module=discretisation.module(False, "neighbours"), enable_backward=False)
     def fill(
-        grid: grid_type,
         s: surroundings,
+        grid: grid_type,
         x: wp.array(dtype=vector),
         # out
         fluid_count: wp.array(dtype=wp.int32),
@@ -202,8 +203,8 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
         count: wp.array(dtype=wp.int32),
         needed: wp.array(dtype=wp.int32),
     ):
-        """``needed`` becomes the longest list, also where that is more than there is room for."""
-        i = wp.tid()
+        """``needed``, for each range, becomes the longest list, also where that is more than there is room for."""
+        i = s.first + wp.tid()
         x_i = x[i]
         c = cell_of(x_i, grid)
         n_y = grid.shape[1]
@@ -226,8 +227,8 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
                     row = (wrap(c[2] + o_z, n_z) * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]
                     found = scan_row(i, -1, row, c[0], found, x_i, s.wall_positions, grid.wall_starts, grid, s)
         count[i] = wp.min(found, capacity)
-        if found > needed[0]:
-            wp.atomic_max(needed, 0, found)
+        if found > needed[s.part]:
+            wp.atomic_max(needed, s.part, found)
 
     return fill
 
@@ -259,7 +260,8 @@ class NeighbourSearch:
         self.fluid_count = wp.zeros(particles, dtype=wp.int32, device=device)
         self.filling = wp.zeros(particles, dtype=wp.int32, device=device)
         self.count = wp.zeros(particles, dtype=wp.int32, device=device)
-        self.needed = wp.zeros(1, dtype=wp.int32, device=device)
+        self._launch = Launcher(particles, device, record_tape=False)
+        self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
         self._grid = _grid_type(precision)()
         self._grid.origin = precision.vector(*grid.origin)
         self._grid.frequency = precision.vector(*(1.0 / grid.cell))
@@ -287,15 +289,18 @@ class NeighbourSearch:
         self._sort(positions, self.particles, self._keys, self.order, self._grid.starts)
 
     def fill(self, surroundings: Any, positions: wp.array) -> None:
-        """List the neighbours of sorted positions (n,) [m]; ``needed`` tells whether the lists were long enough."""
-        wp.launch(
-            self._fill,
-            self.particles,
-            inputs=[self._grid, surroundings, positions],
-            outputs=[self.fluid_count, self.filling, self.count, self.needed],
-            device=self.device,
-            record_tape=False,
-        )
+        """List the neighbours of sorted positions (n,) [m]; `needed` tells whether the lists were long enough."""
+        outputs = [self.fluid_count, self.filling, self.count, self._needed]
+        self._launch(self._fill, [surroundings, self._grid, positions], outputs)
+
+    @property
+    def needed(self) -> int:
+        """The longest list since `forget_needed`; more than the capacity if there was too little room."""
+        return int(self._needed.numpy().max())
+
+    def forget_needed(self) -> None:
+        """Begin anew with `needed`."""
+        self._needed.zero_()
 
     def _sort(self, positions: wp.array, count: int, keys: wp.array, order: wp.array, starts: wp.array) -> None:
         wp.launch(

@@ -118,11 +118,11 @@ class Rollout:
 
     def _grow_lists(self) -> bool:
         """Whether the neighbour lists were too short; they are longer now, and what used them must be repeated."""
-        needed = int(self.solver.search.needed.numpy()[0])
+        needed = self.solver.search.needed
         if needed <= self.solver.search.capacity:
             return False
         self.solver.grow(min(needed + needed // 8 + 1, 2 * self.solver.search.capacity))
-        self.solver.search.needed.zero_()
+        self.solver.search.forget_needed()
         self._forget_stale_graphs()
         self.solver.reset()
         return True
@@ -133,7 +133,7 @@ class Rollout:
             return
         self._growth = self.solver.growth
         step = partial(self.solver.step, self._buffer, self._buffer, self.parameters, self._records)
-        self._step = Replayed(step, self._device)
+        self._step = Replayed(step, self.solver.launch)
         self._steps_back: dict[tuple[StepDerivative, int], Replayed] = {}
 
     def _diverged(self, step: int) -> DivergedError:
@@ -170,7 +170,7 @@ class Rollout:
         key = (derivative, iterations)
         if key not in self._steps_back:
             self.solver.iterates.reserve(iterations)
-            self._steps_back[key] = Replayed(work, self._device)
+            self._steps_back[key] = Replayed(work, self.solver.launch)
         self._steps_back[key]()
 
     def tangent(self, dot: State, parameters_dot: Parameters) -> None:

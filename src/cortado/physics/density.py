@@ -84,7 +84,7 @@ def density_kernels(discretisation: Discretisation) -> SimpleNamespace:
         # out
         rho: wp.array(dtype=real),
     ):
-        i = wp.tid()
+        i = s.first + wp.tid()
         total = weights(i, x, s)
         rho[i] = rest_density[0] * s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
 
@@ -99,7 +99,7 @@ def density_kernels(discretisation: Discretisation) -> SimpleNamespace:
         # out
         rho_dot: wp.array(dtype=real),
     ):
-        i = wp.tid()
+        i = s.first + wp.tid()
         total = weights_tangent(i, x, x_dot, s)
         scaling = rest_density_dot[0] / rest_density[0]
         rho_dot[i] = rest_density[0] * s.volume * total + rho[i] * scaling
@@ -116,7 +116,7 @@ def density_kernels(discretisation: Discretisation) -> SimpleNamespace:
         scalars_bar: wp.array(dtype=vector),
     ):
         """``scalars_bar`` gathers the adjoints of (rest density, viscosity, time step), particle by particle."""
-        i = wp.tid()
+        i = s.first + wp.tid()
         total = weights_adjoint(i, x, rho_bar, s)
         x_bar[i] = x_bar[i] + rest_density[0] * s.volume * total
         scalars_bar[i] = scalars_bar[i] + vector(rho_bar[i] * rho[i] / rest_density[0], real(0.0), real(0.0))

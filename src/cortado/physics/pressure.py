@@ -49,7 +49,7 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         error: wp.array(dtype=pair_of),
     ):
         """``error``: the compression (rho* - rho_0)+ / rho_0 of a particle, twice (for a sum and a maximum)."""
-        i = wp.tid()
+        i = s.first + wp.tid()
         total = weights(i, x_star, s)
         rho_0 = rest_density[0]
         excess = rho_0 * s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - rho_0
@@ -83,7 +83,7 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         p_out_dot: wp.array(dtype=real),
         c_dot: wp.array(dtype=real),
     ):
-        i = wp.tid()
+        i = s.first + wp.tid()
         total = weights_tangent(i, x_star, x_star_dot, s)
         p_i = p_out[i]
         p_dot_i = real(0.0)
@@ -114,7 +114,7 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         push_bar: wp.array(dtype=vector),
     ):
         """From the adjoint r of rho* to that of x*, and on to what x* was predicted from."""
-        i = wp.tid()
+        i = s.first + wp.tid()
         total = weights_adjoint(i, x_star, r, s)
         x_star_bar = rest_density[0] * s.volume * total
         dt = time_step[0]
@@ -191,7 +191,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         x_star: wp.array(dtype=vector),
         v_star: wp.array(dtype=vector),
     ):
-        i = wp.tid()
+        i = s.first + wp.tid()
         total = force_sum(i, x, c, s)
         dt = time_step[0]
         push = -(rest_density[0] * s.volume) * total
@@ -219,7 +219,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         x_star_dot: wp.array(dtype=vector),
         v_star_dot: wp.array(dtype=vector),
     ):
-        i = wp.tid()
+        i = s.first + wp.tid()
         total_dot = force_sum_tangent(i, x, x_dot, c, c_dot, s)
         dt = time_step[0]
         accelerated = (v_star[i] - v[i]) / dt
@@ -252,7 +252,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         r: wp.array(dtype=real),
     ):
         """From the adjoint of the pressure acceleration to those of c, p and (r) of rho*: every sum a gather."""
-        i = wp.tid()
+        i = s.first + wp.tid()
         x_i = x[i]
         c_i = c[i]
         push_bar_i = push_bar[i]

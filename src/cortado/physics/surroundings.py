@@ -36,6 +36,10 @@ def surroundings_type(precision: Precision) -> Any:
     real, vector = precision.real, precision.vector
 
     class Surroundings:
+        first: wp.int32
+        """Particle of a launch's first thread: a launch may be cut into ranges of particles."""
+        part: wp.int32
+        """Number of the range."""
         neighbours: wp.array2d(dtype=wp.int32)
         """First the fluid neighbours of a particle, filled up with itself, then its wall neighbours."""
         fluid_count: wp.array(dtype=wp.int32)

@@ -183,7 +183,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairFunctions) -> Si
         # out
         acceleration: wp.array(dtype=vector),
     ):
-        i = wp.tid()
+        i = s.first + wp.tid()
         total = force_sum(i, rest_density[0] * s.volume, friction, x, v, rho, s)
         acceleration[i] = acceleration_in[i] + (kappa * mu[0] / rho[i]) * total
 
@@ -206,7 +206,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairFunctions) -> Si
         # out
         acceleration_dot: wp.array(dtype=vector),
     ):
-        i = wp.tid()
+        i = s.first + wp.tid()
         mass = rest_density[0] * s.volume
         mass_dot = rest_density_dot[0] * s.volume
         total = force_sum(i, mass, friction, x, v, rho, s)
@@ -233,7 +233,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairFunctions) -> Si
         scalars_bar: wp.array(dtype=vector),
     ):
         """Gathers alone: the pair (i, j) adds to i what it adds to j, seen from i."""
-        i = wp.tid()
+        i = s.first + wp.tid()
         x_i = x[i]
         v_i = v[i]
         rho_i = rho[i]

@@ -49,7 +49,7 @@ def wall_kernels(discretisation: Discretisation) -> SimpleNamespace:
         # out
         y: wp.array(dtype=real),
     ):
-        i = wp.tid()
+        i = s.first + wp.tid()
         total = wall_gradient(i, x, s)
         y[i] = real(1.0) / (real(1.0) + wp.dot(total, total))
 
@@ -62,7 +62,7 @@ def wall_kernels(discretisation: Discretisation) -> SimpleNamespace:
         # out
         y_dot: wp.array(dtype=real),
     ):
-        i = wp.tid()
+        i = s.first + wp.tid()
         total = wall_gradient(i, x, s)
         total_dot = wall_hessian_product(i, x, x_dot[i], s)
         y_dot[i] = real(-2.0) * y[i] * y[i] * wp.dot(total, total_dot)
@@ -76,7 +76,7 @@ def wall_kernels(discretisation: Discretisation) -> SimpleNamespace:
         # in and out
         x_bar: wp.array(dtype=vector),
     ):
-        i = wp.tid()
+        i = s.first + wp.tid()
         total_bar = (real(-2.0) * y_bar[i] * y[i] * y[i]) * wall_gradient(i, x, s)
         x_bar[i] = x_bar[i] + wall_hessian_product(i, x, total_bar, s)
 
