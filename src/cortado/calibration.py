@@ -59,7 +59,7 @@ def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
     gradients = kernel.gradient(offsets, support)
     waves = np.array(list(itertools.product(np.linspace(0.0, np.pi / spacing, 25), repeat=dimension)))
     answers = np.sin(waves @ offsets.T) @ gradients
-    return float((answers**2).sum(axis=1).max() / (2.0 * (gradients**2).sum()))
+    return float((answers**2).sum(axis=1).max() / wall_rigidity(kernel, spacing, support, dimension))
 
 
 @dataclass(frozen=True)

@@ -95,8 +95,8 @@ def certify(problem: Problem, seed: int = 0, policy: Policy | None = None) -> Ce
 
     A viscosity of 0 is taken as 0.01 Pa s, so that there is something to compare.
 
-    Each parameter is moved along a random direction of the size of its scale: gravity by its own size, positions by a
-    tenth of a spacing, velocities by 0.1 m / s, numbers by a tenth of their value.
+    Each parameter is moved along a random direction of the size of its scale: gravity by a tenth of its size,
+    positions by a tenth of a spacing, velocities by 0.1 m / s, numbers by a tenth of their value.
     """
     random = np.random.default_rng(seed)
     compared = []

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from typing import Any
 
@@ -58,7 +58,6 @@ class Launcher:
             record_tape=self._record_tape,
         )
 
-
     def _launch_parts(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
         if self._whole is not inputs[0]:
             self._whole, self._parts = inputs[0], [self._part(inputs[0], n) for n in range(len(self._bounds) - 1)]
@@ -73,7 +72,12 @@ class Launcher:
                 record_tape=False,
             )
 
-        list(_pool().map(launch, range(len(self._parts))))
+        running = [_pool().submit(launch, part) for part in range(len(self._parts))]
+        try:
+            for part in running:
+                part.result()
+        finally:
+            wait(running)  # also after an interruption: nothing may go on writing behind the back of what comes next
 
     def _part(self, surroundings: Any, number: int) -> Any:
         """The surroundings as one range sees them."""

@@ -9,11 +9,14 @@ import warp as wp
 from cortado.precision import Precision
 
 
-def to_device(values: np.ndarray, precision: Precision, device: Any, requires_grad: bool = False) -> wp.array:
+def padded(vectors: np.ndarray) -> np.ndarray:
+    """Vectors (n, 2) or (n, 3) with three components, in float64."""
+    return np.hstack([vectors, np.zeros((len(vectors), 3 - vectors.shape[1]))])
+
+
+def to_device(values: np.ndarray, precision: Precision, device: Any) -> wp.array:
     """Vectors (n, 2) or (n, 3) as a Warp array of vectors (n,)."""
-    padded: np.ndarray = np.zeros((len(values), 3), dtype=precision.numpy)
-    padded[:, : values.shape[1]] = values
-    return wp.array(padded, dtype=precision.vector, device=device, requires_grad=requires_grad)
+    return wp.array(padded(values), dtype=precision.vector, device=device)
 
 
 @dataclass(frozen=True)
@@ -47,10 +50,8 @@ class State:
 
     def set(self, positions: np.ndarray, velocities: np.ndarray) -> None:
         """Write arrays (n, 2) or (n, 3)."""
-        for target, values in ((self.positions, positions), (self.velocities, velocities)):
-            padded = np.zeros((len(values), 3))
-            padded[:, : values.shape[1]] = values
-            target.assign(padded)
+        self.positions.assign(padded(positions))
+        self.velocities.assign(padded(velocities))
 
     def numpy(self, dimension: int) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities as new arrays (n, dimension)."""

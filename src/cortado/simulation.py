@@ -10,7 +10,7 @@ import warp as wp
 from cortado.calibration import WallLayer, pressure_stiffness, rest_volume, wall_layer, wall_rigidity
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.neighbours import SKIN, Grid, NeighbourSearch
-from cortado.particles import State
+from cortado.particles import State, padded
 from cortado.physics.surroundings import Discretisation
 from cortado.precision import precision_named
 from cortado.rollout import Rollout
@@ -150,7 +150,7 @@ class Simulation:
         search = NeighbourSearch(
             discretisation,
             grid,
-            _padded(self.walls),
+            padded(self.walls),
             volumes / volume,
             self.particles,
             first_capacity(support / spacing, dimension),
@@ -215,10 +215,6 @@ def not_converged_sentence(converged: np.ndarray) -> str:
         f"the pressure did not converge in {np.count_nonzero(~converged)} of {len(converged)} steps: "
         "try a smaller time step, more iterations or a larger tolerance."
     )
-
-
-def _padded(vectors: np.ndarray) -> np.ndarray:
-    return np.hstack([vectors, np.zeros((len(vectors), 3 - vectors.shape[1]))])
 
 
 def _device(name: str) -> Any:
