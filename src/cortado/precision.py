@@ -1,6 +1,7 @@
 """The two floating-point precisions as objects: scalar, vector and NumPy types that belong together."""
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,15 @@ class Precision:
     """NumPy scalar type."""
     tiny: float
     """A number that is far below round-off of 1, and whose reciprocal is finite."""
+
+    def fractions(self, phases: int) -> Any:
+        """Warp vector type of one number for each phase."""
+        return _vector_type(self.real, phases)
+
+
+@cache
+def _vector_type(real: Any, length: int) -> Any:
+    return wp.types.vector(length=length, dtype=real)
 
 
 FLOAT32 = Precision("float32", wp.float32, wp.vec3f, wp.vec2f, np.float32, 1e-30)
