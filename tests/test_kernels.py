@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 import warp as wp
 
+from cortado.cells import Grid
 from cortado.launching import TreeSum, sum_and_maximum, vector_sum
-from cortado.neighbours import Grid, NeighbourSearch
+from cortado.neighbours import NeighbourSearch
 from cortado.physics.density import density_kernels
 from cortado.physics.gravity import gravity_kernels
 from cortado.physics.integration import integration_kernels

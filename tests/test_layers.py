@@ -13,10 +13,12 @@ ROOT = Path(cortado.__file__).parent
 
 LAYERS = """
     errors
-    precision smoothing calibration
+    precision smoothing calibration cells
     physics.surroundings physics.density physics.walls physics.integration physics.gravity physics.pressure
     physics.viscosity physics.convergence physics.reduction physics.matching
+    physics.colour_field physics.rays
     launching neighbours particles
+    render.cameras render.views render.renderer
     shapes scene_kinds scene_tables scene_toml scene_points
     scene_fluids scene_containers scene_stability scene_checks scene sampling
     vtkhdf trajectory

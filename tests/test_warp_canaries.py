@@ -556,7 +556,7 @@ def test_guarded_root_needs_an_if():
 
 
 def test_lower_bound_names_the_last_element_where_every_key_is_smaller():
-    """`neighbours.find_starts` steps over that element."""
+    """`cells.find_starts` steps over that element."""
     keys = np.array([1, 1, 3, 3, 3, 4], dtype=np.int32)
     padded = wp.array(np.append(keys, [0, 9]).astype(np.int32), dtype=wp.int32, device="cpu")
     found = wp.zeros(7, dtype=wp.int32, device="cpu")
@@ -567,7 +567,7 @@ def test_lower_bound_names_the_last_element_where_every_key_is_smaller():
 
 
 def test_radix_sort_is_stable():
-    """`NeighbourSearch.sort` lets ties keep the given order."""
+    """`CellSort` lets ties keep the given order."""
     count, random = 1000, np.random.default_rng(4)
     keys = random.integers(0, 32, count).astype(np.int32)
     pair_keys = wp.array(np.concatenate([keys, keys]), dtype=wp.int32, device="cpu")
