@@ -133,3 +133,37 @@ def wall_rigidity(kernel: SmoothingKernel, spacing: float, support: float, dimen
     """2 sum_j G_j . G_j of the prototype [1 / m^(2 d + 2)]: what a wall's own answer is measured by, see
     `cortado.physics.walls`."""
     return float(2.0 * (kernel.gradient(lattice_offsets(spacing, support, dimension), support) ** 2).sum())
+
+
+def laplacian_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """The greatest eigenvalue [1 / m2] of the Laplacian -2 V sum_j (u_i - u_j) F_ij on the lattice."""
+    offsets = lattice_offsets(spacing, support, dimension)
+    volume = rest_volume(kernel, spacing, support, dimension)
+    weights = -2.0 * volume * shear_factor(kernel, offsets, support)
+    waves = np.array(list(itertools.product(np.linspace(0.0, np.pi / spacing, 25), repeat=dimension)))
+    return float(((1.0 - np.cos(waves @ offsets.T)) @ weights).max())
+
+
+DIFFUSION_SAFETY = 0.5
+"""Part of the lattice's limit on a step of diffusion that is taken; the rest is for disorder and free surfaces."""
+
+
+def diffusion_limit(
+    kernel: SmoothingKernel,
+    spacing: float,
+    support: float,
+    dimension: int,
+    greatest_mobility: float,
+    interface_width: float,
+    curvature: float,
+    density_ratio: float,
+) -> float:
+    """The longest explicit step [s] of Cahn-Hilliard diffusion, infinite without mobility:
+
+    dt = safety 2 / (M l (eps^2 l + max f'')),   l the greatest eigenvalue of the Laplacian.
+
+    Beside a particle ``density_ratio`` times as heavy a light one diffuses up to (1 + ratio) / 2 times as fast.
+    """
+    rate = laplacian_rate(kernel, spacing, support, dimension) * 0.5 * (1.0 + density_ratio)
+    speed = greatest_mobility * rate * (interface_width**2 * rate + curvature)
+    return 2.0 * DIFFUSION_SAFETY / speed if speed > 0.0 else np.inf

@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cortado.policies import Policy
 from cortado.problem import Problem
@@ -119,20 +120,20 @@ def certify(problem: Problem, seed: int = 0, policy: Policy | None = None) -> Ce
     return Certificate(problem.steps, problem.simulation.particles, loss, tuple(compared))
 
 
-def _points(problem: Problem) -> list[tuple[str, np.ndarray, float]]:
-    simulation = problem.simulation
-    scene = simulation.scene
-    gravity = np.array(scene.forces.gravity, dtype=np.float64)
+def _points(problem: Problem) -> list[tuple[str, np.ndarray, ArrayLike]]:
+    values = problem.simulation.parameters()
+    gravity = values["gravity"]
     size = float(np.linalg.norm(gravity)) or 1.0
-    numbers = {
-        "viscosity": simulation.phase.viscosity or 0.01,
-        "rest_density": simulation.phase.rest_density,
-        "time_step": scene.solver.time_step,
-    }
-    return [
+    viscosity = np.where(values["viscosity"] > 0.0, values["viscosity"], 0.01)
+    points = [
         ("gravity", gravity, 0.1 * size),
         ("gravity over time", np.tile(gravity, (problem.steps, 1)), 0.1 * size),
-        ("initial_positions", simulation.positions, 0.1 * scene.discretisation.spacing),
-        ("initial_velocities", simulation.velocities, 0.1),
-        *((name, np.array(value, dtype=np.float64), 0.1 * value) for name, value in numbers.items()),
+        ("initial_positions", values["initial_positions"], 0.1 * problem.simulation.scene.discretisation.spacing),
+        ("initial_velocities", values["initial_velocities"], 0.1),
+        ("viscosity", viscosity, 0.1 * viscosity),
     ]
+    relative = ["rest_density", "time_step"]
+    if len(problem.simulation.scene.phase) > 1:
+        points.append(("mass_fractions", values["mass_fractions"], 0.01))
+        relative += ["mobility", "interface_width"] if values["mobility"] > 0.0 else []
+    return points + [(name, values[name], 0.1 * values[name]) for name in relative]

@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.physics.reduction import reduction_kernels
+from cortado.physics.reduction import add_kernel, sum_and_maximum_kernel, sum_kernel
 from cortado.precision import Precision
 
 BRANCHES = 32
@@ -142,11 +142,23 @@ class TreeSum:
         return values
 
 
-def vector_sum(particles: int, precision: Precision, device: Any) -> TreeSum:
-    """Sums of vectors (n,)."""
-    return TreeSum(reduction_kernels(precision).sum, precision.vector, particles, device)
+def sum_of(dtype: Any, particles: int, device: Any) -> TreeSum:
+    """Sums of (n,) numbers, vectors or matrices of a Warp type."""
+    return TreeSum(sum_kernel(dtype), dtype, particles, device)
 
 
 def sum_and_maximum(particles: int, precision: Precision, device: Any) -> TreeSum:
     """Sums of first and maxima of second components of pairs (n,)."""
-    return TreeSum(reduction_kernels(precision).sum_and_maximum, precision.pair, particles, device)
+    return TreeSum(sum_and_maximum_kernel(precision), precision.pair, particles, device)
+
+
+def add(values: wp.array, total: wp.array) -> None:
+    """total += values, element by element."""
+    wp.launch(
+        add_kernel(values.dtype),
+        len(values),
+        inputs=[values],
+        outputs=[total],
+        device=values.device,
+        record_tape=False,
+    )

@@ -1,6 +1,6 @@
-"""What a rollout is judged by: objects with a value and an adjoint at the end of the trajectory."""
+"""What a rollout is judged by: objects with a value and an adjoint at the end of the trajectory, or on the way."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
@@ -10,20 +10,21 @@ import numpy as np
 import warp as wp
 
 from cortado.errors import InputError
-from cortado.launching import TreeSum
+from cortado.launching import sum_of
 from cortado.particles import State, to_device
 from cortado.physics.matching import matching_kernels
-from cortado.physics.reduction import number_sum_kernel
 from cortado.precision import FLOAT32, FLOAT64, Precision
 
 
 @dataclass(frozen=True)
 class TrajectoryEnd:
-    """The last state of a rollout, as NumPy arrays or as Warp arrays, in the scene's order of particles."""
+    """A state of a rollout, the last one as a rule, as NumPy arrays or as Warp arrays, in the scene's order."""
 
     state: State
-    """Warp arrays of vectors (n,): positions [m] and velocities [m / s]."""
+    """Warp arrays (n,): positions [m], velocities [m / s], mass fractions [-]."""
     dimension: int
+    colours: np.ndarray
+    """(phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
 
     @property
     def precision(self) -> Precision:
@@ -40,6 +41,21 @@ class TrajectoryEnd:
         """(n, d) [m / s], float64"""
         return self.state.velocities.numpy()[:, : self.dimension].astype(np.float64)
 
+    @cached_property
+    def mass_fractions(self) -> np.ndarray:
+        """(n, phases) [-], float64"""
+        return self.state.mass_fractions.numpy().astype(np.float64)
+
+
+@dataclass(frozen=True)
+class EndAdjoint:
+    """Derivatives of a loss that also looks at the colours."""
+
+    state: State
+    """With respect to positions, velocities and mass fractions, as Warp arrays."""
+    colours: np.ndarray
+    """(phases, 3)"""
+
 
 class Loss(Protocol):
     """A differentiable number of the end of a trajectory."""
@@ -47,8 +63,29 @@ class Loss(Protocol):
     def value(self, end: TrajectoryEnd) -> float:
         """The loss."""
 
-    def adjoint(self, end: TrajectoryEnd) -> State | tuple[np.ndarray, np.ndarray]:
-        """Derivatives of the loss with respect to positions and velocities, (n, d) each, or as Warp arrays."""
+    def adjoint(self, end: TrajectoryEnd) -> State | EndAdjoint | tuple[np.ndarray, ...]:
+        """Derivatives of the loss with respect to positions and velocities, (n, d) each, and, if there is a third
+        array, mass fractions (n, phases); or as Warp arrays."""
+
+
+class Frames:
+    """The sum of losses of several states on the way, by the number of steps before each."""
+
+    def __init__(self, losses: Mapping[int, Loss]):
+        """``losses`` {number of steps: loss}; 0 is the first state."""
+        if not losses:
+            raise InputError("losses is empty, but must have a loss for at least one frame.")
+        self.losses = dict(losses)
+
+    @property
+    def fingerprint(self) -> str:
+        """Tells one set of targets from another, for checkpoints."""
+        return " ".join(f"{step}:{fingerprint(loss)}" for step, loss in sorted(self.losses.items()))
+
+
+def fingerprint(loss: Any) -> str:
+    """A text that tells one loss from another; of a loss without its own ``fingerprint`` only the type."""
+    return getattr(loss, "fingerprint", type(loss).__qualname__)
 
 
 class FinalPositions:
@@ -69,12 +106,13 @@ class FinalPositions:
         squares = wp.empty(len(x), dtype=wp.float64, device=device)
         kernels = matching_kernels(end.precision)
         wp.launch(kernels.squared_distance, len(x), inputs=[x, target], outputs=[squares], device=device)
-        total = TreeSum(number_sum_kernel(), wp.float64, len(x), device)(squares)
+        total = sum_of(wp.float64, len(x), device)(squares)
         return float(total.numpy()[0]) / len(x)
 
     def adjoint(self, end: TrajectoryEnd) -> State:
         x, target, device = self._positions_and_target(end)
-        bar = State.zeros(len(x), end.precision, device)
+        bar = end.state.like()
+        bar.clear()
         kernels = matching_kernels(end.precision)
         factor = 2.0 / len(x)
         wp.launch(kernels.difference, len(x), inputs=[factor, x, target], outputs=[bar.positions], device=device)

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
 import warp as wp
 
 from cortado.particles import Parameters, State
@@ -47,18 +46,19 @@ class _ExactStep:
         solver = rollout.solver
         self._solver, self._parameters = solver, rollout.parameters
         self._adjoint = PcisphAdjoint(solver)
-        self._bar = Parameters.zeros(rollout.steps, solver.discretisation.precision, solver.search.device)
+        self._bar = solver.new_parameters(rollout.steps)
 
     def begin(self) -> None:
         self._adjoint.clear()
+        self._bar.clear()
 
     def step(self, state: State, iterations: int, bar: State) -> None:
         self._solver.record(state, self._parameters, iterations)
         self._adjoint.step(iterations, bar, bar, self._parameters, self._bar)
 
-    def parameters(self) -> tuple[np.ndarray, np.ndarray]:
-        gravity = self._bar.gravity.numpy().astype(np.float64)
-        return gravity, self._adjoint.scalars().numpy()[0].astype(np.float64)
+    def parameters(self) -> Parameters:
+        self._adjoint.collect(self._bar)
+        return self._bar
 
 
 class _TapeStep:
@@ -66,31 +66,21 @@ class _TapeStep:
 
     def __init__(self, rollout: Rollout):
         solver = rollout.solver
-        precision, device = solver.discretisation.precision, solver.search.device
-        particles = solver.search.particles
+        self._given, self._parameters = solver, rollout.parameters
         self._solver = solver.differentiable()
-        self._step_number = solver.step_number
-        self._before = State.zeros(particles, precision, device, requires_grad=True)
-        self._after = State.zeros(particles, precision, device, requires_grad=True)
-        self._parameters = Parameters.zeros(rollout.steps, precision, device, requires_grad=True)
-        given = rollout.parameters
-        self._search = solver.search
-        self._arrays: list[tuple[wp.array, wp.array]] = [
-            (self._parameters.gravity, given.gravity),
-            (self._parameters.rest_density, given.rest_density),
-            (self._parameters.viscosity, given.viscosity),
-            (self._parameters.time_step, given.time_step),
-        ]
+        self._before, self._after = (self._solver.new_state(requires_grad=True) for _ in range(2))
+        self._own = self._solver.new_parameters(rollout.steps, requires_grad=True)
 
     def begin(self) -> None:
-        self._solver.grow(self._search.capacity)
-        for own, source in self._arrays:
-            wp.copy(own, source)
-            own.grad.zero_()
+        self._solver.grow(self._given.search.capacity)
+        self._solver.diffuse(self._given.mixture.substeps)
+        self._own.assign(self._parameters)
+        for array in self._own.arrays():
+            array.grad.zero_()
 
     def step(self, state: State, iterations: int, bar: State) -> None:
         self._before.assign(state)
-        wp.copy(self._solver.step_number, self._step_number)
+        wp.copy(self._solver.step_number, self._given.step_number)
         tape = wp.Tape()
         try:
             self._back(tape, iterations, bar)
@@ -99,20 +89,18 @@ class _TapeStep:
 
     def _back(self, tape: wp.Tape, iterations: int, bar: State) -> None:
         with tape:
-            self._solver.record(self._before, self._parameters, iterations)
+            self._solver.record(self._before, self._own, iterations)
             self._solver.recorded(iterations, self._after)
-        tape.backward(grads={self._after.positions: bar.positions, self._after.velocities: bar.velocities})
-        wp.copy(bar.positions, self._before.positions.grad)
-        wp.copy(bar.velocities, self._before.velocities.grad)
+        tape.backward(grads=dict(zip(self._after.arrays(), bar.arrays(), strict=True)))
+        for own, total in zip(self._before.arrays(), bar.arrays(), strict=True):
+            wp.copy(total, own.grad)
 
     def _forget(self, tape: Any) -> None:
         """Zero every adjoint but those of the parameters, which add up over the steps."""
-        kept = {own.ptr for own, _ in self._arrays}
+        kept = {own.ptr for own in self._own.arrays()}
         for array, gradient in tape.gradients.items():
             if isinstance(array, wp.array) and array.ptr not in kept:
                 gradient.zero_()
 
-    def parameters(self) -> tuple[np.ndarray, np.ndarray]:
-        p = self._parameters
-        scalars = [a.grad.numpy()[0] for a in (p.rest_density, p.viscosity, p.time_step)]
-        return p.gravity.grad.numpy().astype(np.float64), np.array(scalars, dtype=np.float64)
+    def parameters(self) -> Parameters:
+        return Parameters(*(array.grad for array in self._own.arrays()))

@@ -1,33 +1,30 @@
 """Parameters in, loss out; loss and gradient; and the derivative along a direction."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
+from cortado.controls import NAMES, UNITS, Arrays, Controls, Values
 from cortado.errors import InputError
-from cortado.losses import Loss, Recorded, TrajectoryEnd
-from cortado.particles import Parameters, State
+from cortado.losses import EndAdjoint, Frames, Loss, Recorded, TrajectoryEnd, fingerprint
+from cortado.particles import State
 from cortado.policies import Exact, Policy
 from cortado.rollout import MEMORY_BUDGET, Rollout, StepDerivative
-from cortado.simulation import Simulation, as_numbers, check_steps
+from cortado.simulation import Simulation, check_steps
 from cortado.trajectory import Trajectory
 
-SCALARS = ("rest_density", "viscosity", "time_step")
-"""Parameters that are one number, in the order in which the solver adds up their adjoints."""
-STATES = ("initial_positions", "initial_velocities")
-NAMES = ("gravity", *STATES, *SCALARS)
-UNITS = dict(zip(NAMES, ("m/s²", "m", "m/s", "kg/m³", "Pa s", "s"), strict=True))
-
-Values = Mapping[str, Any]
+__all__ = ["NAMES", "UNITS", "Problem"]
 
 
 class Problem:
     """A simulation of a number of steps, judged by a loss.
 
     Parameters, any of them together: ``gravity`` (d,) or (steps, d) [m / s2]; ``initial_positions`` [m] and
-    ``initial_velocities`` [m / s], (n, d); ``viscosity`` [Pa s], ``rest_density`` [kg / m3], ``time_step`` [s].
+    ``initial_velocities`` [m / s], (n, d); ``viscosity`` [Pa s] and ``rest_density`` [kg / m3], a number, with several
+    phases (phases,); ``time_step`` [s]; with several phases ``mass_fractions`` (n, phases), the first ones, ``mobility``
+    [m2 / s], ``interface_width`` [m]; with a loss of images ``colours`` (phases, 3).
     What is not given is the scene's. n counts fluid particles in the order in which the scene lists them.
     """
 
@@ -35,87 +32,121 @@ class Problem:
         self,
         simulation: Simulation,
         steps: int,
-        loss: Loss | Callable[..., Any],
+        loss: Loss | Frames | Callable[..., Any],
         memory_budget: int = MEMORY_BUDGET,
     ):
-        """``loss``: an object with ``value`` and ``adjoint``, or a function of Warp arrays (see `losses.Recorded`).
+        """``steps`` may be 0: the loss is then one of the first state.
 
-        ``memory_budget``: bytes of states kept on the way forward; with less, states are recomputed on the way back.
+        ``loss``: an object with ``value`` and ``adjoint``, `losses.Frames` of such, or a function of Warp arrays (see
+        `losses.Recorded`). ``memory_budget``: bytes of states kept on the way forward; with less, states are
+        recomputed on the way back.
         """
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is a {type(simulation).__name__}, but must be a cortado.Simulation.")
-        if not hasattr(loss, "adjoint") and not callable(loss):
+        if not (isinstance(loss, Frames) or hasattr(loss, "adjoint") or callable(loss)):
             raise InputError(
                 f"loss is a {type(loss).__name__}, but must have a value and an adjoint, or be a function."
             )
-        self.simulation, self.steps = simulation, check_steps(steps)
-        self.loss: Loss = loss if hasattr(loss, "adjoint") else Recorded(loss)  # type: ignore[assignment]
+        self.simulation, self.steps, self.loss = simulation, check_steps(steps, least=0), loss
+        by_step = loss.losses if isinstance(loss, Frames) else {self.steps: loss}
+        for step in by_step:
+            if step not in range(self.steps + 1):
+                raise InputError(f"losses has the frame {step!r}, but must have frames from 0 to {self.steps}.")
+        self._losses: dict[int, Loss] = {
+            step: one if hasattr(one, "adjoint") else Recorded(one)  # type: ignore[arg-type]
+            for step, one in by_step.items()
+        }
+        self._controls = Controls(simulation, self.steps)
         self._rollout = Rollout(simulation.solver, self.steps, memory_budget)
         self._derivatives: dict[Policy, StepDerivative] = {}
 
     def value(self, parameters: Values) -> float:
         """The loss, forward only."""
-        return self.loss.value(self.end(parameters))
+        return self._total(self._ends(self._controls.checked(parameters), self._losses, keep=False))
 
-    def end(self, parameters: Values, keep: bool = False) -> TrajectoryEnd:
-        """The last state of the rollout under these parameters; ``keep`` checkpoints for a derivative."""
-        self._set(self._checked(parameters))
-        return TrajectoryEnd(self._rollout.forward(keep=keep), self.simulation.dimension)
+    def end(self, parameters: Values, step: int | None = None) -> TrajectoryEnd:
+        """The last state of the rollout under these parameters, or that after so many steps."""
+        number = self.steps if step is None else step
+        return self._ends(self._controls.checked(parameters), [number], keep=False)[number]
 
     def run(self, parameters: Values, record_every: int = 1) -> Trajectory:
         """The whole trajectory under these parameters; see `Simulation.run`."""
-        self._set(self._checked(parameters))
+        self._controls.begin(self._rollout, self._controls.checked(parameters))
         return self.simulation.collect(self._rollout, record_every)
 
-    def value_and_gradient(
-        self, parameters: Values, policy: Policy | None = None
-    ) -> tuple[float, dict[str, np.ndarray]]:
+    def value_and_gradient(self, parameters: Values, policy: Policy | None = None) -> tuple[float, Arrays]:
         """The loss and its derivatives: for each parameter given, an array of its shape (float64)."""
-        values = self._checked(parameters)
-        end = self.end(values, keep=True)
-        bar = self._adjoint(end)
+        values = self._controls.checked(parameters)
+        ends = self._ends(values, self._losses, keep=True)
+        bars = {step: self._adjoint(step, end) for step, end in ends.items()}
         derivative = self._derivative(Exact() if policy is None else policy)
-        self._rollout.backward(derivative, bar)
-        gravity, scalars = derivative.parameters()
-        found = {"gravity": gravity[:, : self.simulation.dimension], **dict(zip(SCALARS, scalars, strict=True))}
-        if not values.keys().isdisjoint(STATES):
-            states = (array.astype(np.float64) for array in bar.numpy(self.simulation.dimension))
-            found |= dict(zip(STATES, states, strict=True))
-        if "gravity" in values and values["gravity"].ndim == 1:
-            found["gravity"] = found["gravity"].sum(axis=0)
-        return self.loss.value(end), {name: np.asarray(found[name]) for name in values}
+        first = self._rollout.backward(derivative, {step: bar.state for step, bar in bars.items()})
+        gradient = self._controls.gradient(values, first, derivative.parameters())
+        if "colours" in values:
+            gradient["colours"] = np.sum([bar.colours for bar in bars.values()], axis=0)
+        return self._total(ends), {name: gradient[name] for name in values}
 
     def tangent(self, parameters: Values, directions: Values) -> float:
         """The derivative of the loss along ``directions`` (any of the parameters), by forward mode."""
-        dot, parameters_dot = self._directions(self._checked(directions, "direction"))
-        end = self.end(parameters, keep=False)
-        self._rollout.tangent(dot, parameters_dot)
-        pairs = zip(self._adjoint(end).numpy(3), dot.numpy(3), strict=True)
-        return float(sum((bar.astype(np.float64) * d).sum() for bar, d in pairs))
+        values = self._controls.checked(parameters)
+        along = self._controls.checked(directions, "direction")
+        ends = self._ends(values, self._losses, keep=False)
+        bars = {step: self._adjoint(step, end) for step, end in ends.items()}
+        dot, parameters_dot = self._controls.direction(self._rollout, values, along)
+        terms = [np.sum(bar.colours * along["colours"]) for bar in bars.values()] if "colours" in along else []
+
+        def observe(step: int, dot: State) -> None:
+            if step in bars:
+                pairs = zip(bars[step].state.numpy(3), dot.numpy(3), strict=True)
+                terms.extend((bar.astype(np.float64) * d).sum() for bar, d in pairs)
+
+        self._rollout.tangent(dot, parameters_dot, observe)
+        return float(sum(terms))
 
     @property
     def fingerprint(self) -> str:
         """Which problem this is, in a checksum: scene, precision, steps, ``fingerprint`` of the loss; for a loss
         without one only its type is known."""
-        loss = getattr(self.loss, "fingerprint", type(self.loss).__qualname__)
-        text = f"{self.simulation.scene.to_json()} {self.simulation.precision.name} {self.steps} {loss}"
-        return sha256(text.encode()).hexdigest()
+        text = f"{self.simulation.scene.to_json()} {self.simulation.precision.name} {self.steps} "
+        return sha256((text + fingerprint(self.loss)).encode()).hexdigest()
 
     def iterations(self) -> np.ndarray:
         """(steps,) pressure iterations of the last evaluation."""
         return self._rollout.iterations
 
-    def _adjoint(self, end: TrajectoryEnd) -> State:
-        bar = self.loss.adjoint(end)
+    def _ends(self, values: Arrays, steps: Iterable[int], keep: bool) -> dict[int, TrajectoryEnd]:
+        """States by the number of steps before them; ``keep`` checkpoints for a way back."""
+        wanted, colours = set(steps), self._controls.colours(values)
+        ends: dict[int, TrajectoryEnd] = {}
+
+        def observe(step: int, state: State) -> None:
+            if step in wanted:
+                ends[step] = TrajectoryEnd(state, self.simulation.dimension, colours)
+
+        self._controls.begin(self._rollout, values)
+        observe(0, self._rollout.initial)
+        self._rollout.forward(observe, keep)
+        return ends
+
+    def _total(self, ends: dict[int, TrajectoryEnd]) -> float:
+        return sum(loss.value(ends[step]) for step, loss in self._losses.items())
+
+    def _adjoint(self, step: int, end: TrajectoryEnd) -> EndAdjoint:
+        bar = self._losses[step].adjoint(end)
+        if isinstance(bar, EndAdjoint):
+            return bar
+        no_colours = np.zeros_like(end.colours)
         if isinstance(bar, State):
-            copy = self._state()
-            copy.assign(bar)
-            return copy
-        shape = self.simulation.positions.shape
-        for what, array in zip(("positions", "velocities"), bar, strict=True):
-            if np.shape(array) != shape:
-                raise InputError(f"the loss's adjoint of {what} has shape {np.shape(array)}, but must be {shape}.")
-        return self._state(*bar)
+            return EndAdjoint(bar, no_colours)
+        arrays = [np.zeros_like(array) for array in (end.positions, end.velocities, end.mass_fractions)]
+        for k, (what, array) in enumerate(zip(("positions", "velocities", "mass_fractions"), bar, strict=False)):
+            if np.shape(array) != arrays[k].shape:
+                wanted = arrays[k].shape
+                raise InputError(f"the loss's adjoint of {what} has shape {np.shape(array)}, but must be {wanted}.")
+            arrays[k] = array
+        state = self.simulation.solver.new_state()
+        state.set(*arrays)
+        return EndAdjoint(state, no_colours)
 
     def _derivative(self, policy: Policy) -> StepDerivative:
         if isinstance(policy, type) or not hasattr(policy, "derivative"):
@@ -123,53 +154,3 @@ class Problem:
         if policy not in self._derivatives:
             self._derivatives[policy] = policy.derivative(self._rollout)
         return self._derivatives[policy]
-
-    def _checked(self, values: Values, what: str = "parameter") -> dict[str, np.ndarray]:
-        shape = self.simulation.positions.shape
-        checked = {}
-        for name, value in values.items():
-            if name not in NAMES:
-                raise InputError(f"{what} {name!r} is unknown, but must be one of {', '.join(NAMES)}.")
-            array = as_numbers(f"{what} {name}", value)
-            wanted = {"gravity": array.shape, "initial_positions": shape, "initial_velocities": shape}.get(name, ())
-            if array.shape != wanted:
-                raise InputError(f"{what} {name} has shape {array.shape}, but must be {wanted}.")
-            if name == "gravity":
-                self.simulation.gravity_table(array, self.steps)
-            if not np.isfinite(array).all():
-                raise InputError(f"{what} {name} has a value that is not finite, but must be numbers.")
-            if what == "parameter" and name in ("rest_density", "time_step") and array <= 0:
-                raise InputError(f"{what} {name} is {array}, but must be greater than 0.")
-            if what == "parameter" and name == "viscosity" and array < 0:
-                raise InputError(f"{what} {name} is {array}, but must be at least 0.")
-            checked[name] = array
-        return checked
-
-    def _set(self, values: dict[str, np.ndarray]) -> None:
-        simulation, phase = self.simulation, self.simulation.phase
-        self._rollout.initial.assign(simulation.state)
-        if not values.keys().isdisjoint(STATES):
-            self._rollout.initial.set(
-                values.get("initial_positions", simulation.positions),
-                values.get("initial_velocities", simulation.velocities),
-            )
-        self._rollout.parameters.set(
-            simulation.gravity_table(values.get("gravity"), self.steps),
-            float(values.get("rest_density", phase.rest_density)),
-            float(values.get("viscosity", phase.viscosity)),
-            float(values.get("time_step", simulation.scene.solver.time_step)),
-        )
-
-    def _directions(self, values: dict[str, np.ndarray]) -> tuple[State, Parameters]:
-        nothing = np.zeros_like(self.simulation.positions)
-        dot = self._state(*(values.get(name, nothing) for name in STATES))
-        parameters = Parameters.zeros(self.steps, self.simulation.precision, self.simulation.device)
-        scalars = {name: float(values.get(name, 0.0)) for name in SCALARS}
-        parameters.set(values.get("gravity", np.zeros(self.simulation.dimension)), **scalars)
-        return dot, parameters
-
-    def _state(self, *arrays: np.ndarray) -> State:
-        state = State.zeros(self.simulation.particles, self.simulation.precision, self.simulation.device)
-        if arrays:
-            state.set(*arrays)
-        return state

@@ -5,7 +5,7 @@ neighbour lists were long enough (if not, they grow and the chunk is repeated) a
 On a GPU a step is a captured graph.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from math import isqrt
 from typing import Protocol
@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from cortado.errors import DivergedError
-from cortado.launching import Replayed
+from cortado.launching import Replayed, add
 from cortado.particles import Parameters, State
 from cortado.solvers.pcisph import Pcisph
 from cortado.solvers.pcisph_derivatives import PcisphTangent
@@ -39,8 +39,8 @@ class StepDerivative(Protocol):
     def step(self, state: State, iterations: int, bar: State) -> None:
         """Replace ``bar``, the adjoint of the step's result, by that of its first state."""
 
-    def parameters(self) -> tuple[np.ndarray, np.ndarray]:
-        """Adjoints of gravity (steps, 3), and of (rest density, viscosity, time step), (3,)."""
+    def parameters(self) -> Parameters:
+        """Adjoints of the parameters, of all steps since `begin`."""
 
 
 def checkpoint_interval(steps: int, affordable: int) -> int:
@@ -57,18 +57,17 @@ class Rollout:
 
     def __init__(self, solver: Pcisph, steps: int, memory_budget: int = MEMORY_BUDGET):
         self.solver, self.steps = solver, steps
-        self._precision, self._device = solver.discretisation.precision, solver.search.device
-        self._particles = solver.search.particles
-        self.initial = self._new_state()
-        self.parameters = Parameters.zeros(steps, self._precision, self._device)
+        self._device = solver.search.device
+        self.initial = solver.new_state()
+        self.parameters = solver.new_parameters(steps)
         self._records = (
             wp.zeros(max(steps, 1), dtype=wp.int32, device=self._device),
-            wp.zeros(max(steps, 1), dtype=self._precision.pair, device=self._device),
+            wp.zeros(max(steps, 1), dtype=solver.discretisation.precision.pair, device=self._device),
         )
-        state_bytes = 2 * 3 * np.dtype(self._precision.numpy).itemsize * self._particles
+        state_bytes = sum(array.capacity for array in self.initial.arrays())
         self._interval = checkpoint_interval(steps, memory_budget // state_bytes)
         self._states: dict[int, State] = {}
-        self._buffer, self._bar = self._new_state(), self._new_state()
+        self._buffer, self._bar = self.initial.like(), self.initial.like()
         self._growth = -1
         self._forget_stale_graphs()
         self.iterations = np.zeros(0, dtype=int)
@@ -112,7 +111,7 @@ class Rollout:
         self._buffer.assign(state)
         for _ in range(first, last):
             self._step()
-            chunk.append(self._new_state())
+            chunk.append(self._buffer.like())
             chunk[-1].assign(self._buffer)
         return chunk
 
@@ -151,16 +150,20 @@ class Rollout:
 
     # ---- derivatives ---------------------------------------------------------------------------------------------
 
-    def backward(self, derivative: StepDerivative, bar: State) -> None:
-        """Replace ``bar``, the adjoint of the last state, by that of the first; `forward` has run."""
+    def backward(self, derivative: StepDerivative, bars: Mapping[int, State]) -> State:
+        """The adjoint of the first state, for ``bars``, adjoints of states by their number; `forward` has run."""
         derivative.begin()
         self._forget_stale_graphs()
-        self._bar.assign(bar)
-        for n in reversed(range(self.steps)):
-            self._buffer.assign(self._restore(n))
-            self.solver.step_number.fill_(n)
-            self._step_back(derivative, int(self.iterations[n]))
-        bar.assign(self._bar)
+        self._bar.clear()
+        for n in reversed(range(self.steps + 1)):
+            if n in bars:
+                for bar, total in zip(bars[n].arrays(), self._bar.arrays(), strict=True):
+                    add(bar, total)
+            if n > 0:
+                self._buffer.assign(self._restore(n - 1))
+                self.solver.step_number.fill_(n - 1)
+                self._step_back(derivative, int(self.iterations[n - 1]))
+        return self._bar
 
     def _step_back(self, derivative: StepDerivative, iterations: int) -> None:
         work = partial(derivative.step, self._buffer, iterations, self._bar)
@@ -173,17 +176,20 @@ class Rollout:
             self._steps_back[key] = Replayed(work, self.solver.launch)
         self._steps_back[key]()
 
-    def tangent(self, dot: State, parameters_dot: Parameters) -> None:
-        """Replace ``dot``, the tangent of the first state, by that of the last; `forward` has run."""
+    def tangent(self, dot: State, parameters_dot: Parameters, observe: Observer) -> None:
+        """From ``dot``, the tangent of the first state, to that of every state, given to ``observe``; `forward` has
+        run."""
         derivative = PcisphTangent(self.solver)
-        state = self._new_state()
+        state = self.initial.like()
         state.assign(self.initial)
+        observe(0, dot)
         for n in range(self.steps):
             iterations = int(self.iterations[n])
             self.solver.step_number.fill_(n)
             self.solver.record(state, self.parameters, iterations)
             derivative.step(iterations, dot, dot, self.parameters, parameters_dot)
             self.solver.recorded(iterations, state)
+            observe(n + 1, dot)
 
     def _restore(self, n: int) -> State:
         """State n: a checkpoint, or recomputed from the one before, with the states in between."""
@@ -192,11 +198,8 @@ class Rollout:
             for m in range(start, n):
                 self.solver.step_number.fill_(m)
                 self.solver.record(self._states[m], self.parameters, int(self.iterations[m]))
-                self._states[m + 1] = self._new_state()
+                self._states[m + 1] = self.initial.like()
                 self.solver.recorded(int(self.iterations[m]), self._states[m + 1])
         if (n + 1) % self._interval:
             self._states.pop(n + 1, None)
         return self._states[n]
-
-    def _new_state(self) -> State:
-        return State.empty(self._particles, self._precision, self._device)

@@ -7,10 +7,20 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.calibration import WallLayer, pressure_stiffness, rest_volume, wall_layer, wall_rigidity
+from cortado.calibration import (
+    WallLayer,
+    diffusion_limit,
+    pressure_stiffness,
+    rest_volume,
+    wall_layer,
+    wall_rigidity,
+)
+from cortado.controls import MATERIALS, Controls
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.neighbours import SKIN, Grid, NeighbourSearch
 from cortado.particles import State, padded
+from cortado.physics.diffusion import Diffusion
+from cortado.physics.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
 from cortado.physics.surroundings import Discretisation
 from cortado.precision import precision_named
 from cortado.rollout import Rollout
@@ -18,6 +28,7 @@ from cortado.sampling import boundary_particles, boundary_volumes, fluid_particl
 from cortado.scene import Scene
 from cortado.smoothing import smoothing_kernel
 from cortado.solvers.forces import ForceTerm, Gravity, laminar_viscosity, pairwise_viscosity
+from cortado.solvers.mixture import Phases
 from cortado.solvers.pcisph import Lattice, Pcisph, PressureSolve
 from cortado.trajectory import Trajectory
 
@@ -27,8 +38,15 @@ VISCOSITIES = {"pairwise": pairwise_viscosity, "laminar": laminar_viscosity}
 class Simulation:
     """A scene made ready to run: particles sampled, masses calibrated, kernels chosen."""
 
-    def __init__(self, scene: Scene, device: str = "cpu", precision: str = "float32"):
-        """``device`` as Warp names it ("cpu", "cuda:0"), ``precision`` "float32" or "float64"."""
+    def __init__(
+        self,
+        scene: Scene,
+        device: str = "cpu",
+        precision: str = "float32",
+        free_energy: FreeEnergy | None = None,
+    ):
+        """``device`` as Warp names it ("cpu", "cuda:0"), ``precision`` "float32" or "float64"; ``free_energy``
+        replaces the one that the scene names."""
         if not isinstance(scene, Scene):
             raise InputError(f"scene is {shown(scene)}, but must be a cortado.Scene, such as load_scene gives.")
         self.scene = scene
@@ -39,8 +57,10 @@ class Simulation:
         """(n, d) first positions [m]."""
         self.velocities = sample.velocities
         """(n, d) first velocities [m / s]."""
+        self.mass_fractions = np.eye(len(scene.phase))[sample.phase]
+        """(n, phases) first mass fractions [-]."""
         self.particles = len(sample.positions)
-        self.phase = scene.phase[int(sample.phase[0])]
+        self.free_energy = FREE_ENERGIES[scene.mixture.free_energy] if free_energy is None else free_energy
         self.smoothing = smoothing_kernel(scene.discretisation.kernel)
         layer = wall_layer(
             self.smoothing, scene.discretisation.spacing, scene.discretisation.support_radius, scene.dimension
@@ -48,10 +68,10 @@ class Simulation:
         self.walls = boundary_particles(scene, layer.depth)
         """(b, d) wall particles [m]."""
         self.solver = self._solver(layer)
-        self.state = State.empty(self.particles, self.precision, self.device)
+        self.state = self.solver.new_state()
         """The first state on the device."""
-        self.state.set(self.positions, self.velocities)
-        for array in (self.positions, self.velocities):
+        self.state.set(self.positions, self.velocities, self.mass_fractions)
+        for array in (self.positions, self.velocities, self.mass_fractions):
             array.setflags(write=False)
 
     @property
@@ -62,7 +82,8 @@ class Simulation:
     def run(self, steps: int, controls: Mapping[str, Any] | None = None, record_every: int = 1) -> Trajectory:
         """Run from the scene's first state and return the frames, the first and the last state included.
 
-        ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity. Warns when the pressure did
+        ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity; so does any other parameter
+        of `Problem`. Warns when the pressure did
         not converge; raises `DivergedError` when a particle is lost.
         """
         return self.collect(self.rollout(steps, controls), record_every)
@@ -81,45 +102,67 @@ class Simulation:
         converged = self.converged(rollout)
         if not converged.all():
             warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=3)
-        numbers, positions, velocities = (np.array(column) for column in zip(*frames, strict=True))
+        numbers, positions, velocities, fractions = (np.array(column) for column in zip(*frames, strict=True))
         return Trajectory(
             times=numbers * float(rollout.parameters.time_step.numpy()[0]),
             steps=numbers,
             positions=positions,
             velocities=velocities,
+            mass_fractions=fractions if len(self.scene.phase) > 1 else None,
             iterations=rollout.iterations,
             density_errors=rollout.errors[:, 0],
             converged=converged,
+            substeps=rollout.solver.mixture.substeps,
         )
 
     def rollout(self, steps: int, controls: Mapping[str, Any] | None = None) -> Rollout:
         """A rollout that is ready to go forward from the scene's first state; see `run` for ``controls``."""
-        unknown = set(controls or {}) - {"gravity"}
-        if unknown:
-            raise InputError(f"controls has the key {sorted(unknown)[0]!r}, but may have only 'gravity'.")
         rollout = Rollout(self.solver, check_steps(steps))
-        self.begin(rollout, **dict(controls or {}))
+        space = Controls(self, rollout.steps)
+        space.begin(rollout, space.checked(controls or {}, "control"))
         return rollout
 
-    def begin(self, rollout: Rollout, gravity: Any = None) -> None:
-        """Give a rollout the scene's first state and parameters."""
-        rollout.initial.assign(self.state)
-        rollout.parameters.set(
-            self.gravity_table(gravity, rollout.steps),
-            self.phase.rest_density,
-            self.phase.viscosity,
-            self.scene.solver.time_step,
-        )
+    def parameters(self) -> dict[str, np.ndarray]:
+        """Every parameter of `Problem` as the scene has it."""
+        scene = self.scene
+        values: dict[str, Any] = {
+            "gravity": scene.forces.gravity,
+            "initial_positions": self.positions,
+            "initial_velocities": self.velocities,
+            "mass_fractions": self.mass_fractions,
+            "rest_density": [phase.rest_density for phase in scene.phase],
+            "viscosity": [phase.viscosity for phase in scene.phase],
+            "time_step": scene.solver.time_step,
+            "mobility": scene.mixture.mobility,
+            "interface_width": scene.mixture.width(scene.discretisation.spacing),
+            "colours": [phase.colour for phase in scene.phase],
+        }
+        arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
+        if len(scene.phase) == 1:
+            arrays |= {name: arrays[name][0] for name in MATERIALS}
+        return arrays
 
-    def gravity_table(self, gravity: Any, steps: int) -> np.ndarray:
-        """Gravity (d,) or (steps, d) as an array, checked; the scene's where None is given."""
-        table = as_numbers("gravity", self.scene.forces.gravity if gravity is None else gravity)
-        if table.shape not in ((self.dimension,), (steps, self.dimension)):
-            wanted = f"({self.dimension},) or ({steps}, {self.dimension})"
-            raise InputError(f"gravity has shape {table.shape}, but must be {wanted} in m/s2.")
-        if not np.isfinite(table).all():
-            raise InputError("gravity has a value that is not finite, but must be numbers in m/s2.")
-        return table
+    def substeps(self, time_step: float, mobility: float, interface_width: float) -> int:
+        """Explicit steps of diffusion within a time step that are stable under these parameters."""
+        diffusion = self.solver.mixture.phases.diffusion
+        if diffusion is None:
+            return 0
+        limit = diffusion_limit(
+            self.smoothing,
+            self.scene.discretisation.spacing,
+            self.scene.discretisation.support_radius,
+            self.dimension,
+            greatest_mobility=mobility * diffusion.mobility.greatest(len(self.scene.phase)),
+            interface_width=interface_width,
+            curvature=self.scene.mixture.strength * diffusion.energy.curvature,
+            density_ratio=self._density_ratio,
+        )
+        return int(np.ceil(time_step / limit))
+
+    @property
+    def _density_ratio(self) -> float:
+        densities = [phase.rest_density for phase in self.scene.phase]
+        return max(densities) / min(densities)
 
     def converged(self, rollout: Rollout) -> np.ndarray:
         """(steps,) whether the density error came below the tolerances; always, with a fixed number of iterations."""
@@ -166,7 +209,15 @@ class Simulation:
             wall_push=layer.push,
         )
         periods = [*lengths, *np.zeros(3 - dimension)]
-        return Pcisph(discretisation, lattice, search, self._terms(discretisation, layer), self._pressure(), periods)
+        terms, phases = self._terms(discretisation, layer), self._phases(discretisation)
+        return Pcisph(discretisation, lattice, search, terms, self._pressure(), periods, phases)
+
+    def _phases(self, discretisation: Discretisation) -> Phases:
+        mixture, count = self.scene.mixture, len(self.scene.phase)
+        if count == 1:
+            return Phases(1, None, 0.0)
+        diffusion = Diffusion(discretisation, count, self.free_energy, MOBILITIES[mixture.mobility_form])
+        return Phases(count, diffusion, mixture.strength)
 
     def _terms(self, discretisation: Discretisation, layer: WallLayer) -> list[ForceTerm]:
         terms: list[ForceTerm] = [Gravity(discretisation, self.particles, self.device)]
@@ -188,18 +239,11 @@ class Simulation:
         )
 
 
-def as_numbers(what: str, value: Any) -> np.ndarray:
-    """A number or array in float64, or an `InputError` in a sentence."""
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{what} is {shown(value)}, but must be a number or an array of numbers.") from None
-
-
-def check_steps(steps: int) -> int:
+def check_steps(steps: int, least: int = 1) -> int:
     """The number of steps, or an `InputError` in a sentence."""
-    if not isinstance(steps, (int, float, np.number)) or not np.isfinite(steps) or int(steps) != steps or steps < 1:
-        raise InputError(f"steps is {steps}, but must be a whole number of at least 1.")
+    number = isinstance(steps, (int, float, np.number)) and np.isfinite(steps)
+    if not number or int(steps) != steps or steps < least:
+        raise InputError(f"steps is {steps}, but must be a whole number of at least {least}.")
     return int(steps)
 
 

@@ -35,6 +35,10 @@ class Trajectory:
     """(steps,) [-] average (rho - rho_0) / rho_0 at the end of each step"""
     converged: NDArray[Any]
     """(steps,) bool: whether the pressure solver reached its tolerance"""
+    mass_fractions: NDArray[Any] | None = None
+    """(frames, n, phases) [-]; None with one phase"""
+    substeps: int = 0
+    """[-] explicit steps of diffusion within each step"""
 
     def __post_init__(self) -> None:
         frames = {len(self.times), len(self.steps), len(self.positions), len(self.velocities)}
@@ -79,10 +83,12 @@ class Trajectory:
             dimension=self.dimension,
             precision="float32" if single else "float64",
             steps=len(self.iterations),
+            scalars=fraction_names(0 if self.mass_fractions is None else self.mass_fractions.shape[2]),
         ) as writer:
             writer.append_steps(self.iterations, self.density_errors, self.converged)
-            for time, step, x, v in zip(self.times, self.steps, self.positions, self.velocities, strict=True):
-                writer.append(time, x, v, step=int(step))
+            for k, (time, step) in enumerate(zip(self.times, self.steps, strict=True)):
+                fractions = {} if self.mass_fractions is None else fraction_fields(self.mass_fractions[k])
+                writer.append(time, self.positions[k], self.velocities[k], step=int(step), **fractions)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -93,4 +99,19 @@ class Trajectory:
         """
         arrays = vtkhdf.read(path)
         names = ("times", "steps", "positions", "velocities", "iterations", "density_errors", "converged")
-        return cls(**{name: arrays[name] for name in names})
+        phases = sum(name.startswith(FRACTION) for name in arrays)
+        fractions = np.stack([arrays[name] for name in fraction_names(phases)], axis=-1) if phases else None
+        return cls(**{name: arrays[name] for name in names}, mass_fractions=fractions)
+
+
+FRACTION = "mass_fraction_"
+
+
+def fraction_names(phases: int) -> list[str]:
+    """Names of the scalar fields that hold the mass fractions of several phases; none for one phase."""
+    return [f"{FRACTION}{k}" for k in range(phases)] if phases > 1 else []
+
+
+def fraction_fields(fractions: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Mass fractions (n, phases) as scalar fields by name."""
+    return dict(zip(fraction_names(fractions.shape[1]), fractions.T, strict=False))

@@ -13,7 +13,7 @@ from cortado.rollout import Rollout
 from cortado.run_folder import RunFolder
 from cortado.scene import Scene, load_scene
 from cortado.simulation import Simulation, check_steps, not_converged_sentence
-from cortado.trajectory import Trajectory
+from cortado.trajectory import Trajectory, fraction_fields, fraction_names
 from cortado.vtkhdf import TrajectoryWriter
 
 
@@ -56,15 +56,21 @@ def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolde
             dimension=simulation.dimension,
             precision=simulation.precision.name,  # type: ignore[arg-type]
             steps=steps,
+            scalars=fraction_names(len(simulation.scene.phase)),
         ) as writer,
         track(steps, "run") as advance,
     ):
-        writer.append(0.0, *rollout.initial.numpy(simulation.dimension), step=0)
+
+        def write(step: int, state: State) -> None:
+            positions, velocities, fractions = state.numpy(simulation.dimension)
+            writer.append(step * time_step, positions, velocities, step=step, **fraction_fields(fractions))
 
         def observe(step: int, state: State) -> None:
             if step % record_every == 0 or step == steps:
-                writer.append(step * time_step, *state.numpy(simulation.dimension), step=step)
+                write(step, state)
             advance()
+
+        write(0, rollout.initial)
 
         try:
             rollout.forward(observe, keep=False)
@@ -97,8 +103,10 @@ def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder) -> 
         path = folder.figures / "density_errors.png"
         density_errors(trajectory, path, tolerance=scene.solver.density_tolerance)
         figures.append(("Average density error of each step, and the tolerance asked.", path))
+    substeps = simulation.solver.mixture.substeps
     rows = [
         ("particles", simulation.particles),
+        *([("substeps of diffusion in each step", substeps)] if substeps else []),
         ("wall particles", len(simulation.walls)),
         ("steps", len(trajectory.iterations)),
         ("simulated time [s]", f"{trajectory.times[-1]:.4g}"),

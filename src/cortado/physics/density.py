@@ -1,6 +1,9 @@
-"""Density by summation (report eq. 5, with the wall masses of Akinci et al. 2012):
+"""Density by summation (report eq. 5, with the wall volumes of Akinci et al. 2012), as a number density:
 
-rho_i = m (W(0) + sum_j W_ij + sum_b (psi_b / m) W_ib),  m = rho_0 V_0.
+n_i = V (W(0) + sum_j W_ij + sum_b (V_b / V) W_ib),   rho_i = m_i n_i.
+
+V is the rest volume on the lattice and m_i a particle's mass over V. No mass of a neighbour enters (Solenthaler and
+Pajarola 2008): the density of a heavy fluid is not smeared into a light one.
 """
 
 from functools import cache
@@ -14,7 +17,7 @@ from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions,
 @cache
 def density_sums(discretisation: Discretisation) -> SimpleNamespace:
     """Raw neighbour sums: ``weights`` (sum of W, with what fills the list up), ``weights_tangent`` and
-    ``weights_adjoint`` (sum_j (r_i + r_j) G_ij + sum_b (psi_b / m) r_i G_ib: the adjoint of positions for an
+    ``weights_adjoint`` (sum_j (r_i + r_j) G_ij + sum_b (V_b / V) r_i G_ib: the adjoint of positions for an
     adjoint r of the sum of every particle)."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     surroundings = surroundings_type(discretisation.precision)
@@ -70,7 +73,7 @@ def density_sums(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def density_kernels(discretisation: Discretisation) -> SimpleNamespace:
-    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the density at given positions."""
+    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the number density at given positions."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     surroundings = surroundings_type(discretisation.precision)
     sums = density_sums(discretisation)
@@ -79,46 +82,34 @@ def density_kernels(discretisation: Discretisation) -> SimpleNamespace:
     @wp.kernel(module=discretisation.module(True))
     def density(
         s: surroundings,
-        rest_density: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         # out
-        rho: wp.array(dtype=real),
+        n: wp.array(dtype=real),
     ):
         i = s.first + wp.tid()
         total = weights(i, x, s)
-        rho[i] = rest_density[0] * s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
+        n[i] = s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def density_tangent(
         s: surroundings,
-        rest_density: wp.array(dtype=real),
-        rest_density_dot: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         x_dot: wp.array(dtype=vector),
-        rho: wp.array(dtype=real),
         # out
-        rho_dot: wp.array(dtype=real),
+        n_dot: wp.array(dtype=real),
     ):
         i = s.first + wp.tid()
-        total = weights_tangent(i, x, x_dot, s)
-        scaling = rest_density_dot[0] / rest_density[0]
-        rho_dot[i] = rest_density[0] * s.volume * total + rho[i] * scaling
+        n_dot[i] = s.volume * weights_tangent(i, x, x_dot, s)
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def density_adjoint(
         s: surroundings,
-        rest_density: wp.array(dtype=real),
         x: wp.array(dtype=vector),
-        rho: wp.array(dtype=real),
-        rho_bar: wp.array(dtype=real),
+        n_bar: wp.array(dtype=real),
         # in and out
         x_bar: wp.array(dtype=vector),
-        scalars_bar: wp.array(dtype=vector),
     ):
-        """``scalars_bar`` gathers the adjoints of (rest density, viscosity, time step), particle by particle."""
         i = s.first + wp.tid()
-        total = weights_adjoint(i, x, rho_bar, s)
-        x_bar[i] = x_bar[i] + rest_density[0] * s.volume * total
-        scalars_bar[i] = scalars_bar[i] + vector(rho_bar[i] * rho[i] / rest_density[0], real(0.0), real(0.0))
+        x_bar[i] = x_bar[i] + s.volume * weights_adjoint(i, x, n_bar, s)
 
     return SimpleNamespace(forward=density, tangent=density_tangent, adjoint=density_adjoint)

@@ -19,13 +19,14 @@ def integration_module(precision: Precision, differentiable: bool) -> Any:
 
 @cache
 def prediction_functions(precision: Precision) -> SimpleNamespace:
-    """``adjoint``: what one prediction v* = v + dt a, x* = x + dt v* adds to the adjoints of the scalars."""
+    """``adjoint``: what one prediction v* = v + dt a, x* = x + dt v* adds to the adjoints of the scalars, which are
+    kept particle by particle as (time step, mobility, interface width)."""
     real, vector = precision.real, precision.vector
 
     @wp.func
     def adjoint(x_star_bar: vector, speed_bar: vector, v: vector, v_star: vector, dt: real) -> vector:
         time_step_bar = wp.dot(x_star_bar, v_star) + wp.dot(speed_bar, v_star - v) / dt
-        return vector(real(0.0), real(0.0), time_step_bar)
+        return vector(time_step_bar, real(0.0), real(0.0))
 
     return SimpleNamespace(adjoint=adjoint)
 
@@ -41,13 +42,16 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         order: wp.array(dtype=wp.int32),
         x_scene: wp.array(dtype=vector),
         v_scene: wp.array(dtype=vector),
+        m_scene: wp.array(dtype=real),
         # out
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
+        m: wp.array(dtype=real),
     ):
         i = wp.tid()
         x[i] = x_scene[order[i]]
         v[i] = v_scene[order[i]]
+        m[i] = m_scene[order[i]]
 
     @wp.kernel(module=integration_module(precision, True))
     def unsort(
@@ -100,6 +104,7 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
     def begin_adjoint(
         order: wp.array(dtype=wp.int32),
         time_step: wp.array(dtype=real),
+        m: wp.array(dtype=real),
         v: wp.array(dtype=vector),
         v_star: wp.array(dtype=vector),
         x_scene_bar: wp.array(dtype=vector),
@@ -109,20 +114,26 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         # out
         x_bar: wp.array(dtype=vector),
         v_bar: wp.array(dtype=vector),
+        n_bar: wp.array(dtype=real),
+        m_bar: wp.array(dtype=real),
+        rho_0_bar: wp.array(dtype=real),
+        mu_bar: wp.array(dtype=real),
         push_bar: wp.array(dtype=vector),
-        rho_bar: wp.array(dtype=real),
         y_bar: wp.array(dtype=real),
         p_bar: wp.array(dtype=real),
     ):
-        """From the adjoint of the new state, in scene order, to that of the last prediction."""
+        """From the adjoint of the new state, in scene order, to that of the last prediction; others begin at 0."""
         i = wp.tid()
         dt = time_step[0]
         x_star_bar = x_scene_bar[order[i]]
         speed_bar = v_scene_bar[order[i]] + dt * x_star_bar
         x_bar[i] = x_star_bar
         v_bar[i] = speed_bar
-        push_bar[i] = dt * speed_bar
-        rho_bar[i] = real(0.0)
+        push_bar[i] = (dt / m[i]) * speed_bar
+        n_bar[i] = real(0.0)
+        m_bar[i] = real(0.0)
+        rho_0_bar[i] = real(0.0)
+        mu_bar[i] = real(0.0)
         y_bar[i] = real(0.0)
         p_bar[i] = real(0.0)
         scalars_bar[i] = scalars_bar[i] + adjoin_prediction(x_star_bar, speed_bar, v[i], v_star[i], dt)
@@ -138,6 +149,16 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         i = wp.tid()
         acceleration_bar[i] = time_step[0] * v_bar[i]
 
+    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
+    def collect_masses(
+        order: wp.array(dtype=wp.int32),
+        m_bar: wp.array(dtype=real),
+        # in and out
+        m_scene_bar: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        m_scene_bar[order[i]] = m_scene_bar[order[i]] + m_bar[i]
+
     return SimpleNamespace(
         sort=sort,
         unsort=unsort,
@@ -145,4 +166,5 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         predict_tangent=predict_tangent,
         begin_adjoint=begin_adjoint,
         acceleration_adjoint=acceleration_adjoint,
+        collect_masses=collect_masses,
     )

@@ -1,12 +1,13 @@
 """One predictive-corrective iteration (Solenthaler and Pajarola 2009; report eqs. 6 and 9, put right):
 
-    p_i  = max(p_i + delta y_i (rho*_i - rho_0), 0),   delta = k / dt^2
-    c_i  = p_i / rho_i^2
-    ap_i = -m (sum_j (c_i + c_j) G_ij + push sum_b (psi_b / m) c_i G_ib)
+    p_i  = max(p_i + delta y_i (m_i n*_i - rho_0i), 0),   delta = k / dt^2
+    c_i  = p_i / n_i^2
+    ap_i = -(V / m_i) (sum_j (c_i + c_j) G_ij + push sum_b (V_b / V) c_i G_ib)
     v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
 
-y is the yield and push the factor beside walls (`cortado.physics.walls`, `cortado.calibration.WallLayer`). G is taken
-at x(t), rho* at the predicted positions over the neighbours of x(t). After the last iteration (x*, v*) is the new
+n is the number density (`cortado.physics.density`; for fluids of different masses: Solenthaler and Pajarola 2008),
+y the yield and push the factor beside walls (`cortado.physics.walls`, `cortado.calibration.WallLayer`). G is taken
+at x(t), n* at the predicted positions over the neighbours of x(t). After the last iteration (x*, v*) is the new
 state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
 """
 
@@ -37,9 +38,10 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
     def pressure(
         s: surroundings,
         stiffness: real,
-        rest_density: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
-        rho: wp.array(dtype=real),
+        n: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        rho_0: wp.array(dtype=real),
         y: wp.array(dtype=real),
         x_star: wp.array(dtype=vector),
         p_in: wp.array(dtype=real),
@@ -51,27 +53,28 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         """``error``: the compression (rho* - rho_0)+ / rho_0 of a particle, twice (for a sum and a maximum)."""
         i = s.first + wp.tid()
         total = weights(i, x_star, s)
-        rho_0 = rest_density[0]
-        excess = rho_0 * s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - rho_0
+        excess = m[i] * s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - rho_0[i]
         delta = y[i] * stiffness / (time_step[0] * time_step[0])
         p_i = p_in[i] + delta * excess
         if p_i < real(0.0):  # not wp.max, which would turn NaN into 0 and hide it
             p_i = real(0.0)
-        compression = wp.max(excess / rho_0, real(0.0))
+        compression = wp.max(excess / rho_0[i], real(0.0))
         p_out[i] = p_i
-        c[i] = p_i / (rho[i] * rho[i])
+        c[i] = p_i / (n[i] * n[i])
         error[i] = pair_of(compression, compression)
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def pressure_tangent(
         s: surroundings,
         stiffness: real,
-        rest_density: wp.array(dtype=real),
-        rest_density_dot: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
-        rho: wp.array(dtype=real),
-        rho_dot: wp.array(dtype=real),
+        n: wp.array(dtype=real),
+        n_dot: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        m_dot: wp.array(dtype=real),
+        rho_0: wp.array(dtype=real),
+        rho_0_dot: wp.array(dtype=real),
         y: wp.array(dtype=real),
         y_dot: wp.array(dtype=real),
         x_star: wp.array(dtype=vector),
@@ -90,18 +93,18 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         if p_i > real(0.0):
             delta = y[i] * stiffness / (time_step[0] * time_step[0])
             excess = (p_i - p_in[i]) / delta
-            excess_dot = rest_density[0] * s.volume * total + excess * rest_density_dot[0] / rest_density[0]
+            excess_dot = m[i] * s.volume * total + (excess + rho_0[i]) * m_dot[i] / m[i] - rho_0_dot[i]
             delta_dot = delta * (y_dot[i] / y[i] - real(2.0) * time_step_dot[0] / time_step[0])
             p_dot_i = p_in_dot[i] + delta * excess_dot + delta_dot * excess
-        rho_i = rho[i]
+        n_i = n[i]
         p_out_dot[i] = p_dot_i
-        c_dot[i] = (p_dot_i - real(2.0) * p_i / rho_i * rho_dot[i]) / (rho_i * rho_i)
+        c_dot[i] = (p_dot_i - real(2.0) * p_i / n_i * n_dot[i]) / (n_i * n_i)
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def pressure_adjoint(
         s: surroundings,
-        rest_density: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
+        m: wp.array(dtype=real),
         v: wp.array(dtype=vector),
         x_star: wp.array(dtype=vector),
         v_star: wp.array(dtype=vector),
@@ -113,15 +116,14 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         # out
         push_bar: wp.array(dtype=vector),
     ):
-        """From the adjoint r of rho* to that of x*, and on to what x* was predicted from."""
+        """From the adjoint r of n* to that of x*, and on to what x* was predicted from."""
         i = s.first + wp.tid()
-        total = weights_adjoint(i, x_star, r, s)
-        x_star_bar = rest_density[0] * s.volume * total
+        x_star_bar = s.volume * weights_adjoint(i, x_star, r, s)
         dt = time_step[0]
         speed_bar = dt * x_star_bar
         x_bar[i] = x_bar[i] + x_star_bar
         v_bar[i] = v_bar[i] + speed_bar
-        push_bar[i] = dt * speed_bar
+        push_bar[i] = (dt / m[i]) * speed_bar
         scalars_bar[i] = scalars_bar[i] + adjoin_prediction(x_star_bar, speed_bar, v[i], v_star[i], dt)
 
     return SimpleNamespace(forward=pressure, tangent=pressure_tangent, adjoint=pressure_adjoint)
@@ -181,8 +183,8 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
     @wp.kernel(module=discretisation.module(True))
     def pressure_force(
         s: surroundings,
-        rest_density: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
+        m: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         acceleration: wp.array(dtype=vector),
@@ -194,7 +196,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         i = s.first + wp.tid()
         total = force_sum(i, x, c, s)
         dt = time_step[0]
-        push = -(rest_density[0] * s.volume) * total
+        push = (-s.volume / m[i]) * total
         velocity = v[i] + dt * (acceleration[i] + push)
         v_star[i] = velocity
         x_star[i] = x[i] + dt * velocity
@@ -202,10 +204,10 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def pressure_force_tangent(
         s: surroundings,
-        rest_density: wp.array(dtype=real),
-        rest_density_dot: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        m_dot: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         x_dot: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
@@ -224,7 +226,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         dt = time_step[0]
         accelerated = (v_star[i] - v[i]) / dt
         push = accelerated - acceleration[i]
-        push_dot = -(rest_density[0] * s.volume) * total_dot + (rest_density_dot[0] / rest_density[0]) * push
+        push_dot = (-s.volume / m[i]) * total_dot - (m_dot[i] / m[i]) * push
         velocity_dot = v_dot[i] + dt * (acceleration_dot[i] + push_dot) + time_step_dot[0] * accelerated
         v_star_dot[i] = velocity_dot
         x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[0] * v_star[i]
@@ -233,10 +235,11 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
     def pressure_force_adjoint(
         s: surroundings,
         stiffness: real,
-        rest_density: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),
-        rho: wp.array(dtype=real),
+        n: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        rho_0: wp.array(dtype=real),
         y: wp.array(dtype=real),
         p_in: wp.array(dtype=real),
         p_out: wp.array(dtype=real),
@@ -244,53 +247,60 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         push_bar: wp.array(dtype=vector),
         # in and out
         x_bar: wp.array(dtype=vector),
-        rho_bar: wp.array(dtype=real),
+        n_bar: wp.array(dtype=real),
+        m_bar: wp.array(dtype=real),
+        rho_0_bar: wp.array(dtype=real),
         y_bar: wp.array(dtype=real),
         p_bar: wp.array(dtype=real),
         scalars_bar: wp.array(dtype=vector),
         # out
         r: wp.array(dtype=real),
     ):
-        """From the adjoint of the pressure acceleration to those of c, p and (r) of rho*: every sum a gather."""
+        """From ``push_bar``, the adjoint of the pressure acceleration over m, to those of c, p and (r) of n*: every
+        sum a gather."""
         i = s.first + wp.tid()
         x_i = x[i]
         c_i = c[i]
         push_bar_i = push_bar[i]
         stretch = real(0.0)
         bend = vector()
+        work = real(0.0)
         for k in range(0, s.fluid_count[i], UNROLL):
             x_j = vectors(x, k, i, s)
             c_j = numbers(c, k, i, s)
             push_bar_j = vectors(push_bar, k, i, s)
             for u in range(UNROLL):
                 x_ij = separation(x_i, x_j[u], s)
+                g_ij = gradient(x_ij, s)
                 u_ij = push_bar_i - push_bar_j[u]
-                stretch += wp.dot(gradient(x_ij, s), u_ij)
+                stretch += wp.dot(g_ij, u_ij)
                 bend += (c_i + c_j[u]) * hessian_product(x_ij, u_ij, s)
+                work += (c_i + c_j[u]) * wp.dot(g_ij, push_bar_i)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             x_ib = separation(x_i, s.wall_positions[b], s)
-            stretch += s.wall_push * s.wall_weights[b] * wp.dot(gradient(x_ib, s), push_bar_i)
-            bend += (s.wall_push * s.wall_weights[b] * c_i) * hessian_product(x_ib, push_bar_i, s)
-        mass = rest_density[0] * s.volume
-        rho_i = rho[i]
+            weight = s.wall_push * s.wall_weights[b]
+            wall_stretch = weight * wp.dot(gradient(x_ib, s), push_bar_i)
+            stretch += wall_stretch
+            bend += (weight * c_i) * hessian_product(x_ib, push_bar_i, s)
+            work += c_i * wall_stretch
+        n_i = n[i]
+        m_i = m[i]
         p_i = p_out[i]
         delta = y[i] * stiffness / (time_step[0] * time_step[0])
-        c_bar = -mass * stretch
+        c_bar = -s.volume * stretch
         p_bar_i = real(0.0)
         if p_i > real(0.0):
-            p_bar_i = p_bar[i] + c_bar / (rho_i * rho_i)
-        r_i = delta * p_bar_i
+            p_bar_i = p_bar[i] + c_bar / (n_i * n_i)
+        excess_bar = delta * p_bar_i
         excess = (p_i - p_in[i]) / delta
-        x_bar[i] = x_bar[i] - mass * bend
-        rho_bar[i] = rho_bar[i] - real(2.0) * c_i / rho_i * c_bar
-        y_bar[i] = y_bar[i] + r_i * excess / y[i]
+        x_bar[i] = x_bar[i] - s.volume * bend
+        n_bar[i] = n_bar[i] - real(2.0) * c_i / n_i * c_bar
+        m_bar[i] = m_bar[i] + (s.volume * work + excess_bar * (excess + rho_0[i])) / m_i
+        rho_0_bar[i] = rho_0_bar[i] - excess_bar
+        y_bar[i] = y_bar[i] + excess_bar * excess / y[i]
         p_bar[i] = p_bar_i
-        r[i] = r_i
-        scalars_bar[i] = scalars_bar[i] + vector(
-            (r_i * excess + c_i * c_bar) / rest_density[0],
-            real(0.0),
-            real(-2.0) * r_i * excess / time_step[0],
-        )
+        r[i] = m_i * excess_bar
+        scalars_bar[i] = scalars_bar[i] - vector(real(2.0) * excess_bar * excess / time_step[0], real(0.0), real(0.0))
 
     return SimpleNamespace(forward=pressure_force, tangent=pressure_force_tangent, adjoint=pressure_force_adjoint)

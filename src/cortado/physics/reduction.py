@@ -1,7 +1,6 @@
 """Sums over particles in a fixed order: a tree of partial sums, so that the same bits come back every time."""
 
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -9,20 +8,35 @@ import warp as wp
 from cortado.precision import Precision
 
 
+def _name(dtype: Any) -> str:
+    """Of a number, vector or matrix type, to tell their modules apart."""
+    shape = getattr(dtype, "_shape_", ())
+    return "_".join([getattr(dtype, "_wp_scalar_type_", dtype).__name__, *map(str, shape)])
+
+
 @cache
-def reduction_kernels(precision: Precision) -> SimpleNamespace:
-    """Kernels ``sum`` (vectors) and ``sum_and_maximum`` (pairs): partial[t] from values t, t + T, t + 2 T, ..."""
-    vector, pair = precision.vector, precision.pair
-    module = wp.get_module(f"cortado_reduction_{precision.name}")
+def sum_kernel(dtype: Any) -> Any:
+    """Sums of numbers, vectors or matrices of one type: partial[t] from values t, t + T, t + 2 T, ..."""
+    module = wp.get_module(f"cortado_sum_{_name(dtype)}")
     module.options["enable_backward"] = False
 
     @wp.kernel(module=module, enable_backward=False)
-    def vector_sum(count: int, stride: int, values: wp.array(dtype=vector), partial: wp.array(dtype=vector)):
+    def add(count: int, stride: int, values: wp.array(dtype=dtype), partial: wp.array(dtype=dtype)):
         t = wp.tid()
-        total = vector()
-        for k in range(t, count, stride):
+        total = values[t]
+        for k in range(t + stride, count, stride):
             total += values[k]
         partial[t] = total
+
+    return add
+
+
+@cache
+def sum_and_maximum_kernel(precision: Precision) -> Any:
+    """Sums of the first and maxima of the second components of pairs, in the same way."""
+    pair = precision.pair
+    module = wp.get_module(f"cortado_sum_and_maximum_{precision.name}")
+    module.options["enable_backward"] = False
 
     @wp.kernel(module=module, enable_backward=False)
     def sum_and_maximum(count: int, stride: int, values: wp.array(dtype=pair), partial: wp.array(dtype=pair)):
@@ -34,21 +48,18 @@ def reduction_kernels(precision: Precision) -> SimpleNamespace:
             largest = wp.max(largest, values[k][1])
         partial[t] = pair(total, largest)
 
-    return SimpleNamespace(sum=vector_sum, sum_and_maximum=sum_and_maximum)
+    return sum_and_maximum
 
 
 @cache
-def number_sum_kernel() -> Any:
-    """The same for numbers in float64."""
-    module = wp.get_module("cortado_reduction_numbers")
+def add_kernel(dtype: Any) -> Any:
+    """total += value, element by element."""
+    module = wp.get_module(f"cortado_add_{_name(dtype)}")
     module.options["enable_backward"] = False
 
     @wp.kernel(module=module, enable_backward=False)
-    def number_sum(count: int, stride: int, values: wp.array(dtype=wp.float64), partial: wp.array(dtype=wp.float64)):
-        t = wp.tid()
-        total = wp.float64(0.0)
-        for k in range(t, count, stride):
-            total += values[k]
-        partial[t] = total
+    def accumulate(value: wp.array(dtype=dtype), total: wp.array(dtype=dtype)):
+        i = wp.tid()
+        total[i] = total[i] + value[i]
 
-    return number_sum
+    return accumulate

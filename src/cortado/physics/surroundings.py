@@ -50,7 +50,7 @@ def surroundings_type(precision: Precision) -> Any:
         wall_positions: wp.array(dtype=vector)
         """[m]"""
         wall_weights: wp.array(dtype=real)
-        """psi_b / m [-]: the mass of a wall particle over that of a fluid particle (after Akinci et al. 2012)."""
+        """V_b / V [-]: the volume of a wall particle over that of a fluid particle (after Akinci et al. 2012)."""
         wall_push: real
         """Factor of a wall's pressure force [-], see `cortado.calibration.WallLayer`."""
         support: real
@@ -64,7 +64,7 @@ def surroundings_type(precision: Precision) -> Any:
         pliancy: real
         """(2 sum_j G_j . G_j / push)^(-1/2) of a filled neighbourhood [m^(d + 1)], see `cortado.physics.walls`."""
         volume: real
-        """Rest volume of a particle [m^d]: with it the lattice of the rest spacing has the rest density."""
+        """Rest volume V of a particle on the lattice [m^d]: with it the lattice of the rest spacing has the rest density."""
         periodic: wp.int32
         period: vector
         """[m], 0 along an axis that is not periodic."""
@@ -79,7 +79,8 @@ def surroundings_type(precision: Precision) -> Any:
 @cache
 def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
     """Warp functions of a separation in given surroundings: ``separation``, ``weight``, ``gradient``,
-    ``hessian_product``; and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have before any of it is
+    ``hessian_product``; ``size`` (|x|^2 + 0.01 h^2, which covers coincident particles), ``factor`` (F = x . G / size,
+    of second derivatives after Brookshaw 1985) and ``factor_gradient``; and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have before any of it is
     used, so that the loads do not wait for one another (on a GPU a tenth of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
@@ -116,6 +117,20 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
         return smooth_hessian_product(x, u, s.support, s.normalisation)
 
     @wp.func
+    def size(x: vector, s: surroundings) -> real:
+        return wp.dot(x, x) + real(0.01) * s.support * s.support
+
+    @wp.func
+    def factor(x: vector, s: surroundings) -> real:
+        return wp.dot(x, gradient(x, s)) / size(x, s)
+
+    @wp.func
+    def factor_gradient(x: vector, s: surroundings) -> vector:
+        d = size(x, s)
+        g = gradient(x, s)
+        return (g + hessian_product(x, x, s) - (real(2.0) * wp.dot(x, g) / d) * x) / d
+
+    @wp.func
     def vectors(a: wp.array(dtype=vector), k: int, i: int, s: surroundings) -> rows:
         return wp.matrix_from_rows(
             a[s.neighbours[k, i]], a[s.neighbours[k + 1, i]], a[s.neighbours[k + 2, i]], a[s.neighbours[k + 3, i]]
@@ -132,6 +147,9 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
         weight=weight,
         gradient=gradient,
         hessian_product=hessian_product,
+        size=size,
+        factor=factor,
+        factor_gradient=factor_gradient,
         vectors=vectors,
         numbers=numbers,
     )

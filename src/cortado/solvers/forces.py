@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import warp as wp
 
 from cortado.calibration import WallLayer
-from cortado.launching import Launcher, TreeSum, vector_sum
+from cortado.launching import Launcher, TreeSum, sum_of
 from cortado.particles import Fields, Parameters
 from cortado.physics.gravity import gravity_kernels
 from cortado.physics.surroundings import Discretisation
@@ -40,8 +40,6 @@ class Adjoints:
 
     fields: Fields
     parameters: Parameters
-    scalars: wp.array
-    """(n,) vectors: adjoints of (rest density, viscosity, time step), particle by particle."""
 
 
 class ForceTerm(Protocol):
@@ -64,7 +62,7 @@ class Gravity:
 
     def __init__(self, discretisation: Discretisation, particles: int, device: Any):
         self._kernels = gravity_kernels(discretisation.precision)
-        self._sum: TreeSum = vector_sum(particles, discretisation.precision, device)
+        self._sum: TreeSum = sum_of(discretisation.precision.vector, particles, device)
 
     def accelerate(self, moment: Moment, before: wp.array, after: wp.array) -> None:
         moment.launch(self._kernels.forward, [moment.parameters.gravity, moment.step, before], [after])
@@ -87,32 +85,30 @@ class Viscosity:
         self._kappa, self._friction = kappa, friction
 
     def accelerate(self, moment: Moment, before: wp.array, after: wp.array) -> None:
-        f, p = moment.fields, moment.parameters
+        f = moment.fields
         moment.launch(
             self._kernels.forward,
-            [moment.surroundings, self._kappa, self._friction, p.rest_density, p.viscosity, f.x, f.v, f.rho, before],
+            [moment.surroundings, self._kappa, self._friction, f.x, f.v, f.n, f.m, f.mu, before],
             [after],
         )
 
     def tangent(
         self, moment: Moment, fields: Fields, parameters: Parameters, before: wp.array, after: wp.array
     ) -> None:
-        f, p = moment.fields, moment.parameters
+        f, d = moment.fields, fields
         moment.launch(
             self._kernels.tangent,
             [moment.surroundings, self._kappa, self._friction]
-            + [p.rest_density, parameters.rest_density, p.viscosity, parameters.viscosity]
-            + [f.x, fields.x, f.v, fields.v, f.rho, fields.rho, before],
+            + [f.x, d.x, f.v, d.v, f.n, d.n, f.m, d.m, f.mu, d.mu, before],
             [after],
         )
 
     def adjoint(self, moment: Moment, acceleration: wp.array, adjoints: Adjoints) -> None:
-        f, p, bar = moment.fields, moment.parameters, adjoints.fields
+        f, bar = moment.fields, adjoints.fields
         moment.launch(
             self._kernels.adjoint,
-            [moment.surroundings, self._kappa, self._friction, p.rest_density, p.viscosity]
-            + [f.x, f.v, f.rho, acceleration],
-            [bar.x, bar.v, bar.rho, adjoints.scalars],
+            [moment.surroundings, self._kappa, self._friction, f.x, f.v, f.n, f.m, f.mu, acceleration],
+            [bar.x, bar.v, bar.n, bar.m, bar.mu],
         )
 
 

@@ -1,4 +1,4 @@
-"""Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009; the report's Algorithm 1, put right).
+"""Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009; the report's Algorithms 1 and 3, put right).
 
 `Pcisph.step` goes on until the density error is small; `Pcisph.record` repeats a step with a known number of iterations
 and keeps every intermediate value, for `cortado.solvers.pcisph_derivatives`. Nothing here reads from the device.
@@ -21,6 +21,7 @@ from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
 from cortado.physics.surroundings import Discretisation, surroundings_type
 from cortado.physics.walls import wall_kernels
 from cortado.solvers.forces import ForceTerm, Moment
+from cortado.solvers.mixture import Mixture, Phases
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,7 @@ class Pcisph:
         terms: Sequence[ForceTerm],
         pressure: PressureSolve | None,
         periods: Sequence[float],
+        phases: Phases,
         requires_grad: bool = False,
     ):
         """``pressure`` None leaves the pressure out; ``periods`` (3,) [m], 0 along an axis that is not periodic."""
@@ -119,6 +121,7 @@ class Pcisph:
         self.discretisation, self.lattice, self.search = discretisation, lattice, search
         self.terms, self.pressure, self.periods = tuple(terms), pressure, tuple(periods)
         self.launch = Launcher(particles, device, record_tape=requires_grad)
+        self.mixture = Mixture(phases, precision, search, self.launch, requires_grad)
         self.kernels = Kernels.of(discretisation)
         self._sum = sum_and_maximum(particles, precision, device)
 
@@ -140,7 +143,7 @@ class Pcisph:
         self.bad_particle, self.bad_step = count(NO_PARTICLE), count(-1)
         self._surroundings: Any = None
         self.growth = 0
-        """How often arrays were replaced by longer ones; what was captured before is stale."""
+        """How often arrays, or the work of a step, were replaced; what was captured before is stale."""
         self.grow(search.capacity)
 
     def grow(self, capacity: int) -> None:
@@ -175,8 +178,26 @@ class Pcisph:
             self.terms,
             self.pressure,
             self.periods,
+            self.mixture.phases,
             requires_grad=True,
         )
+
+    def new_state(self, requires_grad: bool = False) -> State:
+        """A state of this solver's particles, all 0."""
+        phases, search = self.mixture.phases.count, self.search
+        return State.zeros(search.particles, phases, self.discretisation.precision, search.device, requires_grad)
+
+    def new_parameters(self, steps: int, requires_grad: bool = False) -> Parameters:
+        """Parameters of a run of so many steps, all 0."""
+        phases, search = self.mixture.phases.count, self.search
+        precision, device = self.discretisation.precision, search.device
+        return Parameters.zeros(steps, search.particles, phases, precision, device, requires_grad)
+
+    def diffuse(self, substeps: int) -> None:
+        """Take so many substeps of diffusion within each time step from now on."""
+        if substeps != self.mixture.substeps:
+            self.mixture.reserve(substeps)
+            self.growth += 1
 
     def reset(self) -> None:
         """Forget the counts and flags of an earlier run, also of one that was interrupted."""
@@ -221,18 +242,24 @@ class Pcisph:
             [self.search.order, it.x_star[iterations], it.v_star[iterations]],
             [new_state.positions, new_state.velocities],
         )
+        self.mixture.result(new_state.mass_fractions)
 
     def moment(self, parameters: Parameters) -> Moment:
         """The present step as a force term sees it."""
         return Moment(self.launch, self._surroundings, self.fields, parameters, self.step_number)
 
     def _begin(self, state: State, parameters: Parameters) -> None:
-        """Neighbours, density, explicit forces, and the first prediction."""
+        """Neighbours, density, mixture, explicit forces, and the first prediction."""
         f, it, s = self.fields, self.iterates, self._surroundings
         self.search.sort(state.positions)
-        self.launch(self.kernels.integration.sort, [self.search.order, state.positions, state.velocities], [f.x, f.v])
+        self.launch(
+            self.kernels.integration.sort,
+            [self.search.order, state.positions, state.velocities, parameters.masses],
+            [f.x, f.v, f.m],
+        )
         self.search.fill(s, f.x)
-        self.launch(self.kernels.density.forward, [s, parameters.rest_density, f.x], [f.rho])
+        self.launch(self.kernels.density.forward, [s, f.x], [f.n])
+        self.mixture.step(s, f, parameters, state.mass_fractions)
         self.launch(self.kernels.walls.forward, [s, f.x], [self.wall_yield])
         moment = self.moment(parameters)
         for t, term in enumerate(self.terms):
@@ -274,12 +301,12 @@ class Pcisph:
         pressure = it.p[max(slot, 1)]
         self.launch(
             self.kernels.pressure.forward,
-            [s, self.lattice.stiffness, p.rest_density, p.time_step, f.rho, self.wall_yield]
+            [s, self.lattice.stiffness, p.time_step, f.n, f.m, f.rho_0, self.wall_yield]
             + [it.x_star[before], pressure_before],
             [pressure, it.c[before], self._errors],
         )
         self.launch(
             self.kernels.force.forward,
-            [s, p.rest_density, p.time_step, f.x, f.v, self.accelerations[-1], it.c[before]],
+            [s, p.time_step, f.m, f.x, f.v, self.accelerations[-1], it.c[before]],
             [it.x_star[slot], it.v_star[slot]],
         )

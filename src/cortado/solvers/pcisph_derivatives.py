@@ -2,9 +2,10 @@
 
 import warp as wp
 
-from cortado.launching import vector_sum
+from cortado.launching import sum_of
 from cortado.particles import Fields, Parameters, State
 from cortado.solvers.forces import Adjoints
+from cortado.solvers.mixture import MixtureAdjoint, MixtureTangent
 from cortado.solvers.pcisph import Pcisph
 
 
@@ -28,47 +29,57 @@ class PcisphAdjoint:
         vectors, scalars = _scratch(solver, 3, 3)
         self._push_bar, self._acceleration_bar, self._scalars_bar = vectors
         self._p_bar, self._y_bar, self._r = scalars
-        self._sum = vector_sum(particles, precision, device)
+        self._sum = sum_of(precision.vector, particles, device)
+        self._mixture = MixtureAdjoint(solver.mixture)
 
     def clear(self) -> None:
-        """Forget the scalars' adjoints of the steps so far."""
+        """Forget what was kept particle by particle of the steps so far."""
         self._scalars_bar.zero_()
+        self._mixture.clear()
 
-    def scalars(self) -> wp.array:
-        """(1,) vector: adjoints of (rest density, viscosity, time step) of all steps since `clear`."""
-        return self._sum(self._scalars_bar)
+    def collect(self, bar: Parameters) -> None:
+        """Write the adjoints that were kept particle by particle, of all steps since `clear`."""
+        self._mixture.collect(bar)
+        totals = self._sum(self._scalars_bar).view(bar.time_step.dtype).flatten()
+        for k, total in enumerate((bar.time_step, bar.mobility, bar.interface_width)):
+            wp.copy(total, totals, src_offset=k, count=1)
 
     def step(
         self, iterations: int, new_state_bar: State, state_bar: State, parameters: Parameters, bar: Parameters
     ) -> None:
-        """From the adjoint of the recorded step's result to that of its state; may be the same arrays."""
+        """From the adjoint of the recorded step's result to that of its state, which may be the same arrays. Gravity's
+        adjoint is written to ``bar`` and that of the masses added; the others are kept for `collect`."""
         solver, b, f = self._solver, self._bar, self._solver.fields
         kernels = solver.kernels
         s, it, launch = solver.moment(parameters).surroundings, solver.iterates, solver.launch
-        rest_density, time_step, order = parameters.rest_density, parameters.time_step, solver.search.order
+        time_step, order = parameters.time_step, solver.search.order
         launch(
             kernels.integration.begin_adjoint,
-            [order, time_step, f.v, it.v_star[iterations], new_state_bar.positions, new_state_bar.velocities],
-            [self._scalars_bar, b.x, b.v, self._push_bar, b.rho, self._y_bar, self._p_bar],
+            [order, time_step, f.m, f.v, it.v_star[iterations], new_state_bar.positions, new_state_bar.velocities],
+            [self._scalars_bar, b.x, b.v, b.n, b.m, b.rho_0, b.mu, self._push_bar, self._y_bar, self._p_bar],
         )
         for k in reversed(range(iterations)):
             launch(
                 kernels.force.adjoint,
-                [s, solver.lattice.stiffness, rest_density, time_step, f.x, f.rho, solver.wall_yield]
+                [s, solver.lattice.stiffness, time_step, f.x, f.n, f.m, f.rho_0, solver.wall_yield]
                 + [it.p[k], it.p[k + 1], it.c[k], self._push_bar],
-                [b.x, b.rho, self._y_bar, self._p_bar, self._scalars_bar, self._r],
+                [b.x, b.n, b.m, b.rho_0, self._y_bar, self._p_bar, self._scalars_bar, self._r],
             )
             launch(
                 kernels.pressure.adjoint,
-                [s, rest_density, time_step, f.v, it.x_star[k], it.v_star[k], self._r],
+                [s, time_step, f.m, f.v, it.x_star[k], it.v_star[k], self._r],
                 [b.x, b.v, self._scalars_bar, self._push_bar],
             )
         launch(kernels.integration.acceleration_adjoint, [time_step, b.v], [self._acceleration_bar])
-        moment, adjoints = solver.moment(parameters), Adjoints(b, bar, self._scalars_bar)
+        moment, adjoints = solver.moment(parameters), Adjoints(b, bar)
         for term in reversed(solver.terms):
             term.adjoint(moment, self._acceleration_bar, adjoints)
         launch(kernels.walls.adjoint, [s, f.x, solver.wall_yield, self._y_bar], [b.x])
-        launch(kernels.density.adjoint, [s, rest_density, f.x, f.rho, b.rho], [b.x, self._scalars_bar])
+        self._mixture.step(
+            s, f, b, parameters, self._scalars_bar, new_state_bar.mass_fractions, state_bar.mass_fractions
+        )
+        launch(kernels.density.adjoint, [s, f.x, b.n], [b.x])
+        launch(kernels.integration.collect_masses, [order, b.m], [bar.masses])
         launch(kernels.integration.unsort, [order, b.x, b.v], [state_bar.positions, state_bar.velocities])
 
 
@@ -82,6 +93,7 @@ class PcisphTangent:
         vectors, scalars = _scratch(solver, len(solver.terms) + 3, 5)
         self._x_star_dot, self._v_star_dot, *self._accelerations_dot = vectors
         self._zero_pressure, *self._p_dot, self._c_dot, self._y_dot = scalars
+        self._mixture = MixtureTangent(solver.mixture)
 
     def step(
         self, iterations: int, state_dot: State, new_state_dot: State, parameters: Parameters, dot: Parameters
@@ -90,10 +102,13 @@ class PcisphTangent:
         solver, d, f = self._solver, self._dot, self._solver.fields
         kernels = solver.kernels
         s, it, launch = solver.moment(parameters).surroundings, solver.iterates, solver.launch
-        rest_density, time_step, order = parameters.rest_density, parameters.time_step, solver.search.order
+        time_step, order = parameters.time_step, solver.search.order
         acceleration, acceleration_dot = solver.accelerations[-1], self._accelerations_dot[-1]
-        launch(kernels.integration.sort, [order, state_dot.positions, state_dot.velocities], [d.x, d.v])
-        launch(kernels.density.tangent, [s, rest_density, dot.rest_density, f.x, d.x, f.rho], [d.rho])
+        launch(
+            kernels.integration.sort, [order, state_dot.positions, state_dot.velocities, dot.masses], [d.x, d.v, d.m]
+        )
+        launch(kernels.density.tangent, [s, f.x, d.x], [d.n])
+        self._mixture.step(s, f, d, parameters, dot, state_dot.mass_fractions)
         launch(kernels.walls.tangent, [s, f.x, d.x, solver.wall_yield], [self._y_dot])
         for t, term in enumerate(solver.terms):
             before, after = self._accelerations_dot[t], self._accelerations_dot[t + 1]
@@ -108,14 +123,14 @@ class PcisphTangent:
             p_dot = self._p_dot[k % 2]
             launch(
                 kernels.pressure.tangent,
-                [s, solver.lattice.stiffness, rest_density, dot.rest_density, time_step, dot.time_step]
-                + [f.rho, d.rho, solver.wall_yield, self._y_dot, it.x_star[k], self._x_star_dot]
+                [s, solver.lattice.stiffness, time_step, dot.time_step, f.n, d.n, f.m, d.m, f.rho_0, d.rho_0]
+                + [solver.wall_yield, self._y_dot, it.x_star[k], self._x_star_dot]
                 + [it.p[k], p_dot_before, it.p[k + 1]],
                 [p_dot, self._c_dot],
             )
             launch(
                 kernels.force.tangent,
-                [s, rest_density, dot.rest_density, time_step, dot.time_step, f.x, d.x, f.v, d.v]
+                [s, time_step, dot.time_step, f.m, d.m, f.x, d.x, f.v, d.v]
                 + [acceleration, acceleration_dot, it.c[k], self._c_dot, it.v_star[k + 1]],
                 [self._x_star_dot, self._v_star_dot],
             )
@@ -125,3 +140,4 @@ class PcisphTangent:
             [order, self._x_star_dot, self._v_star_dot],
             [new_state_dot.positions, new_state_dot.velocities],
         )
+        self._mixture.result(new_state_dot.mass_fractions)

@@ -1,0 +1,153 @@
+"""Parameters by name: what a user writes, checked, and the way to the arrays of a rollout and back.
+
+n counts fluid particles in the order in which the scene lists them, d is the scene's dimension.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cortado.errors import InputError, shown
+from cortado.masses import masses, masses_adjoint, masses_tangent
+from cortado.particles import Parameters, State
+from cortado.rollout import Rollout
+
+if TYPE_CHECKING:
+    from cortado.simulation import Simulation
+
+UNITS = {
+    "gravity": "m/s²",
+    "initial_positions": "m",
+    "initial_velocities": "m/s",
+    "mass_fractions": "",
+    "rest_density": "kg/m³",
+    "viscosity": "Pa s",
+    "time_step": "s",
+    "mobility": "m²/s",
+    "interface_width": "m",
+    "colours": "",
+}
+"""Every parameter with its unit."""
+NAMES = tuple(UNITS)
+STATES = ("initial_positions", "initial_velocities", "mass_fractions")
+"""Parameters that are the first state, in the order in which `State` keeps them."""
+MATERIALS = ("rest_density", "viscosity")
+"""Parameters of each phase: a number with one phase, else (phases,)."""
+NUMBERS = ("time_step", "mobility", "interface_width")
+POSITIVE = ("rest_density", "time_step", "interface_width")
+"""Parameters that must be greater than 0."""
+NOT_NEGATIVE = ("viscosity", "mobility")
+SUM_TOLERANCE = 0.01
+"""How far the mass fractions of a particle may add up to something else than 1: differences need some room."""
+
+Values = Mapping[str, Any]
+Arrays = dict[str, np.ndarray]
+
+
+class Controls:
+    """The parameters of one simulation over a number of steps."""
+
+    def __init__(self, simulation: "Simulation", steps: int):
+        self._simulation, self._steps = simulation, steps
+        self._phases = len(simulation.scene.phase)
+        self._scene: Arrays = simulation.parameters()
+
+    def shapes(self, name: str) -> list[tuple[int, ...]]:
+        """The shapes that a parameter may have; () is a number."""
+        n, d = self._simulation.positions.shape
+        if name == "gravity":
+            return [(d,), (self._steps, d)]
+        if name in MATERIALS:
+            return [() if self._phases == 1 else (self._phases,)]
+        several = {"mass_fractions": (n, self._phases), "colours": (self._phases, 3)}
+        return [several.get(name, (n, d) if name in STATES else ())]
+
+    def checked(self, values: Values, what: str = "parameter") -> Arrays:
+        """Values as float64 arrays; raises `InputError` in a sentence. A ``what`` of "direction" may be negative."""
+        return {name: self._checked(name, value, what) for name, value in values.items()}
+
+    def colours(self, values: Arrays) -> np.ndarray:
+        """(phases, 3) the colours of the phases."""
+        return values.get("colours", self._scene["colours"])
+
+    def begin(self, rollout: Rollout, values: Arrays) -> None:
+        """Give a rollout its first state and its parameters: ``values``, and the scene's for what is not among them."""
+        simulation, parameters = self._simulation, rollout.parameters
+        if values.keys().isdisjoint(STATES):
+            rollout.initial.assign(simulation.state)
+        else:
+            rollout.initial.set(*(values.get(name, self._scene[name]) for name in STATES))
+        chosen = {name: values.get(name, self._scene[name]) for name in (*MATERIALS, *NUMBERS)}
+        parameters.set_gravity(values.get("gravity", self._scene["gravity"]))
+        parameters.set_constants(**chosen, masses=masses(*self._composition(values)))
+        rollout.solver.diffuse(simulation.substeps(**{name: float(chosen[name]) for name in NUMBERS}))
+
+    def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
+        """A direction by name as tangents of the first state and of the parameters, at ``values``."""
+        dot, parameters = rollout.solver.new_state(), rollout.solver.new_parameters(self._steps)
+        zeros = {name: np.zeros_like(self._scene[name]) for name in self._scene}
+        dot.set(*(along.get(name, zeros[name]) for name in STATES))
+        parameters.set_gravity(along.get("gravity", zeros["gravity"]))
+        composition = [along.get(name, zeros[name]) for name in ("mass_fractions", "rest_density")]
+        parameters.set_constants(
+            **{name: along.get(name, zeros[name]) for name in (*MATERIALS, *NUMBERS)},
+            masses=masses_tangent(*self._composition(values), *map(np.atleast_1d, composition)),
+        )
+        return dot, parameters
+
+    def gradient(self, values: Arrays, state: State, parameters: Parameters) -> Arrays:
+        """Adjoints of the first state and of the parameters, for the names and in the shapes of ``values``."""
+        found: Arrays = {}
+        if not values.keys().isdisjoint(STATES):
+            arrays = state.numpy(self._simulation.dimension)
+            found |= {name: array.astype(np.float64) for name, array in zip(STATES, arrays, strict=True)}
+        for name in ("gravity", *MATERIALS, *NUMBERS):
+            if name in values:
+                found[name] = getattr(parameters, name).numpy().astype(np.float64)
+        if "gravity" in values:
+            table = found["gravity"][:, : self._simulation.dimension]
+            found["gravity"] = table if values["gravity"].ndim == 2 else table.sum(axis=0)
+        if not values.keys().isdisjoint(("mass_fractions", "rest_density")):
+            bars = masses_adjoint(*self._composition(values), parameters.masses.numpy().astype(np.float64))
+            for name, bar in zip(("mass_fractions", "rest_density"), bars, strict=True):
+                if name in found:
+                    found[name] = found[name] + bar
+        return {name: found[name].reshape(values[name].shape) for name in values if name in found}
+
+    def _composition(self, values: Arrays) -> tuple[np.ndarray, np.ndarray]:
+        fractions, density = (values.get(name, self._scene[name]) for name in ("mass_fractions", "rest_density"))
+        return fractions, np.atleast_1d(density)
+
+    def _checked(self, name: str, value: Any, what: str) -> np.ndarray:
+        if name not in NAMES:
+            raise InputError(f"{what} {name!r} is unknown, but must be one of {', '.join(NAMES)}.")
+        array, shapes = as_numbers(f"{what} {name}", value), self.shapes(name)
+        unit = f" in {UNITS[name]}" if UNITS[name] else ""
+        if array.shape not in shapes:
+            raise InputError(f"{what} {name} has shape {array.shape}, but must be {' or '.join(map(str, shapes))}{unit}.")
+        if not np.isfinite(array).all():
+            raise InputError(f"{what} {name} has a value that is not finite, but must be numbers{unit}.")
+        if what != "direction":
+            self._check_range(name, array, what)
+        return array
+
+    def _check_range(self, name: str, array: np.ndarray, what: str) -> None:
+        if name in POSITIVE and (array <= 0.0).any():
+            raise InputError(f"{what} {name} is {shown(array.min())}, but must be greater than 0.")
+        if name in NOT_NEGATIVE and (array < 0.0).any():
+            raise InputError(f"{what} {name} is {shown(array.min())}, but must be at least 0.")
+        if name == "mass_fractions":
+            miss = np.abs(array.sum(axis=1) - 1.0)
+            if miss.max() > SUM_TOLERANCE:
+                worst = int(miss.argmax())
+                total = array[worst].sum()
+                raise InputError(f"{what} mass_fractions of particle {worst} add up to {total:g}, but must to 1.")
+
+
+def as_numbers(what: str, value: Any) -> np.ndarray:
+    """A number or array in float64, or an `InputError` in a sentence."""
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} is {shown(value)}, but must be a number or an array of numbers.") from None

@@ -1,0 +1,128 @@
+"""What a particle of several phases is made of: its mass fractions c, and what follows from them.
+
+    1 / rho_0i = sum_k c_k,i / rho_0k,    mu_i = sum_k c_k,i mu_k
+
+Masses are constant (Yang et al. 2015 and the report's Algorithm 3 leave open whether mass or volume is; with mass
+fractions it is the mass), so that a particle's rest volume follows its rest density.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from cortado.precision import Precision
+
+
+def mixture_module(precision: Precision, phases: int, differentiable: bool) -> Any:
+    """The Warp module of kernels for a number of phases that need no smoothing kernel."""
+    kind = "forward" if differentiable else "derivative"
+    module = wp.get_module(f"cortado_mixture_{kind}_{phases}_{precision.name}")
+    module.options["enable_backward"] = differentiable
+    return module
+
+
+@cache
+def mixture_kernels(precision: Precision, phases: int) -> SimpleNamespace:
+    """Kernels ``sort`` and ``unsort`` of fractions, and ``blend`` with ``blend_tangent`` and ``blend_adjoint``.
+
+    Materials of the phases are arrays (phases,).
+    """
+    real, vector, fractions = precision.real, precision.vector, precision.fractions(phases)
+
+    @wp.kernel(module=mixture_module(precision, phases, True))
+    def sort_fractions(
+        order: wp.array(dtype=wp.int32),
+        c_scene: wp.array(dtype=fractions),
+        # out
+        c: wp.array(dtype=fractions),
+    ):
+        i = wp.tid()
+        c[i] = c_scene[order[i]]
+
+    @wp.kernel(module=mixture_module(precision, phases, True))
+    def unsort_fractions(
+        order: wp.array(dtype=wp.int32),
+        c: wp.array(dtype=fractions),
+        # out
+        c_scene: wp.array(dtype=fractions),
+    ):
+        i = wp.tid()
+        c_scene[order[i]] = c[i]
+
+    @wp.kernel(module=mixture_module(precision, phases, True))
+    def blend(
+        c: wp.array(dtype=fractions),
+        rest_density: wp.array(dtype=real),
+        viscosity: wp.array(dtype=real),
+        # out
+        rho_0: wp.array(dtype=real),
+        mu: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        specific_volume = real(0.0)
+        mu_i = real(0.0)
+        for k in range(wp.static(phases)):
+            specific_volume += c[i][k] / rest_density[k]
+            mu_i += c[i][k] * viscosity[k]
+        rho_0[i] = real(1.0) / specific_volume
+        mu[i] = mu_i
+
+    @wp.kernel(module=mixture_module(precision, phases, False), enable_backward=False)
+    def blend_tangent(
+        c: wp.array(dtype=fractions),
+        c_dot: wp.array(dtype=fractions),
+        rest_density: wp.array(dtype=real),
+        rest_density_dot: wp.array(dtype=real),
+        viscosity: wp.array(dtype=real),
+        viscosity_dot: wp.array(dtype=real),
+        rho_0: wp.array(dtype=real),
+        # out
+        rho_0_dot: wp.array(dtype=real),
+        mu_dot: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        change = real(0.0)
+        mu_dot_i = real(0.0)
+        for k in range(wp.static(phases)):
+            change += (c_dot[i][k] - c[i][k] * rest_density_dot[k] / rest_density[k]) / rest_density[k]
+            mu_dot_i += c_dot[i][k] * viscosity[k] + c[i][k] * viscosity_dot[k]
+        rho_0_dot[i] = -rho_0[i] * rho_0[i] * change
+        mu_dot[i] = mu_dot_i
+
+    @wp.kernel(module=mixture_module(precision, phases, False), enable_backward=False)
+    def blend_adjoint(
+        order: wp.array(dtype=wp.int32),
+        c: wp.array(dtype=fractions),
+        rest_density: wp.array(dtype=real),
+        viscosity: wp.array(dtype=real),
+        rho_0: wp.array(dtype=real),
+        rho_0_bar: wp.array(dtype=real),
+        mu_bar: wp.array(dtype=real),
+        c_scene_bar: wp.array(dtype=fractions),
+        # in and out
+        rest_density_bar: wp.array(dtype=fractions),
+        viscosity_bar: wp.array(dtype=fractions),
+        # out
+        c_bar: wp.array(dtype=fractions),
+    ):
+        """``c_scene_bar``: the adjoint of the new state's fractions; those of the phases add up particle by particle."""
+        i = wp.tid()
+        c_bar_i = c_scene_bar[order[i]]
+        rest_density_bar_i = rest_density_bar[i]
+        for k in range(wp.static(phases)):
+            by_volume = rho_0_bar[i] * rho_0[i] * rho_0[i] / rest_density[k]
+            c_bar_i[k] = c_bar_i[k] - by_volume + mu_bar[i] * viscosity[k]
+            rest_density_bar_i[k] = rest_density_bar_i[k] + by_volume * c[i][k] / rest_density[k]
+        rest_density_bar[i] = rest_density_bar_i
+        viscosity_bar[i] = viscosity_bar[i] + mu_bar[i] * c[i]
+        c_bar[i] = c_bar_i
+
+    return SimpleNamespace(
+        sort=sort_fractions,
+        unsort=unsort_fractions,
+        blend=blend,
+        blend_tangent=blend_tangent,
+        blend_adjoint=blend_adjoint,
+    )
