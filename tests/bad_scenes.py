@@ -77,6 +77,44 @@ def _drop(x: float) -> str:
     return f'[[fluid]]\nshape = "sphere"\ncentre = [{x}, 0.2, 0.12]\nradius = 0.03\nphase = "water"\n'
 
 
+def _with(table: str, old: str, new: str) -> tuple[str, str]:
+    """What to replace in the good scene, and by what, so that it gets a good table in which the old is replaced."""
+    assert old in table
+    return "[solver]", table.replace(old, new, 1) + "[solver]"
+
+
+EMITTER = """\
+[emitter]
+phase = "water"
+outlet = [0.2, 0.6, 0.12]
+direction = [0.0, -2.0, 0.0]
+radius = 0.07
+length = 0.2
+flow_rate = 1e-3
+"""
+OIL = _PHASE.replace("water", "oil")
+MIXTURE = (
+    OIL
+    + """\
+[mixture]
+free_energy = "miscible"
+strength = 2.0
+mobility = 1e-5
+mobility_form = "constant"
+interface_width = 0.1
+"""
+)
+RENDER = """\
+[render]
+view = "volume"
+resolution = [32, 16]
+background = [0.0, 0.5, 1.0]
+extinction = 3.0
+position = [0.2, 0.3, 2.0]
+look_at = [0.2, 0.3, 0.1]
+field_of_view = 30.0
+"""
+
 BAD_SCENES = [
     ("broken syntax", "dimension = 3", "dimension = = 3", "line 2"),
     ("key twice", "dimension = 3", "dimension = 3\ndimension = 3", "line 3"),
@@ -114,8 +152,6 @@ BAD_SCENES = [
     ("no phase", _PHASE, "", "phase"),
     ("phase that is one table", "[[phase]]", "[phase]", "phase"),
     ("unknown phase", 'phase = "water"', 'phase = "oil"', "fluid[0].phase"),
-    ("two phases in use", _FLUIDS, _FLUIDS + _PHASE.replace("water", "oil") + "[[fluid]]\n" + _SPHERE.replace(
-        "0.45", "0.1") + '\nphase = "oil"\n', "fluid[2].phase"),
     ("fluid without phase", 'radius = 0.1\nphase = "water"', "radius = 0.1", "fluid[1].phase"),
     ("no fluid", _FLUIDS, "", "fluid"),
     ("fluid that is text", _FLUIDS + _CONTAINER, _CONTAINER + "[[fluid]]\n", "fluid[0].shape"),
@@ -162,6 +198,57 @@ BAD_SCENES = [
     ("part of an iteration", "minimum_iterations = 5", "minimum_iterations = 4.5", "solver.minimum_iterations"),
     ("no iterations", "minimum_iterations = 5", "minimum_iterations = 0", "solver.minimum_iterations"),
     ("negative tolerance", "0.01", "-0.01", "solver.density_tolerance"),
+    ("mixture of one phase", *_with(MIXTURE, OIL, ""), "mixture"),
+    ("two mixtures", *_with(MIXTURE, "[mixture]", "[[mixture]]"), "mixture"),
+    ("unknown free energy", *_with(MIXTURE, '"miscible"', '"triple_well"'), "mixture.free_energy"),
+    ("strength of zero", *_with(MIXTURE, "strength = 2.0", "strength = 0.0"), "mixture.strength"),
+    ("negative mobility", *_with(MIXTURE, "mobility = 1e-5", "mobility = -1e-5"), "mixture.mobility"),
+    ("mobility that is no number", *_with(MIXTURE, "mobility = 1e-5", "mobility = nan"), "mixture.mobility"),
+    ("unknown form of mobility", *_with(MIXTURE, '"constant"', '"linear"'), "mixture.mobility_form"),
+    ("interface of no width", *_with(MIXTURE, "width = 0.1", "width = 0"), "mixture.interface_width"),
+    ("width that is text", *_with(MIXTURE, "width = 0.1", 'width = "1"'), "mixture.interface_width"),
+    ("misspelt key of mixture", *_with(MIXTURE, "mobility =", "mobilty ="), "mixture.mobilty"),
+    ("two emitters", *_with(EMITTER, "[emitter]", "[[emitter]]"), "emitter"),
+    ("emitter of unknown phase", *_with(EMITTER, "water", "oil"), "emitter.phase"),
+    ("emitter without phase", *_with(EMITTER, 'phase = "water"', ""), "emitter.phase"),
+    ("no outlet", *_with(EMITTER, "outlet = [0.2, 0.6, 0.12]", ""), "emitter.outlet"),
+    ("outlet of two", *_with(EMITTER, "[0.2, 0.6, 0.12]", "[0.2, 0.6]"), "emitter.outlet"),
+    ("outlet outside", *_with(EMITTER, "[0.2, 0.6, 0.12]", "[0.2, 0.61, 0.12]"), "emitter.outlet"),
+    ("outlet in fluid", *_with(EMITTER, "[0.2, 0.6, 0.12]", "[0.2, 0.45, 0.12]"), "emitter"),
+    ("column in fluid", *_with(EMITTER, "outlet = [0.2, 0.6", "outlet = [0.2, 0.35"), "emitter"),
+    ("no direction", *_with(EMITTER, "-2.0", "-0.0"), "emitter.direction"),
+    ("direction of two", *_with(EMITTER, "[0.0, -2.0, 0.0]", "[0.0, -2.0]"), "emitter.direction"),
+    ("direction that is text", *_with(EMITTER, "[0.0, -2.0, 0.0]", '"down"'), "emitter.direction"),
+    ("out of the container", *_with(EMITTER, "-2.0", "2.0"), "emitter.direction"),
+    ("column across the period", *_with(
+        EMITTER, "[0.2, 0.6, 0.12]\ndirection = [0.0, -2.0, 0.0]", "[0.1, 0.33, 0.12]\ndirection = [1, 0, 0]"),
+     "emitter"),
+    ("slanted nozzle at the wall", *_with(EMITTER, "[0.0, -2.0, 0.0]", "[1.0, -1.0, 0.0]"), "emitter.radius"),
+    ("nozzle without size", *_with(EMITTER, "radius = 0.07", "radius = 0"), "emitter.radius"),
+    ("nozzle that does not fit", *_with(EMITTER, "radius = 0.07", "radius = 0.18"), "emitter.radius"),
+    ("column of no length", *_with(EMITTER, "length = 0.2", "length = 0"), "emitter.length"),
+    ("column of no layer", *_with(EMITTER, "length = 0.2", "length = 0.02"), "emitter.length"),
+    ("column of great length", *_with(EMITTER, "length = 0.2", "length = 1e50"), "discretisation.spacing"),
+    ("no flow", *_with(EMITTER, "flow_rate = 1e-3", "flow_rate = 0"), "emitter.flow_rate"),
+    ("flow that is text", *_with(EMITTER, "flow_rate = 1e-3", 'flow_rate = "1"'), "emitter.flow_rate"),
+    ("misspelt key of emitter", *_with(EMITTER, "flow_rate", "flowrate"), "emitter.flowrate"),
+    ("unknown view", *_with(RENDER, '"volume"', '"side"'), "render.view"),
+    ("view that is a list", *_with(RENDER, '"volume"', '["volume"]'), "render.view"),
+    ("camera above", *_with(RENDER, '"volume"', '"top"'), "render.position"),
+    ("camera of the default view", *_with(RENDER, 'view = "volume"', ""), "render.position"),
+    ("plane in space", *_with("[render]\nview = 1\n", "1", '"plane"'), "render.view"),
+    ("no place for the camera", *_with(RENDER, "position = [0.2, 0.3, 2.0]", ""), "render.position"),
+    ("nothing to look at", *_with(RENDER, "look_at = [0.2, 0.3, 0.1]", ""), "render.look_at"),
+    ("camera that looks at itself", *_with(RENDER, "[0.2, 0.3, 0.1]", "[0.2, 0.3, 2.0]"), "render.look_at"),
+    ("camera in the plane", *_with(RENDER, "[0.2, 0.3, 2.0]", "[0.2, 0.3]"), "render.position"),
+    ("view without width", *_with(RENDER, "field_of_view = 30.0", "field_of_view = 0"), "render.field_of_view"),
+    ("view all round", *_with(RENDER, "field_of_view = 30.0", "field_of_view = 171"), "render.field_of_view"),
+    ("few pixels", *_with(RENDER, "[32, 16]", "[32, 7]"), "render.resolution[1]"),
+    ("parts of a pixel", *_with(RENDER, "[32, 16]", "[32.0, 16]"), "render.resolution[0]"),
+    ("pixels in space", *_with(RENDER, "[32, 16]", "[32, 16, 8]"), "render.resolution"),
+    ("bright background", *_with(RENDER, "0.5, 1.0]", "0.5, 1.5]"), "render.background[2]"),
+    ("background of one", *_with(RENDER, "[0.0, 0.5, 1.0]", "0.5"), "render.background"),
+    ("no extinction", *_with(RENDER, "extinction = 3.0", "extinction = 0.0"), "render.extinction"),
     ("key in two lines", 'name = "two', '"a\\nb" = 1\nname = "two', "'a\\nb'"),
     ("unknown table", "[solver]", "[viewer]\nwidth = 3\n[solver]", "viewer"),
 ]  # fmt: skip

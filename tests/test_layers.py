@@ -20,7 +20,7 @@ LAYERS = """
     launching neighbours particles
     render.cameras render.views render.renderer
     shapes scene_kinds scene_tables scene_toml scene_points
-    scene_fluids scene_containers scene_stability scene_checks scene sampling
+    scene_fluids scene_emitter scene_mixture scene_render scene_containers scene_stability scene_checks scene sampling
     vtkhdf trajectory
     solvers.forces solvers.pcisph solvers.pcisph_derivatives
     rollout policies losses simulation problem

@@ -11,11 +11,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence, plane
+from bad_scenes import BAD_SCENES, EMITTER, GOOD_SCENE, MIXTURE, RENDER, assert_one_sentence, plane
 from cortado.errors import CortadoWarning, DivergedError, SceneError
 from cortado.scene import (
     BoxFluid,
     Discretisation,
+    Mixture,
     Scene,
     load_scene,
     read_toml,
@@ -33,6 +34,11 @@ def scene_file(tmp_path):
 
 def good_data() -> dict:
     return tomllib.loads(GOOD_SCENE)
+
+
+def full_data() -> dict:
+    """A scene with every table that there is."""
+    return tomllib.loads(GOOD_SCENE + EMITTER + MIXTURE + RENDER)
 
 
 # ---- good scenes -------------------------------------------------------------------------------------------------
@@ -53,6 +59,7 @@ def test_what_is_left_out_has_a_default():
     assert scene.forces.gravity == (0.0, -9.81) and scene.container.shape == "none"
     assert scene.fluid[0].velocity == (0.0, 0.0)
     assert (scene.solver.minimum_iterations, scene.solver.maximum_iterations) == (3, 50)
+    assert scene.emitter is None and scene.render is None and scene.mixture == Mixture()
     assert scene.discretisation == Discretisation(spacing=0.1, support=2.0, kernel="cubic_spline")
 
 
@@ -62,7 +69,7 @@ def test_a_scene_can_be_built_from_parts():
     assert scene == Scene(**plane()) and fluid.velocity == ()
 
 
-@pytest.mark.parametrize("data", [good_data(), plane()])
+@pytest.mark.parametrize("data", [good_data(), full_data(), plane()])
 def test_json_brings_the_scene_back(data):
     scene = scene_from_dict(data)
     assert Scene.from_json(scene.to_json()) == scene
@@ -221,7 +228,7 @@ CUP = plane(
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(draw=st.data())
 def test_any_change_loads_or_is_a_sentence(draw):
-    data = draw.draw(st.sampled_from([good_data(), plane(), CUP]))
+    data = draw.draw(st.sampled_from([good_data(), full_data(), plane(), CUP]))
     for _ in range(draw.draw(st.integers(1, 3))):
         place = draw.draw(st.sampled_from(places(data) or [("x",)]))
         action = draw.draw(st.sampled_from(["delete", "replace", "replace", "add"]))
@@ -250,6 +257,11 @@ def test_the_stability_limit_is_the_smallest_of_three():
     assert stability_limit(Scene(**shallow)) == pytest.approx(0.25 * sqrt(0.2 / 9.81))
     thick = plane(phase=[{"name": "water", "rest_density": 500, "viscosity": 5000}], solver={"time_step": 1e-4})
     assert stability_limit(Scene(**thick)) == pytest.approx(0.06 * 0.2**2 * 500 / 5000)
+    oil = {"name": "oil", "rest_density": 250, "viscosity": 0.0}
+    above = {"shape": "box", "lower": [0, 0.5], "upper": [1, 1], "phase": "oil"}
+    both = plane(phase=[*thick["phase"], oil], fluid=[*thick["fluid"], above], solver={"time_step": 1e-4})
+    assert stability_limit(Scene(**both)) == pytest.approx(0.06 * 0.2**2 * 250 / 5000)
+    assert stability_limit(Scene(**(both | {"fluid": thick["fluid"]}))) == stability_limit(Scene(**thick))
     assert stability_limit(Scene(**plane(forces={"gravity": [0, 0], "viscosity": "none"}))) == np.inf
 
 

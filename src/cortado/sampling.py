@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from cortado.scene import Scene
+from cortado.scene_emitter import EmitterSample
 from cortado.shapes import Points
 
 CHUNK = 8192
@@ -16,7 +17,7 @@ CHUNK = 8192
 
 @dataclass(frozen=True)
 class FluidSample:
-    """Fluid particles, in the order in which the scene lists their fluids."""
+    """Fluid particles, in the order in which the scene lists their fluids; those of the emitter come last."""
 
     positions: Points
     """(n, d) [m]"""
@@ -24,17 +25,33 @@ class FluidSample:
     """(n, d) [m/s]"""
     phase: NDArray[np.int64]
     """(n,) index into the scene's phases"""
+    emitter: EmitterSample | None
+    """The last of the particles once more, in the same order, as they are along the emitter; None without one."""
+
+    @property
+    def emitted(self) -> slice:
+        """Which particles are the emitter's."""
+        count = len(self.positions)
+        return slice(count if self.emitter is None else count - len(self.emitter.upstream), count)
 
 
 def fluid_particles(scene: Scene) -> FluidSample:
     """The fluid of a scene. Raises `InputError` if a file with points is gone since the scene was read."""
-    blocks = [fluid.particles(scene.discretisation.spacing) for fluid in scene.fluid]
-    counts = [len(block) for block in blocks]
-    names = [phase.name for phase in scene.phase]
+    spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
+    positions = [fluid.particles(spacing) for fluid in scene.fluid]
+    velocities = [np.tile(fluid.velocity, (len(x), 1)) for fluid, x in zip(scene.fluid, positions, strict=True)]
+    phases = [names.index(fluid.phase) for fluid in scene.fluid]
+    emitted = None
+    if scene.emitter is not None:
+        emitted = scene.emitter.sample(spacing)
+        positions.append(emitted.positions)
+        velocities.append(emitted.velocities)
+        phases.append(names.index(scene.emitter.phase))
     return FluidSample(
-        positions=np.concatenate(blocks),
-        velocities=np.repeat(np.array([fluid.velocity for fluid in scene.fluid]), counts, axis=0),
-        phase=np.repeat(np.array([names.index(fluid.phase) for fluid in scene.fluid]), counts),
+        positions=np.concatenate(positions),
+        velocities=np.concatenate(velocities),
+        phase=np.repeat(phases, [len(x) for x in positions]),
+        emitter=emitted,
     )
 
 

@@ -15,8 +15,11 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from cortado.errors import CortadoWarning, SceneError
 from cortado.scene_checks import check_scene
 from cortado.scene_containers import AnyContainer, BoxContainer, CylinderContainer, NoContainer
+from cortado.scene_emitter import Emitter
 from cortado.scene_fluids import AnyFluid, BoxFluid, CylinderFluid, PointsFluid, SphereFluid
-from cortado.scene_kinds import Choice, Components, Count, Flag, Quantity, Tables, Text, wrong
+from cortado.scene_kinds import COLOUR, Choice, Components, Count, Flag, Quantity, Tables, Text, wrong
+from cortado.scene_mixture import Mixture
+from cortado.scene_render import Render
 from cortado.scene_stability import stability_limit
 from cortado.scene_tables import Table, sentences
 from cortado.scene_toml import read_toml
@@ -27,10 +30,13 @@ __all__ = [
     "CylinderContainer",
     "CylinderFluid",
     "Discretisation",
+    "Emitter",
     "Forces",
+    "Mixture",
     "NoContainer",
     "Phase",
     "PointsFluid",
+    "Render",
     "Scene",
     "Solver",
     "SphereFluid",
@@ -69,15 +75,8 @@ class Phase(Table):
     """[kg/m3]"""
     viscosity: Annotated[float, Quantity("Pa s", least=0.0)]
     """Dynamic [Pa s]."""
-    colour: Annotated[tuple[float, ...], Components(Quantity(least=0.0, most=1.0))] = (0.1, 0.3, 0.8)
+    colour: Annotated[tuple[float, ...], COLOUR] = (0.1, 0.3, 0.8)
     """(3,) red, green and blue, each from 0 to 1."""
-
-    @field_validator("colour")
-    @classmethod
-    def _check_colour(cls, colour: tuple[float, ...]) -> tuple[float, ...]:
-        if len(colour) != 3:
-            raise wrong((), colour, "a list of 3 components: red, green and blue")
-        return colour
 
 
 class Forces(Table):
@@ -125,20 +124,27 @@ class Scene(Table):
     discretisation: Discretisation
     """How the fluid is cut into particles."""
     phase: Annotated[tuple[Phase, ...], Tables("phase")]
-    """The materials."""
+    """The materials: in this order the components of mass fractions."""
     fluid: Annotated[tuple[AnyFluid, ...], Tables("fluid")]
     """The bodies of fluid; particles come in this order."""
+    emitter: Emitter | None = None
+    """Fluid that comes out of a nozzle; its particles come after those of all fluids."""
     container: AnyContainer = Field(default=NoContainer(), validate_default=True)
     """What holds the fluid."""
+    mixture: Mixture = Mixture()
+    """How phases mix; the default if there is only one."""
     forces: Forces = Field(default=Forces(), validate_default=True)
     """Which forces act."""
     solver: Solver
     """How a step is solved."""
+    render: Render | None = None
+    """How pictures are taken."""
 
-    @field_validator("container", "forces")
+    @field_validator("emitter", "container", "forces", "render")
     @classmethod
     def _resolve(cls, table: Any, info: ValidationInfo) -> Any:
-        return table.in_dimension(info.data["dimension"]) if "dimension" in info.data else table
+        given = table is not None and "dimension" in info.data
+        return table.in_dimension(info.data["dimension"]) if given else table
 
     @field_validator("fluid")
     @classmethod

@@ -8,8 +8,11 @@ from scipy.spatial import cKDTree
 
 from cortado.errors import InputError, Phrase, shown
 from cortado.scene_containers import check_length
-from cortado.scene_fluids import Fluid, PointsFluid
-from cortado.scene_kinds import wrong
+from cortado.scene_emitter import Emitter
+from cortado.scene_fluids import Body, Fluid, PointsFluid
+from cortado.scene_kinds import FieldPath, wrong
+from cortado.scene_mixture import Mixture
+from cortado.scene_tables import field_name
 from cortado.shapes import Points
 
 if TYPE_CHECKING:
@@ -30,12 +33,24 @@ def check_scene(scene: "Scene") -> None:
     _check_counts(scene)
     for index, fluid in enumerate(scene.fluid):
         _check_size(index, fluid, spacing)
+    if scene.emitter is not None:
+        _check_length(scene.emitter, spacing)
+    for path, body in _bodies(scene):
+        _check_distance(path, body, spacing)
     check_length(scene.container, spacing, scene.discretisation.support_radius)
     _check_place(scene)
     for index, fluid in enumerate(scene.fluid):
         _check_inside(scene, index, fluid)
         _check_distinct(index, fluid, spacing)
+    if scene.emitter is not None:
+        _check_outlet(scene, scene.emitter)
     _check_overlaps(scene)
+
+
+def _bodies(scene: "Scene") -> list[tuple[FieldPath, Body]]:
+    """All that has particles, in their order, each with its path in the scene."""
+    fluids: list[tuple[FieldPath, Body]] = [(("fluid", index), fluid) for index, fluid in enumerate(scene.fluid)]
+    return fluids if scene.emitter is None else [*fluids, (("emitter",), scene.emitter)]
 
 
 def _check_phases(scene: "Scene") -> None:
@@ -43,12 +58,11 @@ def _check_phases(scene: "Scene") -> None:
     for index, name in enumerate(names):
         if name in names[:index]:
             raise wrong(("phase", index, "name"), name, f"different from that of phase[{names.index(name)}]")
-    for index, fluid in enumerate(scene.fluid):
-        if fluid.phase not in names:
-            raise wrong(("fluid", index, "phase"), fluid.phase, f"the name of a phase, of {shown(names)}")
-        if fluid.phase != scene.fluid[0].phase:
-            wanted = f"{shown(scene.fluid[0].phase)} as for fluid[0], as only one phase in a scene is supported so far"
-            raise wrong(("fluid", index, "phase"), fluid.phase, wanted)
+    for path, body in _bodies(scene):
+        if body.phase not in names:
+            raise wrong((*path, "phase"), body.phase, f"the name of a phase, of {shown(names)}")
+    if len(names) == 1 and scene.mixture != Mixture():
+        raise wrong(("mixture",), Phrase("given"), "left out, as the scene has only one phase")
 
 
 def _check_files(scene: "Scene") -> None:
@@ -64,7 +78,7 @@ def _check_files(scene: "Scene") -> None:
 def _check_counts(scene: "Scene") -> None:
     """Before anything is allocated."""
     spacing = scene.discretisation.spacing
-    fluid, walls = sum(fluid.count(spacing) for fluid in scene.fluid), scene.container.wall_count(spacing)
+    fluid, walls = sum(body.count(spacing) for _, body in _bodies(scene)), scene.container.wall_count(spacing)
     for count, what in ((fluid, "particles of fluid"), (walls, "wall particles")):
         if count > MOST_PARTICLES:
             wanted = f"so large that there are at most {MOST_PARTICLES:.0e} {what}, not about {count:.1e}"
@@ -81,9 +95,18 @@ def _check_size(index: int, fluid: Fluid, spacing: float) -> None:
     if fluid.count(spacing) == 0.0:
         wanted = f"at least one spacing, {spacing:g} m, wide along every axis"
         raise wrong(("fluid", index), Phrase("too thin to hold a particle"), wanted)
-    furthest = np.abs(fluid.extent(spacing)).max()
+
+
+def _check_length(emitter: Emitter, spacing: float) -> None:
+    if emitter.layers(spacing) == 0.0:
+        wanted = f"greater than half a spacing, {0.5 * spacing:g} m, for the column to hold a layer of particles"
+        raise wrong(("emitter", "length"), emitter.length, wanted)
+
+
+def _check_distance(path: FieldPath, body: Body, spacing: float) -> None:
+    furthest = np.abs(body.extent(spacing)).max()
     if furthest > FURTHEST * spacing:
-        raise wrong(("fluid", index), Phrase(f"{furthest:g} m from the origin"), _nearer(spacing))
+        raise wrong(path, Phrase(f"{furthest:g} m from the origin"), _nearer(spacing))
 
 
 def _check_inside(scene: "Scene", index: int, fluid: Fluid) -> None:
@@ -96,6 +119,31 @@ def _check_inside(scene: "Scene", index: int, fluid: Fluid) -> None:
     if outside.any():
         found = Phrase(f"partly outside, for example at {_place(witnesses[outside][0])}")
         raise wrong(("fluid", index), found, "inside the container")
+
+
+def _check_outlet(scene: "Scene", emitter: Emitter) -> None:
+    """The opening is inside, and fluid comes in through it; upstream of it the column may be outside.
+
+    Along a periodic axis it may not: what is outside there comes in again on the other side.
+    """
+    spacing, lengths = scene.discretisation.spacing, scene.container.periods(scene.dimension)[1]
+    tolerance, outlet, opening = 1e-6 * spacing, np.array(emitter.outlet), emitter.opening(spacing)
+    if not scene.container.contains(outlet[None], tolerance).all():
+        raise wrong(("emitter", "outlet"), emitter.outlet, "inside the container")
+    outside = ~scene.container.contains(opening, tolerance)
+    if outside.any():
+        wanted = f"so small that the opening is inside the container, also at {_place(opening[outside][0])}"
+        raise wrong(("emitter", "radius"), emitter.radius, wanted)
+    ahead = outlet + np.where(lengths > 0.0, 0.0, spacing * np.array(emitter.direction))
+    if not scene.container.contains(ahead[None], tolerance).all():
+        raise wrong(("emitter", "direction"), emitter.direction, "into the container, where the outlet is")
+    ends, (lower, upper) = scene.container.extent(), emitter.extent(spacing)
+    if ends is None:
+        return
+    out = (lengths > 0.0) & ((lower < ends[0] - tolerance) | (upper > ends[1] + tolerance))
+    if out.any():
+        found = Phrase(f"partly outside along axis {int(np.argmax(out))}, which is periodic")
+        raise wrong(("emitter",), found, "inside the container along that axis")
 
 
 def _check_distinct(index: int, fluid: Fluid, spacing: float) -> None:
@@ -112,22 +160,23 @@ def _check_distinct(index: int, fluid: Fluid, spacing: float) -> None:
 
 
 def _check_overlaps(scene: "Scene") -> None:
-    """Between different fluids, and between a fluid and the periodic images of all."""
+    """Between different bodies, and between a body and the periodic images of all."""
     spacing = scene.discretisation.spacing
+    paths, bodies = zip(*_bodies(scene), strict=True)
     lengths = scene.container.periods(scene.dimension)[1]
-    lower, upper = np.swapaxes([fluid.extent(spacing) for fluid in scene.fluid], 0, 1)
+    lower, upper = np.swapaxes([body.extent(spacing) for body in bodies], 0, 1)
     shifts = [np.array(s) * lengths for s in product(*[(0, -1, 1) if length else (0,) for length in lengths])]
-    for second, shift in product(range(len(scene.fluid)), shifts):
+    for second, shift in product(range(len(bodies)), shifts):
         last = second + 1 if shift.any() else second
         gaps = np.maximum(lower[:last] - upper[second] - shift, lower[second] + shift - upper[:last])
         for first in np.nonzero((gaps < _nearest(spacing)).all(axis=1))[0]:
-            place = _meeting(scene.fluid[first], scene.fluid[second], shift, spacing)
+            place = _meeting(bodies[first], bodies[second], shift, spacing)
             if place is not None:
-                raise wrong(("fluid", second), *_overlap(f"fluid[{first}]", place, spacing))
+                raise wrong(paths[second], *_overlap(field_name(paths[first]), place, spacing))
 
 
-def _meeting(first: Fluid, second: Fluid, shift: Points, spacing: float) -> Points | None:
-    """(d,) where a particle of the second fluid, shifted, is too near to one of the first; None if nowhere."""
+def _meeting(first: Body, second: Body, shift: Points, spacing: float) -> Points | None:
+    """(d,) where a particle of the second body, shifted, is too near to one of the first; None if nowhere."""
     lower, upper = first.extent(spacing)
     moved = second.particles(spacing) + shift
     near = moved[((moved > lower - spacing) & (moved < upper + spacing)).all(axis=1)]

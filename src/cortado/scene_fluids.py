@@ -16,13 +16,11 @@ LENGTH = Quantity("m")
 INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
 
 
-class Fluid(Table):
-    """A body of fluid."""
+class Body(Table):
+    """Particles of one phase: a body of fluid, or what an emitter holds."""
 
     phase: Annotated[str, Text()]
     """Name of its phase."""
-    velocity: Annotated[tuple[float, ...], Components(Quantity("m/s"), default=(0.0, 0.0, 0.0))] = ()
-    """(d,) [m/s]"""
 
     @abstractmethod
     def count(self, spacing: float) -> float:
@@ -35,6 +33,13 @@ class Fluid(Table):
     @abstractmethod
     def particles(self, spacing: float) -> Points:
         """(n, d) [m]"""
+
+
+class Fluid(Body):
+    """A body of fluid."""
+
+    velocity: Annotated[tuple[float, ...], Components(Quantity("m/s"), default=(0.0, 0.0, 0.0))] = ()
+    """(d,) [m/s]"""
 
     def corners(self, spacing: float) -> Points:
         """(2^d, d) the corners of the extent [m]."""

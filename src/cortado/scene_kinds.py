@@ -153,18 +153,10 @@ class Components(Kind):
         return f"a list with one component for each axis, each {self.kind.wanted}"
 
     def check(self, value: Any) -> tuple[Any, ...]:
-        if isinstance(value, np.ndarray):
-            value = value.tolist()
-        if not isinstance(value, (list, tuple)) or not value:
+        components = as_sequence(value)
+        if not components:
             raise wrong((), value, self.wanted)
-        return tuple(self._check_component(index, component) for index, component in enumerate(value))
-
-    def _check_component(self, index: int, value: Any) -> Any:
-        try:
-            return self.kind.check(value)
-        except PydanticCustomError as error:
-            trouble = (error.context or {})["trouble"]
-            raise wrong((index,), trouble.found, trouble.wanted) from None
+        return _check_components(self.kind, components)
 
     def in_dimension(self, path: FieldPath, value: tuple[Any, ...], dimension: int) -> tuple[Any, ...]:
         """The value with as many components as there are dimensions."""
@@ -172,6 +164,25 @@ class Components(Kind):
         if len(value) != dimension:
             raise wrong(path, value, f"a list of {dimension} components, as the scene has {dimension} dimensions")
         return value
+
+
+@dataclass(frozen=True)
+class Parts(Kind):
+    """Components that each have a name, as many in 2-D as in 3-D: a colour."""
+
+    kind: Kind
+    names: tuple[str, ...]
+
+    @property
+    def wanted(self) -> str:
+        *first, last = self.names
+        return f"a list of {len(self.names)} components: {', '.join(first)} and {last}"
+
+    def check(self, value: Any) -> tuple[Any, ...]:
+        components = as_sequence(value)
+        if components is None or len(components) != len(self.names):
+            raise wrong((), value, self.wanted)
+        return _check_components(self.kind, components)
 
 
 @dataclass(frozen=True)
@@ -206,6 +217,28 @@ class Shaped(Kind):
         elif not isinstance(value, BaseModel):
             raise wrong((), value, self.wanted)
         return value
+
+
+COLOUR = Parts(Quantity(least=0.0, most=1.0), ("red", "green", "blue"))
+
+
+def _check_components(kind: Kind, values: Sequence[Any]) -> tuple[Any, ...]:
+    return tuple(_check_component(kind, index, value) for index, value in enumerate(values))
+
+
+def _check_component(kind: Kind, index: int, value: Any) -> Any:
+    try:
+        return kind.check(value)
+    except PydanticCustomError as error:
+        trouble = (error.context or {})["trouble"]
+        raise wrong((index,), trouble.found, trouble.wanted) from None
+
+
+def as_sequence(value: Any) -> Sequence[Any] | None:
+    """A list, tuple or array as the first or second; None for anything else."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    return value if isinstance(value, (list, tuple)) else None
 
 
 def as_number(value: Any) -> float | None:

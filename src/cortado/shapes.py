@@ -53,6 +53,31 @@ def block_about(centre: ArrayLike, half: ArrayLike, spacing: float) -> Block:
     return Block(np.asarray(centre, dtype=np.float64) - 0.5 * (counts - 1.0) * spacing, counts, spacing)
 
 
+def disc_cells(radius: float, spacing: float, dimension: int) -> Points:
+    """(dimension,) the cells of the lattice around a disc about the origin, at least one along each axis, as floats."""
+    return np.full(dimension, np.maximum(whole_cells(np.array(2.0 * radius), spacing), 1.0))
+
+
+def disc(radius: float, spacing: float, dimension: int) -> Points:
+    """(n, dimension) [m] a symmetric lattice in a disc about the origin, or on a line in one dimension: at least 1."""
+    counts = disc_cells(radius, spacing, dimension)
+    points = Block(-0.5 * (counts - 1.0) * spacing, counts, spacing).points()
+    return points[np.linalg.norm(points, axis=1) <= radius]
+
+
+def across(direction: ArrayLike) -> Points:
+    """(d - 1, d) unit vectors, perpendicular to a unit vector (d,) and to one another.
+
+    They begin as the axes of space that the direction is least along, so that one along an axis gives the others.
+    """
+    frame = [np.asarray(direction, dtype=np.float64)]
+    for axis in np.argsort(np.abs(frame[0]), kind="stable")[:-1]:
+        vector = np.eye(len(frame[0]))[axis]
+        vector = vector - sum((vector @ other) * other for other in frame)
+        frame.append(vector / np.linalg.norm(vector))
+    return np.array(frame[1:])
+
+
 def whole_cells(lengths: Points, spacing: float) -> Points:
     """How many cells fit into lengths [m], any shape."""
     return np.maximum(np.floor(lengths / spacing + ROUND_OFF), 0.0)

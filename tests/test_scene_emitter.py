@@ -1,0 +1,157 @@
+"""Emitters: where their particles are, how fast, how many, and after which others they come."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from bad_scenes import plane
+from cortado.errors import CortadoWarning, SceneError
+from cortado.sampling import fluid_particles
+from cortado.scene import Emitter, Scene, stability_limit
+from cortado.shapes import across, disc
+
+SPACING = 0.05
+NOZZLE = {"phase": "water", "outlet": [0.1, 0.6, 0.2], "radius": 0.12, "length": 0.3, "flow_rate": 2e-3}
+SLOT = {"phase": "water", "outlet": [0.5, 2.0], "radius": 0.25, "length": 0.7, "flow_rate": 0.3}
+
+
+def space(**emitter) -> Scene:
+    """A block in space, and a nozzle above it."""
+    block = {"shape": "box", "lower": [0, 0, 0], "upper": [0.2, 0.1, 0.2], "phase": "oil", "velocity": [1, 0, 0]}
+    return Scene(
+        dimension=3,
+        discretisation={"spacing": SPACING},
+        phase=[{"name": name, "rest_density": 1000, "viscosity": 0.0} for name in ("water", "oil")],
+        fluid=[block],
+        emitter=NOZZLE | emitter,
+        solver={"time_step": 1e-4},
+    )
+
+
+def emitter_of(scene: Scene) -> Emitter:
+    assert scene.emitter is not None
+    return scene.emitter
+
+
+DIRECTIONS = [[0, -1, 0], [1, 0, 0], [0, 0, 3], [1, -2, 0.5], [-1, -1, -1]]
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_a_column_is_a_lattice_along_its_axis(direction):
+    emitter = emitter_of(space(direction=direction))
+    sample = emitter.sample(SPACING)
+    unit = np.array(direction) / np.linalg.norm(direction)
+    from_outlet = sample.positions - NOZZLE["outlet"]
+    np.testing.assert_allclose(-from_outlet @ unit, sample.upstream, atol=1e-14)
+    np.testing.assert_allclose(from_outlet + np.outer(sample.upstream, unit), sample.offsets, atol=1e-14)
+    np.testing.assert_allclose(sample.offsets @ unit, 0.0, atol=1e-14)
+    np.testing.assert_allclose(sample.velocities, np.tile(sample.speed * unit, (len(from_outlet), 1)), rtol=1e-14)
+    layers = np.split(sample.offsets, 6)
+    np.testing.assert_allclose(sample.upstream, np.repeat(SPACING * (np.arange(6) + 0.5), sample.layer))
+    assert all((layer == layers[0]).all() for layer in layers)
+    np.testing.assert_allclose(cKDTree(from_outlet).query(from_outlet, k=2)[0][:, 1], SPACING)
+    assert cKDTree(layers[0]).query(-layers[0])[0].max() < 1e-14  # symmetric about the axis
+    assert 0.08 < np.linalg.norm(layers[0], axis=1).max() <= NOZZLE["radius"]
+
+
+def test_across_a_direction_along_an_axis_are_the_others():
+    sample = emitter_of(space()).sample(SPACING)
+    cells = SPACING * (np.arange(4) - 1.5)
+    wanted = [(x, 0.0, z) for x in cells for z in cells if np.hypot(x, z) <= NOZZLE["radius"]]
+    np.testing.assert_allclose(sample.offsets[: sample.layer], wanted, atol=1e-15)
+    assert sample.layer == 16
+
+
+@pytest.mark.parametrize("size", [2, 3])
+@given(draw=st.data())
+def test_a_frame_is_orthonormal(size, draw):
+    vector = np.array(draw.draw(st.lists(st.floats(-1, 1), min_size=size, max_size=size)))
+    if np.linalg.norm(vector) > 1e-3:
+        unit = vector / np.linalg.norm(vector)
+        frame = np.array([unit, *across(unit)])
+        np.testing.assert_allclose(frame @ frame.T, np.eye(size), atol=1e-14)
+
+
+@pytest.mark.parametrize("radius, count", [(0.01, 1), (0.05, 4), (0.075, 9), (0.09, 9), (0.12, 16)])
+def test_a_disc_has_a_particle_at_least(radius, count):
+    assert len(disc(radius, SPACING, 2)) == count
+    assert len(disc(radius, SPACING, 1)) == max(int(2 * radius / SPACING + 1e-6), 1)
+
+
+@pytest.mark.parametrize("length, layers", [(0.026, 1), (0.05, 1), (0.075, 1), (0.076, 2), (0.3, 6), (0.33, 7)])
+def test_a_layer_counts_if_its_middle_is_within_the_length(length, layers):
+    assert emitter_of(space(length=length)).sample(SPACING).upstream[-1] == pytest.approx(SPACING * (layers - 0.5))
+
+
+@pytest.mark.parametrize("scene, spacing", [(space(), SPACING), (Scene(**plane(emitter=SLOT)), 0.1)])
+def test_the_volume_that_comes_out_is_exact(scene, spacing):
+    emitter, cell = emitter_of(scene), spacing**scene.dimension
+    sample = emitter.sample(spacing)
+    duration = len(sample.upstream) // sample.layer * spacing / sample.speed
+    assert len(sample.upstream) * cell == pytest.approx(emitter.flow_rate * duration, rel=1e-14)
+    assert emitter.speed(spacing) == sample.speed
+    assert emitter.count(spacing) >= len(sample.positions)
+    lower, upper = emitter.extent(spacing)
+    np.testing.assert_allclose(lower, sample.positions.min(axis=0), atol=1e-14)
+    np.testing.assert_allclose(upper, sample.positions.max(axis=0), atol=1e-14)
+
+
+def test_in_the_plane_the_cross_section_is_a_line():
+    emitter = emitter_of(Scene(**plane(emitter=SLOT)))
+    sample = emitter.sample(0.1)
+    assert emitter.direction == (0.0, -1.0)
+    assert (sample.layer, sample.positions.shape, sample.offsets.shape) == (5, (35, 2), (35, 2))
+    np.testing.assert_allclose(sample.positions[:5], [[0.5 + 0.1 * a, 2.05] for a in (-2, -1, 0, 1, 2)])
+    np.testing.assert_allclose(sample.velocities, np.tile([0.0, -0.3 / 0.5], (35, 1)))
+
+
+def test_emitted_particles_come_last():
+    scene = space(direction=[1, -2, 0.5])
+    sample = fluid_particles(scene)
+    assert sample.emitter is not None and sample.emitted == slice(32, 32 + len(sample.emitter.upstream))
+    np.testing.assert_array_equal(sample.positions[sample.emitted], sample.emitter.positions)
+    np.testing.assert_array_equal(sample.velocities[sample.emitted], sample.emitter.velocities)
+    np.testing.assert_array_equal(sample.velocities[:32], np.tile([1.0, 0.0, 0.0], (32, 1)))
+    assert set(sample.phase[:32]) == {1} and set(sample.phase[sample.emitted]) == {0}
+    assert len(sample.phase) == len(sample.velocities) == len(sample.positions)
+
+
+def test_without_an_emitter_nothing_is_emitted():
+    sample = fluid_particles(Scene(**plane()))
+    assert sample.emitter is None and len(sample.positions[sample.emitted]) == 0
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_a_direction_is_normalised_once(direction):
+    scene = space(direction=direction)
+    assert np.linalg.norm(emitter_of(scene).direction) == pytest.approx(1.0, rel=1e-15)
+    assert Scene.from_json(scene.to_json()) == scene
+
+
+def test_a_column_may_be_outside_upstream_but_not_beside():
+    room = {"shape": "box", "lower": [0, 0, 0], "upper": [0.3, 0.6, 0.4]}
+    inside = Scene(**(space().model_dump() | {"container": room}))
+    assert fluid_particles(inside).positions[:, 1].max() > 0.8
+    with pytest.raises(SceneError, match=r"emitter\.radius is 0\.12, but must be so small that the opening is inside"):
+        Scene(**(space(outlet=[0.05, 0.6, 0.2]).model_dump() | {"container": room}))
+
+
+def test_a_column_and_a_fluid_are_told_apart():
+    with pytest.raises(SceneError, match=r"^emitter is overlapping fluid\[0\] at"):
+        space(outlet=[0.1, 0.05, 0.1])
+    space(outlet=[0.1, 0.1, 0.1])
+
+
+def test_an_emitter_counts_for_the_stability_limit():
+    still = {"gravity": [0.0, 0.0], "viscosity": "none"}
+    fast = SLOT | {"flow_rate": 2.0}
+    assert stability_limit(Scene(**plane(emitter=fast, forces=still))) == pytest.approx(0.4 * 0.2 / 4.0)
+    fall = np.sqrt(2 * 9.81 * 2.0)  # from the outlet to the foot of the fluid
+    assert stability_limit(Scene(**plane(emitter=fast))) == pytest.approx(0.4 * 0.2 / (4.0 + fall))
+    honey = [{"name": "water", "rest_density": 1000, "viscosity": 0.0}]
+    honey += [{"name": "honey", "rest_density": 1400, "viscosity": 1e5}]
+    with pytest.warns(CortadoWarning, match="limit of stability"):
+        scene = Scene(**plane(emitter=SLOT | {"phase": "honey"}, phase=honey))
+    assert stability_limit(scene) == pytest.approx(0.06 * 0.2**2 * 1000 / 1e5)
