@@ -4,7 +4,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from cortado.policies import Policy
 from cortado.problem import Problem
@@ -120,7 +119,7 @@ def certify(problem: Problem, seed: int = 0, policy: Policy | None = None) -> Ce
     return Certificate(problem.steps, problem.simulation.particles, loss, tuple(compared))
 
 
-def _points(problem: Problem) -> list[tuple[str, np.ndarray, ArrayLike]]:
+def _points(problem: Problem) -> list[tuple[str, np.ndarray, Any]]:
     values = problem.simulation.parameters()
     gravity = values["gravity"]
     size = float(np.linalg.norm(gravity)) or 1.0

@@ -10,7 +10,7 @@ import numpy as np
 
 from cortado.errors import InputError, shown
 from cortado.masses import masses, masses_adjoint, masses_tangent
-from cortado.particles import Parameters, State
+from cortado.particles import TABLES, Parameters, State
 from cortado.rollout import Rollout
 
 if TYPE_CHECKING:
@@ -26,6 +26,8 @@ UNITS = {
     "time_step": "s",
     "mobility": "m²/s",
     "interface_width": "m",
+    "nozzle_path": "m",
+    "flow_rate": "m³/s",
     "colours": "",
 }
 """Every parameter with its unit."""
@@ -34,8 +36,10 @@ STATES = ("initial_positions", "initial_velocities", "mass_fractions")
 """Parameters that are the first state, in the order in which `State` keeps them."""
 MATERIALS = ("rest_density", "viscosity")
 """Parameters of each phase: a number with one phase, else (phases,)."""
-NUMBERS = ("time_step", "mobility", "interface_width")
-POSITIVE = ("rest_density", "time_step", "interface_width")
+NUMBERS = ("time_step", "mobility", "interface_width", "flow_rate")
+OF_EMITTER = ("nozzle_path", "flow_rate")
+"""Parameters of scenes with an emitter."""
+POSITIVE = ("rest_density", "time_step", "interface_width", "flow_rate")
 """Parameters that must be greater than 0."""
 NOT_NEGATIVE = ("viscosity", "mobility")
 SUM_TOLERANCE = 0.01
@@ -56,7 +60,7 @@ class Controls:
     def shapes(self, name: str) -> list[tuple[int, ...]]:
         """The shapes that a parameter may have; () is a number."""
         n, d = self._simulation.positions.shape
-        if name == "gravity":
+        if name in TABLES:
             return [(d,), (self._steps, d)]
         if name in MATERIALS:
             return [() if self._phases == 1 else (self._phases,)]
@@ -79,16 +83,17 @@ class Controls:
         else:
             rollout.initial.set(*(values.get(name, self._scene[name]) for name in STATES))
         chosen = {name: values.get(name, self._scene[name]) for name in (*MATERIALS, *NUMBERS)}
-        parameters.set_gravity(values.get("gravity", self._scene["gravity"]))
+        parameters.set_tables(**{name: values.get(name, self._scene[name]) for name in TABLES})
         parameters.set_constants(**chosen, masses=masses(*self._composition(values)))
-        rollout.solver.diffuse(simulation.substeps(**{name: float(chosen[name]) for name in NUMBERS}))
+        diffusion = ("time_step", "mobility", "interface_width")
+        rollout.solver.diffuse(simulation.substeps(**{name: float(chosen[name]) for name in diffusion}))
 
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
         """A direction by name as tangents of the first state and of the parameters, at ``values``."""
         dot, parameters = rollout.solver.new_state(), rollout.solver.new_parameters(self._steps)
         zeros = {name: np.zeros_like(self._scene[name]) for name in self._scene}
         dot.set(*(along.get(name, zeros[name]) for name in STATES))
-        parameters.set_gravity(along.get("gravity", zeros["gravity"]))
+        parameters.set_tables(**{name: along.get(name, zeros[name]) for name in TABLES})
         composition = [along.get(name, zeros[name]) for name in ("mass_fractions", "rest_density")]
         parameters.set_constants(
             **{name: along.get(name, zeros[name]) for name in (*MATERIALS, *NUMBERS)},
@@ -102,12 +107,13 @@ class Controls:
         if not values.keys().isdisjoint(STATES):
             arrays = state.numpy(self._simulation.dimension)
             found |= {name: array.astype(np.float64) for name, array in zip(STATES, arrays, strict=True)}
-        for name in ("gravity", *MATERIALS, *NUMBERS):
+        for name in (*TABLES, *MATERIALS, *NUMBERS):
             if name in values:
                 found[name] = getattr(parameters, name).numpy().astype(np.float64)
-        if "gravity" in values:
-            table = found["gravity"][:, : self._simulation.dimension]
-            found["gravity"] = table if values["gravity"].ndim == 2 else table.sum(axis=0)
+        for name in TABLES:
+            if name in values:
+                table = found[name][:, : self._simulation.dimension]
+                found[name] = table if values[name].ndim == 2 else table.sum(axis=0)
         if not values.keys().isdisjoint(("mass_fractions", "rest_density")):
             bars = masses_adjoint(*self._composition(values), parameters.masses.numpy().astype(np.float64))
             for name, bar in zip(("mass_fractions", "rest_density"), bars, strict=True):
@@ -122,10 +128,14 @@ class Controls:
     def _checked(self, name: str, value: Any, what: str) -> np.ndarray:
         if name not in NAMES:
             raise InputError(f"{what} {name!r} is unknown, but must be one of {', '.join(NAMES)}.")
+        if name in OF_EMITTER and self._simulation.scene.emitter is None:
+            raise InputError(f"{what} {name} is given, but must be left out, as the scene has no emitter.")
         array, shapes = as_numbers(f"{what} {name}", value), self.shapes(name)
         unit = f" in {UNITS[name]}" if UNITS[name] else ""
         if array.shape not in shapes:
-            raise InputError(f"{what} {name} has shape {array.shape}, but must be {' or '.join(map(str, shapes))}{unit}.")
+            raise InputError(
+                f"{what} {name} has shape {array.shape}, but must be {' or '.join(map(str, shapes))}{unit}."
+            )
         if not np.isfinite(array).all():
             raise InputError(f"{what} {name} has a value that is not finite, but must be numbers{unit}.")
         if what != "direction":

@@ -157,3 +157,8 @@ class Recorded:
         loss = wp.zeros(1, dtype=end.precision.real, device=copies[0].device, requires_grad=True)
         self.function(copies[0], copies[1], loss)
         return loss, copies[0], copies[1]
+
+
+def as_loss(loss: Any) -> Loss:
+    """A loss, or a function of Warp arrays made into one."""
+    return loss if hasattr(loss, "adjoint") else Recorded(loss)

@@ -76,6 +76,10 @@ class State(Arrays):
         )
 
 
+TABLES = ("gravity", "nozzle_path")
+"""Parameters that are a vector for each step."""
+
+
 @dataclass(frozen=True)
 class Parameters(Arrays):
     """What a run depends on besides its first state. Also the type of its derivatives."""
@@ -94,6 +98,10 @@ class Parameters(Arrays):
     """(1,) M_0 of Cahn-Hilliard diffusion [m2 / s]"""
     interface_width: wp.array
     """(1,) epsilon of Cahn-Hilliard diffusion [m]"""
+    nozzle_path: wp.array
+    """(steps,) vectors [m]: where the opening of the nozzle is after each step."""
+    flow_rate: wp.array
+    """(1,) of the nozzle [m3 / s]"""
 
     @classmethod
     def zeros(
@@ -101,16 +109,22 @@ class Parameters(Arrays):
     ) -> "Parameters":
         """Parameters of a run of so many steps, all 0."""
         options = {"device": device, "requires_grad": requires_grad}
+        sizes = {"masses": particles, "rest_density": phases, "viscosity": phases}
         return cls(
-            wp.zeros(max(steps, 1), dtype=precision.vector, **options),
-            *(wp.zeros(size, dtype=precision.real, **options) for size in (particles, phases, phases, 1, 1, 1)),
+            *(
+                wp.zeros(max(steps, 1), dtype=precision.vector, **options)
+                if field.name in TABLES
+                else wp.zeros(sizes.get(field.name, 1), dtype=precision.real, **options)
+                for field in fields(cls)
+            )
         )
 
-    def set_gravity(self, gravity: np.ndarray) -> None:
-        """Write gravity, (d,) for every step or (steps, d)."""
-        table = np.zeros((self.gravity.shape[0], 3))
-        table[:, : gravity.shape[-1]] = gravity
-        self.gravity.assign(table)
+    def set_tables(self, **values: np.ndarray) -> None:
+        """Write any of `TABLES` by name, (d,) for every step or (steps, d)."""
+        for name, value in values.items():
+            table = np.zeros((len(getattr(self, name)), 3))
+            table[:, : value.shape[-1]] = value
+            getattr(self, name).assign(table)
 
     def set_constants(self, **values: Any) -> None:
         """Write any of the others by name, numbers or arrays."""

@@ -90,7 +90,7 @@ class _TapeStep:
     def _back(self, tape: wp.Tape, iterations: int, bar: State) -> None:
         with tape:
             self._solver.record(self._before, self._own, iterations)
-            self._solver.recorded(iterations, self._after)
+            self._solver.recorded(iterations, self._own, self._after)
         tape.backward(grads=dict(zip(self._after.arrays(), bar.arrays(), strict=True)))
         for own, total in zip(self._before.arrays(), bar.arrays(), strict=True):
             wp.copy(total, own.grad)

@@ -8,7 +8,7 @@ import numpy as np
 
 from cortado.controls import NAMES, UNITS, Arrays, Controls, Values
 from cortado.errors import InputError
-from cortado.losses import EndAdjoint, Frames, Loss, Recorded, TrajectoryEnd, fingerprint
+from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd, as_loss, fingerprint
 from cortado.particles import State
 from cortado.policies import Exact, Policy
 from cortado.rollout import MEMORY_BUDGET, Rollout, StepDerivative
@@ -21,10 +21,16 @@ __all__ = ["NAMES", "UNITS", "Problem"]
 class Problem:
     """A simulation of a number of steps, judged by a loss.
 
-    Parameters, any of them together: ``gravity`` (d,) or (steps, d) [m / s2]; ``initial_positions`` [m] and
-    ``initial_velocities`` [m / s], (n, d); ``viscosity`` [Pa s] and ``rest_density`` [kg / m3], a number, with several
-    phases (phases,); ``time_step`` [s]; with several phases ``mass_fractions`` (n, phases), the first ones, ``mobility``
-    [m2 / s], ``interface_width`` [m]; with a loss of images ``colours`` (phases, 3).
+    Parameters, any of them together:
+
+    - ``gravity`` (d,) or (steps, d) [m / s2]; ``time_step`` [s];
+    - ``initial_positions`` [m] and ``initial_velocities`` [m / s], (n, d);
+    - ``viscosity`` [Pa s] and ``rest_density`` [kg / m3], a number, with several phases (phases,);
+    - with several phases the first ``mass_fractions`` (n, phases), ``mobility`` [m2 / s], ``interface_width`` [m];
+    - with an emitter ``nozzle_path`` (d,) or (steps, d), where its opening is after each step [m], and ``flow_rate``
+      [m3 / s];
+    - with a loss of images ``colours`` (phases, 3).
+
     What is not given is the scene's. n counts fluid particles in the order in which the scene lists them.
     """
 
@@ -52,10 +58,7 @@ class Problem:
         for step in by_step:
             if step not in range(self.steps + 1):
                 raise InputError(f"losses has the frame {step!r}, but must have frames from 0 to {self.steps}.")
-        self._losses: dict[int, Loss] = {
-            step: one if hasattr(one, "adjoint") else Recorded(one)  # type: ignore[arg-type]
-            for step, one in by_step.items()
-        }
+        self._losses: dict[int, Loss] = {step: as_loss(one) for step, one in by_step.items()}
         self._controls = Controls(simulation, self.steps)
         self._rollout = Rollout(simulation.solver, self.steps, memory_budget)
         self._derivatives: dict[Policy, StepDerivative] = {}

@@ -188,7 +188,7 @@ class Rollout:
             self.solver.step_number.fill_(n)
             self.solver.record(state, self.parameters, iterations)
             derivative.step(iterations, dot, dot, self.parameters, parameters_dot)
-            self.solver.recorded(iterations, state)
+            self.solver.recorded(iterations, self.parameters, state)
             observe(n + 1, dot)
 
     def _restore(self, n: int) -> State:
@@ -199,7 +199,7 @@ class Rollout:
                 self.solver.step_number.fill_(m)
                 self.solver.record(self._states[m], self.parameters, int(self.iterations[m]))
                 self._states[m + 1] = self.initial.like()
-                self.solver.recorded(int(self.iterations[m]), self._states[m + 1])
+                self.solver.recorded(int(self.iterations[m]), self.parameters, self._states[m + 1])
         if (n + 1) % self._interval:
             self._states.pop(n + 1, None)
         return self._states[n]

@@ -27,6 +27,7 @@ from cortado.rollout import Rollout
 from cortado.sampling import boundary_particles, boundary_volumes, fluid_particles, period
 from cortado.scene import Scene
 from cortado.smoothing import smoothing_kernel
+from cortado.solvers.emitter import Nozzle
 from cortado.solvers.forces import ForceTerm, Gravity, laminar_viscosity, pairwise_viscosity
 from cortado.solvers.mixture import Phases
 from cortado.solvers.pcisph import Lattice, Pcisph, PressureSolve
@@ -52,7 +53,7 @@ class Simulation:
         self.scene = scene
         self.device = _device(device)
         self.precision = precision_named(precision)
-        sample = fluid_particles(scene)
+        self._sample = sample = fluid_particles(scene)
         self.positions = sample.positions
         """(n, d) first positions [m]."""
         self.velocities = sample.velocities
@@ -135,6 +136,8 @@ class Simulation:
             "time_step": scene.solver.time_step,
             "mobility": scene.mixture.mobility,
             "interface_width": scene.mixture.width(scene.discretisation.spacing),
+            "nozzle_path": np.zeros(self.dimension) if scene.emitter is None else scene.emitter.outlet,
+            "flow_rate": 0.0 if scene.emitter is None else scene.emitter.flow_rate,
             "colours": [phase.colour for phase in scene.phase],
         }
         arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
@@ -210,7 +213,19 @@ class Simulation:
         )
         periods = [*lengths, *np.zeros(3 - dimension)]
         terms, phases = self._terms(discretisation, layer), self._phases(discretisation)
-        return Pcisph(discretisation, lattice, search, terms, self._pressure(), periods, phases)
+        return Pcisph(discretisation, lattice, search, terms, self._pressure(), periods, phases, self._nozzle())
+
+    def _nozzle(self) -> Nozzle | None:
+        scene, sample = self.scene, self._sample.emitter
+        if scene.emitter is None or sample is None:
+            return None
+        return Nozzle(
+            first=self._sample.emitted.start,
+            upstream=sample.upstream,
+            offsets=sample.offsets,
+            direction=np.array(scene.emitter.direction),
+            area=scene.emitter.flow_rate / sample.speed,
+        )
 
     def _phases(self, discretisation: Discretisation) -> Phases:
         mixture, count = self.scene.mixture, len(self.scene.phase)

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from cortado.controls import NAMES, STATES
 from cortado.errors import Phrase, SceneError
 from cortado.optimisers import LBFGS, Adam, GradientDescent, Optimiser
-from cortado.problem import NAMES, STATES
 from cortado.sampling import fluid_particles
 from cortado.scene import Scene, read_toml, scene_from_dict
 from cortado.scene_kinds import MISSING, Choice, Count, Kind, Quantity, as_number, wrong

@@ -101,7 +101,7 @@ class Trajectory:
         names = ("times", "steps", "positions", "velocities", "iterations", "density_errors", "converged")
         phases = sum(name.startswith(FRACTION) for name in arrays)
         fractions = np.stack([arrays[name] for name in fraction_names(phases)], axis=-1) if phases else None
-        return cls(**{name: arrays[name] for name in names}, mass_fractions=fractions)
+        return cls(**{name: arrays[name] for name in names} | {"mass_fractions": fractions})  # type: ignore[arg-type]
 
 
 FRACTION = "mass_fraction_"

@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -63,9 +62,7 @@ def _double_well(precision: Precision, phases: int) -> SimpleNamespace:
     @wp.func
     def bend(c: fractions, u: fractions) -> fractions:
         squares = wp.cw_mul(c, c)
-        return (
-            real(4.0) * wp.dot(c, u) * c + real(2.0) * wp.dot(c, c) * u - real(6.0) * wp.cw_mul(squares, u)
-        )
+        return real(4.0) * wp.dot(c, u) * c + real(2.0) * wp.dot(c, c) * u - real(6.0) * wp.cw_mul(squares, u)
 
     return SimpleNamespace(slope=slope, bend=bend)
 

@@ -29,7 +29,7 @@ def mixture_kernels(precision: Precision, phases: int) -> SimpleNamespace:
 
     Materials of the phases are arrays (phases,).
     """
-    real, vector, fractions = precision.real, precision.vector, precision.fractions(phases)
+    real, fractions = precision.real, precision.fractions(phases)
 
     @wp.kernel(module=mixture_module(precision, phases, True))
     def sort_fractions(
@@ -107,7 +107,7 @@ def mixture_kernels(precision: Precision, phases: int) -> SimpleNamespace:
         # out
         c_bar: wp.array(dtype=fractions),
     ):
-        """``c_scene_bar``: the adjoint of the new state's fractions; those of the phases add up particle by particle."""
+        """``c_scene_bar``: the adjoint of the new state's fractions. Those of the phases add up by particle."""
         i = wp.tid()
         c_bar_i = c_scene_bar[order[i]]
         rest_density_bar_i = rest_density_bar[i]

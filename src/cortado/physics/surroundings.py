@@ -64,7 +64,7 @@ def surroundings_type(precision: Precision) -> Any:
         pliancy: real
         """(2 sum_j G_j . G_j / push)^(-1/2) of a filled neighbourhood [m^(d + 1)], see `cortado.physics.walls`."""
         volume: real
-        """Rest volume V of a particle on the lattice [m^d]: with it the lattice of the rest spacing has the rest density."""
+        """Volume V of a particle on the rest lattice [m^d]: with it that lattice has the rest density."""
         periodic: wp.int32
         period: vector
         """[m], 0 along an axis that is not periodic."""
@@ -78,10 +78,12 @@ def surroundings_type(precision: Precision) -> Any:
 
 @cache
 def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
-    """Warp functions of a separation in given surroundings: ``separation``, ``weight``, ``gradient``,
-    ``hessian_product``; ``size`` (|x|^2 + 0.01 h^2, which covers coincident particles), ``factor`` (F = x . G / size,
-    of second derivatives after Brookshaw 1985) and ``factor_gradient``; and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have before any of it is
-    used, so that the loads do not wait for one another (on a GPU a tenth of a whole step).
+    """Warp functions of a separation in given surroundings.
+
+    ``separation``, ``weight``, ``gradient``, ``hessian_product``; ``size`` (|x|^2 + 0.01 h^2, which covers coincident
+    particles), ``factor`` (F = x . G / size, of second derivatives after Brookshaw 1985) and ``factor_gradient``;
+    and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have before any of it is used, so that the
+    loads do not wait for one another (on a GPU a tenth of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     surroundings = surroundings_type(discretisation.precision)

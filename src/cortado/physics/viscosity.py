@@ -55,7 +55,7 @@ def pairwise_functions(discretisation: Discretisation) -> SimpleNamespace:
 @cache
 def laminar_functions(discretisation: Discretisation) -> SimpleNamespace:
     """phi of the laminar form, as `pairwise_functions`."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
+    vector = discretisation.precision.vector
     surroundings = surroundings_type(discretisation.precision)
     pair = pair_functions(discretisation)
     factor, factor_gradient = pair.factor, pair.factor_gradient

@@ -20,6 +20,7 @@ from cortado.physics.integration import integration_kernels
 from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
 from cortado.physics.surroundings import Discretisation, surroundings_type
 from cortado.physics.walls import wall_kernels
+from cortado.solvers.emitter import Emitter, Nozzle
 from cortado.solvers.forces import ForceTerm, Moment
 from cortado.solvers.mixture import Mixture, Phases
 
@@ -114,6 +115,7 @@ class Pcisph:
         pressure: PressureSolve | None,
         periods: Sequence[float],
         phases: Phases,
+        nozzle: Nozzle | None,
         requires_grad: bool = False,
     ):
         """``pressure`` None leaves the pressure out; ``periods`` (3,) [m], 0 along an axis that is not periodic."""
@@ -131,6 +133,7 @@ class Pcisph:
         def count(value: int = 0) -> wp.array:
             return wp.full(1, value, dtype=wp.int32, device=device)
 
+        self.emitter = Emitter(nozzle, precision, self.launch, self.new_state(requires_grad)) if nozzle else None
         self.fields = Fields.zeros(particles, precision, device, requires_grad)
         self.wall_yield = wp.zeros(particles, dtype=precision.real, device=device, requires_grad=requires_grad)
         self.accelerations = [vectors() for _ in range(len(self.terms) + 1)]
@@ -179,6 +182,7 @@ class Pcisph:
             self.pressure,
             self.periods,
             self.mixture.phases,
+            self.emitter.nozzle if self.emitter else None,
             requires_grad=True,
         )
 
@@ -213,7 +217,7 @@ class Pcisph:
         self._begin(state, parameters)
         if self.pressure is not None:
             self._solve_pressure(self.pressure, parameters)
-        self.recorded(0, new_state)
+        self.recorded(0, parameters, new_state)
         f, c = self.iterates, self.kernels.convergence
         self.launch(
             c.check,
@@ -234,15 +238,19 @@ class Pcisph:
         for k in range(iterations):
             self._iterate(k, k + 1, parameters)
 
-    def recorded(self, iterations: int, new_state: State) -> None:
-        """The new state of the step that was recorded: its last prediction, in the scene's order."""
+    def recorded(self, iterations: int, parameters: Parameters, new_state: State) -> None:
+        """The new state of the step that was recorded: its last prediction, in the scene's order, but for particles
+        that a nozzle leads."""
         it = self.iterates
+        free = self.emitter.free if self.emitter else new_state
         self.launch(
             self.kernels.integration.unsort,
             [self.search.order, it.x_star[iterations], it.v_star[iterations]],
-            [new_state.positions, new_state.velocities],
+            [free.positions, free.velocities],
         )
         self.mixture.result(new_state.mass_fractions)
+        if self.emitter:
+            self.emitter.lead(parameters, self.step_number, new_state)
 
     def moment(self, parameters: Parameters) -> Moment:
         """The present step as a force term sees it."""

@@ -4,6 +4,7 @@ import warp as wp
 
 from cortado.launching import sum_of
 from cortado.particles import Fields, Parameters, State
+from cortado.solvers.emitter import EmitterAdjoint
 from cortado.solvers.forces import Adjoints
 from cortado.solvers.mixture import MixtureAdjoint, MixtureTangent
 from cortado.solvers.pcisph import Pcisph
@@ -31,11 +32,14 @@ class PcisphAdjoint:
         self._p_bar, self._y_bar, self._r = scalars
         self._sum = sum_of(precision.vector, particles, device)
         self._mixture = MixtureAdjoint(solver.mixture)
+        self._emitter = EmitterAdjoint(solver.emitter) if solver.emitter else None
 
     def clear(self) -> None:
         """Forget what was kept particle by particle of the steps so far."""
         self._scalars_bar.zero_()
         self._mixture.clear()
+        if self._emitter:
+            self._emitter.clear()
 
     def collect(self, bar: Parameters) -> None:
         """Write the adjoints that were kept particle by particle, of all steps since `clear`."""
@@ -43,19 +47,25 @@ class PcisphAdjoint:
         totals = self._sum(self._scalars_bar).view(bar.time_step.dtype).flatten()
         for k, total in enumerate((bar.time_step, bar.mobility, bar.interface_width)):
             wp.copy(total, totals, src_offset=k, count=1)
+        if self._emitter:
+            self._emitter.collect(bar)
 
     def step(
         self, iterations: int, new_state_bar: State, state_bar: State, parameters: Parameters, bar: Parameters
     ) -> None:
-        """From the adjoint of the recorded step's result to that of its state, which may be the same arrays. Gravity's
-        adjoint is written to ``bar`` and that of the masses added; the others are kept for `collect`."""
+        """From the adjoint of the recorded step's result to that of its state, which may be the same arrays. Adjoints
+        of gravity, masses and the nozzle are added to ``bar``; the others are kept for `collect`."""
         solver, b, f = self._solver, self._bar, self._solver.fields
         kernels = solver.kernels
         s, it, launch = solver.moment(parameters).surroundings, solver.iterates, solver.launch
         time_step, order = parameters.time_step, solver.search.order
+        free_bar = new_state_bar
+        if self._emitter:
+            self._emitter.step(parameters, solver.step_number, new_state_bar, bar)
+            free_bar = self._emitter.free
         launch(
             kernels.integration.begin_adjoint,
-            [order, time_step, f.m, f.v, it.v_star[iterations], new_state_bar.positions, new_state_bar.velocities],
+            [order, time_step, f.m, f.v, it.v_star[iterations], free_bar.positions, free_bar.velocities],
             [self._scalars_bar, b.x, b.v, b.n, b.m, b.rho_0, b.mu, self._push_bar, self._y_bar, self._p_bar],
         )
         for k in reversed(range(iterations)):
@@ -141,3 +151,5 @@ class PcisphTangent:
             [new_state_dot.positions, new_state_dot.velocities],
         )
         self._mixture.result(new_state_dot.mass_fractions)
+        if solver.emitter:
+            solver.emitter.tangent(parameters, dot, solver.step_number, new_state_dot)
