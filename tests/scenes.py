@@ -36,3 +36,29 @@ def plane(**changes: Any) -> Scene:
         "forces": {"gravity": [0.0, -9.81]},
     }
     return scene(**{**tables, **changes})
+
+
+OIL = {"name": "oil", "rest_density": 1800.0, "viscosity": 0.4}
+HONEY = {"name": "honey", "rest_density": 1300.0, "viscosity": 2.0}
+MIXING = {"mobility": 0.1, "mobility_form": "degenerate", "interface_width": 0.04, "strength": 1.0}
+
+
+def splash_of_two(**changes: Any) -> Scene:
+    """The splash with a heavier and stickier fluid in its upper layers, which diffuses into the lower one."""
+    blocks = [
+        {"shape": "box", "lower": [0.0, 0.3, 0.0], "upper": [0.25, 0.45, 0.25], "phase": "water"},
+        {"shape": "box", "lower": [0.0, 0.45, 0.0], "upper": [0.25, 0.55, 0.25], "phase": "oil"},
+    ]
+    phases = [scene().phase[0].model_dump(), OIL]
+    return scene(**{"name": "splash of two", "phase": phases, "fluid": blocks, "mixture": MIXING, **changes})
+
+
+def plane_of_three(**changes: Any) -> Scene:
+    """Three fluids side by side in two dimensions: 8 x 8 particles, 24 of each but the last."""
+    blocks = [
+        {"shape": "box", "lower": [x, 0.0], "upper": [min(x + 0.15, 0.4), 0.4], "phase": name}
+        for x, name in ((0.0, "water"), (0.15, "oil"), (0.3, "honey"))
+    ]
+    phases = [scene().phase[0].model_dump(), OIL, HONEY]
+    mixture = {**MIXING, "mobility": 0.03, "mobility_form": "constant"}
+    return plane(**{"name": "plane of three", "phase": phases, "fluid": blocks, "mixture": mixture, **changes})

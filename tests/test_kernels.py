@@ -7,6 +7,7 @@ Kernels are launched directly, their arguments found by name: inputs as given, t
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,15 @@ import pytest
 import warp as wp
 
 from cortado.cells import Grid
-from cortado.launching import TreeSum, sum_and_maximum, vector_sum
+from cortado.launching import TreeSum, add, sum_and_maximum, sum_of
+from cortado.masses import masses, masses_adjoint, masses_tangent
 from cortado.neighbours import NeighbourSearch
 from cortado.physics.density import density_kernels
+from cortado.physics.diffusion import Diffusion, diffusion_kernels
+from cortado.physics.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
 from cortado.physics.gravity import gravity_kernels
 from cortado.physics.integration import integration_kernels
+from cortado.physics.mixture import mixture_kernels
 from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
 from cortado.physics.surroundings import Discretisation, surroundings_type
 from cortado.physics.viscosity import laminar_functions, pairwise_functions, viscosity_kernels
@@ -45,20 +50,30 @@ class Kernels:
     gravity = gravity_kernels(FLOAT64)
     pairwise = viscosity_kernels(DISCRETISATION, pairwise_functions)
     laminar = viscosity_kernels(DISCRETISATION, laminar_functions)
+    mixture = mixture_kernels(FLOAT64, 3)
+    diffusion = MappingProxyType(
+        {
+            variant: diffusion_kernels(Diffusion(DISCRETISATION, *kinds))
+            for variant, kinds in {
+                "2, double well, degenerate": (2, DOUBLE_WELL, DEGENERATE),
+                "2, miscible, constant": (2, MISCIBLE, CONSTANT),
+                "3, double well, constant": (3, DOUBLE_WELL, CONSTANT),
+                "3, miscible, degenerate": (3, MISCIBLE, DEGENERATE),
+                "4, double well, degenerate": (4, DOUBLE_WELL, DEGENERATE),
+            }.items()
+        }
+    )
 
 
-def array(values: np.ndarray) -> Any:
-    """A Warp array of vectors, reals or integers, by the look of the values."""
-    values = np.asarray(values)
-    if values.dtype.kind == "i":
-        return wp.array(values, dtype=wp.int32, device=CPU)
-    return wp.array(values, dtype=wp.vec3d if values.ndim == 2 else wp.float64, device=CPU)
+def array(values: np.ndarray, dtype: Any = wp.vec3d) -> Any:
+    return wp.array(values, dtype=dtype, device=CPU)
 
 
 def launch(kernel: Any, threads: int = N, **given: Any) -> Values:
     """Run a kernel on arguments by name and return every array argument after it."""
     arguments = [
-        array(given[a.label]) if isinstance(given[a.label], np.ndarray) else given[a.label] for a in kernel.adj.args
+        array(given[a.label], a.type.dtype) if isinstance(given[a.label], np.ndarray) else given[a.label]
+        for a in kernel.adj.args
     ]
     wp.launch(kernel, threads, inputs=arguments, device=CPU)
     return {
@@ -115,11 +130,17 @@ def cloud(name: str) -> Cloud:
     return Cloud(x, s, search, dimension)
 
 
+VECTORS = ("x", "v", "acceleration", "acceleration_in", "table", "x_star")
+
+
 class Operation:
     """A differentiable piece of the step on one cloud: values in, values out."""
 
     inputs: Sequence[str]
     outputs: Sequence[str]
+
+    passed: Sequence[str] = ()
+    """Inputs whose adjoint is handed through and not added to."""
 
     def __init__(self, cloud: Cloud):
         self.cloud = cloud
@@ -129,11 +150,9 @@ class Operation:
             "x": cloud.x,
             "v": cloud.vectors(1),
             "acceleration": cloud.vectors(2),
-            "rho": random.uniform(0.6, 1.6, N),
+            **{name: random.uniform(0.6, 1.6, N) for name in ("n", "m", "rho_0", "mu")},
             "y": random.uniform(0.4, 1.0, N),
             "p_in": random.uniform(0.0, 1.0, N) * (random.uniform(0.0, 1.0, N) < 0.6),
-            "rest_density": np.array([1.3]),
-            "mu": np.array([0.7]),
             "time_step": np.array([0.2]),
             "table": cloud.vectors(3, n=4),
         }
@@ -144,7 +163,7 @@ class Operation:
         found = {}
         for name in self.inputs:
             value = random.standard_normal(self.start[name].shape)
-            if value.ndim == 2:
+            if name in VECTORS:
                 value[:, self.cloud.dimension :] = 0.0
             found[name] = value if names is None or name in names else np.zeros_like(value)
         return found
@@ -176,22 +195,17 @@ def zeros(*names: str) -> Values:
 
 
 class Density(Operation):
-    inputs, outputs = ("x", "rest_density"), ("rho",)
+    inputs, outputs = ("x",), ("n",)
 
     def forward(self, values):
-        return launch(Kernels.density.forward, s=self.s, **{**values, "rho": np.zeros(N)})
+        return launch(Kernels.density.forward, s=self.s, **{**values, "n": np.zeros(N)})
 
     def tangent(self, values, dots):
-        values = {**values, "rho": self.forward(values)["rho"]}
-        found = launch(Kernels.density.tangent, s=self.s, **values, **dotted(dots), rho_dot=np.zeros(N))
-        return {"rho": found["rho_dot"]}
+        return {"n": launch(Kernels.density.tangent, s=self.s, **values, **dotted(dots), n_dot=np.zeros(N))["n_dot"]}
 
     def adjoint(self, values, bars):
-        values = {**values, "rho": self.forward(values)["rho"]}
-        found = launch(
-            Kernels.density.adjoint, s=self.s, **values, rho_bar=bars["rho"], **zeros("x_bar", "scalars_bar")
-        )
-        return {"x": found["x_bar"], "rest_density": found["scalars_bar"][:, 0].sum(keepdims=True)}
+        found = launch(Kernels.density.adjoint, s=self.s, **values, n_bar=bars["n"], **zeros("x_bar"))
+        return {"x": found["x_bar"]}
 
 
 class WallYield(Operation):
@@ -210,7 +224,8 @@ class WallYield(Operation):
 
 
 class Viscosity(Operation):
-    inputs, outputs = ("x", "v", "rho", "acceleration_in", "rest_density", "mu"), ("acceleration",)
+    inputs, outputs = ("x", "v", "n", "m", "mu", "acceleration_in"), ("acceleration",)
+    passed = ("acceleration_in",)
     kernels: Any = None
     friction = 0.0
 
@@ -228,13 +243,9 @@ class Viscosity(Operation):
 
     def adjoint(self, values, bars):
         given = {**self.given, **values, "acceleration_bar": bars["acceleration"]}
-        found = launch(self.kernels.adjoint, **given, **zeros("x_bar", "v_bar", "rho_bar", "scalars_bar"))
-        return {
-            **{name: found[f"{name}_bar"] for name in ("x", "v", "rho")},
-            "acceleration_in": bars["acceleration"],
-            "rest_density": found["scalars_bar"][:, 0].sum(keepdims=True),
-            "mu": found["scalars_bar"][:, 1].sum(keepdims=True),
-        }
+        names = ("x", "v", "n", "m", "mu")
+        found = launch(self.kernels.adjoint, **given, **zeros(*(f"{name}_bar" for name in names)))
+        return {**{name: found[f"{name}_bar"] for name in names}, "acceleration_in": bars["acceleration"]}
 
 
 class Pairwise(Viscosity):
@@ -243,6 +254,19 @@ class Pairwise(Viscosity):
 
 class PairwiseWithFriction(Pairwise):
     friction = 0.7
+
+
+class WithoutViscosity(Pairwise):
+    """Every other particle has none, so that there are pairs without any."""
+
+    inputs = ("x", "v", "n", "m", "acceleration_in")
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.start["mu"] = np.where(np.arange(N) % 2, 0.0, self.start["mu"])
+
+    def tangent(self, values, dots):
+        return super().tangent(values, {**dots, "mu": np.zeros(N)})
 
 
 class Laminar(Viscosity):
@@ -268,7 +292,7 @@ class GravityTable(Operation):
         return launch(Kernels.gravity.tangent, **dots, step=self.step, acceleration=np.zeros((N, 3)))
 
     def adjoint(self, values, bars):
-        total = vector_sum(N, FLOAT64, CPU)(array(bars["acceleration"])).numpy()
+        total = sum_of(FLOAT64.vector, N, CPU)(array(bars["acceleration"])).numpy()
         found = launch(Kernels.gravity.adjoint, 1, total=total, step=self.step, table_bar=np.zeros((4, 3)))
         return {"table": found["table_bar"], "acceleration_in": bars["acceleration"]}
 
@@ -276,7 +300,7 @@ class GravityTable(Operation):
 class Pressure(Operation):
     """The pressure alone; its adjoint is fused with what comes before and after it, see `Iterations`."""
 
-    inputs = ("x_star", "rho", "y", "p_in", "rest_density", "time_step")
+    inputs = ("x_star", "n", "m", "rho_0", "y", "p_in", "time_step")
     outputs = ("p_out", "c")
 
     def __init__(self, cloud):
@@ -297,7 +321,7 @@ class Pressure(Operation):
 class PressureForce(Operation):
     """The pressure force and the prediction that follows it, alone."""
 
-    inputs = ("x", "v", "acceleration", "c", "rest_density", "time_step")
+    inputs = ("x", "v", "acceleration", "m", "c", "time_step")
     outputs = ("x_star", "v_star")
 
     def __init__(self, cloud):
@@ -317,7 +341,7 @@ class PressureForce(Operation):
 class Iterations(Operation):
     """A prediction and then so many pressure iterations, in the order of the solver; the new state in scene order."""
 
-    inputs = ("x", "v", "acceleration", "rho", "y", "p_in", "rest_density", "time_step")
+    inputs = ("x", "v", "acceleration", "n", "m", "rho_0", "y", "p_in", "time_step")
     outputs = ("x_new", "v_new", "p_new")
     iterations = 1
     stiffness = 0.03
@@ -381,7 +405,9 @@ class Iterations(Operation):
             v_star=states[-1]["v_star"],
             x_scene_bar=bars["x_new"],
             v_scene_bar=bars["v_new"],
-            **zeros("scalars_bar", "x_bar", "v_bar", "push_bar", "rho_bar", "y_bar", "p_bar"),
+            **zeros(
+                "scalars_bar", "x_bar", "v_bar", "n_bar", "m_bar", "rho_0_bar", "mu_bar", "push_bar", "y_bar", "p_bar"
+            ),
         )
         bar = {name: value for name, value in bar.items() if name.endswith("_bar")}
         bar["p_bar"] = bars["p_new"]
@@ -394,12 +420,142 @@ class Iterations(Operation):
             bar |= {name: found[name] for name in bar if name in found}
         found = launch(Kernels.integration.acceleration_adjoint, **values, **bar, acceleration_bar=np.zeros((N, 3)))
         return {
-            **{name: bar[f"{name}_bar"] for name in ("x", "v", "rho", "y")},
+            **{name: bar[f"{name}_bar"] for name in ("x", "v", "n", "m", "rho_0", "y")},
             "acceleration": found["acceleration_bar"],
             "p_in": bar["p_bar"],
-            "rest_density": bar["scalars_bar"][:, 0].sum(keepdims=True),
-            "time_step": bar["scalars_bar"][:, 2].sum(keepdims=True),
+            "time_step": bar["scalars_bar"][:, 0].sum(keepdims=True),
         }
+
+
+class Blend(Operation):
+    """The materials of 3 phases; with them go the fractions themselves, into the scene's order."""
+
+    inputs, outputs, passed = ("c", "rest_density", "viscosity"), ("rho_0", "mu", "c_new"), ("c",)
+    kernels = Kernels.mixture
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        random = np.random.default_rng(17)
+        self.order = random.permutation(N).astype(np.int32)
+        self.start |= {
+            "c": random.dirichlet(np.ones(3), N) + 0.03 * random.standard_normal((N, 3)),
+            "rest_density": random.uniform(0.6, 1.6, 3),
+            "viscosity": random.uniform(0.1, 2.0, 3),
+        }
+
+    def in_scene_order(self, c):
+        return launch(self.kernels.unsort, order=self.order, c=c, c_scene=np.zeros_like(c))["c_scene"]
+
+    def forward(self, values):
+        found = launch(self.kernels.blend, **{**values, "rho_0": np.zeros(N), "mu": np.zeros(N)})
+        return {**found, "c_new": self.in_scene_order(values["c"])}
+
+    def tangent(self, values, dots):
+        given = {**values, **dotted(dots), "rho_0": self.forward(values)["rho_0"]}
+        found = launch(self.kernels.blend_tangent, **given, rho_0_dot=np.zeros(N), mu_dot=np.zeros(N))
+        return {"rho_0": found["rho_0_dot"], "mu": found["mu_dot"], "c_new": self.in_scene_order(dots["c"])}
+
+    def adjoint(self, values, bars):
+        given = {**values, "rho_0": self.forward(values)["rho_0"], "order": self.order, "c_scene_bar": bars["c_new"]}
+        given |= {f"{name}_bar": bars[name] for name in ("rho_0", "mu")} | {"c_bar": np.zeros((N, 3))}
+        sums = {
+            name: np.stack([values] * 3, axis=1) for name, values in zeros("rest_density_bar", "viscosity_bar").items()
+        }
+        found = launch(self.kernels.blend_adjoint, **given, **sums)
+        return {
+            "c": found["c_bar"],
+            "rest_density": found["rest_density_bar"].sum(axis=0),
+            "viscosity": found["viscosity_bar"].sum(axis=0),
+        }
+
+
+class Potential(Operation):
+    """The chemical potential, and what mobility makes of it, alone; its adjoint is part of `Substep`'s."""
+
+    inputs, outputs = ("x", "n", "m", "c", "mobility_0", "interface_width"), ("chi", "w")
+    variant = "2, double well, degenerate"
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.kernels, phases = Kernels.diffusion[self.variant], int(self.variant[0])
+        random = np.random.default_rng(19)
+        self.start |= {
+            "c": random.dirichlet(np.ones(phases), N) + 0.03 * random.standard_normal((N, phases)),
+            "w": random.uniform(0.6, 1.6, N),
+            "chi": random.standard_normal((N, phases)),
+            "mobility_0": np.array([0.8]),
+            "interface_width": np.array([0.4]),
+        }
+        self.given = {"s": self.s, "strength": 1.7, "substeps": 3}
+        self.empty = np.zeros((N, phases))
+
+    def forward(self, values):
+        return launch(self.kernels.potential, **{**self.given, **values, "chi": self.empty, "w": np.zeros(N)})
+
+    def tangent(self, values, dots):
+        out = {"chi_dot": self.empty, "w_dot": np.zeros(N)}
+        found = launch(self.kernels.potential_tangent, **{**self.given, **values, **dotted(dots), **out})
+        return {"chi": found["chi_dot"], "w": found["w_dot"]}
+
+
+class Flux(Potential):
+    """The change of the fractions under a given potential, alone."""
+
+    inputs, outputs = ("x", "n", "m", "c", "w", "chi", "time_step"), ("c_new",)
+
+    def forward(self, values):
+        return launch(self.kernels.flux, **self.given, **values, c_new=self.empty)
+
+    def tangent(self, values, dots):
+        found = launch(self.kernels.flux_tangent, **self.given, **values, **dotted(dots), c_new_dot=self.empty)
+        return {"c_new": found["c_new_dot"]}
+
+
+class Substep(Potential):
+    """One step of diffusion."""
+
+    inputs, outputs = ("x", "n", "m", "c", "time_step", "mobility_0", "interface_width"), ("c_new",)
+    passed = ("c",)
+
+    def record(self, values):
+        found = Potential.forward(self, values)
+        return {**values, "chi": found["chi"], "w": found["w"]}
+
+    def forward(self, values):
+        return Flux.forward(self, self.record(values))
+
+    def tangent(self, values, dots):
+        found = Potential.tangent(self, values, dots)
+        return Flux.tangent(self, self.record(values), {**dots, **found})
+
+    def adjoint(self, values, bars):
+        given = {**self.given, **self.record(values)}
+        given |= launch(self.kernels.scale_adjoint, **{**given, "c_bar": bars["c_new"], "y": self.empty})
+        bar = {"c_bar": bars["c_new"], **zeros("x_bar", "n_bar", "m_bar", "scalars_bar")}
+        found = launch(self.kernels.flux_adjoint, **{**given, **bar, "z": self.empty})
+        bar = {name: found[name] for name in bar}
+        found = launch(self.kernels.potential_adjoint, **{**given, **bar, "z": found["z"]})
+        scalars = found["scalars_bar"].sum(axis=0)
+        return {
+            **{name: found[f"{name}_bar"] for name in ("x", "n", "m", "c")},
+            **{name: scalars[k : k + 1] for k, name in enumerate(("time_step", "mobility_0", "interface_width"))},
+        }
+
+
+class SubstepOfMiscible(Substep):
+    variant = "2, miscible, constant"
+
+
+class SubstepOfThree(Substep):
+    variant = "3, double well, constant"
+
+
+class SubstepOfThreeMiscible(Substep):
+    variant = "3, miscible, degenerate"
+
+
+class SubstepOfFour(Substep):
+    variant = "4, double well, degenerate"
 
 
 class TwoIterations(Iterations):
@@ -421,8 +577,15 @@ ADJOINT = [
     Iterations,
     TwoIterations,
     FiveIterations,
+    WithoutViscosity,
+    Blend,
+    Substep,
+    SubstepOfMiscible,
+    SubstepOfThree,
+    SubstepOfThreeMiscible,
+    SubstepOfFour,
 ]
-TANGENT = [*ADJOINT, Pressure, PressureForce]
+TANGENT = [*ADJOINT, Pressure, PressureForce, Potential, Flux]
 
 clouds = pytest.mark.parametrize("where", ["3-D", "2-D", "periodic"])
 
@@ -483,16 +646,16 @@ def test_some_pressures_are_active_and_some_are_not(where):
 
 
 @clouds
-@pytest.mark.parametrize("operation", [Density, WallYield, PairwiseWithFriction, LaminarWithFriction])
+@pytest.mark.parametrize("operation", [Density, WallYield, PairwiseWithFriction, LaminarWithFriction, Blend, Substep])
 def test_adjoints_are_added(operation, where, monkeypatch):
-    """What other terms left in the adjoints of x, v, rho and the scalars stays."""
+    """What other terms left in the adjoints of particles and of scalars stays."""
     op = operation(cloud(where))
     bars = op.weights(41)
     alone = op.adjoint(op.start, bars)
     monkeypatch.setitem(globals(), "zeros", lambda *names, make=zeros: {k: v + 1.0 for k, v in make(*names).items()})
     added = op.adjoint(op.start, bars)
-    for name in set(op.inputs) - {"acceleration_in"}:
-        one = N if op.start[name].shape == (1,) else 1.0
+    for name in set(op.inputs) - set(op.passed):
+        one = 1.0 if len(op.start[name]) == N else N
         np.testing.assert_allclose(added[name], alone[name] + one, rtol=1e-12, atol=1e-12)
 
 
@@ -507,16 +670,37 @@ def test_same_bits_twice(operation, where):
 
 def test_sort_and_unsort_are_inverses():
     there = cloud("3-D")
-    order = np.random.default_rng(61).permutation(N).astype(np.int32)
-    x, v = there.vectors(62), there.vectors(63)
-    given = {"order": order, "x_scene": x, "v_scene": v}
-    found = launch(Kernels.integration.sort, **given, x=np.zeros((N, 3)), v=np.zeros((N, 3)))
-    np.testing.assert_array_equal(found["x"], x[order])
-    np.testing.assert_array_equal(found["v"], v[order])
+    random = np.random.default_rng(61)
+    order = random.permutation(N).astype(np.int32)
+    x, v, m, c = there.vectors(62), there.vectors(63), random.random(N), random.random((N, 3))
+    given = {"order": order, "x_scene": x, "v_scene": v, "m_scene": m}
+    found = launch(Kernels.integration.sort, **given, x=np.zeros((N, 3)), v=np.zeros((N, 3)), m=np.zeros(N))
+    for name, values in (("x", x), ("v", v), ("m", m)):
+        np.testing.assert_array_equal(found[name], values[order])
     given = {"order": order, "x": found["x"], "v": found["v"]}
     back = launch(Kernels.integration.unsort, **given, x_scene=np.zeros((N, 3)), v_scene=np.zeros((N, 3)))
     np.testing.assert_array_equal(back["x_scene"], x)
     np.testing.assert_array_equal(back["v_scene"], v)
+    back = launch(Kernels.integration.collect_masses, order=order, m_bar=found["m"], m_scene_bar=m)
+    np.testing.assert_array_equal(back["m_scene_bar"], 2.0 * m)
+    found = launch(Kernels.mixture.sort, order=order, c_scene=c, c=np.zeros((N, 3)))
+    np.testing.assert_array_equal(found["c"], c[order])
+    back = launch(Kernels.mixture.unsort, order=order, c=found["c"], c_scene=np.zeros((N, 3)))
+    np.testing.assert_array_equal(back["c_scene"], c)
+
+
+@pytest.mark.parametrize("phases", [1, 2, 3])
+def test_derivatives_of_masses(phases):
+    random = np.random.default_rng(71)
+    c, density = random.dirichlet(np.ones(phases), N), random.uniform(800.0, 2000.0, phases)
+    c_dot, density_dot, bar = random.standard_normal((N, phases)), random.standard_normal(phases), random.random(N)
+    tangent = masses_tangent(c, density, c_dot, density_dot)
+    step = 1e-30j
+    np.testing.assert_allclose(tangent, np.imag(masses(c + step * c_dot, density + step * density_dot)) / 1e-30, 1e-13)
+    c_bar, density_bar = masses_adjoint(c, density, bar)
+    backward = (c_bar * c_dot).sum() + (density_bar * density_dot).sum()
+    assert backward == pytest.approx(bar @ tangent, rel=1e-13)
+    assert masses(np.eye(phases), density) == pytest.approx(density, rel=1e-15)
 
 
 SIZES = [1, 2, 63, 64, 65, 128, 4096, 4097, 5000]
@@ -527,19 +711,42 @@ def summed(tree: TreeSum, values: np.ndarray, dtype: Any) -> np.ndarray:
     return tree(wp.array(values, dtype=dtype, device=CPU)).numpy()
 
 
+TYPES: dict[str, Callable[[Precision], Any]] = {
+    "numbers": lambda precision: precision.real,
+    "vectors": lambda precision: precision.vector,
+    "four fractions": lambda precision: precision.fractions(4),
+    "matrices": lambda precision: wp.types.matrix(shape=(3, 3), dtype=precision.real),
+}
+types = pytest.mark.parametrize("type_of", TYPES.values(), ids=TYPES)
+
+
 @precisions
+@types
 @pytest.mark.parametrize("size", SIZES)
-def test_vector_sum(size, precision: Precision):
-    values = np.random.default_rng(size).standard_normal((size, 3)).astype(precision.numpy)
-    tree = vector_sum(size, precision, CPU)
-    first, second = (summed(tree, values, precision.vector).copy() for _ in range(2))
-    again = summed(vector_sum(size, precision, CPU), values, precision.vector)
-    assert first.shape == (1, 3)
+def test_sum_of(size, type_of, precision: Precision):
+    dtype = type_of(precision)
+    one = getattr(dtype, "_shape_", ())
+    values = np.random.default_rng(size).standard_normal((size, *one)).astype(precision.numpy)
+    tree = sum_of(dtype, size, CPU)
+    first, second = (summed(tree, values, dtype).copy() for _ in range(2))
+    again = summed(sum_of(dtype, size, CPU), values, dtype)
+    assert first.shape == (1, *one)
     assert first.tobytes() == second.tobytes() == again.tobytes()
     error = 20 * np.finfo(precision.numpy).eps * np.abs(values).sum()
     np.testing.assert_allclose(first[0], values.astype(np.float64).sum(axis=0), rtol=0, atol=error)
-    whole = np.arange(3 * size).reshape(size, 3) % 7  # every partial sum is exact
-    np.testing.assert_array_equal(summed(tree, whole.astype(precision.numpy), precision.vector)[0], whole.sum(axis=0))
+    whole = np.arange(values.size).reshape(values.shape) % 7  # every partial sum is exact
+    np.testing.assert_array_equal(summed(tree, whole.astype(precision.numpy), dtype)[0], whole.sum(axis=0))
+
+
+@precisions
+@types
+def test_add(type_of, precision: Precision):
+    dtype = type_of(precision)
+    shape = (N, *getattr(dtype, "_shape_", ()))
+    values, total = np.random.default_rng(81).standard_normal((2, *shape)).astype(precision.numpy)
+    target = array(total, dtype)
+    add(array(values, dtype), target)
+    np.testing.assert_array_equal(target.numpy(), total + values)
 
 
 @precisions
