@@ -55,7 +55,8 @@ class Controls:
     def __init__(self, simulation: "Simulation", steps: int):
         self._simulation, self._steps = simulation, steps
         self._phases = len(simulation.scene.phase)
-        self._scene: Arrays = simulation.parameters()
+        no_emitter = {"nozzle_path": np.zeros(simulation.dimension), "flow_rate": np.zeros(())}
+        self._scene: Arrays = no_emitter | simulation.parameters()
 
     def shapes(self, name: str) -> list[tuple[int, ...]]:
         """The shapes that a parameter may have; () is a number."""

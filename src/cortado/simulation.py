@@ -10,6 +10,7 @@ import warp as wp
 from cortado.calibration import (
     WallLayer,
     diffusion_limit,
+    laplacian_evenness,
     pressure_stiffness,
     rest_volume,
     wall_layer,
@@ -136,10 +137,10 @@ class Simulation:
             "time_step": scene.solver.time_step,
             "mobility": scene.mixture.mobility,
             "interface_width": scene.mixture.width(scene.discretisation.spacing),
-            "nozzle_path": np.zeros(self.dimension) if scene.emitter is None else scene.emitter.outlet,
-            "flow_rate": 0.0 if scene.emitter is None else scene.emitter.flow_rate,
             "colours": [phase.colour for phase in scene.phase],
         }
+        if scene.emitter is not None:
+            values |= {"nozzle_path": scene.emitter.outlet, "flow_rate": scene.emitter.flow_rate}
         arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
         if len(scene.phase) == 1:
             arrays |= {name: arrays[name][0] for name in MATERIALS}
@@ -210,6 +211,7 @@ class Simulation:
             stiffness=pressure_stiffness(kernel, spacing, support, dimension),
             rigidity=wall_rigidity(kernel, spacing, support, dimension) / layer.push,
             wall_push=layer.push,
+            evenness=laplacian_evenness(kernel, spacing, support, dimension),
         )
         periods = [*lengths, *np.zeros(3 - dimension)]
         terms, phases = self._terms(discretisation, layer), self._phases(discretisation)

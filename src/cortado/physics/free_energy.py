@@ -1,10 +1,13 @@
 """Helmholtz free energies F(c) = alpha f(c) of a mixture, and how mobile its phases are (Yang et al. 2015).
 
-    double well  f = sum_(k < l) c_k^2 c_l^2: phases part, into pure ones
+    double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: phases part, into pure ones (Lee and Kim 2015)
     miscible     f = sum_k c_k^2 / 2: phases mix, by Fick's law
 
     constant     m = 1
     degenerate   m = (z + sqrt(z^2 + delta^2)) / 2,  z = sum_(k < l) c_k c_l: phases exchange where they touch
+
+For two phases the double well is c_1^2 c_2^2. The other generalisation, sum_(k < l) c_k^2 c_l^2, pulls a third phase into
+the interface of two, and lets equal parts of three or more stay mixed.
 
 delta keeps the mobility positive, and smooth, where a fraction strays out of [0, 1]: a negative one would feed the
 excursion. It leaves a pure phase delta / 2, and z <= 1 / 4 for two phases is hardly touched.
@@ -57,12 +60,11 @@ def _double_well(precision: Precision, phases: int) -> SimpleNamespace:
     @wp.func
     def slope(c: fractions) -> fractions:
         squares = wp.cw_mul(c, c)
-        return real(2.0) * (wp.dot(c, c) * c - wp.cw_mul(squares, c))
+        return c - real(3.0) * squares + real(2.0) * wp.cw_mul(squares, c)
 
     @wp.func
     def bend(c: fractions, u: fractions) -> fractions:
-        squares = wp.cw_mul(c, c)
-        return real(4.0) * wp.dot(c, u) * c + real(2.0) * wp.dot(c, c) * u - real(6.0) * wp.cw_mul(squares, u)
+        return u - real(6.0) * wp.cw_mul(c, u) + real(6.0) * wp.cw_mul(wp.cw_mul(c, c), u)
 
     return SimpleNamespace(slope=slope, bend=bend)
 
@@ -133,7 +135,7 @@ def _degenerate(precision: Precision, phases: int) -> SimpleNamespace:
 
 
 DOUBLE_WELL = FreeEnergy(
-    "double_well", lambda c: 0.5 * ((c**2).sum(1) ** 2 - (c**4).sum(1)), curvature=2.0, functions=_double_well
+    "double_well", lambda c: 0.5 * (c**2 * (1.0 - c) ** 2).sum(1), curvature=1.0, functions=_double_well
 )
 MISCIBLE = FreeEnergy("miscible", lambda c: 0.5 * (c**2).sum(1), curvature=1.0, functions=_miscible)
 FREE_ENERGIES = {energy.name: energy for energy in (DOUBLE_WELL, MISCIBLE)}

@@ -63,6 +63,8 @@ def surroundings_type(precision: Precision) -> Any:
         """W(0) [1 / m^d]."""
         pliancy: real
         """(2 sum_j G_j . G_j / push)^(-1/2) of a filled neighbourhood [m^(d + 1)], see `cortado.physics.walls`."""
+        evenness: real
+        """What second derivatives are multiplied with [-], see `cortado.calibration.laplacian_evenness`."""
         volume: real
         """Volume V of a particle on the rest lattice [m^d]: with it that lattice has the rest density."""
         periodic: wp.int32
@@ -81,7 +83,8 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
     """Warp functions of a separation in given surroundings.
 
     ``separation``, ``weight``, ``gradient``, ``hessian_product``; ``size`` (|x|^2 + 0.01 h^2, which covers coincident
-    particles), ``factor`` (F = x . G / size, of second derivatives after Brookshaw 1985) and ``factor_gradient``;
+    particles), ``factor`` (F = evenness x . G / size, of second derivatives after Brookshaw 1985) and
+    ``factor_gradient``;
     and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have before any of it is used, so that the
     loads do not wait for one another (on a GPU a tenth of a whole step).
     """
@@ -124,13 +127,13 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
 
     @wp.func
     def factor(x: vector, s: surroundings) -> real:
-        return wp.dot(x, gradient(x, s)) / size(x, s)
+        return s.evenness * wp.dot(x, gradient(x, s)) / size(x, s)
 
     @wp.func
     def factor_gradient(x: vector, s: surroundings) -> vector:
         d = size(x, s)
         g = gradient(x, s)
-        return (g + hessian_product(x, x, s) - (real(2.0) * wp.dot(x, g) / d) * x) / d
+        return (s.evenness / d) * (g + hessian_product(x, x, s) - (real(2.0) * wp.dot(x, g) / d) * x)
 
     @wp.func
     def vectors(a: wp.array(dtype=vector), k: int, i: int, s: surroundings) -> rows:

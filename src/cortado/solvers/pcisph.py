@@ -43,6 +43,8 @@ class Lattice:
     """[1 / m^(2 d + 2)], see `cortado.physics.walls`."""
     wall_push: float
     """[-], see `cortado.calibration.WallLayer`."""
+    evenness: float
+    """[-], see `cortado.calibration.laplacian_evenness`."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +168,7 @@ class Pcisph:
         s.support, s.reach = lattice.support, (1.0 + SKIN) * lattice.support
         s.normalisation = lattice.normalisation
         s.self_weight, s.volume, s.pliancy = lattice.self_weight, lattice.volume, lattice.rigidity**-0.5
-        s.wall_push = lattice.wall_push
+        s.wall_push, s.evenness = lattice.wall_push, lattice.evenness
         s.periodic = int(any(self.periods))
         s.period = precision.vector(*self.periods)
         s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in self.periods))
