@@ -13,19 +13,21 @@ ROOT = Path(cortado.__file__).parent
 
 LAYERS = """
     errors
+    image_losses srgb
     precision smoothing calibration cells
     physics.surroundings physics.density physics.walls physics.integration physics.gravity physics.pressure
     physics.viscosity physics.convergence physics.reduction physics.matching
-    physics.colour_field physics.rays
+    physics.tint physics.colour_field physics.interpolation physics.rays physics.absorption
     launching neighbours particles
-    render.cameras render.views render.renderer
+    render.cameras render.views render.fields render.marching render.renderer
     shapes scene_kinds scene_tables scene_toml scene_points
     scene_fluids scene_emitter scene_mixture scene_render scene_containers scene_stability scene_checks scene sampling
     vtkhdf trajectory
     solvers.forces solvers.pcisph solvers.pcisph_derivatives
     rollout policies losses simulation problem
     evaluations optimisers optimisation
-    run_folder progress figures report
+    run_folder progress pictures video
+    figures.canvas figures.curves figures.particle_sets figures.side_by_side figures report
     task certificate bench
     commands.* cli
 """

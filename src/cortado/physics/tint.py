@@ -18,7 +18,7 @@ def colours_type(precision: Precision, phases: int) -> Any:
 @cache
 def tint_kernels(precision: Precision, phases: int) -> SimpleNamespace:
     """Kernels ``forward`` (which sorts positions besides) and ``adjoint``."""
-    real, vector, fractions = precision.real, precision.vector, precision.fractions(phases)
+    vector, fractions = precision.vector, precision.fractions(phases)
     colours_matrix = colours_type(precision, phases)
     module = wp.get_module(f"cortado_tint_{phases}_{precision.name}")
     module.options["enable_backward"] = False

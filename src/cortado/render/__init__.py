@@ -1,0 +1,1 @@
+"""From particles to a picture and back: colour field on a grid, camera, image."""

@@ -1,0 +1,132 @@
+"""Cameras: where they stand, where they look, and what they see of the depth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cortado.errors import InputError, shown
+
+Vector = tuple[float, ...]
+
+
+def vector(name: str, values: Sequence[float] | np.ndarray, length: int = 3) -> Vector:
+    """Finite numbers as a tuple of that length, or an `InputError` that calls them ``name``."""
+    try:
+        found = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        found = np.array(np.nan)
+    if found.shape != (length,) or not np.isfinite(found).all():
+        raise InputError(f"{name} is {shown(values)}, but must be {length} finite numbers.")
+    return tuple(found.tolist())
+
+
+def positive(name: str, value: float) -> None:
+    """An `InputError` where a number is not."""
+    if not 0 < value < np.inf:
+        raise InputError(f"{name} is {shown(value)}, but must be a positive number.")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """What all cameras have. Samples along a ray stand at fixed distances between ``near`` and ``far``."""
+
+    position: Vector
+    """[m], (3,)"""
+    look_at: Vector
+    """The point in the middle of the picture [m], (3,)."""
+    up: Vector
+    """A direction that points upwards in the picture, not along the view, (3,)."""
+    resolution: tuple[int, int] = field(default=(256, 256), kw_only=True)
+    """Columns and rows; pixels are square."""
+    near: float = field(default=0.0, kw_only=True)
+    """Distance of the first sample's layer [m]."""
+    far: float | None = field(default=None, kw_only=True)
+    """Distance at which samples end [m]; by default twice that of ``look_at``."""
+
+    def __post_init__(self) -> None:
+        for name in ("position", "look_at", "up"):
+            object.__setattr__(self, name, vector(name, getattr(self, name)))
+        sight = np.subtract(self.look_at, self.position)
+        if not sight.any():
+            raise InputError(f"look_at is {shown(self.look_at)}, but must not be the position of the camera.")
+        if np.linalg.norm(np.cross(sight, self.up)) <= 1e-9 * np.linalg.norm(sight) * np.linalg.norm(self.up):
+            raise InputError(f"up is {shown(self.up)}, but must not be zero or along the view.")
+        check_resolution(self.resolution)
+        if self.far is None:
+            object.__setattr__(self, "far", 2.0 * float(np.linalg.norm(sight)))
+        if not 0 <= self.near < self.reach < np.inf:
+            raise InputError(f"near is {shown(self.near)} and far {shown(self.far)}, but must be 0 <= near < far.")
+
+    @property
+    def reach(self) -> float:
+        """``far``, which is a number once the camera is made."""
+        assert self.far is not None
+        return self.far
+
+    @property
+    def orientation(self) -> np.ndarray:
+        """A rotation (3, 3) whose columns point to the right, upwards and backwards in the picture."""
+        back = np.subtract(self.position, self.look_at)
+        back /= np.linalg.norm(back)
+        right = np.cross(self.up, back)
+        right /= np.linalg.norm(right)
+        return np.stack([right, np.cross(back, right), back], axis=1)
+
+    @property
+    def half_width(self) -> tuple[float, float]:
+        """Half of the width seen at the camera [m] and how much wider that is per depth [-]."""
+        raise NotImplementedError
+
+    def moved(self, translation: Sequence[float] | np.ndarray, rotation: Sequence[float] | np.ndarray) -> "Camera":
+        """The camera shifted by a vector (3,) [m] and turned about its own position by a rotation vector (3,) [rad].
+
+        These are the coordinates, at zero, in which the renderer gives the derivative with respect to the pose.
+        """
+        turn = Rotation.from_rotvec(vector("rotation", rotation)).as_matrix()
+        position = np.add(self.position, vector("translation", translation))
+        look_at = position + turn @ np.subtract(self.look_at, self.position)
+        return replace(self, position=tuple(position), look_at=tuple(look_at), up=tuple(turn @ self.up))
+
+
+@dataclass(frozen=True)
+class Orthographic(Camera):
+    """Parallel rays."""
+
+    width: float
+    """What the width of the picture shows [m]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive("width", self.width)
+
+    @property
+    def half_width(self) -> tuple[float, float]:
+        return 0.5 * self.width, 0.0
+
+
+@dataclass(frozen=True)
+class Perspective(Camera):
+    """Rays from one point."""
+
+    field_of_view: float
+    """The angle that the width of the picture spans [degree]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.field_of_view < 180:
+            raise InputError(f"field_of_view is {shown(self.field_of_view)}, but must be between 0 and 180 degrees.")
+
+    @property
+    def half_width(self) -> tuple[float, float]:
+        return 0.0, float(np.tan(np.radians(0.5 * self.field_of_view)))
+
+
+def check_resolution(resolution: tuple[int, int]) -> None:
+    """An `InputError` unless these are numbers of columns and rows."""
+    good = len(resolution) == 2 and all(isinstance(n, (int, np.integer)) and n > 0 for n in resolution)
+    if not good:
+        raise InputError(
+            f"resolution is {shown(resolution)}, but must be two positive whole numbers, columns and rows."
+        )

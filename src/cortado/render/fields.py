@@ -1,0 +1,115 @@
+"""The colour field of particles on a device, and the way back from it."""
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.cells import CellSort, Grid
+from cortado.errors import InputError
+from cortado.launching import sum_of
+from cortado.physics.colour_field import colour_field_kernels, ink_type, nodes_type
+from cortado.physics.surroundings import Discretisation
+from cortado.physics.tint import colours_type, tint_kernels
+from cortado.precision import Precision
+from cortado.smoothing import SmoothingKernel
+
+MOST_NODES = 2**27
+"""Of a colour field: 2 GiB in float32."""
+MOST_CELLS = 2**20
+"""Of the grid in which particles are sorted."""
+
+
+def nodes_over(lower: np.ndarray, upper: np.ndarray, cell: float, support: float, precision: Precision) -> Any:
+    """The struct of nodes of that distance [m] over a region (d,) to (d,) [m], and beyond as far as particles in it
+    are felt. In 2-D they are one layer."""
+    margin = int(np.ceil(support / cell))
+    counts = np.ceil((upper - lower) / cell * (1 - 1e-12)) + 2 * margin + 1
+    if np.prod(counts) > MOST_NODES:
+        raise InputError(
+            f"cell is {cell:g}, which makes {np.prod(counts):.1e} nodes; {MOST_NODES} at most, take a larger."
+        )
+    flat = 3 - len(lower)
+    nodes = nodes_type(precision)()
+    nodes.origin = precision.vector(*(lower - margin * cell), *[0.0] * flat)
+    nodes.cell, nodes.frequency = cell, 1.0 / cell
+    nodes.shape = wp.vec3i(*(int(n) for n in counts), *[1] * flat)
+    return nodes
+
+
+class ColourField:
+    """Gathers a fixed number of particles into a field. What `adjoint` returns is overwritten by its next call."""
+
+    def __init__(
+        self,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        cell: float,
+        smoothing: SmoothingKernel,
+        support: float,
+        volume: float,
+        particles: int,
+        phases: int,
+        precision: Precision,
+        device: Any,
+    ):
+        """Of particles in a region (d,) to (d,) [m]; arguments as those of the `Renderer`."""
+        self._particles = particles
+        self._tint = tint_kernels(precision, phases)
+        self._field = colour_field_kernels(Discretisation(smoothing, precision))
+        self._launch = partial(wp.launch, device=device, record_tape=False)
+        grid = Grid.around(lower, upper, np.zeros(len(lower)), support, MOST_CELLS)
+        self._sort = CellSort(grid, particles, precision, device)
+        self._kernel = [support, smoothing.normalisation(len(lower), support), volume]
+        zeros, mix, palette = (
+            partial(wp.zeros, device=device),
+            precision.fractions(phases),
+            colours_type(precision, phases),
+        )
+        self._x, self._x_bar, self._colour, self._colour_bar = (
+            zeros(particles, dtype=precision.vector) for _ in range(4)
+        )
+        self._fractions, self._fractions_bar = (zeros(particles, dtype=mix) for _ in range(2))
+        self._colours, self._colours_bar = zeros(1, dtype=palette), zeros(particles, dtype=palette)
+        self._sum = sum_of(palette, particles, device)
+        self.nodes = nodes_over(lower, upper, cell, support, precision)
+        """The struct that kernels see."""
+        self.values = zeros(tuple(self.nodes.shape)[::-1], dtype=ink_type(precision))
+        """(nz, ny, nx) colour times coverage, and coverage [-]."""
+
+    def gather(self, positions: wp.array, fractions: wp.array, colours: np.ndarray) -> None:
+        """Make the field of positions (n,) [m], mass fractions (n,) [-] and the colours (phases, 3) of the phases."""
+        self._sort(positions)
+        wp.copy(self._fractions, fractions)
+        self._colours.assign(colours[None])
+        self._launch(
+            self._tint.forward,
+            self._particles,
+            inputs=[self._colours, self._sort.order, positions, self._fractions],
+            outputs=[self._x, self._colour],
+        )
+        self._launch(
+            self._field.forward,
+            self.values.shape,
+            inputs=[self.nodes, self._sort.grid, *self._kernel, self._x, self._colour],
+            outputs=[self.values],
+        )
+
+    def adjoint(self, field_bar: wp.array) -> tuple[wp.array, wp.array, np.ndarray]:
+        """The derivative with respect to positions (n,), fractions (n,) and colours (phases, 3), from that with respect
+        to the field."""
+        self._launch(
+            self._field.adjoint,
+            self._particles,
+            inputs=[self.nodes, *self._kernel, self._sort.order, self._x, self._colour, field_bar],
+            outputs=[self._x_bar, self._colour_bar],
+        )
+        self._launch(
+            self._tint.adjoint,
+            self._particles,
+            inputs=[self._colours, self._fractions, self._colour_bar],
+            outputs=[self._fractions_bar, self._colours_bar],
+        )
+        colours = self._sum(self._colours_bar).numpy()[0].astype(np.float64)
+        return self._x_bar, self._fractions_bar, colours

@@ -1,0 +1,89 @@
+"""A picture of a colour field on a device, and the way back from it."""
+
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.launching import sum_of
+from cortado.physics.absorption import absorption_kernels, pose_type
+from cortado.physics.colour_field import ink_type
+from cortado.physics.rays import camera_type
+from cortado.precision import Precision
+from cortado.render.cameras import Camera
+from cortado.render.views import View
+
+SAMPLES_PER_CELL = 2
+"""Samples of a ray on one node distance."""
+
+
+def camera_struct(camera: Camera, step: float, precision: Precision) -> Any:
+    """What kernels see of a camera whose samples are so far apart [m]."""
+    struct = camera_type(precision)()
+    struct.position = precision.vector(*camera.position)
+    struct.orientation = type(struct.orientation)(*camera.orientation.ravel())
+    struct.half_width, struct.growth = camera.half_width
+    struct.columns, struct.rows = camera.resolution
+    struct.near, struct.step = camera.near, step
+    struct.samples = int(np.ceil((camera.reach - camera.near) / step))
+    return struct
+
+
+class RayMarcher:
+    """Makes pictures of one view of fields. What `adjoint` returns is overwritten by its next call."""
+
+    def __init__(self, view: View, nodes: Any, precision: Precision, device: Any):
+        """``nodes`` as `ColourField.nodes`."""
+        step = nodes.cell / SAMPLES_PER_CELL
+        self._camera, self._nodes = camera_struct(view.camera, step, precision), nodes
+        self._thickness, self._background = view.extinction * step, precision.vector(*view.background)
+        self._kernels = absorption_kernels(precision)
+        self._launch = partial(wp.launch, device=device, record_tape=False)
+        self._zeros = partial(wp.zeros, device=device)
+        self._ink, self._pose = ink_type(precision), pose_type(precision)
+        self.pixels = self._camera.rows * self._camera.columns
+        self.image, self._image_bar = (self._zeros(self.pixels, dtype=precision.vector) for _ in range(2))
+        """(pixels,) linear RGB, row by row."""
+        self._spans = self._zeros(self.pixels, dtype=wp.vec2i)
+        self._pose_bar = self._zeros(self.pixels, dtype=self._pose)
+        self._sum = sum_of(self._pose, self.pixels, device)
+
+    def march(self, field: wp.array) -> None:
+        """Make the image of a field (nz, ny, nx)."""
+        self._launch(
+            self._kernels.forward,
+            self.pixels,
+            inputs=[self._camera, self._nodes, self._thickness, self._background, field],
+            outputs=[self.image, self._spans],
+        )
+
+    def adjoint(self, image_bar: np.ndarray, field: wp.array) -> tuple[wp.array, np.ndarray]:
+        """The derivative with respect to the field and to the pose (6,), from that with respect to the image (pixels,
+        3) of the field."""
+        self._image_bar.assign(image_bar)
+        self._launch(
+            self._kernels.adjoint,
+            self.pixels,
+            inputs=[self._camera, self._nodes, self._thickness, field, self.image, self._spans, self._image_bar],
+            outputs=[self._samples_bar, self._pose_bar],
+        )
+        self._launch(
+            self._kernels.gather,
+            field.shape,
+            inputs=[self._camera, self._nodes, self._spans, self._samples_bar],
+            outputs=[self._field_bar],
+        )
+        return self._field_bar, self._sum(self._pose_bar).numpy()[0].astype(np.float64)
+
+    @cached_property
+    def _samples_bar(self) -> wp.array:
+        """(samples, pixels): the greatest array by far, made when it is first needed. No ray has more samples in the
+        field than its diagonal has room for."""
+        cells = np.linalg.norm(np.array(self._nodes.shape) + 1)
+        samples = min(int(cells * SAMPLES_PER_CELL) + 4, self._camera.samples)
+        return self._zeros((samples, self.pixels), dtype=self._ink)
+
+    @cached_property
+    def _field_bar(self) -> wp.array:
+        return self._zeros(tuple(self._nodes.shape)[::-1], dtype=self._ink)

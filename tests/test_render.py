@@ -1,0 +1,478 @@
+"""Pictures against a slow twin in NumPy, and their derivatives against central differences."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+from cortado.errors import InputError
+from cortado.precision import FLOAT32, FLOAT64, Precision
+from cortado.render.cameras import Camera, Orthographic, Perspective
+from cortado.render.renderer import RenderAdjoint, Renderer
+from cortado.render.views import TopView, View, Volume
+from cortado.smoothing import CUBIC_SPLINE, KERNELS, WENDLAND_C2, SmoothingKernel
+
+SPACING, SUPPORT, N, PHASES = 0.1, 0.2, 200, 3
+LOWER, UPPER = np.array([-0.31, 0.02, -0.23]), np.array([0.3, 0.47, 0.27])
+RESOLUTION = (24, 20)
+MIDDLE = (0.01, 0.25, 0.03)
+OUTSIDE, INSIDE = (0.4, 0.9, 1.1), (0.11, 0.21, 0.13)
+
+VIEWS: dict[str, View] = {
+    "top": TopView(tuple(LOWER), tuple(UPPER), SPACING, RESOLUTION, background=(0.2, 0.9, 0.4)),
+    "parallel": Volume(Orthographic(OUTSIDE, MIDDLE, (0.1, 1, 0), 0.8, resolution=RESOLUTION), 9.0, (0.2, 0.9, 0.4)),
+    "perspective": Volume(Perspective(OUTSIDE, MIDDLE, (0.1, 1, 0), 40.0, resolution=RESOLUTION), 9.0),
+    "within": Volume(Perspective(INSIDE, MIDDLE, (0, 1, 0), 100.0, resolution=RESOLUTION, far=0.6), 9.0),
+}
+views = pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS.keys())
+
+
+def renderer(view: View, **changed: Any) -> Renderer:
+    """Of the scene above, unless something is ``changed``."""
+    given = {"lower": LOWER, "upper": UPPER, "smoothing": CUBIC_SPLINE, "support": SUPPORT, "volume": SPACING**3}
+    given |= {"particles": N, "phases": PHASES, "precision": FLOAT64, "device": "cpu"}
+    return Renderer(view, **(given | changed))
+
+
+def scene(dimension: int = 3, n: int = N, phases: int = PHASES) -> dict[str, np.ndarray]:
+    """Random positions, fractions and colours."""
+    random = np.random.default_rng(3)
+    positions = random.uniform(LOWER, UPPER, (n, 3))
+    positions[:, dimension:] = 0.0
+    return {
+        "positions": positions,
+        "fractions": random.dirichlet(np.full(phases, 0.3), n),
+        "colours": random.uniform(0.0, 1.0, (phases, 3)),
+    }
+
+
+def picture(made: Renderer, values: dict[str, np.ndarray], precision: Precision = FLOAT64, device: Any = "cpu"):
+    phases = len(values["colours"])
+    x = wp.array(values["positions"], dtype=precision.vector, device=device)
+    c = wp.array(values["fractions"], dtype=precision.fractions(phases), device=device)
+    return made.render(x, c, values["colours"])
+
+
+def weights(made: Renderer) -> np.ndarray:
+    """The derivative of a random linear function of the picture."""
+    return np.random.default_rng(5).standard_normal(made.shape)
+
+
+def gradient(adjoint: RenderAdjoint) -> dict[str, np.ndarray]:
+    return {
+        name: value.numpy().astype(float) if isinstance(value, wp.array) else value
+        for name, value in vars(adjoint).items()
+    }
+
+
+def twin_field(nodes, values, smoothing: SmoothingKernel, dimension: int) -> np.ndarray:
+    """(nx, ny, nz, 4): the colour times the coverage, and the coverage."""
+    r = np.linalg.norm(nodes[..., None, :] - values["positions"], axis=-1)
+    w = SPACING**dimension * smoothing.weight(r, dimension, SUPPORT)
+    return w @ np.column_stack([values["fractions"] @ values["colours"], np.ones(len(values["positions"]))])
+
+
+def twin_rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays start and where they go, both (rows, columns, 3)."""
+    columns, rows = camera.resolution
+    ahead = np.subtract(camera.look_at, camera.position)
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, camera.up)
+    right /= np.linalg.norm(right)
+    up = np.cross(right, ahead)
+    u = (np.arange(columns) + 0.5) / columns - 0.5
+    v = (0.5 - (np.arange(rows) + 0.5) / rows) * rows / columns
+    offset = u[None, :, None] * right + v[:, None, None] * up
+    start, way = np.broadcast_to(camera.position, offset.shape), np.broadcast_to(ahead, offset.shape)
+    if isinstance(camera, Orthographic):
+        return start + camera.width * offset, way
+    assert isinstance(camera, Perspective)
+    way = way + 2 * np.tan(np.radians(camera.field_of_view / 2)) * offset
+    return start, way / np.linalg.norm(way, axis=-1, keepdims=True)
+
+
+def twin_samples(camera: Camera, step: float) -> np.ndarray:
+    """Where the samples are (samples, rows, columns, 3)."""
+    start, way = twin_rays(camera)
+    t = camera.near + (np.arange(np.ceil((camera.far - camera.near) / step)) + 0.5) * step
+    return start + t[:, None, None, None] * way
+
+
+def corners(x: np.ndarray, nodes: np.ndarray, cell: float):
+    """For each of the eight nodes around points (..., 3): its index where there is such a node, and its share."""
+    s = (x - nodes[0, 0, 0]) / cell
+    base = np.floor(s).astype(int)
+    for corner in np.ndindex(2, 2, 2):
+        share = np.prod(np.where(corner, s - base, 1 - s + base), axis=-1)
+        index = base + corner
+        there = ((index >= 0) & (index < nodes.shape[:3])).all(axis=-1)
+        yield np.where(there[..., None], index, 0), np.where(there, share, 0.0)
+
+
+def twin_picture(view: View, nodes: np.ndarray, field: np.ndarray, cell: float) -> np.ndarray:
+    """Sample by sample from the back, the other way round."""
+    inks = sum(
+        share[..., None] * field[tuple(np.moveaxis(index, -1, 0))]
+        for index, share in corners(twin_samples(view.camera, cell / 2), nodes, cell)
+    )
+    image = np.zeros(inks.shape[1:3] + (3,)) + view.background
+    for ink in inks[::-1]:
+        u = view.extinction * cell / 2 * ink[..., 3:]
+        opacity = -np.expm1(-u)
+        colour = np.divide(ink[..., :3], ink[..., 3:], out=np.zeros_like(ink[..., :3]), where=ink[..., 3:] > 0)
+        image = image * (1 - opacity) + opacity * colour
+    return image
+
+
+@pytest.mark.parametrize("smoothing", KERNELS.values(), ids=KERNELS.keys())
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_field_is_its_definition(dimension, smoothing):
+    values = scene(dimension)
+    made = renderer(
+        VIEWS["top"],
+        lower=LOWER[:dimension],
+        upper=UPPER[:dimension],
+        volume=SPACING**dimension,
+        dimension=dimension,
+        smoothing=smoothing,
+    )
+    picture(made, values)
+    coverage, colour = made.field()
+    nodes = made.nodes()
+    assert coverage.shape[2] == 1 if dimension == 2 else coverage.shape[2] > 5
+    wanted = twin_field(nodes, values, smoothing, dimension)
+    np.testing.assert_allclose(coverage, wanted[..., 3], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(colour, wanted[..., :3], rtol=0, atol=1e-14)
+    assert coverage.max() > 0.8
+    for axis in range(dimension):
+        assert not coverage.take([0, -1], axis).any(), "the field does not end within the grid"
+
+
+def test_coverage_is_one_within_filled_fluid():
+    lattice = np.stack(np.meshgrid(*[np.arange(6) * SPACING] * 3, indexing="ij"), -1).reshape(-1, 3)
+    made = renderer(VIEWS["top"], lower=[0] * 3, upper=[0.5] * 3, particles=216, phases=1)
+    picture(made, {"positions": lattice, "fractions": np.ones((216, 1)), "colours": np.ones((1, 3))})
+    inner = ((made.nodes() > 0.15) & (made.nodes() < 0.35)).all(axis=-1)
+    assert inner.any()
+    np.testing.assert_allclose(made.field()[0][inner], 1.0, atol=0.03)
+
+
+@views
+def test_the_picture_is_its_definition(view):
+    values, made = scene(), renderer(view)
+    found, nodes = picture(made, values), made.nodes()
+    wanted = twin_picture(view, nodes, twin_field(nodes, values, CUBIC_SPLINE, 3), SUPPORT / 2)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-13)
+    assert np.ptp(found, axis=(0, 1)).min() > 0.01, "there is too little to see"
+
+
+def test_the_plane_as_a_picture():
+    """In 2-D one looks at a sheet, x to the right and y upwards."""
+    view = TopView(tuple(LOWER[:2]), tuple(UPPER[:2]), SPACING, RESOLUTION, up_axis=2)
+    values = scene(2, n=1, phases=1)
+    values["positions"][:] = [0.2, 0.4, 0.0]
+    made = renderer(view, lower=LOWER[:2], upper=UPPER[:2], dimension=2, particles=1, phases=1, volume=SPACING**2)
+    found, nodes = picture(made, values), made.nodes()
+    wanted = twin_picture(view, nodes, twin_field(nodes, values, CUBIC_SPLINE, 2), SUPPORT / 2)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-13)
+    row, column = centre(found)
+    assert row < 8 and column > 16
+
+
+def centre(image: np.ndarray, background: float = 1.0) -> np.ndarray:
+    """Row and column of the middle of what differs from the background."""
+    seen = np.abs(image - background).sum(axis=-1)
+    return np.array([(index * seen).sum() for index in np.indices(seen.shape)]) / seen.sum()
+
+
+@pytest.mark.parametrize(
+    ("up_axis", "towards_right", "towards_bottom"), [(0, (1, 1), (2, -1)), (1, (0, 1), (2, 1)), (2, (0, 1), (1, -1))]
+)
+def test_what_is_where_from_above(up_axis, towards_right, towards_bottom):
+    lower, upper = np.zeros(3), np.ones(3)
+    made = renderer(
+        TopView(tuple(lower), tuple(upper), SPACING, up_axis=up_axis, resolution=(20, 20)),
+        lower=lower,
+        upper=upper,
+        particles=1,
+        phases=1,
+    )
+
+    def seen(x: np.ndarray) -> np.ndarray:
+        return centre(picture(made, {"positions": x[None], "fractions": np.ones((1, 1)), "colours": np.zeros((1, 3))}))
+
+    middle = np.full(3, 0.5)
+    np.testing.assert_allclose(seen(middle), 9.5, atol=1e-3)
+    for (axis, sign), moved in ((towards_right, (0, 4)), (towards_bottom, (4, 0))):
+        np.testing.assert_allclose(seen(middle + 0.2 * sign * np.eye(3)[axis]), np.add(9.5, moved), atol=0.1)
+
+
+def test_the_upper_fluid_hides_the_lower():
+    made = renderer(VIEWS["top"], particles=2, phases=2)
+    x = np.array([[0.0, 0.4, 0.0], [0.0, 0.1, 0.0]])
+    image = picture(made, {"positions": x, "fractions": np.eye(2), "colours": np.eye(3)[:2]})
+    assert image[10, 12, 0] > image[10, 12, 1]
+
+
+def directions(values: dict[str, np.ndarray], dimension: int = 3) -> dict[str, np.ndarray]:
+    random = np.random.default_rng(7)
+    found = {name: random.standard_normal(value.shape) for name, value in values.items()}
+    found["positions"][:, dimension:] = 0.0
+    return found | {"translation": random.standard_normal(3), "rotation": random.standard_normal(3)}
+
+
+def moved(view: View, translation: np.ndarray, rotation: np.ndarray) -> Volume:
+    return Volume(view.camera.moved(translation, rotation), view.extinction, view.background)
+
+
+def check_gradient(view: View, values: dict[str, np.ndarray], names: list[str], **changed: Any):
+    made = renderer(view, **changed)
+    picture(made, values)
+    bar = weights(made)
+    found, along = gradient(made.adjoint(bar)), directions(values, changed.get("dimension", 3))
+
+    def function(name: str, h: float) -> float:
+        pose = {key: h * (key == name) * along[key] for key in ("translation", "rotation")}
+        there = {key: value + h * (key == name) * along[key] for key, value in values.items()}
+        seen = renderer(moved(view, **pose), **changed) if name in pose else made
+        return float((bar * picture(seen, there)).sum())
+
+    for name in names:
+        wanted = float((found[name] * along[name]).sum())
+        misses = [
+            abs((function(name, h) - function(name, -h)) / (2 * h) - wanted) for h in 10.0 ** -np.arange(4.0, 7.6, 0.5)
+        ]
+        assert min(misses) < 1e-6 * abs(wanted) and wanted != 0.0, f"{name}: {min(misses) / abs(wanted):.1e}"
+
+
+EVERYTHING = ["positions", "fractions", "colours", "translation", "rotation"]
+
+
+@views
+@pytest.mark.parametrize("name", EVERYTHING)
+def test_gradient_is_the_limit_of_central_differences(view, name):
+    check_gradient(view, scene(), [name])
+
+
+def test_gradient_in_the_plane():
+    view = TopView(tuple(LOWER[:2]), tuple(UPPER[:2]), SPACING, RESOLUTION, up_axis=2)
+    plane = {"dimension": 2, "lower": LOWER[:2], "upper": UPPER[:2], "volume": SPACING**2}
+    check_gradient(view, scene(2, phases=1), EVERYTHING, **plane, phases=1, smoothing=WENDLAND_C2)
+
+
+def test_gradient_particle_by_particle():
+    """A wrong one among many would not hide here; one of them is outside, where the grid ends."""
+    view = replace(VIEWS["perspective"], camera=replace(VIEWS["perspective"].camera, field_of_view=70.0))
+    values, made = scene(n=3), renderer(view, particles=3)
+    values["positions"][0] = [UPPER[0] + 0.15, 0.2, 0.1]
+    picture(made, values)
+    assert made.field()[0][-1].any()
+    found = gradient(made.adjoint(weights(made)))
+    for name in ("positions", "fractions"):
+        for index in np.ndindex(values[name].shape):
+            h, sides = 1e-6, []
+            for sign in (1, -1):
+                there = values[name].copy()
+                there[index] += sign * h
+                sides.append((weights(made) * picture(made, values | {name: there})).sum())
+            scale = np.abs(found[name]).max()
+            assert abs((sides[0] - sides[1]) / (2 * h) - found[name][index]) < 1e-7 * scale, (name, index)
+
+
+@views
+def test_nodes_gather_what_samples_would_scatter(view):
+    """Nothing is missed on the way from the screen, from wherever one looks, and nothing counts twice."""
+    made = renderer(view)
+    picture(made, scene())
+    made.adjoint(weights(made))
+    rays, nodes, cell = made._rays, made.nodes(), SUPPORT / 2
+    samples_bar, spans = rays._samples_bar.numpy(), rays._spans.numpy()
+    columns, rows = view.camera.resolution
+    x = twin_samples(view.camera, cell / 2).reshape(-1, rows * columns, 3)
+    wanted, landed = np.zeros((*nodes.shape[:3], 4)), 0.0
+    for pixel, (first, last) in enumerate(spans):
+        for index, share in corners(x[first:last, pixel], nodes, cell):
+            np.add.at(wanted, tuple(index.T), share[:, None] * samples_bar[: last - first, pixel])
+            landed += share.sum()
+    found = rays._field_bar.numpy().transpose(2, 1, 0, 3)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-13 * np.abs(wanted).max())
+    everywhere = sum(share.sum() for _, share in corners(x, nodes, cell))
+    assert landed == pytest.approx(everywhere, rel=1e-12), "a sample in the field lies in no span"
+
+
+@views
+def test_one_colour_gives_that_colour(view):
+    values, colour = scene(), np.array([0.3, 0.7, 0.1])
+    values["colours"][:] = colour
+    given = replace(view, background=tuple(colour))
+    image = picture(renderer(given), values)
+    np.testing.assert_allclose(image, np.broadcast_to(colour, image.shape), rtol=0, atol=1e-14)
+
+
+def test_opaque_fluid_hides_the_background():
+    values, colour = scene(), np.array([0.3, 0.7, 0.1])
+    values["colours"][:] = colour
+    image = picture(renderer(replace(VIEWS["parallel"], extinction=1e4)), values)
+    np.testing.assert_allclose(image[10, 12], colour, rtol=0, atol=1e-12)
+
+
+def test_pictures_converge_with_the_grid():
+    """To second order: nodes and samples are refined together."""
+    values = scene(n=30)
+    camera = Orthographic(OUTSIDE, MIDDLE, (0.1, 1, 0), 0.8, resolution=(12, 10))
+    images = [picture(renderer(Volume(camera, 9.0), particles=30, cell=SUPPORT / n), values) for n in (4, 8, 16)]
+    coarse, fine = (np.linalg.norm(images[k] - images[k + 1]) for k in range(2))
+    assert 1.7 < np.log2(coarse / fine) < 2.5
+    assert fine < 0.01 * np.linalg.norm(1.0 - images[2])
+
+
+@views
+def test_empty_space(view):
+    """Nothing is seen where nothing is, and nothing pulls."""
+    values = scene(n=1)
+    values["positions"][:] = [5.0, 5.0, 5.0]
+    made = renderer(view, particles=1)
+    np.testing.assert_array_equal(picture(made, values), np.broadcast_to(view.background, made.shape))
+    assert all(not value.any() for value in gradient(made.adjoint(weights(made))).values())
+
+
+@views
+def test_a_single_particle_moves_without_a_step(view):
+    """Through nodes, faces of cells and out at the end of the grid; there is no step, and nothing is not a number."""
+    values, made = scene(n=1), renderer(view, particles=1)
+    corner = made.nodes()[3, 3, 3]
+    for x in (corner, corner + [0.5 * SUPPORT, 0.0, 0.0], LOWER, UPPER + 0.5 * SUPPORT):
+        sides = []
+        for sign in (1, 0, -1):
+            image = picture(made, values | {"positions": x[None] + sign * 1e-9})
+            pulls = gradient(made.adjoint(weights(made)))
+            assert np.isfinite(image).all() and all(np.isfinite(value).all() for value in pulls.values())
+            sides.append((image, pulls["positions"]))
+        (ahead, pull_ahead), (there, _), (behind, pull_behind) = sides
+        assert np.abs(ahead - there).max() < 1e-6 and np.abs(there - behind).max() < 1e-6
+        assert np.abs(pull_ahead - pull_behind).max() < 1e-5 * (1 + np.abs(pull_ahead).max())
+
+
+def test_thin_and_thick_samples_meet():
+    """The series of E(u) and its formula: as the extinction passes u = 0.1 neither the picture nor a pull steps."""
+    values = {"positions": np.array([MIDDLE]), "fractions": np.ones((1, 1)), "colours": np.full((1, 3), 0.5)}
+    view = VIEWS["parallel"]
+    made = renderer(view, particles=1, phases=1)
+    picture(made, values)
+    limit = 0.1 / (made.field()[0].max() * SUPPORT / 4)
+    found = []
+    for factor in np.linspace(0.9, 2.0, 23):
+        thick = renderer(replace(view, extinction=factor * limit), particles=1, phases=1)
+        image = picture(thick, values)
+        pull = thick.adjoint(weights(thick)).positions.numpy()[0]
+        found.append([*image[10, 12], *(pull / np.abs(pull).max())])
+    assert np.abs(np.diff(found, n=4, axis=0)).max() < 1e-4
+
+
+@views
+def test_same_bits_twice(view):
+    def bits() -> list[bytes]:
+        made = renderer(view)
+        image = picture(made, scene())
+        return [image.tobytes(), *(value.tobytes() for value in gradient(made.adjoint(weights(made))).values())]
+
+    assert bits() == bits()
+
+
+@views
+def test_single_precision(view):
+    values = scene()
+    made, single = renderer(view), renderer(view, precision=FLOAT32)
+    np.testing.assert_allclose(picture(single, values, FLOAT32), picture(made, values), rtol=0, atol=1e-5)
+    wanted = gradient(made.adjoint(weights(made)))
+    for name, found in gradient(single.adjoint(weights(made))).items():
+        assert np.linalg.norm(found - wanted[name]) < 1e-4 * np.linalg.norm(wanted[name]), name
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
+@views
+def test_the_gpu_agrees(view):
+    values = scene()
+    made, other = renderer(view), renderer(view, device="cuda:0")
+    np.testing.assert_allclose(picture(other, values, device="cuda:0"), picture(made, values), rtol=0, atol=1e-12)
+    wanted = gradient(made.adjoint(weights(made)))
+    for name, found in gradient(other.adjoint(weights(made))).items():
+        assert np.linalg.norm(found - wanted[name]) < 1e-10 * np.linalg.norm(wanted[name]), name
+
+
+def test_a_renderer_keeps_what_the_way_back_needs():
+    """What happens to the given arrays after `render` does not matter."""
+    made, values = renderer(VIEWS["top"]), scene()
+    x = wp.array(values["positions"], dtype=wp.vec3d, device="cpu")
+    c = wp.array(values["fractions"], dtype=FLOAT64.fractions(PHASES), device="cpu")
+    made.render(x, c, values["colours"])
+    wanted = gradient(made.adjoint(weights(made)))
+    x.zero_()
+    c.zero_()
+    for name, found in gradient(made.adjoint(weights(made))).items():
+        np.testing.assert_array_equal(found, wanted[name])
+
+
+def test_cameras_move():
+    camera = VIEWS["perspective"].camera
+    turned = camera.moved([1, 2, 3], [0, 0, np.pi / 2])
+    np.testing.assert_allclose(turned.position, np.add(camera.position, [1, 2, 3]))
+    x, y, z = camera.orientation
+    np.testing.assert_allclose(turned.orientation, [-y, x, z], atol=1e-15)
+    assert (turned.near, turned.far, turned.resolution) == (camera.near, camera.far, camera.resolution)
+    assert np.linalg.det(camera.orientation) == pytest.approx(1.0)
+
+
+def camera(**changed: Any) -> Perspective:
+    return Perspective(
+        **{"position": (0, 1, 0), "look_at": (0, 0, 0), "up": (0, 0, 1), "field_of_view": 40.0} | changed
+    )
+
+
+def top(**changed: Any) -> TopView:
+    return TopView(**{"lower": (0, 0, 0), "upper": (1, 1, 1), "spacing": 0.1} | changed)
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: camera(look_at=(0, 1, 0)), "look_at is .* must not be the position"),
+        (lambda: camera(up=(0, 2, 0)), "up is .* along the view"),
+        (lambda: camera(position=(0, 1)), "position is .* must be 3 finite numbers"),
+        (lambda: camera(position=(0, np.nan, 0)), "position is .* must be 3 finite numbers"),
+        (lambda: camera(position="here"), "position is 'here'"),
+        (lambda: camera(field_of_view=180.0), "field_of_view is 180.0, but must be between 0 and 180"),
+        (lambda: camera(resolution=(0, 4)), "resolution is .* positive whole numbers"),
+        (lambda: camera(resolution=(3, 4.5)), "resolution is .* positive whole numbers"),
+        (lambda: camera(near=2.0, far=1.0), "near is 2.0 and far 1.0"),
+        (lambda: Orthographic((0, 1, 0), (0, 0, 0), (0, 0, 1), 0.0), "width is 0.0"),
+        (lambda: Volume(camera(), -1.0), "extinction is -1.0, but must be a positive number"),
+        (lambda: Volume(camera(), 1.0, (0, 1)), "background is .* 3 finite numbers"),
+        (lambda: top(up_axis=3), "up_axis is 3, but must be 0, 1 or 2"),
+        (lambda: top(spacing=0.0), "spacing is 0.0"),
+        (lambda: top(upper=(0, 1, 1)), "upper is .* must be above lower"),
+        (lambda: top(resolution=(1,)), "resolution is"),
+        (lambda: renderer(top(), support=0.0), "support is 0.0"),
+        (lambda: renderer(top(), particles=0), "particles is 0, but must be at least 1"),
+        (lambda: renderer(top(), lower=[0, 0]), "lower is .* 3 finite numbers"),
+        (lambda: renderer(top(), lower=[1, 1, 1]), "upper is .* must not be below lower"),
+        (lambda: renderer(top(), cell=1e-5), "cell is 1e-05, which makes .* nodes"),
+        (lambda: renderer(top()).adjoint(np.zeros((256, 256, 3))), "call render before"),
+        (lambda: picture(renderer(top()), scene(n=4)), r"positions is vec3d of shape \(4,\), but"),
+        (lambda: picture(renderer(top()), scene(phases=2)), "fractions is"),
+        (lambda: picture(renderer(top()), scene(), FLOAT32), "positions is vec3f"),
+        (lambda: picture(renderer(top()), scene() | {"colours": np.zeros((3, 4))}), "colours has shape"),
+    ],
+)
+def test_wrong_input_is_a_sentence(make, sentence):
+    with pytest.raises(InputError, match=sentence):
+        make()
+
+
+def test_the_derivative_has_the_shape_of_the_picture():
+    made = renderer(VIEWS["top"])
+    picture(made, scene())
+    with pytest.raises(InputError, match="image_bar has shape"):
+        made.adjoint(np.zeros((3, 3, 3)))
