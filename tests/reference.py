@@ -28,6 +28,17 @@ def slope(name, q):
     return -20 * t**3 if name == "wendland_c2" else -56 / 3 * (1 + 5 * q) * t**5
 
 
+def blend(c, rest_density, viscosity):
+    """Rest densities and viscosities (n,) of particles with mass fractions c (n, phases)."""
+    return 1 / (c / rest_density).sum(1), (c * viscosity).sum(1)
+
+
+def harmonic(a):
+    """(n, n) harmonic means of all pairs; 0 between two zeros."""
+    total = a[:, None] + a[None, :]
+    return 2 * a[:, None] * a[None, :] / np.where(total == 0, 1, total)
+
+
 class Pcisph:
     """One step of corrections-to-the-letter PCISPH over all pairs, float64 or complex128."""
 
@@ -39,6 +50,7 @@ class Pcisph:
         self.viscosity_form = options.get("viscosity", "pairwise")
         self.friction = options.get("friction", 0.0)
         self.reach, self.rigidity, self.push = options["reach"], options["rigidity"], options["push"]
+        self.evenness = options.get("evenness", 1.0)
 
     def _pairs(self, x, y):
         s = x[:, None, :] - y[None, :, :]
@@ -52,50 +64,59 @@ class Pcisph:
         s, q = self._pairs(x, y)
         return (self.sigma / self.h**2 * slope(self.name, q))[..., None] * s
 
-    def density_sum(self, x, near, near_walls):
-        fluid = (self.weight(x, x) * near).sum(1)
-        return fluid + (self.weight(x, self.walls) * near_walls * self.wall_weights).sum(1)
+    def near(self, x):
+        """Which fluid and which wall particles the lists of x hold."""
+        fluid = (np.abs(self._pairs(x.real, x.real)[1]) * self.h < self.reach) | np.eye(len(x), dtype=bool)
+        return fluid, self._pairs(x.real, self.walls)[1] * self.h < self.reach
 
-    def step(self, x, v, gravity, rest_density, viscosity, time_step, iterations):
+    def wall_density(self, x, near_walls):
+        """What walls add to the density (n,) of particles [1 / m^d]."""
+        return (self.weight(x, self.walls) * near_walls * self.wall_weights).sum(1)
+
+    def density(self, x, near, near_walls):
+        """Particles to the volume (n,) [1 / m^d]."""
+        return (self.weight(x, x) * near).sum(1) + self.wall_density(x, near_walls)
+
+    def step(self, x, v, gravity, mass, rest_density, viscosity, time_step, iterations):
+        """``mass`` [kg], ``rest_density`` and ``viscosity`` (n,) each."""
         n = len(x)
-        near = (np.abs(self._pairs(x.real, x.real)[1]) * self.h < self.reach) | np.eye(n, dtype=bool)
-        near_walls = self._pairs(x.real, self.walls)[1] * self.h < self.reach
-        mass = rest_density * self.volume
-        rho = mass * self.density_sum(x, near, near_walls)
+        near, near_walls = self.near(x)
+        sigma = self.density(x, near, near_walls)
         g, g_walls = self.gradient(x, x), self.gradient(x, self.walls)
-        acceleration = gravity + self.viscous(x, v, rho, g, g_walls, mass, viscosity)
+        acceleration = gravity + self.viscous(x, v, sigma, g, g_walls, mass, viscosity)
         p, push = np.zeros(n, dtype=x.dtype), np.zeros_like(x)
         pull = (self.wall_weights[None, :, None] * near_walls[..., None] * g_walls).sum(1)
         delta = self.stiffness / time_step**2 / (1 + (pull * pull).sum(1) / self.rigidity)
         for _ in range(iterations):
             v_star = v + time_step * (acceleration + push)
             x_star = x + time_step * v_star
-            rho_star = mass * self.density_sum(x_star, near, near_walls)
-            p = p + delta * (rho_star - rest_density)
+            p = p + delta * (mass * self.density(x_star, near, near_walls) - rest_density)
             p = np.where(p.real > 0, p, 0)
-            c = p / rho**2
-            push = -mass * ((c[:, None] + c[None, :])[..., None] * g).sum(1)
-            push = push - mass * self.push * (c[:, None, None] * self.wall_weights[None, :, None] * g_walls).sum(1)
+            c = p / sigma**2
+            force = -((c[:, None] + c[None, :])[..., None] * g).sum(1)
+            force = force - self.push * (c[:, None, None] * self.wall_weights[None, :, None] * g_walls).sum(1)
+            push = force / mass[:, None]
         v_new = v + time_step * (acceleration + push)
         return x + time_step * v_new, v_new
 
-    def viscous(self, x, v, rho, g, g_walls, mass, viscosity):
+    def viscous(self, x, v, sigma, g, g_walls, mass, viscosity):
         if self.viscosity_form == "none":
             return np.zeros_like(x)
         kappa = 2 * (self.d + 2) if self.viscosity_form == "pairwise" else 2
-        fluid = (mass / rho)[None, :, None] * self.phi(x, x, v[:, None] - v[None, :], g)
+        fluid = (harmonic(viscosity) / sigma[None, :])[..., None] * self.phi(x, x, v[:, None] - v[None, :], g)
         total = fluid.sum(1)
         if self.friction:
             walls = self.phi(x, self.walls, np.broadcast_to(v[:, None], g_walls.shape), g_walls)
-            total = total + self.friction * self.volume * (self.wall_weights[None, :, None] * walls).sum(1)
-        return kappa * viscosity / rho[:, None] * total
+            weights = self.friction * self.volume * viscosity[:, None, None] * self.wall_weights[None, :, None]
+            total = total + (weights * walls).sum(1)
+        return kappa / (mass * sigma)[:, None] * total
 
     def phi(self, x, y, v, g):
         s = x[:, None, :] - y[None, :, :]
         size = (s * s).sum(-1) + 0.01 * self.h**2
         if self.viscosity_form == "pairwise":
             return ((v * s).sum(-1) / size)[..., None] * g
-        return ((s * g).sum(-1) / size)[..., None] * v
+        return (self.evenness * (s * g).sum(-1) / size)[..., None] * v
 
 
 def complex_step(function, values, directions):

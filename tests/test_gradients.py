@@ -28,16 +28,9 @@ def problem_of(made, steps):
 def point_and_direction(problem, what, seed=0):
     simulation, random = problem.simulation, np.random.default_rng(seed)
     name = what.removesuffix(" over time")
-    gravity = np.array(simulation.scene.forces.gravity)
-    point = {
-        "gravity": gravity,
-        "gravity over time": np.tile(gravity, (problem.steps, 1)),
-        "initial_positions": simulation.positions,
-        "initial_velocities": simulation.velocities,
-        "viscosity": np.array(simulation.phase.viscosity),
-        "rest_density": np.array(simulation.phase.rest_density),
-        "time_step": np.array(simulation.scene.solver.time_step),
-    }[what]
+    point = simulation.parameters()[name]
+    if what != name:
+        point = np.tile(point, (problem.steps, 1))
     direction = random.standard_normal(point.shape)
     return name, point, SCALES[what] * direction / np.linalg.norm(direction)
 
@@ -100,7 +93,9 @@ def test_gather_adjoint_equals_warps_tape(made):
     taped_loss, taped = problem.value_and_gradient(point, policies.Tape())
     assert loss == taped_loss
     for name, gradient in gathered.items():
-        assert np.linalg.norm(gradient - taped[name]) <= 1e-9 * np.linalg.norm(gradient), name
+        # One fluid hardly feels its density: there what a change of its size does to the loss is below round-off.
+        floor = np.finfo(np.float64).eps * loss / SCALES[name]
+        assert np.linalg.norm(gradient - taped[name]) <= max(1e-9 * np.linalg.norm(gradient), floor), name
 
 
 def disturbed(positions):
@@ -126,8 +121,8 @@ def test_all_parameters_at_once(made):
 
 
 def test_checkpoints_under_a_budget_give_the_same_bits():
-    problem, frugal = problem_of(splash(), 50), problem_of(splash(), 50)
-    frugal._rollout = type(frugal._rollout)(frugal.simulation.solver, 50, memory_budget=7 * 48 * 125)
+    problem = problem_of(splash(), 50)
+    frugal = Problem(problem.simulation, 50, problem.loss, memory_budget=7 * 56 * 125)
     point = {"gravity": np.array([0.0, -9.81, 0.0]), "initial_positions": problem.simulation.positions}
     for (_, wanted), (_, found) in [(problem.value_and_gradient(point), frugal.value_and_gradient(point))]:
         for name, gradient in wanted.items():

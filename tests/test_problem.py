@@ -71,8 +71,8 @@ def test_an_adjoint_that_a_loss_keeps_is_not_changed(simulation):
 
         def adjoint(self, end):
             if self.kept is None:
-                self.kept = State.zeros(125, end.precision, end.state.positions.device)
-                self.kept.set(np.tile([0.0, 1.0, 0.0], (125, 1)), np.zeros((125, 3)))
+                self.kept = State.zeros(125, 1, end.precision, end.state.positions.device)
+                self.kept.set(np.tile([0.0, 1.0, 0.0], (125, 1)), np.zeros((125, 3)), np.zeros((125, 1)))
             return self.kept
 
     problem = Problem(simulation, 20, Height())
@@ -125,7 +125,8 @@ MISTAKES = {
     "policy by name": lambda p: p.value_and_gradient(GRAVITY, policy="exact"),
     "policy class": lambda p: p.value_and_gradient(GRAVITY, policy=policies.Exact),
     "loss is an array": lambda p: Problem(p.simulation, 10, np.zeros((125, 3))),
-    "steps 0": lambda p: Problem(p.simulation, 0, p.loss),
+    "steps 0 of a run": lambda p: p.simulation.run(0),
+    "steps -1": lambda p: Problem(p.simulation, -1, p.loss),
     "steps 1.5": lambda p: Problem(p.simulation, 1.5, p.loss),
     "steps None": lambda p: Problem(p.simulation, None, p.loss),
     "simulation is a file": lambda p: Problem("scene.toml", 10, p.loss),

@@ -1,27 +1,44 @@
-"""Whole steps of the engine against the slow twin, and their tangents against complex steps."""
+"""Whole steps of the engine against the slow twins, and their tangents and adjoints against complex steps."""
 
 import numpy as np
 import pytest
 
 import reference
+import reference_mixture
 from cortado import Simulation
-from cortado.particles import Parameters, State
+from cortado.controls import Controls
+from cortado.policies import Exact
 from cortado.smoothing import KERNELS
-from scenes import plane, scene
+from scenes import plane, plane_of_three, scene, splash_of_two
 
-GRAVITY, DENSITY, VISCOSITY, TIME_STEP, STEPS = np.array([0.3, -9.81, 0.1]), 1000.0, 5.0, 0.0021, 3
+GRAVITY, STEPS, ITERATIONS = np.array([0.3, -9.81, 0.1]), 3, 5
+ONE = {"rest_density": 1000.0, "viscosity": 5.0, "time_step": 0.0021}
+"""Parameters of the fluids."""
+SEVERAL = {"rest_density": [1000.0, 1800.0, 1300.0], "viscosity": [5.0, 0.4, 20.0], "time_step": 0.0021}
+RATES = {"rest_density": 10.0, "viscosity": 0.3, "time_step": 1e-4, "mobility": 0.01, "interface_width": 0.003}
+"""Sizes of directions; 1 for the others."""
 
 
-def disturbed(simulation, seed=0):
-    """A random state near the scene's own, so that no symmetry hides a mistake."""
+def point_of(simulation, seed=0):
+    """Values of all parameters: a random state near the scene's own, so that no symmetry hides a mistake."""
     random = np.random.default_rng(seed)
-    spacing = simulation.scene.discretisation.spacing
-    positions = simulation.positions + 0.05 * spacing * random.standard_normal(simulation.positions.shape)
-    return positions, 0.3 * random.standard_normal(positions.shape)
+    spacing, phases = simulation.scene.discretisation.spacing, len(simulation.scene.phase)
+    shape = simulation.positions.shape
+    point = {
+        "gravity": GRAVITY[: simulation.dimension],
+        "initial_positions": simulation.positions + 0.05 * spacing * random.standard_normal(shape),
+        "initial_velocities": 0.3 * random.standard_normal(shape),
+        **(ONE if phases == 1 else SEVERAL),
+    }
+    if phases > 1:
+        point |= {name: simulation.parameters()[name] for name in ("mobility", "interface_width")}
+        point |= {name: point[name][:phases] for name in ("rest_density", "viscosity")}
+        point["mass_fractions"] = random.dirichlet(np.full(phases, 0.5), len(simulation.positions))
+    return {name: np.asarray(value, dtype=np.float64) for name, value in point.items()}
 
 
-def twin(simulation, viscosity):
-    """The slow twin of a simulation, in the simulation's own dimension."""
+def twin(simulation):
+    """The slow twin of a simulation's solver, in the simulation's own dimension."""
     lattice, search, d = simulation.solver.lattice, simulation.solver.search, simulation.dimension
     terms = [term for term in simulation.solver.terms if hasattr(term, "_friction")]
     return reference.Pcisph(
@@ -32,12 +49,46 @@ def twin(simulation, viscosity):
         lattice.stiffness,
         search.wall_positions.numpy()[:, :d].astype(np.float64),
         search.wall_weights.numpy().astype(np.float64),
-        viscosity=viscosity,
+        viscosity=simulation.scene.forces.viscosity,
         friction=terms[0]._friction if terms else 0.0,
         reach=1.03 * lattice.support,
         rigidity=lattice.rigidity,
         push=lattice.wall_push,
+        evenness=lattice.evenness,
     )
+
+
+def twins_steps(simulation, substeps):
+    """The function of parameters, in the order of `point_of`, to the twin's last (x, v, c)."""
+    slow, lattice, mixture = twin(simulation), simulation.solver.lattice, simulation.scene.mixture
+    phases = len(simulation.scene.phase)
+
+    def mix(x, c, mass, time_step, mobility, width):
+        slow_mixture = reference_mixture.Mixture(
+            simulation.smoothing,
+            simulation.dimension,
+            lattice.support,
+            lattice.volume,
+            alpha=mixture.strength,
+            mobility=lattice.evenness * mobility,
+            eps=lattice.evenness**0.5 * width,
+            form=mixture.mobility_form,
+            energy=mixture.free_energy,
+        )
+        walls = lattice.volume * slow.wall_density(x, slow.near(x)[1])
+        return slow_mixture.step(x, c, mass, time_step / substeps, substeps, walls)
+
+    def steps(gravity, x, v, rest_density, viscosity, time_step, mobility=0.0, width=1.0, c=None):
+        c = np.ones((len(x), 1)) if c is None else c
+        mass = reference.blend(c, rest_density, viscosity)[0]
+        for _ in range(STEPS):
+            if phases > 1:
+                c = mix(x, c, mass, time_step, mobility, width)
+            rho_0, mu = reference.blend(c, rest_density, viscosity)
+            x, v = slow.step(x, v, gravity, lattice.volume * mass, rho_0, mu, time_step, ITERATIONS)
+        return np.concatenate([x, v, c], axis=1)
+
+    return steps
 
 
 CASES = [
@@ -46,66 +97,60 @@ CASES = [
     (scene, "wendland_c4", "none", "free"),
     (plane, "cubic_spline", "laminar", "no"),
     (plane, "wendland_c2", "pairwise", "no"),
+    (splash_of_two, "cubic_spline", "pairwise", "free"),
+    (plane_of_three, "cubic_spline", "laminar", "no"),
 ]
+cases = pytest.mark.parametrize(("make", "kernel", "viscosity", "slip"), CASES)
 
 
-@pytest.mark.parametrize(("make", "kernel", "viscosity", "slip"), CASES)
+@cases
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_steps_equal_those_of_the_twin(make, kernel, viscosity, slip, precision):
-    simulation, gravity = prepared(make, kernel, viscosity, slip, precision)
-    x, v = positions, velocities = disturbed(simulation)
-    rollout = simulation.rollout(STEPS, {"gravity": gravity})
-    rollout.initial.set(positions, velocities)
-    rollout.parameters.set(gravity, DENSITY, VISCOSITY, TIME_STEP)
-    found = rollout.forward().numpy(simulation.dimension)
-    slow = twin(simulation, viscosity)
-    for _ in range(STEPS):
-        x, v = slow.step(x, v, gravity, DENSITY, VISCOSITY, TIME_STEP, 5)
+    simulation = prepared(make, kernel, viscosity, slip, precision)
+    point, d = point_of(simulation), simulation.dimension
+    rollout = simulation.rollout(STEPS, point)
+    found = np.concatenate(rollout.forward().numpy(d), axis=1)
+    wanted = twins_steps(simulation, rollout.solver.mixture.substeps)(*point.values())
     tolerance = 1e-13 if precision == "float64" else 2e-5
-    assert np.abs(x - positions).max() > 1e-3
-    np.testing.assert_allclose(found[0], x, rtol=0, atol=tolerance)
-    np.testing.assert_allclose(found[1], v, rtol=0, atol=100 * tolerance)
+    assert np.abs(wanted[:, :d] - point["initial_positions"]).max() > 1e-3
+    if "mass_fractions" in point:
+        assert np.abs(wanted[:, 2 * d :] - point["mass_fractions"]).max() > 1e-2
+    np.testing.assert_allclose(found[:, :d], wanted[:, :d], rtol=0, atol=tolerance)
+    np.testing.assert_allclose(found[:, d : 2 * d], wanted[:, d : 2 * d], rtol=0, atol=100 * tolerance)
+    np.testing.assert_allclose(found[:, 2 * d :], wanted[:, 2 * d :], rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize(("make", "kernel", "viscosity", "slip"), CASES)
-def test_tangents_equal_complex_steps_of_the_twin(make, kernel, viscosity, slip):
-    simulation, gravity = prepared(make, kernel, viscosity, slip, "float64")
-    positions, velocities = disturbed(simulation)
-    rollout = simulation.rollout(STEPS, {"gravity": gravity})
-    rollout.initial.set(positions, velocities)
-    rollout.parameters.set(gravity, DENSITY, VISCOSITY, TIME_STEP)
-    rollout.forward()
+@cases
+def test_tangents_and_adjoints_equal_complex_steps_of_the_twin(make, kernel, viscosity, slip):
+    simulation = prepared(make, kernel, viscosity, slip, "float64")
+    values, d = point_of(simulation), simulation.dimension
     random = np.random.default_rng(1)
-    x_dot, v_dot = random.standard_normal((2, *positions.shape))
-    rates = {
-        "gravity": random.standard_normal(gravity.shape),
-        "rest_density": 10.0,
-        "viscosity": 0.3,
-        "time_step": 1e-4,
-    }
-    dot = State.zeros(len(positions), simulation.precision, simulation.device)
-    dot.set(x_dot, v_dot)
-    parameters = Parameters.zeros(STEPS, simulation.precision, simulation.device)
-    parameters.set(**rates)
-    rollout.tangent(dot, parameters)
-    slow = twin(simulation, viscosity)
+    along = {name: RATES.get(name, 1.0) * random.standard_normal(value.shape) for name, value in values.items()}
+    rollout, controls = simulation.rollout(STEPS, values), Controls(simulation, STEPS)
+    rollout.forward()
+    states = {}
+    rollout.tangent(*controls.direction(rollout, values, along), lambda step, dot: states.update({step: dot.numpy(d)}))
+    slow = twins_steps(simulation, rollout.solver.mixture.substeps)
+    exact = reference.complex_step(slow, list(values.values()), list(along.values()))
+    wanted = np.split(exact, [d, 2 * d], axis=1)
+    for found, one in zip(states[STEPS], wanted, strict=True):
+        assert np.linalg.norm(found - one) <= 1e-12 * np.linalg.norm(one)
 
-    def steps(x, v, *parameters):
-        for _ in range(STEPS):
-            x, v = slow.step(x, v, *parameters, 5)
-        return np.stack([x, v])
-
-    point = (positions, velocities, gravity, DENSITY, VISCOSITY, TIME_STEP)
-    wanted = reference.complex_step(steps, point, (x_dot, v_dot, *rates.values()))
-    for found, exact in zip(dot.numpy(simulation.dimension), wanted, strict=True):
-        assert np.linalg.norm(found - exact) < 1e-12 * np.linalg.norm(exact)
+    bars = [random.standard_normal(one.shape) for one in wanted]
+    bar = rollout.solver.new_state()
+    bar.set(*bars)
+    derivative = Exact().derivative(rollout)
+    gradient = controls.gradient(values, rollout.backward(derivative, {STEPS: bar}), derivative.parameters())
+    adjoint = sum((gradient[name] * along[name]).sum() for name in values)
+    size = sum(np.linalg.norm(one) * np.linalg.norm(w) for one, w in zip(wanted, bars, strict=True))
+    assert abs(adjoint - sum((one * w).sum() for one, w in zip(wanted, bars, strict=True))) <= 1e-12 * size
 
 
 def prepared(make, kernel, viscosity, slip, precision):
-    """A simulation of one case, and gravity in its dimension."""
+    """A simulation of one case."""
     assert kernel in KERNELS
     original = make()
-    simulation = Simulation(
+    return Simulation(
         make(
             discretisation={"spacing": 0.05, "support": 2.0 if kernel == "cubic_spline" else 2.6, "kernel": kernel},
             forces={"gravity": original.forces.gravity, "viscosity": viscosity},
@@ -113,4 +158,3 @@ def prepared(make, kernel, viscosity, slip, precision):
         ),
         precision=precision,
     )
-    return simulation, GRAVITY[: simulation.dimension]
