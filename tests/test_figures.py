@@ -6,6 +6,7 @@ from PIL import Image
 
 from cortado import figures
 from cortado.errors import InputError
+from cortado.srgb import to_srgb
 from cortado.trajectory import Trajectory
 
 
@@ -97,6 +98,40 @@ def test_steps_that_did_not_converge_are_marked(tmp_path):
     assert share_of(mark, image) > 1e-4
     assert share_of(mark, pixels(figures.density_errors(trajectory_of(3), tmp_path / "b.png"))) == 0.0
     pixels(figures.density_errors(trajectory_of(0), tmp_path / "c.png"))
+
+
+def test_a_curve_leaves_out_what_has_no_place_on_it(tmp_path):
+    labels = {"title": "a", "x_label": "iteration", "y_label": "loss"}
+    odd = {"odd": [1.0, np.nan, 0.0, 10.0], "none": [-1.0, 0.0, np.inf, np.nan]}
+    for logarithmic in (False, True):
+        path = tmp_path / f"{logarithmic}.png"
+        image = pixels(figures.curve(np.arange(4), odd, path, **labels, logarithmic=logarithmic))
+        assert share_of((0x3D, 0x6B, 0x8E), image) > 1e-3
+    pixels(figures.curve([0.0], {"none": [0.0]}, tmp_path / "c.png", **labels, logarithmic=True))
+    with pytest.raises(InputError, match="'a' has shape"):
+        figures.curve([0.0, 1.0], {"a": [1.0]}, tmp_path / "d.png", **labels)
+
+
+@pytest.mark.parametrize("count", [1, 3, 6])
+def test_images_are_shown_in_srgb(tmp_path, count):
+    shades = [(0.05 + 0.15 * k) * np.ones((16, 24, 3)) for k in range(count)]
+    image = pixels(figures.images(shades, [f"step {k}" for k in range(count)], tmp_path / "a.png", "moments"))
+    places = []
+    for shade in shades:
+        level = int(to_srgb(shade)[0, 0, 0])
+        there = np.all(image == level, axis=-1)
+        assert there.mean() > 0.6 / count * 0.5
+        places.append(np.argwhere(there).mean(axis=0))
+    rows, columns = np.array(places).T
+    across = min(count, 3)
+    assert np.all(np.diff(columns[:across]) > 100) and np.ptp(rows[:across]) < 5
+    assert np.all(rows[across:] > rows[0] + 100)
+
+
+def test_images_without_titles_are_a_sentence(tmp_path):
+    for shown, titles in (([], []), ([np.zeros((2, 2, 3))], [])):
+        with pytest.raises(InputError, match="titles"):
+            figures.images(shown, titles, tmp_path / "a.png")
 
 
 def test_unwritable_picture_is_a_sentence(tmp_path):

@@ -1,0 +1,149 @@
+"""Numbers over iterations, steps or anything else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cortado.errors import InputError
+from cortado.figures.canvas import DASHED, FAINT, PALETTE, drawing, whole_numbers
+from cortado.trajectory import Trajectory
+
+
+def loss_curve(losses: ArrayLike, path: str | Path, *, title: str = "Loss", label: str = "loss") -> Path:
+    """Losses (iterations,) over the iterations, on a logarithmic scale where any is positive."""
+    values = np.asarray(losses, dtype=float)
+    with drawing(path) as figure:
+        axes = figure.subplots()
+        iterations, values = _line(axes, np.arange(len(values)), values, _any_positive(values), color=PALETTE[0])
+        labels = {0: {"xytext": (0, 9), "ha": "center"}, len(values) - 1: {"xytext": (9, 0), "va": "center"}}
+        for k, place in labels.items() if len(values) else ():
+            end = (iterations[k], values[k])
+            axes.plot(*end, "o", color=PALETTE[0], markersize=7)
+            axes.annotate(f"{values[k]:.3g}", end, textcoords="offset points", weight="bold", **place)
+        axes.margins(x=0.06, y=0.14)
+        axes.set(title=title, xlabel="iteration", ylabel=label)
+        whole_numbers(axes.xaxis)
+    return Path(path)
+
+
+def curve(
+    x: ArrayLike,
+    series: Mapping[str, ArrayLike],
+    path: str | Path,
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+    logarithmic: bool = False,
+) -> Path:
+    """Several series over the same numbers.
+
+    Args:
+        x: (k,), at whole numbers only if they are integers.
+        series: label -> (k,); what is not finite is left out. Labels are shown if there are two or more.
+        logarithmic: scale of the series, where any is positive; zeros and negative numbers are left out.
+    """
+    x, lines = np.asarray(x), {label: np.asarray(values, dtype=float) for label, values in series.items()}
+    for label, values in lines.items():
+        if values.shape != x.shape or x.ndim != 1:
+            raise InputError(f"The series {label!r} has shape {values.shape} over {x.shape}: both must be (k,).")
+    logarithmic = logarithmic and any(_any_positive(values) for values in lines.values())
+    with drawing(path) as figure:
+        axes = figure.subplots()
+        for k, (label, values) in enumerate(lines.items()):
+            _line(axes, x, values, logarithmic, color=PALETTE[k % len(PALETTE)], label=label)
+        axes.margins(x=0.03, y=0.08)
+        axes.set(title=title, xlabel=x_label, ylabel=y_label)
+        if np.issubdtype(x.dtype, np.integer):
+            whole_numbers(axes.xaxis)
+        if len(lines) > 1:
+            axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+    return Path(path)
+
+
+def parameters(
+    history: ArrayLike,
+    hidden: ArrayLike | None,
+    path: str | Path,
+    *,
+    names: Sequence[str] | None = None,
+    unit: str = "",
+    title: str = "Recovered parameters",
+) -> Path:
+    """Every component of the parameters over the iterations (solid), against the hidden ones (dashed).
+
+    Args:
+        history: (iterations, k), or (iterations, ...) with k components in all.
+        hidden: (k,) or the same shape as one iteration; None where nobody knows.
+        names: k of them; by default x, y, z for up to three, numbers for more.
+    """
+    values = np.asarray(history, dtype=float)
+    values = values.reshape(len(values), -1)
+    count = values.shape[1]
+    truth = None if hidden is None else np.broadcast_to(np.ravel(np.asarray(hidden, dtype=float)), (count,))
+    labels = names or (["x", "y", "z"][:count] if count <= 3 else [str(k + 1) for k in range(count)])
+    with drawing(path) as figure:
+        axes = figure.subplots()
+        for k in range(count):
+            colour, faint = PALETTE[k % len(PALETTE)], 1.0 if count <= len(PALETTE) else 0.55
+            axes.plot(values[:, k], color=colour, alpha=faint, label=labels[k])
+            if truth is not None:
+                axes.axhline(truth[k], **DASHED, color=colour, alpha=faint)
+        axes.set(title=title, xlabel="iteration", ylabel=f"value [{unit}]" if unit else "value")
+        axes.margins(x=0.02, y=0.08)
+        whole_numbers(axes.xaxis)
+        if truth is not None:
+            axes.plot([], [], **DASHED, color=FAINT, label="hidden")
+        if count <= len(PALETTE):
+            axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+    return Path(path)
+
+
+def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float | None = None) -> Path:
+    """Density error [%] and pressure iterations of every step; steps that did not converge are marked.
+
+    Args:
+        tolerance: the solver's, drawn as a line [-].
+    """
+    steps = np.arange(1, len(trajectory.iterations) + 1)
+    errors = 100.0 * trajectory.density_errors
+    failed = ~trajectory.converged
+    with drawing(path, height=6.0) as figure:
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+        upper.plot(steps, errors, color=PALETTE[0], linewidth=1.4, label="density error")
+        if failed.any():
+            label = f"not converged ({failed.sum()} of {len(steps)} steps)"
+            upper.plot(steps[failed], errors[failed], "o", color=PALETTE[6], markersize=3.5, label=label)
+        if tolerance is not None:
+            upper.axhline(100.0 * tolerance, **DASHED, color=FAINT, label="tolerance")
+        upper.set_title("Density error and pressure iterations", pad=32)
+        upper.set_ylabel("average density\nerror [%]")
+        upper.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2)
+        lower.step(steps, trajectory.iterations, color=PALETTE[1], where="mid", linewidth=1.2)
+        lower.set(xlabel="step", ylabel="pressure\niterations", ylim=(0, None))
+        whole_numbers(lower.xaxis)
+        whole_numbers(lower.yaxis)
+        figure.align_ylabels()
+    return Path(path)
+
+
+def _any_positive(values: NDArray[Any]) -> bool:
+    return bool(np.any(values[np.isfinite(values)] > 0.0))
+
+
+def _line(
+    axes: Any, x: NDArray[Any], values: NDArray[Any], logarithmic: bool, **style: Any
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Draws what can be shown of a line, few points with marks, and returns it."""
+    shown = np.isfinite(x) & np.isfinite(values)
+    if logarithmic:
+        axes.set_yscale("log")
+        shown &= values > 0.0
+    x, values = x[shown], values[shown]
+    axes.plot(x, values, marker="o", markersize=4 if len(values) <= 40 else 0, **style)
+    return x, values

@@ -1,0 +1,135 @@
+"""Target pictures: that a heart is a heart and a rosetta a rosetta, and that files keep their light."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from cortado.errors import InputError
+from cortado.pictures import COFFEE, MILK, WHITE, heart, read_picture, rosetta, write_picture
+from cortado.srgb import from_srgb, to_srgb
+
+DRAWINGS = [heart, rosetta]
+
+
+def milk_share(image: np.ndarray) -> np.ndarray:
+    """(rows, columns) from 0, coffee, to 1, milk"""
+    return (image[..., 0] - COFFEE[0]) / (MILK[0] - COFFEE[0])
+
+
+def layers(shares: np.ndarray) -> int:
+    """How often milk begins along a line of pixels."""
+    return int(np.sum(np.diff((shares > 0.5).astype(int)) == 1))
+
+
+@pytest.mark.parametrize("draw", DRAWINGS)
+def test_drawings_are_symmetric_and_of_two_colours(draw):
+    image = draw(128)
+    assert image.shape == (128, 128, 3) and image.dtype == np.float64
+    assert np.allclose(image, image[:, ::-1], atol=0.03)
+    share = milk_share(image)
+    assert np.allclose(image, share[..., None] * MILK + (1.0 - share[..., None]) * COFFEE)
+    assert share.min() == pytest.approx(0.0) and share.max() == pytest.approx(1.0)
+    assert np.mean((share > 0.01) & (share < 0.99)) > 0.005  # the edges are smooth
+
+
+@pytest.mark.parametrize("draw", DRAWINGS)
+def test_a_drawing_has_the_same_area_at_any_resolution(draw):
+    fine = milk_share(draw(256)).mean()
+    for resolution in (32, 77, 128):
+        assert milk_share(draw(resolution)).mean() == pytest.approx(fine, rel=0.015)
+    assert milk_share(draw((96, 32))).mean() == pytest.approx(fine / 3.0, rel=0.015)
+
+
+def test_a_heart_stands_on_its_tip():
+    share = milk_share(heart(128))
+    widths = share.sum(axis=1)
+    rows = np.flatnonzero(widths > 0.5)
+    assert rows[0] == pytest.approx(64 - 0.6 * 64, abs=2) and rows[-1] == pytest.approx(64 + 0.6 * 64, abs=2)
+    assert widths[rows[-1]] < 5 and np.argmax(widths) < 60
+    below = widths[np.argmax(widths) : rows[-1]]
+    assert np.all(np.diff(below) <= 0.0)
+    assert layers(share[rows[0] + 3]) == 2  # two lobes and a notch between them
+    assert all(layers(share[row]) == 1 for row in range(60, rows[-1]))
+
+
+def test_a_rosetta_has_leaves_a_stem_and_a_heart():
+    share = milk_share(rosetta(128))
+    assert layers(share[:, 64 + 16]) == layers(share[:, 64 - 17]) == 6
+    assert layers(share[:, 64]) == 1 and share[:, 64].sum() > 0.7 * 128  # the stem goes from the bottom to the heart
+    assert layers(share[108]) == 1 and share[108].sum() < 3  # and stands free below
+    assert layers(share[25]) == 1 and share[25].sum() > 25  # the heart
+
+
+@pytest.mark.parametrize("draw", DRAWINGS)
+def test_a_cup_stands_on_its_background(draw):
+    image = draw((100, 60), cup=0.8, background=(0.1, 0.2, 0.3))
+    rows, columns = np.mgrid[:60, :100]
+    radius = np.hypot(columns + 0.5 - 50, rows + 0.5 - 30) / 30
+    assert np.allclose(image[radius > 0.85], (0.1, 0.2, 0.3))
+    assert np.allclose(image[(radius > 0.7) & (radius < 0.75) & (abs(columns - 50) > 15)], COFFEE)
+    assert milk_share(draw(128, cup=0.8, background=COFFEE)).mean() == pytest.approx(
+        0.64 * milk_share(draw(128)).mean(), rel=5e-3
+    )
+    assert np.allclose(draw(16, cup=0.8)[0, 0], WHITE)
+
+
+@pytest.mark.parametrize("wrong", [{"cup": 0.0}, {"size": -1.0}, {"size": np.nan}, {"resolution": (0, 8)}])
+def test_what_cannot_be_drawn_is_a_sentence(wrong):
+    with pytest.raises(InputError, match="must be"):
+        heart(**{"resolution": 8, **wrong})
+
+
+def test_the_curve_of_srgb():
+    every = np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, axis=2)
+    assert np.array_equal(to_srgb(from_srgb(every)), every)
+    assert to_srgb(np.full((1, 1, 3), 0.5))[0, 0, 0] == 188
+    assert from_srgb(np.array([10, 188], np.uint8)) == pytest.approx([0.0030353, 0.5028865], rel=1e-5)
+    assert to_srgb([[[-1.0, 0.0, 2.0]]]).tolist() == [[[0, 0, 255]]]
+
+
+def test_a_picture_comes_back_as_it_was_written(tmp_path):
+    image = heart((24, 16))
+    again = read_picture(write_picture(tmp_path / "a.png", image))
+    assert again.shape == (16, 24, 3) and again.dtype == np.float64
+    assert np.abs(again - image).max() < 0.005
+    assert np.array_equal(read_picture(tmp_path / "a.png", (24, 16)), again)
+
+
+def test_pictures_are_resampled_in_linear_light(tmp_path):
+    chequers = np.indices((8, 8)).sum(axis=0) % 2
+    path = write_picture(tmp_path / "a.png", chequers[..., None] * np.ones(3))
+    assert read_picture(path, 2) == pytest.approx(0.5, abs=0.02)
+
+
+def test_the_middle_of_a_picture_is_read(tmp_path):
+    stripes = np.zeros((8, 24, 3))
+    stripes[:, :8, 0] = stripes[:, 8:16, 1] = stripes[:, 16:, 2] = 1.0
+    path = write_picture(tmp_path / "a.png", stripes)
+    assert np.allclose(read_picture(path, 8), (0.0, 1.0, 0.0))
+    assert np.allclose(read_picture(path, (6, 2))[:, [0, -1]], [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)], atol=0.1)
+
+
+def test_nothing_is_white(tmp_path):
+    Image.new("RGBA", (4, 4), (255, 0, 0, 0)).save(tmp_path / "a.png")
+    assert np.array_equal(read_picture(tmp_path / "a.png"), np.ones((4, 4, 3)))
+
+
+def test_unreadable_pictures_are_sentences(tmp_path):
+    (tmp_path / "text.png").write_text("no picture")
+    whole = write_picture(tmp_path / "whole.png", heart(64)).read_bytes()
+    (tmp_path / "torn.png").write_bytes(whole[: len(whole) // 2])
+    for name in ("absent.png", "text.png", "torn.png", "."):
+        with pytest.raises(InputError, match="cannot be read"):
+            read_picture(tmp_path / name)
+    Image.fromarray(np.zeros((4, 4), np.uint16)).save(tmp_path / "deep.png")
+    with pytest.raises(InputError, match="more than 8 bits"):
+        read_picture(tmp_path / "deep.png")
+
+
+def test_unwritable_pictures_are_sentences(tmp_path):
+    with pytest.raises(InputError, match="cannot be written"):
+        write_picture(tmp_path / "absent" / "a.png", heart(8))
+    for image, words in ((np.zeros((4, 4)), "has shape"), (np.full((4, 4, 3), np.nan), "not finite")):
+        with pytest.raises(InputError, match=words):
+            write_picture(tmp_path / "a.png", image)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,65 @@
+"""Videos: that what is written can be played, with its size, its length and its colours."""
+
+import sys
+
+import av
+import numpy as np
+import pytest
+
+from cortado.errors import InputError
+from cortado.pictures import COFFEE, MILK, heart
+from cortado.srgb import to_srgb
+from cortado.video import write_video
+
+
+def levels_of(frame: av.VideoFrame) -> np.ndarray:
+    """(3,) mean red, green and blue in 0..255, as ITU-R BT.709 has them of luma and chroma."""
+    planes = frame.to_ndarray()
+    count = frame.height * frame.width
+    y, cb, cr = (part.mean() for part in np.split(planes.ravel(), [count, count * 5 // 4]))
+    y, cb, cr = (y - 16) * 255 / 219, (cb - 128) * 255 / 224, (cr - 128) * 255 / 224
+    return np.array([y + 1.5748 * cr, y - 0.1873 * cb - 0.4681 * cr, y + 1.8556 * cb])
+
+
+def test_a_video_can_be_played(tmp_path):
+    images = [np.ones((32, 48, 3)) * MILK, np.ones((32, 48, 3)) * COFFEE, *[heart((48, 32))] * 5]
+    path = write_video(tmp_path / "a.mp4", iter(images), frames_per_second=12.5)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
+    with av.open(path) as container:
+        stream = container.streams.video[0]
+        context = stream.codec_context
+        assert (context.name, context.pix_fmt, context.width, context.height) == ("h264", "yuv420p", 48, 32)
+        assert (context.color_primaries, context.colorspace, context.color_trc, context.color_range) == (1, 1, 13, 1)
+        assert stream.average_rate == 12.5
+        frames = list(container.decode(stream))
+    assert len(frames) == len(images)
+    for frame, image in zip(frames, images, strict=True):
+        assert levels_of(frame) == pytest.approx(to_srgb(image).mean(axis=(0, 1)), abs=4)
+
+
+def test_odd_sides_are_made_even(tmp_path):
+    with av.open(write_video(tmp_path / "a.mp4", [heart((33, 21))])) as container:
+        context = container.streams.video[0].codec_context
+        assert (context.width, context.height) == (34, 22)
+
+
+@pytest.mark.parametrize(
+    "name, frames, rate, words",
+    [
+        ("a.mp4", [], 25, "no frames"),
+        ("a.mp4", [heart(16), heart(18)], 25, "Frame 1 of the video has shape"),
+        ("a.mp4", [heart(16)], 0, "positive"),
+        ("a.avi", [heart(16)], 25, "must end in .mp4"),
+        ("absent/a.mp4", [heart(16)], 25, "cannot be written"),
+    ],
+)
+def test_what_cannot_be_filmed_is_a_sentence(tmp_path, name, frames, rate, words):
+    with pytest.raises(InputError, match=words):
+        write_video(tmp_path / name, frames, rate)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_package_is_a_sentence(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match=r"pip install 'cortado\[video\]'"):
+        write_video(tmp_path / "a.mp4", [heart(16)])
