@@ -60,13 +60,7 @@ class Controls:
 
     def shapes(self, name: str) -> list[tuple[int, ...]]:
         """The shapes that a parameter may have; () is a number."""
-        n, d = self._simulation.positions.shape
-        if name in TABLES:
-            return [(d,), (self._steps, d)]
-        if name in MATERIALS:
-            return [() if self._phases == 1 else (self._phases,)]
-        several = {"mass_fractions": (n, self._phases), "colours": (self._phases, 3)}
-        return [several.get(name, (n, d) if name in STATES else ())]
+        return parameter_shapes(name, self._steps, self._phases, self._simulation.positions.shape)
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
         """Values as float64 arrays; raises `InputError` in a sentence. A ``what`` of "direction" may be negative."""
@@ -154,6 +148,17 @@ class Controls:
                 worst = int(miss.argmax())
                 total = array[worst].sum()
                 raise InputError(f"{what} mass_fractions of particle {worst} add up to {total:g}, but must to 1.")
+
+
+def parameter_shapes(name: str, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """The shapes that a parameter may have, () for a number, where positions are (n, d)."""
+    n, d = positions
+    if name in TABLES:
+        return [(d,), (steps, d)]
+    if name in MATERIALS:
+        return [() if phases == 1 else (phases,)]
+    several = {"mass_fractions": (n, phases), "colours": (phases, 3)}
+    return [several.get(name, (n, d) if name in STATES else ())]
 
 
 def as_numbers(what: str, value: Any) -> np.ndarray:

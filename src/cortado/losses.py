@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from cortado.errors import InputError
+from cortado.image_losses import ImageLoss, SquaredDifference
 from cortado.launching import sum_of
 from cortado.particles import State, to_device
 from cortado.physics.matching import matching_kernels
@@ -126,6 +127,49 @@ class FinalPositions:
         if key not in self._on_device:
             self._on_device[key] = to_device(self.target, end.precision, x.device)
         return x, self._on_device[key], x.device
+
+
+class Pictures(Protocol):
+    """What makes pictures, such as `cortado.render.renderer.Renderer`."""
+
+    def render(self, positions: wp.array, fractions: wp.array, colours: np.ndarray) -> np.ndarray:
+        """The picture (rows, columns, 3)."""
+
+    def adjoint(self, image_bar: np.ndarray) -> Any:
+        """``positions``, ``fractions`` and ``colours``: derivatives of a function of the last picture."""
+
+
+class Image:
+    """How far the picture of a state is from a target picture."""
+
+    def __init__(self, renderer: Pictures, target: np.ndarray, distance: ImageLoss | None = None):
+        """``target`` (rows, columns, 3), linear RGB; ``distance``: `cortado.image_losses.SquaredDifference`, the
+        default (the report's 6.2.2), or `Pyramid`, whose gradient leads shapes to each other that do not overlap."""
+        self.renderer, self.distance = renderer, SquaredDifference() if distance is None else distance
+        self.target = np.array(target, dtype=np.float64)
+        self.target.setflags(write=False)
+        self.fingerprint = f"{self.distance.fingerprint} {sha256(self.target.tobytes()).hexdigest()}"
+        """Tells one target from another, for checkpoints."""
+        self._seen: tuple[TrajectoryEnd, float] | None = None
+
+    def image(self, end: TrajectoryEnd) -> np.ndarray:
+        """The picture (rows, columns, 3) of a state."""
+        return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
+
+    def value(self, end: TrajectoryEnd) -> float:
+        if self._seen is not None and self._seen[0] is end:
+            return self._seen[1]
+        return self.distance.value(self.image(end), self.target)
+
+    def adjoint(self, end: TrajectoryEnd) -> EndAdjoint:
+        image = self.image(end)
+        self._seen = (end, self.distance.value(image, self.target))
+        found = self.renderer.adjoint(self.distance.adjoint(image, self.target))
+        bar = end.state.like()
+        bar.velocities.zero_()
+        wp.copy(bar.positions, found.positions)
+        wp.copy(bar.mass_fractions, found.fractions)
+        return EndAdjoint(bar, found.colours)
 
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]

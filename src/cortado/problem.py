@@ -67,10 +67,13 @@ class Problem:
         """The loss, forward only."""
         return self._total(self._ends(self._controls.checked(parameters), self._losses, keep=False))
 
-    def end(self, parameters: Values, step: int | None = None) -> TrajectoryEnd:
-        """The last state of the rollout under these parameters, or that after so many steps."""
-        number = self.steps if step is None else step
-        return self._ends(self._controls.checked(parameters), [number], keep=False)[number]
+    def end(self, parameters: Values) -> TrajectoryEnd:
+        """The last state of the rollout under these parameters."""
+        return self.states(parameters, [self.steps])[self.steps]
+
+    def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, TrajectoryEnd]:
+        """States of the rollout under these parameters, by the number of steps before them."""
+        return self._ends(self._controls.checked(parameters), steps, keep=False)
 
     def run(self, parameters: Values, record_every: int = 1) -> Trajectory:
         """The whole trajectory under these parameters; see `Simulation.run`."""

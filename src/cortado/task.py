@@ -3,16 +3,21 @@
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, Self
 
 import numpy as np
+from pydantic import model_validator
 
-from cortado.controls import NAMES, STATES
+from cortado.controls import NAMES, OF_EMITTER, POSITIVE, Arrays, parameter_shapes
 from cortado.errors import Phrase, SceneError
+from cortado.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisers import LBFGS, Adam, GradientDescent, Optimiser
+from cortado.particles import TABLES
+from cortado.reparametrisation import Knots
 from cortado.sampling import fluid_particles
 from cortado.scene import Scene, read_toml, scene_from_dict
-from cortado.scene_kinds import MISSING, Choice, Count, Kind, Quantity, as_number, wrong
+from cortado.scene_kinds import MISSING, Choice, Count, Kind, Quantity, Text, as_number, wrong
 from cortado.scene_tables import Table, sentences
 
 OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
@@ -21,24 +26,30 @@ OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
     "lbfgs": lambda scale: LBFGS(scale=scale),
 }
 """By the names in a file; each is made from the learning rate (for L-BFGS the size of its first step)."""
-POSITIVE = ("rest_density", "time_step")
-"""Parameters that must be greater than 0."""
+DISTANCES: dict[str, ImageLoss] = {"squared_difference": SquaredDifference(), "pyramid": Pyramid()}
+RANDOM = "random"
+CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
 
 
 @dataclass(frozen=True)
 class Values(Kind):
     """Parameters by name: a number, or a list, of lists, of numbers."""
 
+    random: bool = False
+    """Whether `CAN_BE_RANDOM` may be the word "random"."""
+
     wanted = f"a table of at least one parameter out of {', '.join(NAMES)}"
 
-    def check(self, value: Any) -> dict[str, np.ndarray]:
+    def check(self, value: Any) -> dict[str, Any]:
         if not isinstance(value, Mapping) or not value:
             raise wrong((), Phrase("empty") if value == {} else value, self.wanted)
         return {name: self._array(name, entry) for name, entry in value.items()}
 
-    def _array(self, name: str, value: Any) -> np.ndarray:
+    def _array(self, name: str, value: Any) -> Any:
         if name not in NAMES:
             raise wrong((name,), Phrase("unknown"), f"one of {', '.join(NAMES)}")
+        if self.random and name in CAN_BE_RANDOM and value == RANDOM:
+            return value
         wanted = "made of finite numbers: one, a list of them, or a list of lists of one length"
         if not _is_numeric(value):
             raise wrong((name,), value, wanted)
@@ -46,6 +57,18 @@ class Values(Kind):
             return np.array(value, dtype=np.float64)
         except ValueError:
             raise wrong((name,), value, wanted) from None
+
+
+@dataclass(frozen=True)
+class Names(Kind):
+    """A list of parameters."""
+
+    wanted = f"a list of parameters out of {', '.join(NAMES)}"
+
+    def check(self, value: Any) -> tuple[str, ...]:
+        if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) and name in NAMES for name in value):
+            raise wrong((), value, self.wanted)
+        return tuple(value)
 
 
 def _is_numeric(value: Any) -> bool:
@@ -56,12 +79,37 @@ def _is_numeric(value: Any) -> bool:
 
 
 class ProblemTable(Table):
-    """[problem]: a number of steps, and a target that a run with hidden parameters makes."""
+    """[problem]: a number of steps, and a target: what a run with hidden parameters makes, or a picture."""
 
-    steps: Annotated[int, Count(1, 10_000_000)]
-    """Time steps."""
-    target: Annotated[dict[str, Any], Values()]
-    """Hidden parameters: the target is where their run ends."""
+    steps: Annotated[int, Count(0, 10_000_000)]
+    """Time steps; 0 for a loss of the first state."""
+    loss: Annotated[str, Choice(("positions", "image"))] = "positions"
+    """What is compared: where the particles are, or how they look."""
+    distance: Annotated[str, Choice(tuple(DISTANCES))] = "squared_difference"
+    """How images are compared."""
+    frames: Annotated[int, Count(1, 10_000)] = 1
+    """How many states are compared, evenly spaced up to the last one."""
+    target: Annotated[dict[str, Any] | None, Values()] = None
+    """Hidden parameters: the target is what their run makes."""
+    picture: Annotated[str | None, Text()] = None
+    """"heart", "rosetta", or a file with a picture, beside the task's own."""
+
+    @model_validator(mode="after")
+    def _check_target(self) -> Self:
+        if self.picture is None and self.target is None:
+            raise wrong(("target",), MISSING, Values.wanted)
+        if self.picture is not None and self.target is not None:
+            raise wrong(("picture",), self.picture, "left out, as there is a target")
+        if self.picture is not None and self.loss != "image":
+            raise wrong(("loss",), self.loss, '"image", as there is a picture')
+        if self.frames > max(self.steps, 1):
+            raise wrong(("frames",), self.frames, f"at most steps, {self.steps}")
+        return self
+
+    @property
+    def compared(self) -> list[int]:
+        """The numbers of the states that are compared."""
+        return [round(self.steps * (k + 1) / self.frames) for k in range(self.frames)]
 
 
 class CheckTable(Table):
@@ -71,13 +119,21 @@ class CheckTable(Table):
     """First loss / best loss."""
     parameter_error: Annotated[float, Quantity(above=0.0)] = 1e50
     """Largest relative distance (L2) of a found parameter from the hidden one."""
+    psnr: Annotated[float, Quantity("dB", least=0.0)] = 0.0
+    """Peak signal-to-noise ratio of the found image to the target."""
 
 
 class OptimiseTable(Table):
     """[optimise]: from where, how and how long."""
 
-    start: Annotated[dict[str, Any], Values()]
+    start: Annotated[dict[str, Any], Values(random=True)]
     """Parameters to begin with; these are optimised."""
+    knots: Annotated[int | None, Count(2, 10_000_000)] = None
+    """Parameters over time are interpolated between so many free values; None: every step has its own."""
+    logarithmic: Annotated[tuple[str, ...], Names()] = ()
+    """Parameters that are changed by factors."""
+    bounds: Annotated[dict[str, Any] | None, Values()] = None
+    """By name: two entries, the lower and the upper bound."""
     optimiser: Annotated[str, Choice(tuple(OPTIMISERS))] = "adam"
     """Name of the algorithm."""
     learning_rate: Annotated[float, Quantity(above=0.0)]
@@ -101,11 +157,17 @@ class TaskTables(Table):
 
 @dataclass(frozen=True)
 class Task:
-    """A scene, what is asked of it, and how to find it."""
+    """A scene, what is asked of it, and how to find it. Parameters over time have a row for each step."""
 
     scene: Scene
     problem: ProblemTable
     optimise: OptimiseTable
+    hidden: Arrays
+    """Parameters that made the target; none for a picture."""
+    start: dict[str, Any]
+    """Parameters to begin with; arrays, or the word "random"."""
+    folder: Path = Path()
+    """Where its other files are looked for."""
 
 
 def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Task:
@@ -116,31 +178,57 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
     try:
         with sentences():
             tables = TaskTables.model_validate({key: data[key] for key in TaskTables.model_fields if key in data})
-        for name in tables.optimise.start:
-            if name not in tables.problem.target:
+        problem, optimise = tables.problem, tables.optimise
+        hidden, steps = problem.target or {}, problem.steps
+        for name in optimise.start:
+            if problem.picture is None and name not in hidden:
                 raise SceneError(None, f"problem.target.{name}", MISSING, "given, as optimise.start has it")
-        _check_shapes("problem.target", tables.problem.target, scene, tables.problem.steps)
-        _check_shapes("optimise.start", tables.optimise.start, scene, tables.problem.steps)
+        hidden = _resolved("problem.target", hidden, scene, steps)
+        start = _resolved("optimise.start", optimise.start, scene, steps)
+        _check_options(optimise, start)
     except SceneError as error:
         raise error.in_file(file) from None
-    return Task(scene, tables.problem, tables.optimise)
+    return Task(scene, problem, optimise, hidden, start, Path(file).parent)
 
 
-def _check_shapes(table: str, values: Mapping[str, np.ndarray], scene: Scene, steps: int) -> None:
-    """Raise `SceneError` for a parameter that does not fit the scene."""
+def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int) -> dict[str, Any]:
+    """Values with a row for each step where they change over time; raises `SceneError` for one that does not fit."""
+    found = {}
     for name, array in values.items():
+        field = f"{table}.{name}"
+        if name in OF_EMITTER and scene.emitter is None:
+            raise SceneError(None, field, Phrase("given"), "left out, as the scene has no emitter")
+        if isinstance(array, str):
+            found[name] = array
+            continue
+        if name in TABLES and array.ndim == 2 and 2 <= len(array) <= steps:
+            array = Knots(steps, len(array)).parameter(array)
         shapes = _shapes(name, scene, steps)
         if array.shape not in shapes:
-            raise SceneError(None, f"{table}.{name}", Phrase(_in_words([array.shape])), _in_words(shapes))
-        if name in POSITIVE and array <= 0.0:
-            raise SceneError(None, f"{table}.{name}", float(array), "greater than 0")
+            raise SceneError(None, field, Phrase(_in_words([array.shape])), _in_words(shapes))
+        if name in POSITIVE and (array <= 0.0).any():
+            raise SceneError(None, field, float(array.min()), "greater than 0")
+        found[name] = array
+    return found
+
+
+def _check_options(optimise: OptimiseTable, start: Mapping[str, Any]) -> None:
+    for name in optimise.logarithmic:
+        if name not in start:
+            raise SceneError(None, "optimise.logarithmic", name, "made of parameters that optimise.start has")
+        if (np.asarray(start[name]) <= 0.0).any():
+            raise SceneError(None, f"optimise.start.{name}", float(np.min(start[name])), "greater than 0")
+    for name, pair in (optimise.bounds or {}).items():
+        if name not in start:
+            raise SceneError(None, f"optimise.bounds.{name}", Phrase("given"), "left out, as optimise.start lacks it")
+        if pair.ndim == 0 or len(pair) != 2:
+            wanted = "two entries, the lower and the upper bound"
+            raise SceneError(None, f"optimise.bounds.{name}", Phrase(_in_words([pair.shape])), wanted)
 
 
 def _shapes(name: str, scene: Scene, steps: int) -> list[tuple[int, ...]]:
     """The shapes that a parameter may have; () is a number."""
-    if name == "gravity":
-        return [(scene.dimension,), (steps, scene.dimension)]
-    return [fluid_particles(scene).positions.shape] if name in STATES else [()]
+    return parameter_shapes(name, steps, len(scene.phase), fluid_particles(scene).positions.shape)
 
 
 def _in_words(shapes: Sequence[tuple[int, ...]]) -> str:

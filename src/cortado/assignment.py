@@ -1,0 +1,125 @@
+"""A task made ready: its problem with the target, in the coordinates in which it is searched, from a start."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cortado.controls import Arrays
+from cortado.errors import InputError
+from cortado.losses import FinalPositions, Frames, Image, Loss, TrajectoryEnd
+from cortado.particles import TABLES
+from cortado.pictures import heart, read_picture, rosetta
+from cortado.problem import Problem
+from cortado.render.renderer import Renderer
+from cortado.render.scene_renderer import scene_renderer
+from cortado.reparametrisation import Coordinates, Knots, Logarithm, Reparametrised, Softmax
+from cortado.scene_containers import CylinderContainer
+from cortado.simulation import Simulation
+from cortado.task import DISTANCES, RANDOM, Task
+
+DRAWN = {"heart": heart, "rosetta": rosetta}
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """What `cortado.optimise` is given, and what its result is held against."""
+
+    task: Task
+    problem: Problem
+    search: Reparametrised
+    start: Arrays
+    """Coordinates to begin with."""
+    bounds: dict[str, tuple[Any, Any]]
+    """Of coordinates."""
+    renderer: Renderer | None
+    """None where positions are compared."""
+    targets: dict[int, np.ndarray]
+    """Images (rows, columns, 3) or positions (n, d) [m] by the number of steps before them."""
+
+    def image(self, end: TrajectoryEnd) -> np.ndarray:
+        """The picture (rows, columns, 3) of a state."""
+        assert self.renderer is not None
+        return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
+
+    def hidden(self, name: str) -> np.ndarray | None:
+        """The parameter that made the target, None where a picture is the target."""
+        return self.task.hidden.get(name)
+
+
+def assignment(task: Task, device: str, precision: str) -> Assignment:
+    """The task on a device; raises `InputError` for a picture that cannot be read."""
+    simulation = Simulation(task.scene, device, precision)
+    renderer = scene_renderer(simulation) if task.problem.loss == "image" else None
+    targets = _targets(task, simulation, renderer)
+    losses: dict[int, Loss] = {}
+    for step, target in targets.items():
+        if renderer is None:
+            losses[step] = FinalPositions(target)
+        else:
+            losses[step] = Image(renderer, target, DISTANCES[task.problem.distance])
+    problem = Problem(simulation, task.problem.steps, Frames(losses))
+    start = {name: _start(name, value, simulation) for name, value in task.start.items()}
+    search = Reparametrised(problem, _coordinates(task, start))
+    return Assignment(task, problem, search, search.coordinate(start), _bounds(task, search), renderer, targets)
+
+
+def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> dict[int, np.ndarray]:
+    steps = task.problem.compared
+    if task.problem.picture is not None:
+        assert renderer is not None
+        return {steps[-1]: _picture(task, renderer)}
+    nothing = FinalPositions(simulation.positions)
+    ends = Problem(simulation, task.problem.steps, nothing).states(task.hidden, steps)
+    if renderer is None:
+        return {step: end.positions for step, end in ends.items()}
+    return {
+        step: renderer.render(end.state.positions, end.state.mass_fractions, end.colours) for step, end in ends.items()
+    }
+
+
+def _picture(task: Task, renderer: Renderer) -> np.ndarray:
+    """The picture that a task names; one of ours in the colours of the scene, the last phase on the first."""
+    name, scene = task.problem.picture, task.scene
+    assert name is not None
+    rows, columns, _ = renderer.shape
+    if name not in DRAWN:
+        return read_picture(task.folder / name, (columns, rows))
+    colours = [phase.colour for phase in scene.phase]
+    background = scene.render.background if scene.render else (1.0, 1.0, 1.0)
+    under = colours[0] if len(colours) > 1 else background
+    cup = 1.0 if isinstance(scene.container, CylinderContainer) else None
+    options: dict[str, Any] = {"milk": colours[-1], "coffee": under, "background": background}
+    return DRAWN[name]((columns, rows), cup=cup, **options)
+
+
+def _start(name: str, value: Any, simulation: Simulation) -> np.ndarray:
+    if not isinstance(value, str) or value != RANDOM:
+        return np.asarray(value)
+    random = np.random.default_rng(0)
+    if name == "mass_fractions":
+        return random.dirichlet(np.ones(len(simulation.scene.phase)), simulation.particles)
+    extent = simulation.scene.container.extent()
+    if extent is None:
+        raise InputError('optimise.start.initial_positions is "random", but the scene has no container to fill.')
+    half = 0.5 * simulation.scene.discretisation.spacing
+    return random.uniform(extent[0] + half, extent[1] - half, simulation.positions.shape)
+
+
+def _coordinates(task: Task, start: Arrays) -> dict[str, Coordinates]:
+    found: dict[str, Coordinates] = {name: Logarithm() for name in task.optimise.logarithmic}
+    for name, value in start.items():
+        if name == "mass_fractions":
+            found[name] = Softmax()
+        elif name in TABLES and value.ndim == 2 and task.optimise.knots is not None:
+            found[name] = Knots(task.problem.steps, task.optimise.knots)
+    return found
+
+
+def _bounds(task: Task, search: Reparametrised) -> dict[str, tuple[Any, Any]]:
+    """Bounds hold for knots as they do for what lies between them, and for logarithms after they are taken."""
+    found = {}
+    for name, pair in (task.optimise.bounds or {}).items():
+        lower, upper = (np.log(b) if name in task.optimise.logarithmic else b for b in pair)
+        found[name] = (lower, upper)
+    return found

@@ -1,0 +1,126 @@
+"""Other coordinates for the parameters of a problem, in which an optimiser may step freely.
+
+A coordinate u stands for the parameter p(u): fractions that add up to 1, numbers that stay positive, controls that
+change slowly.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from cortado.controls import Arrays
+from cortado.errors import InputError
+from cortado.policies import Policy
+from cortado.problem import Problem
+
+SMALLEST = 1e-4
+"""Fractions below it are taken as it where coordinates are looked for: that of 0 is infinitely far away."""
+
+
+class Coordinates(Protocol):
+    """A smooth map p(u), with what it does to a gradient."""
+
+    def parameter(self, u: np.ndarray) -> np.ndarray:
+        """p(u)."""
+
+    def coordinate(self, parameter: np.ndarray) -> np.ndarray:
+        """A u with p(u) = ``parameter``, as nearly as there is one."""
+
+    def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
+        """The derivative with respect to u, from that with respect to p(u)."""
+
+
+@dataclass(frozen=True)
+class Logarithm:
+    """p = exp(u): a positive number, changed by factors."""
+
+    def parameter(self, u: np.ndarray) -> np.ndarray:
+        return np.exp(u)
+
+    def coordinate(self, parameter: np.ndarray) -> np.ndarray:
+        if (np.asarray(parameter) <= 0.0).any():
+            raise InputError("A parameter that is changed by factors must be greater than 0.")
+        return np.log(parameter)
+
+    def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
+        return bar * np.exp(u)
+
+
+@dataclass(frozen=True)
+class Softmax:
+    """p_k = exp(u_k) / sum_l exp(u_l), row by row: fractions (n, phases) that add up to 1."""
+
+    def parameter(self, u: np.ndarray) -> np.ndarray:
+        powers = np.exp(u - u.max(axis=1, keepdims=True))
+        return powers / powers.sum(axis=1, keepdims=True)
+
+    def coordinate(self, parameter: np.ndarray) -> np.ndarray:
+        u = np.log(np.maximum(parameter, SMALLEST))
+        return u - u.mean(axis=1, keepdims=True)
+
+    def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
+        p = self.parameter(u)
+        return p * (bar - (p * bar).sum(axis=1, keepdims=True))
+
+
+@dataclass(frozen=True)
+class Knots:
+    """p (steps, d) interpolated linearly in time between knots u (k, d), the first and last at both ends."""
+
+    steps: int
+    knots: int
+
+    @property
+    def _weights(self) -> np.ndarray:
+        """(steps, knots)"""
+        places = np.linspace(0.0, self.knots - 1.0, self.steps)
+        return np.maximum(1.0 - np.abs(places[:, None] - np.arange(self.knots)), 0.0)
+
+    def parameter(self, u: np.ndarray) -> np.ndarray:
+        return self._weights @ u
+
+    def coordinate(self, parameter: np.ndarray) -> np.ndarray:
+        return np.linalg.lstsq(self._weights, parameter, rcond=None)[0]
+
+    def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
+        return self._weights.T @ bar
+
+
+class Reparametrised:
+    """A problem whose parameters are coordinates; those without any are their own."""
+
+    def __init__(self, problem: Problem, coordinates: Mapping[str, Coordinates]):
+        self.problem, self.coordinates = problem, dict(coordinates)
+
+    @property
+    def fingerprint(self) -> str:
+        """Which problem in which coordinates this is."""
+        return f"{self.problem.fingerprint} {sorted(self.coordinates.items(), key=str)}"
+
+    def parameters(self, u: Mapping[str, Any]) -> Arrays:
+        """p(u) by name."""
+        return {
+            name: self.coordinates[name].parameter(np.asarray(value)) if name in self.coordinates else value
+            for name, value in u.items()
+        }
+
+    def coordinate(self, parameters: Mapping[str, Any]) -> Arrays:
+        """u by name."""
+        return {
+            name: self.coordinates[name].coordinate(value) if name in self.coordinates else value
+            for name, value in parameters.items()
+        }
+
+    def value(self, u: Mapping[str, Any]) -> float:
+        """The loss, forward only."""
+        return self.problem.value(self.parameters(u))
+
+    def value_and_gradient(self, u: Mapping[str, Any], policy: Policy | None = None) -> tuple[float, Arrays]:
+        """The loss and its derivatives with respect to the coordinates."""
+        loss, gradient = self.problem.value_and_gradient(self.parameters(u), policy)
+        for name, coordinates in self.coordinates.items():
+            if name in gradient:
+                gradient[name] = coordinates.adjoint(np.asarray(u[name]), gradient[name])
+        return loss, gradient

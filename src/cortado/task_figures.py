@@ -1,0 +1,86 @@
+"""The pictures of a solved task: the loss, parameters, particles or images on the way, and a video."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from cortado.assignment import Assignment
+from cortado.controls import UNITS
+from cortado.figures import curve, images, loss_curve, parameters, particles
+from cortado.optimisation import Result
+from cortado.particles import TABLES
+from cortado.video import write_video
+
+MOST_CURVES = 12
+"""Parameters with more components get no picture of their own."""
+MOMENTS = 6
+"""Images on the way."""
+MOST_FRAMES = 120
+"""Frames of a video."""
+
+Figures = list[tuple[str, str | Path]]
+
+
+def task_figures(made: Assignment, result: Result, folder: Path) -> Figures:
+    """Draw them into a folder; (caption, path) of each."""
+    losses = [record.loss for record in result.history]
+    label = "loss [m²]" if made.renderer is None else "loss"
+    figures: Figures = [("The loss.", loss_curve(losses, folder / "loss.png", label=label))]
+    if made.renderer is None:
+        figures.append(_particles(made, result, folder))
+    else:
+        figures += _images(made, result, folder)
+    for name in result.parameters:
+        figures += _parameter(made, result, name, folder)
+    return figures
+
+
+def _particles(made: Assignment, result: Result, folder: Path) -> tuple[str, Path]:
+    before, after = (made.problem.end(made.search.parameters(u)).positions for u in (made.start, result.parameters))
+    target = made.targets[made.problem.steps]
+    path = particles([before, after, target], ["start", "found", "target"], folder / "particles.png")
+    return "Where the fluid ends: with the first guess, with the parameters found, and the target.", path
+
+
+def _images(made: Assignment, result: Result, folder: Path) -> Figures:
+    last, target = max(made.targets.items())
+
+    def image(u: dict[str, np.ndarray]) -> np.ndarray:
+        return made.image(made.problem.states(made.search.parameters(u), [last])[last])
+
+    path = images(
+        [image(made.start), image(result.parameters), target], ["start", "found", "target"], folder / "images.png"
+    )
+    figures: Figures = [("The last image: with the first guess, with the parameters found, and the target.", path)]
+    moments = np.unique(np.linspace(0, len(result.history) - 1, MOMENTS).astype(int))
+    shown = [image(result.history[k].parameters) for k in moments]
+    path = images(shown, [f"iteration {k}" for k in moments], folder / "progress.png")
+    figures.append(("The last image during the optimisation.", path))
+    steps = made.problem.steps
+    if steps > 0 and find_spec("av"):
+        numbers = np.unique(np.linspace(0, steps, MOST_FRAMES).astype(int))
+        found = made.problem.states(made.search.parameters(result.parameters), numbers.tolist())
+        path = write_video(folder / "found.mp4", (made.image(found[k]) for k in numbers.tolist()), 20)
+        figures.append(("What happens with the parameters found.", path))
+    return figures
+
+
+def _parameter(made: Assignment, result: Result, name: str, folder: Path) -> Figures:
+    """A small parameter over the iterations, one over time as it was found."""
+    found, hidden = made.search.parameters(result.parameters)[name], made.hidden(name)
+    if name in TABLES and np.ndim(found) == 2:
+        series = {f"{axis}, found": column for axis, column in zip("xyz", found.T, strict=False)}
+        if hidden is not None:
+            hidden = np.broadcast_to(hidden, found.shape)
+            series |= {f"{axis}, hidden": column for axis, column in zip("xyz", hidden.T, strict=False)}
+        path = folder / f"{name}.png"
+        curve(np.arange(len(found)), series, path, title=name, x_label="step", y_label=f"{name} [{UNITS[name]}]")
+        return [(f"The parameter {name} over time.", path)]
+    if hidden is None or max(np.size(found), hidden.size) > MOST_CURVES:
+        return []
+    values = [made.search.parameters(record.parameters)[name] for record in result.history]
+    history = [np.broadcast_arrays(value, hidden)[0] for value in values]
+    hidden = np.broadcast_to(hidden, history[0].shape)
+    path = parameters(history, hidden, folder / f"{name}.png", title=name, unit=UNITS[name])
+    return [(f"The parameter {name} during the optimisation, and the hidden one.", path)]
