@@ -43,14 +43,14 @@ HONEY = {"name": "honey", "rest_density": 1300.0, "viscosity": 2.0}
 MIXING = {"mobility": 0.1, "mobility_form": "degenerate", "interface_width": 0.04, "strength": 1.0}
 
 
-def splash_of_two(**changes: Any) -> Scene:
-    """The splash with a heavier and stickier fluid in its upper layers, which diffuses into the lower one."""
+def two_layers(**changes: Any) -> Scene:
+    """The collapse, with a heavier and stickier fluid in the upper layers, which diffuses into the lower one."""
     blocks = [
-        {"shape": "box", "lower": [0.0, 0.3, 0.0], "upper": [0.25, 0.45, 0.25], "phase": "water"},
-        {"shape": "box", "lower": [0.0, 0.45, 0.0], "upper": [0.25, 0.55, 0.25], "phase": "oil"},
+        {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.25, 0.15, 0.25], "phase": "water"},
+        {"shape": "box", "lower": [0.0, 0.15, 0.0], "upper": [0.25, 0.25, 0.25], "phase": "oil"},
     ]
     phases = [scene().phase[0].model_dump(), OIL]
-    return scene(**{"name": "splash of two", "phase": phases, "fluid": blocks, "mixture": MIXING, **changes})
+    return scene(**{"name": "two layers", "phase": phases, "fluid": blocks, "mixture": MIXING, **changes})
 
 
 def plane_of_three(**changes: Any) -> Scene:

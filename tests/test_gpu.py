@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from cortado import Problem, Simulation, losses
-from scenes import plane, plane_of_three, splash, splash_of_two
+from scenes import plane, plane_of_three, splash, two_layers
 
 pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
 
@@ -38,7 +38,7 @@ SCENES = {
     "fixed": splash(),
     "tolerance": splash(**TOLERANT),
     "plane": plane(),
-    "two fluids": splash_of_two(),
+    "two fluids": two_layers(),
     "three fluids": plane_of_three(),
 }
 
@@ -50,7 +50,7 @@ def test_the_same_as_the_cpu(made):
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("made", [splash(**TOLERANT), splash_of_two()], ids=["tolerance", "two fluids"])
+@pytest.mark.parametrize("made", [splash(**TOLERANT), two_layers()], ids=["tolerance", "two fluids"])
 def test_same_bits_twice(made, precision):
     for first, second in zip(*(evaluate(made, "cuda:0", precision) for _ in range(2)), strict=True):
         assert first.tobytes() == second.tobytes()

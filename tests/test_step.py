@@ -9,7 +9,7 @@ from cortado import Simulation
 from cortado.controls import Controls
 from cortado.policies import Exact
 from cortado.smoothing import KERNELS
-from scenes import plane, plane_of_three, scene, splash_of_two
+from scenes import plane, plane_of_three, scene, two_layers
 
 GRAVITY, STEPS, ITERATIONS = np.array([0.3, -9.81, 0.1]), 3, 5
 ONE = {"rest_density": 1000.0, "viscosity": 5.0, "time_step": 0.0021}
@@ -97,7 +97,7 @@ CASES = [
     (scene, "wendland_c4", "none", "free"),
     (plane, "cubic_spline", "laminar", "no"),
     (plane, "wendland_c2", "pairwise", "no"),
-    (splash_of_two, "cubic_spline", "pairwise", "free"),
+    (two_layers, "cubic_spline", "pairwise", "free"),
     (plane_of_three, "cubic_spline", "laminar", "no"),
 ]
 cases = pytest.mark.parametrize(("make", "kernel", "viscosity", "slip"), CASES)

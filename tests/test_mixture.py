@@ -1,0 +1,335 @@
+"""Several fluids: gradients are right in everything they depend on, and what must be kept is kept."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+
+from cortado import InputError, Problem, Simulation, Trajectory, losses, policies
+from cortado.masses import masses
+from cortado.physics.free_energy import FreeEnergy
+from scenes import MIXING, OIL, plane, plane_of_three, scene, two_layers
+
+MAKERS = {"two layers": two_layers, "plane of three": plane_of_three}
+STEPS = {"two layers": 30, "plane of three": 50}
+scenes = pytest.mark.parametrize("name", MAKERS)
+
+
+@cache
+def simulation_of(name, precision="float64"):
+    return Simulation(MAKERS[name](), precision=precision)
+
+
+class Everything:
+    """A loss of positions, velocities and mass fractions."""
+
+    def __init__(self, simulation, seed=5):
+        random, (n, d), phases = np.random.default_rng(seed), simulation.positions.shape, len(simulation.scene.phase)
+        self.targets = [0.2 + 0.1 * random.random((n, d)), random.standard_normal((n, d)), random.random((n, phases))]
+        self.weights = (1.0 / n, 0.01 / n, 0.1 / n)
+
+    def value(self, end):
+        found = (end.positions, end.velocities, end.mass_fractions)
+        return sum(w * ((a - b) ** 2).sum() for w, a, b in zip(self.weights, found, self.targets, strict=True))
+
+    def adjoint(self, end):
+        found = (end.positions, end.velocities, end.mass_fractions)
+        return tuple(2.0 * w * (a - b) for w, a, b in zip(self.weights, found, self.targets, strict=True))
+
+
+SIZES = {
+    "gravity": 1.0,
+    "initial_positions": 0.05,
+    "initial_velocities": 0.1,
+    "mass_fractions": 0.1,
+    "rest_density": 100.0,
+    "viscosity": 0.05,
+    "time_step": 1e-4,
+    "mobility": 0.01,
+    "interface_width": 0.004,
+}
+"""Size of a direction of each parameter."""
+
+
+def point_of(simulation, seed=3):
+    """All parameters: the scene's, but for a lattice that is disturbed and phases that are mixed a little."""
+    random = np.random.default_rng(seed)
+    point = {name: simulation.parameters()[name] for name in SIZES}
+    x, c = point["initial_positions"], point["mass_fractions"]
+    mixed = 0.8 * c + 0.2 * random.dirichlet(np.ones(c.shape[1]), len(c))
+    velocities = 0.3 * random.standard_normal(x.shape)
+    disturbed = x + 0.001 * random.standard_normal(x.shape)
+    return {**point, "initial_positions": disturbed, "initial_velocities": velocities, "mass_fractions": mixed}
+
+
+def directions_of(point, seed=4):
+    random = np.random.default_rng(seed)
+    found = {}
+    for name, value in point.items():
+        direction = random.standard_normal(value.shape)
+        found[name] = SIZES[name] * direction / np.linalg.norm(direction)
+    return found
+
+
+def best_difference(problem, point, directions, derivative):
+    """Relative distance of the derivative from the nearest central difference."""
+    found = []
+    for h in (1e-5, 1e-6, 3e-7, 1e-7, 1e-4, 1e-3):
+        ahead, behind = (
+            problem.value({name: value + sign * h * directions.get(name, 0.0) for name, value in point.items()})
+            for sign in (1, -1)
+        )
+        found.append(abs((ahead - behind) / (2 * h) - derivative) / abs(derivative))
+        if found[-1] < 1e-6:
+            break
+    return min(found)
+
+
+@cache
+def case(name):
+    """A problem with its point, directions, and gradient in all parameters together."""
+    simulation = simulation_of(name)
+    problem, point = Problem(simulation, STEPS[name], Everything(simulation)), point_of(simulation)
+    return problem, point, directions_of(point), problem.value_and_gradient(point)
+
+
+@scenes
+@pytest.mark.parametrize("what", [*SIZES, "all"])
+def test_gradient_equals_tangent_and_differences(name, what):
+    problem, point, directions, (_, gradient) = case(name)
+    chosen = {key: value for key, value in directions.items() if what in (key, "all")}
+    adjoint = sum((gradient[key] * value).sum() for key, value in chosen.items())
+    tangent = problem.tangent(point, chosen)
+    assert abs(adjoint - tangent) <= 1e-10 * abs(tangent)
+    assert best_difference(problem, point, chosen, tangent) < 1e-6
+
+
+@scenes
+@pytest.mark.parametrize("what", SIZES)
+def test_a_parameter_alone_has_the_gradient_that_it_has_among_all(name, what):
+    """Not given are only those at which the scene's own value is taken."""
+    problem, point, _, _ = case(name)
+    own = {key: value for key, value in problem.simulation.parameters().items() if key in SIZES}
+    _, wanted = problem.value_and_gradient({**own, what: point[what]})
+    _, found = problem.value_and_gradient({what: point[what]})
+    assert found.keys() == {what} and found[what].tobytes() == wanted[what].tobytes()
+
+
+@scenes
+def test_gradient_equals_warps_tape(name):
+    problem, point, _, (loss, gradient) = case(name)
+    taped_loss, taped = problem.value_and_gradient(point, policies.Tape())
+    assert loss == taped_loss
+    for key in SIZES:
+        assert np.linalg.norm(gradient[key] - taped[key]) <= 1e-9 * np.linalg.norm(gradient[key]), key
+
+
+@scenes
+def test_same_bits_twice_and_under_a_memory_budget(name):
+    problem, point, _, (loss, gradient) = case(name)
+    state_bytes = sum(array.capacity for array in problem.simulation.state.arrays())
+    frugal = Problem(problem.simulation, problem.steps, problem.loss, memory_budget=12 * state_bytes)
+    for other in (Problem(problem.simulation, problem.steps, problem.loss), frugal):
+        found, bits = other.value_and_gradient(point)
+        assert found == loss
+        assert all(bits[key].tobytes() == gradient[key].tobytes() for key in SIZES)
+    assert len(frugal._rollout._states) < 16
+
+
+def test_float32_is_near_float64():
+    wide, narrow = (simulation_of("two layers", precision) for precision in ("float64", "float32"))
+    (loss, exact), (found, gradient) = (
+        Problem(simulation, 30, Everything(simulation)).value_and_gradient(point_of(wide))
+        for simulation in (wide, narrow)
+    )
+    assert found == pytest.approx(loss, rel=1e-5)
+    for key in SIZES:
+        assert np.linalg.norm(gradient[key] - exact[key]) < 2e-3 * np.linalg.norm(exact[key]), key
+
+
+@scenes
+def test_phases_keep_their_mass_and_fractions_add_up_to_1(name):
+    simulation = simulation_of(name)
+    trajectory = simulation.run(200)
+    c, first = trajectory.mass_fractions, simulation.mass_fractions
+    weights = masses(first, simulation.parameters()["rest_density"])
+    kept = np.einsum("i,tik->tk", weights, c)
+    assert trajectory.substeps in (2, 3)
+    assert np.abs(trajectory.positions[-1] - trajectory.positions[0]).max() > 0.1  # it flowed
+    assert np.abs(c[-1] - first).max() > 0.3  # and mixed
+    assert np.abs(kept / kept[0] - 1.0).max() < 1e-12
+    assert np.abs(c.sum(axis=2) - 1.0).max() < 1e-12
+
+
+@pytest.mark.parametrize("make", [two_layers, plane_of_three])
+def test_momentum_is_kept_in_free_space(make):
+    d = make().dimension
+    free = Simulation(make(container={"shape": "none"}, forces={"gravity": [0.0] * d}), precision="float64")
+    point = point_of(free)
+    chosen = {name: point[name] for name in ("initial_positions", "initial_velocities", "mass_fractions")}
+    trajectory = free.run(100, chosen)
+    m = masses(point["mass_fractions"], point["rest_density"])
+    assert np.abs(trajectory.velocities[-1] - trajectory.velocities[0]).max() > 0.3
+    momentum = np.einsum("i,tid->td", m, trajectory.velocities)
+    assert np.abs(momentum - momentum[0]).max() < 1e-10 * (m[:, None] * np.abs(trajectory.velocities[0])).sum()
+    x, v = (np.pad(a, ((0, 0), (0, 0), (0, 3 - d))) for a in (trajectory.positions, trajectory.velocities))
+    spin = np.einsum("i,tid->td", m, np.cross(x, v))
+    assert np.abs(spin - spin[0]).max() < 1e-10 * (m[:, None] * np.abs(np.cross(x[0], v[0]))).sum()
+
+
+def test_without_mobility_every_particle_keeps_its_phase():
+    trajectory = Simulation(two_layers(mixture={}), precision="float64").run(20)
+    assert trajectory.substeps == 0
+    assert all(c.tobytes() == trajectory.mass_fractions[0].tobytes() for c in trajectory.mass_fractions)
+
+
+def equal_fluids(phases, **mixture):
+    """The two layers, of one fluid: as one phase, or as two that are equal."""
+    water = scene().phase[0].model_dump()
+    layers = [fluid.model_dump() for fluid in two_layers().fluid]
+    if phases == 1:
+        return scene(phase=[water], fluid=[{**layer, "phase": "water"} for layer in layers])
+    return two_layers(phase=[water, {**water, "name": "oil"}], mixture=mixture)
+
+
+def test_two_equal_phases_behave_like_one():
+    alone, two, mixing = (
+        Simulation(equal_fluids(phases, **mixture), precision="float64")
+        for phases, mixture in ((1, {}), (2, {}), (2, MIXING))
+    )
+    wanted, same, near = (simulation.run(60) for simulation in (alone, two, mixing))
+    assert np.abs(near.mass_fractions[-1] - near.mass_fractions[0]).max() > 0.1
+    for name in ("positions", "velocities"):
+        assert getattr(same, name).tobytes() == getattr(wanted, name).tobytes()
+        np.testing.assert_allclose(getattr(near, name), getattr(wanted, name), rtol=0, atol=1e-12)
+
+
+def test_problems_with_different_substeps_share_a_simulation():
+    problem, point, _, (loss, gradient) = case("two layers")
+    other = Problem(problem.simulation, 5, problem.loss)
+    for mobility in (0.0, 0.5):
+        other.value_and_gradient({"mobility": mobility}, policies.Tape())
+    found, bits = problem.value_and_gradient(point)
+    assert found == loss and all(bits[key].tobytes() == gradient[key].tobytes() for key in SIZES)
+
+
+def test_a_trajectory_of_mixtures_comes_back_from_disk(tmp_path):
+    trajectory = simulation_of("plane of three").run(6, record_every=2)
+    trajectory.save(tmp_path / "a.vtkhdf")
+    loaded = Trajectory.load(tmp_path / "a.vtkhdf")
+    assert trajectory.mass_fractions.shape == (4, 64, 3)
+    np.testing.assert_array_equal(loaded.mass_fractions, trajectory.mass_fractions)
+    np.testing.assert_array_equal(loaded.positions, trajectory.positions)
+    one = Simulation(plane()).run(2)
+    one.save(tmp_path / "b.vtkhdf")
+    assert one.mass_fractions is None and Trajectory.load(tmp_path / "b.vtkhdf").mass_fractions is None
+
+
+@cache
+def quartic_functions(precision, phases):
+    real, fractions = precision.real, precision.fractions(phases)
+
+    @wp.func
+    def slope(c: fractions) -> fractions:
+        return wp.cw_mul(wp.cw_mul(c, c), c)
+
+    @wp.func
+    def bend(c: fractions, u: fractions) -> fractions:
+        return real(3.0) * wp.cw_mul(wp.cw_mul(c, c), u)
+
+    return SimpleNamespace(slope=slope, bend=bend)
+
+
+QUARTIC = FreeEnergy("quartic", lambda c: 0.25 * (c**4).sum(1), curvature=3.0, functions=quartic_functions)
+
+
+def test_a_free_energy_of_ones_own():
+    simulation = Simulation(two_layers(), precision="float64", free_energy=QUARTIC)
+    problem, point = Problem(simulation, 20, Everything(simulation)), point_of(simulation)
+    loss, gradient = problem.value_and_gradient(point)
+    assert loss != Problem(simulation_of("two layers"), 20, Everything(simulation)).value(point)
+    directions = directions_of(point)
+    tangent = problem.tangent(point, directions)
+    assert sum((gradient[key] * directions[key]).sum() for key in SIZES) == pytest.approx(tangent, rel=1e-10)
+    assert best_difference(problem, point, directions, tangent) < 1e-6
+
+
+def test_a_loss_of_several_frames():
+    simulation = simulation_of("plane of three")
+    frames = {step: Everything(simulation, seed=step) for step in (0, 3, 7, 12)}
+    problem, point = Problem(simulation, 12, losses.Frames(frames)), point_of(simulation)
+    loss, gradient = problem.value_and_gradient(point)
+    directions = directions_of(point)
+    tangent = problem.tangent(point, directions)
+    assert sum((gradient[key] * directions[key]).sum() for key in SIZES) == pytest.approx(tangent, rel=1e-10)
+    assert best_difference(problem, point, directions, tangent) < 1e-6
+    alone = [Problem(simulation, step, one).value_and_gradient(point) for step, one in frames.items()]
+    assert loss == pytest.approx(sum(value for value, _ in alone), rel=1e-14)
+    for key in SIZES:
+        np.testing.assert_allclose(gradient[key], sum(found[key] for _, found in alone), rtol=1e-9, atol=1e-15)
+
+
+def test_a_problem_of_no_steps_is_one_of_the_first_state():
+    simulation = simulation_of("plane of three")
+    loss = Everything(simulation)
+    problem, point = Problem(simulation, 0, loss), point_of(simulation)
+    value, gradient = problem.value_and_gradient(point)
+    end = problem.end(point)
+    names = ("initial_positions", "initial_velocities", "mass_fractions")
+    for key, wanted in zip(names, loss.adjoint(end), strict=True):
+        np.testing.assert_array_equal(getattr(end, key.removeprefix("initial_")), point[key])
+        np.testing.assert_array_equal(gradient[key], wanted)
+    assert value == loss.value(end) == problem.value(point)
+    assert all(not gradient[key].any() for key in SIZES if key not in names)
+    directions = directions_of(point)
+    wanted = sum((gradient[key] * directions[key]).sum() for key in names)
+    assert problem.tangent(point, directions) == pytest.approx(wanted, rel=1e-14)
+
+
+def wrong_fractions():
+    fractions = np.tile([0.5, 0.5], (125, 1))
+    fractions[7] = [0.8, 0.3]
+    return fractions
+
+
+MISTAKES = {
+    "viscosity has shape (), but must be (2,)": {"viscosity": 1.0},
+    "rest_density has shape (3,), but must be (2,)": {"rest_density": [1.0, 2.0, 3.0]},
+    "mass_fractions has shape (125,), but must be (125, 2)": {"mass_fractions": np.ones(125)},
+    "mass_fractions of particle 7 add up to 1.1, but must to 1": {"mass_fractions": wrong_fractions()},
+    "mobility is -0.1, but must be at least 0": {"mobility": -0.1},
+    "mobility has shape (2,), but must be ()": {"mobility": [0.1, 0.1]},
+    "interface_width is 0.0, but must be greater than 0": {"interface_width": 0.0},
+    "rest_density is -1.0, but must be greater than 0": {"rest_density": [1000.0, -1.0]},
+    "viscosity has a value that is not finite": {"viscosity": [np.nan, 1.0]},
+    "colours has shape (3,), but must be (2, 3)": {"colours": [0.1, 0.2, 0.3]},
+}
+
+
+@pytest.mark.parametrize("words", MISTAKES)
+def test_a_mistake_is_a_sentence(words):
+    problem = case("two layers")[0]
+    with pytest.raises(InputError) as caught:
+        problem.value(MISTAKES[words])
+    sentence = str(caught.value)
+    assert words in sentence
+    assert "\n" not in sentence and sentence.endswith(".") and len(sentence) < 300
+
+
+def test_frames_that_do_not_exist_are_a_sentence():
+    simulation = simulation_of("plane of three")
+    with pytest.raises(InputError, match="frame 5, but must have frames from 0 to 4"):
+        Problem(simulation, 4, losses.Frames({5: Everything(simulation)}))
+    with pytest.raises(InputError, match="at least one frame"):
+        losses.Frames({})
+
+
+def test_parameters_are_those_of_the_scene():
+    parameters = simulation_of("two layers").parameters()
+    np.testing.assert_array_equal(parameters["rest_density"], [1000.0, OIL["rest_density"]])
+    np.testing.assert_array_equal(parameters["viscosity"], [0.05, OIL["viscosity"]])
+    np.testing.assert_array_equal(parameters["mass_fractions"].sum(axis=0), [75.0, 50.0])
+    assert parameters["mobility"] == MIXING["mobility"] and parameters["interface_width"] == MIXING["interface_width"]
+    assert Simulation(plane()).parameters()["viscosity"].shape == ()
