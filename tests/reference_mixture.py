@@ -22,6 +22,7 @@ class Mixture:
         self.alpha, self.mobility, self.eps = options["alpha"], options["mobility"], options["eps"]
         self.form = options.get("form", "constant")
         self.well = options.get("energy", "double_well")
+        self.evenness = options.get("evenness", 1.0)
 
     def pairs(self, x, n=0.0):
         """F (n, n) and the volumes V / n_i; ``n`` (n,) is what walls add to the number density."""
@@ -31,7 +32,7 @@ class Mixture:
         size = (s * s).sum(-1)
         q = np.sqrt(size) / self.h
         density = self.volume * (self.sigma * value(self.name, q)).sum(1) + n
-        pull = self.sigma / self.h**2 * slope(self.name, q) * size / (size + 0.01 * self.h**2)
+        pull = self.evenness * self.sigma / self.h**2 * slope(self.name, q) * size / (size + 0.01 * self.h**2)
         return pull, self.volume / density
 
     def exchange(self, s, volumes, pull, u):
@@ -41,7 +42,7 @@ class Mixture:
 
     def potential(self, c, mass, volumes, pull):
         squares = c * c
-        bulk = c if self.well == "miscible" else 2 * c * (squares.sum(1, keepdims=True) - squares)
+        bulk = c if self.well == "miscible" else c - 3 * squares + 2 * squares * c
         bulk = self.alpha * (bulk - bulk.mean(1, keepdims=True))
         return bulk - self.eps**2 / mass[:, None] * self.exchange(mass, volumes, pull, c)
 
@@ -62,5 +63,5 @@ class Mixture:
         """The discrete free energy whose gradient the potential is; never rises while dt is below its limit."""
         pull, volumes = self.pairs(x, n)
         squares = c * c
-        well = squares.sum(1) / 2 if self.well == "miscible" else (squares.sum(1) ** 2 - (squares**2).sum(1)) / 2
+        well = squares.sum(1) / 2 if self.well == "miscible" else (squares * (1 - c) ** 2).sum(1) / 2
         return self.alpha * (mass * well).sum() - self.eps**2 / 2 * (c * self.exchange(mass, volumes, pull, c)).sum()

@@ -70,8 +70,9 @@ def twins_steps(simulation, substeps):
             lattice.support,
             lattice.volume,
             alpha=mixture.strength,
-            mobility=lattice.evenness * mobility,
-            eps=lattice.evenness**0.5 * width,
+            mobility=mobility,
+            eps=width,
+            evenness=lattice.evenness,
             form=mixture.mobility_form,
             energy=mixture.free_energy,
         )
