@@ -4,7 +4,7 @@
     miscible     f = sum_k c_k^2 / 2: phases mix, by Fick's law
 
     constant     m = 1
-    degenerate   m = (z + sqrt(z^2 + delta^2)) / 2,  z = sum_(k < l) c_k c_l: only where phases touch
+    degenerate   m = (z + sqrt(z^2 + delta^2)) / 2,   z = sum_(k<l) c_k c_l: where phases touch
 
 For two phases the double well is c_1^2 c_2^2. The other generalisation, sum_(k < l) c_k^2 c_l^2, pulls a third phase into
 the interface of two, and lets equal parts of three or more stay mixed.
