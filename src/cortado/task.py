@@ -9,7 +9,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import model_validator
 
-from cortado.controls import NAMES, OF_EMITTER, POSITIVE, Arrays, parameter_shapes
+from cortado.controls import NAMES, NOT_NEGATIVE, OF_EMITTER, POSITIVE, SUM_TOLERANCE, Arrays, parameter_shapes
 from cortado.errors import Phrase, SceneError
 from cortado.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisers import LBFGS, Adam, GradientDescent, Optimiser
@@ -97,13 +97,17 @@ class ProblemTable(Table):
     @model_validator(mode="after")
     def _check_target(self) -> Self:
         if self.picture is None and self.target is None:
-            raise wrong(("target",), MISSING, Values.wanted)
+            raise wrong(("target",), MISSING, f"{Values.wanted}, as there is no picture")
         if self.picture is not None and self.target is not None:
             raise wrong(("picture",), self.picture, "left out, as there is a target")
         if self.picture is not None and self.loss != "image":
             raise wrong(("loss",), self.loss, '"image", as there is a picture')
+        if self.picture is not None and self.frames > 1:
+            raise wrong(("frames",), self.frames, "1, as there is a picture, which is one")
+        if self.loss != "image" and "distance" in self.model_fields_set:
+            raise wrong(("distance",), self.distance, "left out, as positions are compared")
         if self.frames > max(self.steps, 1):
-            raise wrong(("frames",), self.frames, f"at most steps, {self.steps}")
+            raise wrong(("frames",), self.frames, f"at most {max(self.steps, 1)}, as there are {self.steps} steps")
         return self
 
     @property
@@ -185,7 +189,9 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
                 raise SceneError(None, f"problem.target.{name}", MISSING, "given, as optimise.start has it")
         hidden = _resolved("problem.target", hidden, scene, steps)
         start = _resolved("optimise.start", optimise.start, scene, steps)
-        _check_options(optimise, start)
+        _check_options(problem, optimise, start)
+        for name, pair in (optimise.bounds or {}).items():
+            _check_bounds(name, pair, optimise, start, scene)
     except SceneError as error:
         raise error.in_file(file) from None
     return Task(scene, problem, optimise, hidden, start, Path(file).parent)
@@ -201,34 +207,88 @@ def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int) -
         if isinstance(array, str):
             found[name] = array
             continue
-        if name in TABLES and array.ndim == 2 and 2 <= len(array) <= steps:
-            array = Knots(steps, len(array)).parameter(array)
         shapes = _shapes(name, scene, steps)
+        if name in TABLES and array.ndim == 2 and 2 <= len(array) <= steps and array.shape[1:] == shapes[0]:
+            array = Knots(steps, len(array)).parameter(array)
         if array.shape not in shapes:
-            raise SceneError(None, field, Phrase(_in_words([array.shape])), _in_words(shapes))
-        if name in POSITIVE and (array <= 0.0).any():
-            raise SceneError(None, field, float(array.min()), "greater than 0")
+            wanted = _in_words(shapes)
+            if name in TABLES and steps > 1:
+                wanted = f"{_in_words(shapes[:1])}, or 2 to {steps} rows of it"
+            raise SceneError(None, field, Phrase(_in_words([array.shape])), wanted)
+        _check_range(name, field, array)
         found[name] = array
     return found
 
 
-def _check_options(optimise: OptimiseTable, start: Mapping[str, Any]) -> None:
+def _check_range(name: str, field: str, array: np.ndarray) -> None:
+    if name in POSITIVE and (array <= 0.0).any():
+        raise SceneError(None, field, float(array.min()), "greater than 0")
+    if name in NOT_NEGATIVE and (array < 0.0).any():
+        raise SceneError(None, field, float(array.min()), "at least 0")
+    if name == "mass_fractions":
+        row = int(np.abs(array.sum(axis=1) - 1.0).argmax())
+        if abs(array[row].sum() - 1.0) > SUM_TOLERANCE:
+            raise SceneError(None, f"{field}[{row}]", array[row].tolist(), "fractions that add up to 1")
+        if (array < 0.0).any():
+            raise SceneError(None, field, float(array.min()), "at least 0")
+
+
+def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mapping[str, Any]) -> None:
+    """Raises `SceneError` for an option that does not fit the others; none is silently left unused."""
+    over_time = [name for name in TABLES if name in start and start[name].ndim == 2]
+    if optimise.knots is not None and not over_time:
+        raise SceneError(None, "optimise.knots", optimise.knots, "left out, as nothing that is optimised has rows")
+    if optimise.knots is not None and optimise.knots > problem.steps:
+        raise SceneError(None, "optimise.knots", optimise.knots, f"at most the number of steps, {problem.steps}")
     for name in optimise.logarithmic:
         if name not in start:
             raise SceneError(None, "optimise.logarithmic", name, "made of parameters that optimise.start has")
-        if (np.asarray(start[name]) <= 0.0).any():
-            raise SceneError(None, f"optimise.start.{name}", float(np.min(start[name])), "greater than 0")
-    for name, pair in (optimise.bounds or {}).items():
-        if name not in start:
-            raise SceneError(None, f"optimise.bounds.{name}", Phrase("given"), "left out, as optimise.start lacks it")
-        if pair.ndim == 0 or len(pair) != 2:
-            wanted = "two entries, the lower and the upper bound"
-            raise SceneError(None, f"optimise.bounds.{name}", Phrase(_in_words([pair.shape])), wanted)
+        if name == "mass_fractions" or (optimise.knots is not None and name in over_time):
+            wanted = "made of other parameters: mass fractions and knots have coordinates of their own"
+            raise SceneError(None, "optimise.logarithmic", name, wanted)
+        if not isinstance(start[name], str) and (start[name] <= 0.0).any():
+            raise SceneError(None, f"optimise.start.{name}", float(start[name].min()), "greater than 0")
+    given = optimise.check.model_fields_set
+    if problem.loss != "image" and "psnr" in given:
+        raise SceneError(None, "optimise.check.psnr", optimise.check.psnr, "left out, as positions are compared")
+    if problem.picture is not None and "parameter_error" in given:
+        wanted = "left out, as the target is a picture and no parameter is hidden"
+        raise SceneError(None, "optimise.check.parameter_error", optimise.check.parameter_error, wanted)
+
+
+def _check_bounds(name: str, pair: np.ndarray, optimise: OptimiseTable, start: Mapping[str, Any], scene: Scene) -> None:
+    """Raises `SceneError` for bounds that do not fit the start."""
+    field = f"optimise.bounds.{name}"
+    if name not in start:
+        raise SceneError(None, field, Phrase("given"), "left out, as optimise.start lacks it")
+    if name == "mass_fractions":
+        raise SceneError(None, field, Phrase("given"), "left out, as fractions stay from 0 to 1 by themselves")
+    value = start[name]
+    if pair.ndim == 0 or len(pair) != 2:
+        wanted = "two entries, the lower and the upper bound"
+        raise SceneError(None, field, Phrase(_in_words([pair.shape])), wanted)
+    if (pair[0] > pair[1]).any():
+        raise SceneError(None, field, pair.tolist(), "two entries, the lower one not above the upper one")
+    if name in optimise.logarithmic and (pair <= 0.0).any():
+        raise SceneError(None, field, pair.tolist(), "greater than 0, as the parameter is changed by factors")
+    shape = _shapes(name, scene, 0)[0] if isinstance(value, str) else value.shape
+    if optimise.knots is not None and name in TABLES and len(shape) == 2:
+        shape = (optimise.knots, shape[1])
+    try:
+        np.broadcast_to(pair[0], shape)
+    except ValueError:
+        each = " or ".join(["a number", *(f"of shape {shape[k:]}" for k in reversed(range(len(shape))))])
+        wanted = f"two entries, the lower and the upper bound, each {each}"
+        raise SceneError(None, field, Phrase(_in_words([pair.shape])), wanted) from None
+    comparable = not isinstance(value, str) and pair[0].shape in ((), value.shape, value.shape[1:])
+    if comparable and ((value < pair[0]) | (value > pair[1])).any():
+        raise SceneError(None, f"optimise.start.{name}", value.tolist(), f"within {field}, {pair.tolist()}")
 
 
 def _shapes(name: str, scene: Scene, steps: int) -> list[tuple[int, ...]]:
     """The shapes that a parameter may have; () is a number."""
-    return parameter_shapes(name, steps, len(scene.phase), fluid_particles(scene).positions.shape)
+    shapes = parameter_shapes(name, steps, len(scene.phase), fluid_particles(scene).positions.shape)
+    return [shape for shape in shapes if 0 not in shape]
 
 
 def _in_words(shapes: Sequence[tuple[int, ...]]) -> str:
