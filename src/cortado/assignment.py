@@ -61,7 +61,11 @@ def assignment(task: Task, device: str, precision: str) -> Assignment:
     problem = Problem(simulation, task.problem.steps, Frames(losses))
     start = {name: _start(name, value, simulation) for name, value in task.start.items()}
     search = Reparametrised(problem, _coordinates(task, start))
-    return Assignment(task, problem, search, search.coordinate(start), _bounds(task, search), renderer, targets)
+    bounds = _bounds(task)
+    coordinates = search.coordinate(start)
+    for name, (lower, upper) in bounds.items():
+        coordinates[name] = np.clip(coordinates[name], lower, upper)  # what is random, or a little outside by round-off
+    return Assignment(task, problem, search, coordinates, bounds, renderer, targets)
 
 
 def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> dict[int, np.ndarray]:
@@ -99,11 +103,16 @@ def _start(name: str, value: Any, simulation: Simulation) -> np.ndarray:
     random = np.random.default_rng(0)
     if name == "mass_fractions":
         return random.dirichlet(np.ones(len(simulation.scene.phase)), simulation.particles)
-    extent = simulation.scene.container.extent()
+    container = simulation.scene.container
+    extent = container.extent()
     if extent is None:
         raise InputError('optimise.start.initial_positions is "random", but the scene has no container to fill.')
     half = 0.5 * simulation.scene.discretisation.spacing
-    return random.uniform(extent[0] + half, extent[1] - half, simulation.positions.shape)
+    lower, upper = extent[0] + half, extent[1] - half
+    x = random.uniform(lower, upper, simulation.positions.shape)
+    while (outside := ~container.contains(x, 0.0)).any():  # in the corners around a cylinder
+        x[outside] = random.uniform(lower, upper, x[outside].shape)
+    return x
 
 
 def _coordinates(task: Task, start: Arrays) -> dict[str, Coordinates]:
@@ -116,7 +125,7 @@ def _coordinates(task: Task, start: Arrays) -> dict[str, Coordinates]:
     return found
 
 
-def _bounds(task: Task, search: Reparametrised) -> dict[str, tuple[Any, Any]]:
+def _bounds(task: Task) -> dict[str, tuple[Any, Any]]:
     """Bounds hold for knots as they do for what lies between them, and for logarithms after they are taken."""
     found = {}
     for name, pair in (task.optimise.bounds or {}).items():
