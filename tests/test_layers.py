@@ -13,22 +13,24 @@ ROOT = Path(cortado.__file__).parent
 
 LAYERS = """
     errors
-    image_losses srgb
+    image_losses srgb masses
     precision smoothing calibration cells
-    physics.surroundings physics.density physics.walls physics.integration physics.gravity physics.pressure
-    physics.viscosity physics.convergence physics.reduction physics.matching
+    physics.surroundings physics.density physics.walls physics.integration physics.gravity physics.nozzle
+    physics.pressure physics.viscosity physics.free_energy physics.diffusion physics.mixture
+    physics.convergence physics.reduction physics.matching
     physics.tint physics.colour_field physics.interpolation physics.rays physics.absorption
     launching neighbours particles
     render.cameras render.views render.fields render.marching render.renderer
     shapes scene_kinds scene_tables scene_toml scene_points
     scene_fluids scene_emitter scene_mixture scene_render scene_containers scene_stability scene_checks scene sampling
     vtkhdf trajectory
-    solvers.forces solvers.pcisph solvers.pcisph_derivatives
-    rollout policies losses simulation problem
+    solvers.forces solvers.mixture solvers.emitter solvers.pcisph solvers.pcisph_derivatives
+    rollout policies losses controls simulation problem
+    render.scene_renderer reparametrisation
     evaluations optimisers optimisation
     run_folder progress pictures video
     figures.canvas figures.curves figures.particle_sets figures.side_by_side figures report
-    task certificate bench
+    task assignment task_figures certificate
     commands.* cli
 """
 """From the foundations to the command line; ``package.*`` stands for modules that do not import one another.
@@ -120,6 +122,12 @@ def test_imports_run_one_way(module):
 
 def test_the_list_names_nothing_twice():
     assert len(set(ORDER)) == len(ORDER)
+
+
+def test_the_list_names_only_what_there_is():
+    packages = {f"{path.parent.name}.*" for path in ROOT.glob("*/__init__.py")}
+    packages |= {path.parent.name for path in ROOT.glob("*/__init__.py")}
+    assert set(ORDER) <= {*MODULES, *packages}
 
 
 @pytest.mark.parametrize(
