@@ -51,6 +51,18 @@ PARTICLES = 64
 _TABLES = GOOD_TASK[GOOD_TASK.index("[problem]") :]
 _OPTIMISE = GOOD_TASK[GOOD_TASK.index("[optimise]") :]
 _TARGET, _START = "target.gravity = [1.5, -9.81]", "start.gravity = [0.0, -7.0]"
+_RATE, _STEPS = "learning_rate = 0.5", "steps = 5"
+_ROWS = "start.gravity = [[0.0, -7.0], [0.0, -8.0]]"
+_FOR_EACH_STEP = [[[-9.0, -9.0]] * 5, [[9.0, 9.0]] * 5]
+_PLACES, _PURE = [[0.1, 0.1]] * PARTICLES, [[1.0]] * PARTICLES
+_RANDOM_IN_SPACE = 'start.initial_positions = "random"\nbounds.initial_positions = [[0, 0, 0], [1, 1, 1]]'
+
+
+def _both(name: str, value: object, option: str = "") -> str:
+    """The tables with another parameter, hidden and to begin with, and an option of the optimisation."""
+    start = f"start.{name} = {value}\n{option}"
+    return _TABLES.replace(_TARGET, f"target.{name} = {value}").replace(_START, start)
+
 
 BAD_TASKS = [
     ("no problem", _TABLES, _OPTIMISE, "problem"),
@@ -61,11 +73,15 @@ BAD_TASKS = [
     ("empty target", _TARGET, "target = {}", "problem.target"),
     ("target that is a list", _TARGET, "target = [1.5, -9.81]", "problem.target"),
     ("unknown parameter", _START, "start.gravitation = [0.0, -7.0]", "optimise.start.gravitation"),
-    ("parameter of another table", _TARGET, "target.colours = [1.0]", "problem.target.colours"),
+    ("colour of one channel", _TARGET, f"{_TARGET}\ntarget.colours = [1.0]", "problem.target.colours"),
+    ("parameter of another table", _TARGET, "target.spacing = 0.1", "problem.target.spacing"),
     ("start without target", _START, "start.gravity = [0.0, -7.0]\nstart.viscosity = 0.1", "problem.target.viscosity"),
     ("gravity of three", _START, "start.gravity = [0.0, -7.0, 0.0]", "optimise.start.gravity"),
     ("gravity that is a number", _TARGET, "target.gravity = -9.81", "problem.target.gravity"),
-    ("gravity of two steps", _TARGET, "target.gravity = [[0.0, 1.0], [0.0, 2.0]]", "problem.target.gravity"),
+    ("gravity of one row", _TARGET, "target.gravity = [[0.0, 1.0]]", "problem.target.gravity"),
+    ("gravity of more rows than steps", _TARGET, f"target.gravity = {[[0.0, 1.0]] * 6}", "problem.target.gravity"),
+    ("gravity of rows of three", _START, "start.gravity = [[0.0, 1.0, 2.0], [0.0, 2.0, 3.0]]",
+     "optimise.start.gravity"),
     ("ragged gravity", _TARGET, "target.gravity = [[0.0, 1.0], [0.0]]", "problem.target.gravity"),
     ("gravity of nothing", _TARGET, "target.gravity = []", "problem.target.gravity"),
     ("gravity in text", _TARGET, 'target.gravity = ["1.5", "-9.81"]', "problem.target.gravity"),
@@ -79,7 +95,9 @@ BAD_TASKS = [
     ("negative time step", _TARGET, f"{_TARGET}\ntarget.time_step = -0.001", "problem.target.time_step"),
     ("no density", _TABLES, _TABLES.replace(_START, "start.rest_density = 0.0").replace(
         _TARGET, "target.rest_density = 900"), "optimise.start.rest_density"),
-    ("no steps", "steps = 5", "steps = 0", "problem.steps"),
+    ("fewer than no steps", "steps = 5", "steps = -1", "problem.steps"),
+    ("rows where no time passes", _TABLES, _TABLES.replace("steps = 5", "steps = 0").replace(
+        _TARGET, "target.gravity = [[0.0, 1.0], [0.0, 2.0]]"), "problem.target.gravity"),
     ("part of a step", "steps = 5", "steps = 2.5", "problem.steps"),
     ("steps left out", "steps = 5", "", "problem.steps"),
     ("misspelt steps", "steps = 5", "step = 5", "problem.step"),
@@ -94,4 +112,64 @@ BAD_TASKS = [
     ("unknown check", "parameter_error", "gravity_error", "optimise.check.gravity_error"),
     ("wrong scene", "spacing = 0.05", "spacing = -0.05", "discretisation.spacing"),
     ("unknown table", "[problem]", "[problems]", "problems"),
+    ("unknown loss", _STEPS, f'{_STEPS}\nloss = "picture"', "problem.loss"),
+    ("picture and target", _TARGET, f'loss = "image"\npicture = "heart"\n{_TARGET}', "problem.picture"),
+    ("neither picture nor target", _TARGET, 'loss = "image"', "problem.target"),
+    ("picture of positions", _TARGET, 'picture = "heart"', "problem.loss"),
+    ("picture without a name", _TARGET, 'loss = "image"\npicture = " "', "problem.picture"),
+    ("picture of numbers", _TARGET, 'loss = "image"\npicture = [[0.0, 1.0]]', "problem.picture"),
+    ("several frames of a picture", _TARGET, 'loss = "image"\npicture = "heart"\nframes = 2', "problem.frames"),
+    ("more frames than steps", _STEPS, f"{_STEPS}\nframes = 6", "problem.frames"),
+    ("two frames of no steps", "steps = 5", "steps = 0\nframes = 2", "problem.frames"),
+    ("no frames", _STEPS, f"{_STEPS}\nframes = 0", "problem.frames"),
+    ("half a frame", _STEPS, f"{_STEPS}\nframes = 1.5", "problem.frames"),
+    ("unknown distance", _STEPS, f'{_STEPS}\nloss = "image"\ndistance = "manhattan"', "problem.distance"),
+    ("distance of positions", _STEPS, f'{_STEPS}\ndistance = "pyramid"', "problem.distance"),
+    ("top of the plane", "[problem]", '[render]\nview = "top"\n[problem]', "render.view"),
+    ("random gravity", _START, 'start.gravity = "random"', "optimise.start.gravity"),
+    ("random target", _TARGET, 'target.initial_positions = "random"', "problem.target.initial_positions"),
+    ("positions by chance", _START, 'start.initial_positions = "chance"', "optimise.start.initial_positions"),
+    ("fractions without rows", _TABLES, _both("mass_fractions", [1.0] * PARTICLES), "problem.target.mass_fractions"),
+    ("fractions beyond 1", _TABLES, _both("mass_fractions", [[1.5]] * PARTICLES), "problem.target.mass_fractions[0]"),
+    ("negative viscosity", _TABLES, _both("viscosity", -0.1), "problem.target.viscosity"),
+    ("negative mobility", _TABLES, _both("mobility", -0.1), "problem.target.mobility"),
+    ("colours of two phases", _TABLES, _both("colours", [[1.0] * 3] * 2), "problem.target.colours"),
+    ("viscosity in a list", _TABLES, _both("viscosity", [0.1]), "problem.target.viscosity"),
+    ("path without an emitter", _TABLES, _both("nozzle_path", [0.1, 0.2]), "problem.target.nozzle_path"),
+    ("flow rate without an emitter", _TABLES, _both("flow_rate", 0.1), "problem.target.flow_rate"),
+    ("one knot", _RATE, f"{_RATE}\nknots = 1", "optimise.knots"),
+    ("knots of a constant", _RATE, f"{_RATE}\nknots = 3", "optimise.knots"),
+    ("more knots than steps", _START, f"{_ROWS}\nknots = 6", "optimise.knots"),
+    ("logarithm of a negative number", _RATE, f'{_RATE}\nlogarithmic = ["gravity"]', "optimise.start.gravity"),
+    ("logarithm of what is not optimised", _RATE, f'{_RATE}\nlogarithmic = ["viscosity"]', "optimise.logarithmic"),
+    ("logarithm of an unknown parameter", _RATE, f'{_RATE}\nlogarithmic = ["wind"]', "optimise.logarithmic"),
+    ("logarithm in text", _RATE, f'{_RATE}\nlogarithmic = "gravity"', "optimise.logarithmic"),
+    ("logarithm of fractions", _TABLES, _both("mass_fractions", _PURE, 'logarithmic = ["mass_fractions"]'),
+     "optimise.logarithmic"),
+    ("logarithm of knots", _START, f'{_ROWS}\nknots = 2\nlogarithmic = ["gravity"]', "optimise.logarithmic"),
+    ("bounds of what is not optimised", _RATE, f"{_RATE}\nbounds.viscosity = [0.1, 0.2]", "optimise.bounds.viscosity"),
+    ("bounds of an unknown parameter", _RATE, f"{_RATE}\nbounds.wind = [0.1, 0.2]", "optimise.bounds.wind"),
+    ("no bounds", _RATE, f"{_RATE}\nbounds = {{}}", "optimise.bounds"),
+    ("bounds in a list", _RATE, f"{_RATE}\nbounds = [0.0, 1.0]", "optimise.bounds"),
+    ("one bound", _RATE, f"{_RATE}\nbounds.gravity = 20.0", "optimise.bounds.gravity"),
+    ("three bounds", _RATE, f"{_RATE}\nbounds.gravity = [0.0, 1.0, 2.0]", "optimise.bounds.gravity"),
+    ("ragged bounds", _RATE, f"{_RATE}\nbounds.gravity = [0.0, [1.0, 2.0]]", "optimise.bounds.gravity"),
+    ("endless bounds", _RATE, f"{_RATE}\nbounds.gravity = [-inf, inf]", "optimise.bounds.gravity"),
+    ("bounds of three components", _RATE, f"{_RATE}\nbounds.gravity = [[-9.0, -9.0, -9.0], [9.0, 9.0, 9.0]]",
+     "optimise.bounds.gravity"),
+    ("bounds upside down", _RATE, f"{_RATE}\nbounds.gravity = [[-9.0, 9.0], [9.0, -9.0]]", "optimise.bounds.gravity"),
+    ("start outside", _RATE, f"{_RATE}\nbounds.gravity = [-5.0, 5.0]", "optimise.start.gravity"),
+    ("bounds for every step, with knots", _START, f"{_ROWS}\nknots = 2\nbounds.gravity = {_FOR_EACH_STEP}",
+     "optimise.bounds.gravity"),
+    ("bounds of random places in space", _TABLES, _both("initial_positions", _PLACES).replace(
+        f"start.initial_positions = {_PLACES}", _RANDOM_IN_SPACE),
+     "optimise.bounds.initial_positions"),
+    ("bounds of fractions", _TABLES, _both("mass_fractions", _PURE, "bounds.mass_fractions = [0.0, 1.0]"),
+     "optimise.bounds.mass_fractions"),
+    ("bound of a logarithm that is zero", _TABLES,
+     _both("viscosity", 0.1, 'logarithmic = ["viscosity"]\nbounds.viscosity = [0.0, 1.0]'),
+     "optimise.bounds.viscosity"),
+    ("noise of positions", "loss_reduction = 2.0", "psnr = 30.0", "optimise.check.psnr"),
+    ("negative noise", "loss_reduction = 2.0", "psnr = -3.0", "optimise.check.psnr"),
+    ("hidden parameters of a picture", _TARGET, 'loss = "image"\npicture = "heart"', "optimise.check.parameter_error"),
 ]  # fmt: skip

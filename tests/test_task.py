@@ -57,7 +57,67 @@ def test_an_optimiser_is_chosen_by_name(task_file, name, wanted):
 def test_gravity_may_change_with_time(task_file):
     table = [[0.0, -float(step)] for step in range(5)]
     task = load_task(task_file, [f"problem.target.gravity={table}", f"optimise.start.gravity={table}"])
-    assert task.problem.target["gravity"].shape == task.optimise.start["gravity"].shape == (5, 2)
+    np.testing.assert_array_equal(task.hidden["gravity"], table)
+    np.testing.assert_array_equal(task.start["gravity"], table)
+
+
+def test_a_few_rows_are_interpolated_to_one_for_each_step(task_file):
+    task = load_task(
+        task_file, ["problem.target.gravity=[[0,-9],[4,-5]]", "optimise.start.gravity=[[0,-7],[2,-7],[0,-5]]"]
+    )
+    np.testing.assert_allclose(task.hidden["gravity"], [[0, -9], [1, -8], [2, -7], [3, -6], [4, -5]], atol=1e-15)
+    np.testing.assert_allclose(task.start["gravity"], [[0, -7], [1, -7], [2, -7], [1, -6], [0, -5]], atol=1e-15)
+
+
+def test_what_may_be_left_out(task_file):
+    task = load_task(task_file)
+    assert (task.problem.loss, task.problem.frames, task.problem.picture) == ("positions", 1, None)
+    assert (task.optimise.knots, task.optimise.logarithmic, task.optimise.bounds) == (None, (), None)
+    assert task.folder == task_file.parent and task.problem.compared == [5]
+
+
+@pytest.mark.parametrize(
+    ("steps", "frames", "wanted"),
+    [(0, 1, [0]), (5, 1, [5]), (5, 2, [2, 5]), (6, 3, [2, 4, 6]), (7, 7, [*range(1, 8)]), (100, 4, [25, 50, 75, 100])],
+)
+def test_frames_are_spread_evenly_up_to_the_last(task_file, steps, frames, wanted):
+    task = load_task(task_file, [f"problem.steps={steps}", f"problem.frames={frames}"])
+    assert task.problem.compared == wanted
+
+
+def test_a_picture_needs_no_hidden_parameters(task_file):
+    task_file.write_text(GOOD_TASK.replace("target.gravity = [1.5, -9.81]", 'loss = "image"\npicture = "heart"'))
+    with pytest.raises(SceneError, match=r"parameter_error is 0\.5, but must be left out"):
+        load_task(task_file)
+    task_file.write_text(task_file.read_text().replace("parameter_error = 0.5", "psnr = 10.0"))
+    task = load_task(task_file)
+    assert (task.problem.loss, task.problem.picture, task.hidden) == ("image", "heart", {})
+    assert task.optimise.check.psnr == 10.0
+
+
+def test_options_of_the_search(task_file):
+    task = load_task(
+        task_file,
+        [
+            "problem.target.viscosity=0.1",
+            "optimise.start.viscosity=0.05",
+            "optimise.start.gravity=[[0,-7],[0,-8]]",
+            "optimise.knots=2",
+            'optimise.logarithmic=["viscosity"]',
+            "optimise.bounds.viscosity=[0.01,1]",
+            "optimise.bounds.gravity=[[-5,-20],[5,0]]",
+        ],
+    )
+    assert (task.optimise.knots, task.optimise.logarithmic) == (2, ("viscosity",))
+    np.testing.assert_array_equal(task.optimise.bounds["gravity"], [[-5, -20], [5, 0]])
+
+
+def test_random_values_are_drawn_later(task_file):
+    places = np.full((64, 2), 0.1).tolist()
+    task = load_task(
+        task_file, [f"problem.target={{initial_positions={places}}}", 'optimise.start={initial_positions="random"}']
+    )
+    assert task.start == {"initial_positions": "random"}
 
 
 # ---- bad tasks ---------------------------------------------------------------------------------------------------
@@ -128,3 +188,18 @@ def test_constant_gravity_is_compared_with_gravity_over_time(task_file, over_tim
 def test_a_target_that_is_not_optimised_is_not_judged(task_file):
     task = load_task(task_file, ["problem.target.viscosity=0.1"])
     assert judge(task, result({"gravity": [1.5, -9.81]}, [4.0, 1.0])).errors == {"gravity": 0.0}
+
+
+def test_an_image_is_judged_by_its_noise(task_file):
+    task_file.write_text(GOOD_TASK.replace("steps = 5", 'steps = 5\nloss = "image"'))
+    task, reached = load_task(task_file, ["optimise.check.psnr=30"]), result({"gravity": [1.5, -9.81]}, [4.0, 1.0])
+    assert judge(task, reached, noise=30.5).failures == []
+    assert judge(task, reached, noise=math.inf).psnr == math.inf
+    assert judge(task, reached, noise=29.5).failures == [
+        "The image is matched to 29.5 dB, but the task asks for 30 dB."
+    ]
+
+
+def test_what_is_found_is_judged_not_its_coordinates(task_file):
+    verdict = judge(load_task(task_file), result({"gravity": [9.0, 9.0]}, [4.0, 1.0]), {"gravity": [1.5, -9.81]})
+    assert verdict.errors == {"gravity": 0.0}
