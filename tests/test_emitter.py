@@ -1,0 +1,281 @@
+"""Emitters: led particles move as the nozzle says, are let go without a jump, and every gradient is right."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from cortado import InputError, Problem, Scene, Simulation, losses, policies
+from scenes import MIXING, OIL, plane, scene
+
+STEPS = 30
+
+
+def jet(**changes) -> Scene:
+    """In the plane: 3 particles abreast shot into a pool of 48."""
+    slot = {"phase": "water", "outlet": [0.3, 0.26], "radius": 0.075, "length": 0.3, "flow_rate": 0.3}
+    pool = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.2], "phase": "water"}
+    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.8]}
+    return plane(**{"name": "jet", "fluid": [pool], "container": room, "emitter": slot, **changes})
+
+
+def pour(**changes) -> Scene:
+    """Oil that is poured aslant on water and mixes with it, 4 particles in a layer."""
+    outlet = {"outlet": [0.09, 0.17, 0.12], "direction": [0.3, -1.0, 0.1]}
+    nozzle = {"phase": "oil", "radius": 0.06, "length": 0.2, "flow_rate": 0.015, **outlet}
+    pool = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.25, 0.1, 0.25], "phase": "water"}
+    room = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.25, 0.5, 0.25]}
+    phases = [scene().phase[0].model_dump(), OIL]
+    tables = {"name": "pour", "phase": phases, "fluid": [pool], "container": room, "mixture": MIXING}
+    return scene(**{**tables, "emitter": nozzle, **changes})
+
+
+MAKERS = {"jet": jet, "pour": pour}
+scenes = pytest.mark.parametrize("name", MAKERS)
+SIZES = {"nozzle_path": 0.01, "nozzle_path over time": 0.01, "flow_rate": 0.1, "time_step": 1e-4}
+"""Size of a direction of each parameter; of the flow rate relative to it."""
+DISTURBED = {"gravity": 1.0, "initial_positions": 0.01, "initial_velocities": 0.1}
+
+
+class Motion:
+    """A loss of positions and velocities."""
+
+    def __init__(self, simulation):
+        random, shape = np.random.default_rng(5), simulation.positions.shape
+        self.x, self.v, self.n = 0.2 * random.random(shape), random.standard_normal(shape), shape[0]
+
+    def value(self, end):
+        return (((end.positions - self.x) ** 2).sum() + 0.01 * ((end.velocities - self.v) ** 2).sum()) / self.n
+
+    def adjoint(self, end):
+        return 2.0 / self.n * (end.positions - self.x), 0.02 / self.n * (end.velocities - self.v)
+
+
+@cache
+def problem_of(name):
+    simulation = Simulation(MAKERS[name](), precision="float64")
+    return Problem(simulation, STEPS, Motion(simulation))
+
+
+def swaying(outlet, steps=STEPS):
+    """A path of the opening (steps, d) that begins at its place at rest."""
+    time = np.arange(steps)[:, None] / steps
+    return outlet + 0.02 * np.sin(time * np.arange(2.0, 2.0 + len(outlet)))
+
+
+def point_of(problem, over_time=True):
+    simulation, random = problem.simulation, np.random.default_rng(3)
+    own = simulation.parameters()
+    path = swaying(own["nozzle_path"]) if over_time else own["nozzle_path"] + 0.003
+    x = own["initial_positions"]
+    return {
+        "nozzle_path": path,
+        "flow_rate": own["flow_rate"],
+        "time_step": own["time_step"],
+        "gravity": own["gravity"],
+        "initial_positions": x + 0.001 * random.standard_normal(x.shape),
+        "initial_velocities": own["initial_velocities"] + 0.1 * random.standard_normal(x.shape),
+    }
+
+
+def direction_of(name, value, seed=4):
+    direction = np.random.default_rng(seed).standard_normal(value.shape)
+    size = {**SIZES, **DISTURBED}[name] * (value if name == "flow_rate" else 1.0)
+    return size * direction / np.linalg.norm(direction)
+
+
+def best_difference(problem, point, directions, derivative):
+    """Relative distance of the derivative from the nearest central difference. No particle is let go earlier or later
+    over the steps tried."""
+    found = []
+    for h in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
+        ahead, behind = (
+            problem.value({name: value + sign * h * directions.get(name, 0.0) for name, value in point.items()})
+            for sign in (1, -1)
+        )
+        found.append(abs((ahead - behind) / (2.0 * h) - derivative) / abs(derivative))
+        if found[-1] < 1e-7:
+            break
+    return min(found)
+
+
+def released(problem, point, frames):
+    """(m,) distance before the opening [m] after a number of steps; negative once let go."""
+    nozzle = problem.simulation.solver.emitter.nozzle
+    return nozzle.upstream - float(point["flow_rate"]) / nozzle.area * frames * float(point["time_step"])
+
+
+@scenes
+def test_some_particles_are_let_go_none_near_a_step(name):
+    """What the tests below stand on."""
+    problem = problem_of(name)
+    point = point_of(problem)
+    left = released(problem, point, np.arange(STEPS + 1)[:, None])
+    speed = -np.diff(left[:, 0])[0]
+    assert (left[-1] < 0.0).sum() >= 4 and (left[-1] > 0.0).sum() >= 4
+    assert np.abs(left).min() > 1e-2 * speed
+
+
+@scenes
+@pytest.mark.parametrize("what", [*SIZES, "all", "all over time"])
+def test_gradient_equals_tangent_and_differences(name, what):
+    problem = problem_of(name)
+    point = point_of(problem, over_time="over time" in what)
+    key = what.removesuffix(" over time")
+    directions = {k: direction_of(k, value) for k, value in point.items() if key in ("all", k)}
+    _, gradient = problem.value_and_gradient(point)
+    assert all(gradient[k].shape == value.shape for k, value in point.items())
+    adjoint = sum((gradient[k] * direction).sum() for k, direction in directions.items())
+    tangent = problem.tangent(point, directions)
+    assert abs(adjoint - tangent) <= 1e-10 * abs(tangent)
+    assert best_difference(problem, point, directions, tangent) < 1e-6
+
+
+@scenes
+@pytest.mark.parametrize("over_time", [False, True])
+def test_gradient_equals_warps_tape(name, over_time):
+    problem = problem_of(name)
+    point = point_of(problem, over_time)
+    (loss, gathered), (taped_loss, taped) = (
+        problem.value_and_gradient(point, policy) for policy in (policies.Exact(), policies.Tape())
+    )
+    assert loss == taped_loss
+    for key, gradient in gathered.items():
+        assert np.linalg.norm(gradient) > 0.0
+        assert np.linalg.norm(gradient - taped[key]) <= 1e-9 * np.linalg.norm(gradient), key
+
+
+@scenes
+def test_a_place_at_rest_has_the_gradient_of_a_path_summed_up(name):
+    problem = problem_of(name)
+    point = point_of(problem, over_time=False)
+    rows = {**point, "nozzle_path": np.tile(point["nozzle_path"], (STEPS, 1))}
+    (loss, whole), (same, parts) = problem.value_and_gradient(point), problem.value_and_gradient(rows)
+    assert loss == same and np.ptp(parts["nozzle_path"], axis=0).max() > 0.0
+    np.testing.assert_allclose(parts["nozzle_path"].sum(axis=0), whole["nozzle_path"], rtol=1e-9)
+
+
+@scenes
+def test_same_bits_twice_and_under_a_memory_budget(name):
+    problem = problem_of(name)
+    point = point_of(problem)
+    loss, gradient = problem.value_and_gradient(point)
+    state_bytes = sum(array.capacity for array in problem.simulation.state.arrays())
+    frugal = Problem(problem.simulation, STEPS, problem.loss, memory_budget=12 * state_bytes)
+    for other in (Problem(problem.simulation, STEPS, problem.loss), frugal):
+        found, bits = other.value_and_gradient(point)
+        assert found == loss and all(bits[key].tobytes() == gradient[key].tobytes() for key in point)
+    assert len(frugal._rollout._states) < 16
+
+
+@scenes
+def test_led_particles_follow_the_formula(name):
+    problem = problem_of(name)
+    point, simulation = point_of(problem), problem.simulation
+    trajectory = problem.run(point)
+    nozzle, dt = simulation.solver.emitter.nozzle, float(point["time_step"])
+    speed, path = float(point["flow_rate"]) / nozzle.area, point["nozzle_path"]
+    assert speed == pytest.approx(simulation.scene.emitter.speed(simulation.scene.discretisation.spacing))
+    for n in range(1, STEPS + 1):
+        left = released(problem, point, n)
+        led = left > 0.0
+        x, v = trajectory.positions[n][nozzle.first :], trajectory.velocities[n][nozzle.first :]
+        place = path[n - 1] + nozzle.offsets - left[:, None] * nozzle.direction
+        before = path[max(n - 2, 0)]
+        np.testing.assert_allclose(x[led], place[led], rtol=0, atol=1e-14)
+        wanted = (path[n - 1] - before) / dt + speed * nozzle.direction
+        np.testing.assert_allclose(v[led], np.broadcast_to(wanted, v[led].shape), rtol=0, atol=1e-12)
+
+
+@scenes
+def test_particles_are_let_go_without_a_jump(name):
+    """High above the pool they go on with the velocity that they were led with, but for one step of small forces."""
+    low = MAKERS[name]().emitter.model_dump()
+    high = {**low, "outlet": [*low["outlet"][:1], 0.45, *low["outlet"][2:]]}
+    simulation = Simulation(MAKERS[name](emitter=high, container={"shape": "none"}), precision="float64")
+    problem = Problem(simulation, STEPS, Motion(simulation))
+    point = {key: value for key, value in simulation.parameters().items() if key in SIZES}
+    trajectory = problem.run(point)
+    first, dt = problem.simulation.solver.emitter.nozzle.first, float(point["time_step"])
+    seen = 0
+    for n in range(1, STEPS + 1):
+        free = (released(problem, point, n - 1) > 0.0) & (released(problem, point, n) <= 0.0)
+        (x_before, x), (v_before, v) = (
+            frames[n - 1 : n + 1, first:][:, free] for frames in (trajectory.positions, trajectory.velocities)
+        )
+        np.testing.assert_allclose(x - x_before, dt * v, rtol=0, atol=1e-14)
+        assert np.linalg.norm(v - v_before, axis=1).max(initial=0.0) < 0.05 * np.linalg.norm(v, axis=1).max(initial=1.0)
+        seen += free.sum()
+    assert seen >= 4
+
+
+@pytest.mark.parametrize("direction", [[0.0, -1.0, 0.0], [1.0, 2.0, -0.5]])
+def test_without_forces_the_column_goes_straight_on(direction):
+    nozzle = {"phase": "water", "outlet": [0.1, 0.6, 0.2], "radius": 0.06, "length": 0.2, "flow_rate": 0.01}
+    made = scene(
+        emitter={**nozzle, "direction": direction},
+        container={"shape": "none"},
+        forces={"gravity": [0.0, 0.0, 0.0], "viscosity": "none", "pressure": False},
+    )
+    simulation = Simulation(made, precision="float64")
+    sample, emitter = made.emitter.sample(0.05), simulation.solver.emitter.nozzle
+    trajectory = simulation.run(40)
+    unit = np.array(direction) / np.linalg.norm(direction)
+    travelled = sample.speed * trajectory.times[:, None, None] * unit
+    assert sample.speed * trajectory.times[-1] > 0.075
+    np.testing.assert_allclose(
+        trajectory.positions[:, emitter.first :], sample.positions + travelled, rtol=0, atol=1e-13
+    )
+    np.testing.assert_allclose(trajectory.velocities[:, emitter.first :] - sample.speed * unit, 0.0, rtol=0, atol=1e-12)
+
+
+@scenes
+def test_a_run_repeats_its_bits(name):
+    simulation = problem_of(name).simulation
+    one, other = simulation.run(STEPS), simulation.run(STEPS)
+    assert one.positions.tobytes() == other.positions.tobytes()
+
+
+def test_float32_is_near_float64():
+    wide, narrow = (Simulation(jet(), precision=precision) for precision in ("float64", "float32"))
+    point = point_of(problem_of("jet"))
+    (loss, exact), (found, gradient) = (
+        Problem(simulation, STEPS, Motion(wide)).value_and_gradient(point) for simulation in (wide, narrow)
+    )
+    assert found == pytest.approx(loss, rel=1e-5)
+    for key in ("nozzle_path", "flow_rate", "time_step"):
+        assert np.linalg.norm(gradient[key] - exact[key]) < 2e-3 * np.linalg.norm(exact[key]), key
+
+
+MISTAKES = {
+    "parameter nozzle_path has shape (3,), but must be (2,) or (30, 2) in m": {"nozzle_path": [0.1, 0.2, 0.3]},
+    "parameter nozzle_path has shape (4, 2), but must be": {"nozzle_path": np.zeros((4, 2))},
+    "parameter nozzle_path has a value that is not finite": {"nozzle_path": [np.nan, 0.2]},
+    "parameter flow_rate has shape (1,), but must be ()": {"flow_rate": [0.1]},
+    "parameter flow_rate is 0.0, but must be greater than 0": {"flow_rate": 0.0},
+}
+
+
+@pytest.mark.parametrize("words", MISTAKES)
+def test_a_mistake_is_a_sentence(words):
+    with pytest.raises(InputError) as caught:
+        problem_of("jet").value(MISTAKES[words])
+    sentence = str(caught.value)
+    assert sentence.startswith(words) and sentence.endswith(".") and "\n" not in sentence
+
+
+@pytest.mark.parametrize(
+    "value", [{"nozzle_path": [0.1, 0.2]}, {"flow_rate": 0.1}], ids=lambda value: next(iter(value))
+)
+def test_without_an_emitter_its_parameters_are_a_sentence(value):
+    simulation = Simulation(plane(), precision="float64")
+    problem = Problem(simulation, 2, losses.FinalPositions(simulation.positions))
+    gravity = {"gravity": [0.0, -9.81]}
+    for refused in (
+        lambda: problem.value(value),
+        lambda: problem.tangent(gravity, value),
+        lambda: simulation.run(2, controls=value),
+    ):
+        with pytest.raises(InputError, match=r"must be left out, as the scene has no emitter\."):
+            refused()
+    assert value.keys().isdisjoint(simulation.parameters())
