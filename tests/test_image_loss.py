@@ -1,0 +1,237 @@
+"""Losses of images: gradients through picture, grid, particles and fluid are right."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from cortado import InputError, Problem, Scene, Simulation, losses
+from cortado.image_losses import Pyramid, SquaredDifference
+from cortado.render.scene_renderer import scene_renderer
+from scenes import plane_of_three, two_layers
+
+RESOLUTION = [20, 16]
+EYE = {"view": "volume", "position": [0.6, 0.5, 0.7], "look_at": [0.15, 0.1, 0.12], "resolution": RESOLUTION}
+MAKERS = {
+    "top": lambda: two_layers(render={"view": "top", "resolution": RESOLUTION}),
+    "volume": lambda: two_layers(render=EYE),
+    "plane": lambda: plane_of_three(render={"view": "plane", "resolution": RESOLUTION, "background": [0.2, 0.4, 0.3]}),
+}
+DISTANCES = {"top": SquaredDifference(), "volume": Pyramid(), "plane": Pyramid(levels=3)}
+scenes = pytest.mark.parametrize("name", MAKERS)
+FRAMES = (0, 4, 12)
+SIZES = {
+    "gravity": 1.0,
+    "gravity over time": 1.0,
+    "initial_positions": 0.01,
+    "initial_velocities": 0.1,
+    "mass_fractions": 0.1,
+    "colours": 0.3,
+    "mobility": 0.01,
+    "viscosity": 0.05,
+}
+"""Size of a direction of each parameter."""
+
+
+def target_of(renderer, seed=7):
+    """(rows, columns, 3) of noise."""
+    return np.random.default_rng(seed).random(renderer.shape)
+
+
+@cache
+def case(name):
+    """A problem of three frames, with its renderer."""
+    simulation = Simulation(MAKERS[name](), precision="float64")
+    renderer = scene_renderer(simulation)
+    frames = {step: losses.Image(renderer, target_of(renderer, step), DISTANCES[name]) for step in FRAMES}
+    return Problem(simulation, FRAMES[-1], losses.Frames(frames)), renderer
+
+
+def point_of(problem, over_time=False):
+    """The scene's parameters, but for a lattice that is disturbed and phases that are mixed a little."""
+    simulation, random = problem.simulation, np.random.default_rng(3)
+    own = simulation.parameters()
+    point = {name.removesuffix(" over time"): own[name.removesuffix(" over time")] for name in SIZES}
+    x, c = point["initial_positions"], point["mass_fractions"]
+    point["initial_positions"] = x + 0.001 * random.standard_normal(x.shape)
+    point["mass_fractions"] = 0.8 * c + 0.2 * random.dirichlet(np.ones(c.shape[1]), len(c))
+    point["colours"] = random.uniform(0.1, 0.9, point["colours"].shape)
+    if over_time:
+        point["gravity"] = point["gravity"] + random.standard_normal((problem.steps, simulation.dimension))
+    return point
+
+
+def directions_of(point, chosen, seed=4):
+    found = {}
+    for name in chosen:
+        direction = np.random.default_rng(seed).standard_normal(point[name].shape)
+        found[name] = SIZES[name] * direction / np.linalg.norm(direction)
+    return found
+
+
+def differences(value, point, directions, derivative, steps, enough):
+    """Relative distance of the derivative from the nearest central difference; stops where that is small enough."""
+    found = []
+    for h in steps:
+        ahead, behind = (
+            value({name: array + sign * h * directions.get(name, 0.0) for name, array in point.items()})
+            for sign in (1, -1)
+        )
+        found.append(abs((ahead - behind) / (2.0 * h) - derivative) / abs(derivative))
+        if found[-1] < enough:
+            break
+    return min(found)
+
+
+@scenes
+@pytest.mark.parametrize("what", [*SIZES, "all"])
+def test_gradient_equals_tangent_and_differences(name, what):
+    problem, _ = case(name)
+    point = point_of(problem, over_time="over time" in what)
+    directions = directions_of(point, [what.removesuffix(" over time")] if what != "all" else list(point))
+    loss, gradient = problem.value_and_gradient(point)
+    assert loss == problem.value(point) and {k: g.shape for k, g in gradient.items()} == {
+        k: value.shape for k, value in point.items()
+    }
+    adjoint = sum((gradient[k] * direction).sum() for k, direction in directions.items())
+    tangent = problem.tangent(point, directions)
+    assert abs(adjoint - tangent) <= 1e-10 * abs(tangent)
+    steps = 10.0 ** -np.arange(2.0, 6.1, 0.5)
+    assert differences(problem.value, point, directions, tangent, steps, enough=1e-7) < 1e-6
+
+
+@scenes
+def test_a_parameter_alone_has_the_gradient_that_it_has_among_all(name):
+    problem, _ = case(name)
+    own = {k: value for k, value in problem.simulation.parameters().items() if k in SIZES}
+    _, wanted = problem.value_and_gradient(own)
+    for what, value in own.items():
+        _, found = problem.value_and_gradient({what: value})
+        assert found.keys() == {what} and found[what].tobytes() == wanted[what].tobytes()
+
+
+@scenes
+def test_frames_add_up(name):
+    problem, _ = case(name)
+    point = point_of(problem)
+    loss, gradient = problem.value_and_gradient(point)
+    alone = [
+        Problem(problem.simulation, step, one).value_and_gradient(point) for step, one in problem.loss.losses.items()
+    ]
+    assert loss == pytest.approx(sum(value for value, _ in alone), rel=1e-14)
+    for key, found in gradient.items():
+        parts = sum(part[key] for _, part in alone)
+        assert np.linalg.norm(found - parts) <= 1e-10 * np.linalg.norm(parts), key
+
+
+@scenes
+def test_its_own_picture_is_the_lowest(name):
+    problem, renderer = case(name)
+    point = point_of(problem)
+    end = problem.end(point)
+    target = renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
+    loss = losses.Image(renderer, target, DISTANCES[name])
+    np.testing.assert_array_equal(loss.image(end), target)
+    value, gradient = Problem(problem.simulation, problem.steps, loss).value_and_gradient(point)
+    assert value == 0.0 and not any(array.any() for array in gradient.values())
+
+
+def test_float32_is_near_float64():
+    wide, renderer = case("top")
+    simulation = Simulation(MAKERS["top"](), precision="float32")
+    narrow_renderer = scene_renderer(simulation)
+    frames = {step: losses.Image(narrow_renderer, target_of(renderer, step)) for step in FRAMES}
+    narrow, point = Problem(simulation, FRAMES[-1], losses.Frames(frames)), point_of(wide)
+    (loss, exact), (found, gradient) = wide.value_and_gradient(point), narrow.value_and_gradient(point)
+    assert found == pytest.approx(loss, rel=1e-5)
+    for key, array in exact.items():
+        assert np.linalg.norm(gradient[key] - array) < 5e-3 * np.linalg.norm(array), key
+
+
+def test_a_target_cannot_be_changed_behind_the_back():
+    _, renderer = case("plane")
+    target = target_of(renderer)
+    loss = losses.Image(renderer, target)
+    target[:] = 0.0
+    assert loss.target.max() > 0.9
+    with pytest.raises(ValueError, match="read-only"):
+        loss.target[0] = 1.0
+
+
+def test_fingerprints_tell_targets_and_distances_apart():
+    _, renderer = case("plane")
+    made = [
+        losses.Image(renderer, target_of(renderer)),
+        losses.Image(renderer, target_of(renderer, 8)),
+        losses.Image(renderer, target_of(renderer), Pyramid()),
+        losses.Image(renderer, target_of(renderer), Pyramid(levels=2)),
+        losses.Frames({3: losses.Image(renderer, target_of(renderer))}),
+        losses.Frames({4: losses.Image(renderer, target_of(renderer))}),
+    ]
+    assert len({loss.fingerprint for loss in made}) == len(made)
+    assert made[0].fingerprint == losses.Image(renderer, target_of(renderer), SquaredDifference()).fingerprint
+
+
+def test_a_target_of_another_size_is_a_sentence():
+    problem, renderer = case("plane")
+    wrong = Problem(problem.simulation, 1, losses.Image(renderer, np.zeros((16, 21, 3))))
+    for refused in (wrong.value, wrong.value_and_gradient):
+        with pytest.raises(InputError, match=r"its target \(16, 21, 3\): they must be the same\.$"):
+            refused({})
+
+
+def cup() -> Scene:
+    """Milk on coffee in a round cup, as examples/latte_art_small.toml has it: about 1,000 particles."""
+    spacing = 0.0035
+    radius, depth = 8.0 * spacing, 4.5 * spacing
+    phases = [
+        {"name": "coffee", "rest_density": 1000.0, "viscosity": 0.02, "colour": [0.20, 0.09, 0.04]},
+        {"name": "milk", "rest_density": 900.0, "viscosity": 0.04, "colour": [0.95, 0.92, 0.85]},
+    ]
+    coffee = {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": radius, "height": depth, "phase": "coffee"}
+    milk = {**coffee, "base": [0.0, depth, 0.0], "radius": 0.7 * radius, "height": 2.0 * spacing, "phase": "milk"}
+    return Scene(
+        name="cup",
+        dimension=3,
+        discretisation={"spacing": spacing},
+        phase=phases,
+        fluid=[coffee, milk],
+        container={"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": radius, "height": 0.05},
+        mixture={"mobility": 1e-5},
+        forces={"gravity": [0.0, -9.81, 0.0]},
+        solver={"time_step": 0.002, "minimum_iterations": 5, "maximum_iterations": 5},
+        render={"view": "top", "resolution": [32, 32]},
+    )
+
+
+@cache
+def whole_chain():
+    """The picture of the cup after 30 steps, against that of one that is swung around."""
+    simulation = Simulation(cup(), precision="float64")
+    renderer = scene_renderer(simulation)
+    time = np.linspace(0.0, 1.0, 30)[:, None]
+    hidden = np.array([0.0, -9.81, 0.0]) + 6.0 * np.hstack([np.sin(6.0 * time), 0.0 * time, np.cos(6.0 * time)])
+    problem = Problem(simulation, 30, losses.FinalPositions(simulation.positions))
+    end = problem.end({"gravity": hidden})
+    target = renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
+    return Problem(simulation, 30, losses.Image(renderer, target))
+
+
+@pytest.mark.parametrize("over_time", [False, True])
+def test_the_whole_chain_from_gravity_to_the_picture(over_time):
+    """Image <- grid <- particles <- mixture PCISPH <- gravity, with about 1,000 particles."""
+    problem = whole_chain()
+    assert 950 < problem.simulation.particles < 1050
+    random = np.random.default_rng(1)
+    gravity = np.array([2.0, -9.81, 1.0])
+    if over_time:
+        gravity = gravity + random.standard_normal((30, 3))
+    direction = random.standard_normal(gravity.shape)
+    point, directions = {"gravity": gravity}, {"gravity": direction / np.linalg.norm(direction)}
+    loss, gradient = problem.value_and_gradient(point)
+    adjoint = (gradient["gravity"] * directions["gravity"]).sum()
+    tangent = problem.tangent(point, directions)
+    assert loss > 1e-4 and abs(tangent) > 1e-6
+    assert abs(adjoint - tangent) <= 1e-10 * abs(tangent)
+    steps = 10.0 ** -np.arange(2.0, 7.1)
+    assert differences(problem.value, point, directions, adjoint, steps, enough=1e-6) < 1e-5
