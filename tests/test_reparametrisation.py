@@ -1,0 +1,179 @@
+"""Coordinates: there and back, derivatives, and a problem that is searched in them."""
+
+import numpy as np
+import pytest
+
+from cortado import InputError, Problem, Simulation, losses
+from cortado.reparametrisation import SMALLEST, Knots, Logarithm, Reparametrised, Softmax
+from scenes import plane, plane_of_three
+
+STEPS = 6
+
+
+def random_array(*shape, seed=0):
+    return np.random.default_rng(seed).standard_normal(shape)
+
+
+CASES = {
+    "logarithm of a number": (Logarithm(), random_array()),
+    "logarithm": (Logarithm(), random_array(4, 3)),
+    "softmax": (Softmax(), random_array(5, 3)),
+    "softmax, steep": (Softmax(), 20.0 * random_array(5, 2)),
+    "knots": (Knots(11, 4), random_array(4, 3)),
+    "a knot for each step": (Knots(5, 5), random_array(5, 2)),
+    "two knots for two steps": (Knots(2, 2), random_array(2, 2)),
+}
+cases = pytest.mark.parametrize(("coordinates", "u"), CASES.values(), ids=CASES)
+
+
+@cases
+def test_the_adjoint_is_the_limit_of_differences(coordinates, u):
+    direction, bar = random_array(*u.shape, seed=1), random_array(*coordinates.parameter(u).shape, seed=2)
+    h = 1e-5
+    ahead, behind = (coordinates.parameter(u + sign * h * direction) for sign in (1, -1))
+    difference = (bar * (ahead - behind)).sum() / (2.0 * h)
+    adjoint = coordinates.adjoint(u, bar)
+    assert np.shape(adjoint) == u.shape
+    assert (adjoint * direction).sum() == pytest.approx(difference, rel=1e-8, abs=1e-12)
+
+
+@cases
+def test_there_and_back(coordinates, u):
+    parameter = coordinates.parameter(u)
+    if isinstance(coordinates, Softmax):
+        parameter = np.maximum(parameter, 2.0 * SMALLEST)
+        parameter /= parameter.sum(axis=1, keepdims=True)
+    found = coordinates.coordinate(parameter)
+    np.testing.assert_allclose(coordinates.parameter(found), parameter, rtol=1e-12)
+    np.testing.assert_allclose(coordinates.coordinate(coordinates.parameter(found)), found, rtol=0, atol=1e-12)
+
+
+def test_what_is_changed_by_factors_is_positive():
+    assert (Logarithm().parameter(np.array([-700.0, 0.0, 3.0])) > 0.0).all()
+    for wrong in (0.0, np.array([1.0, -1.0])):
+        with pytest.raises(InputError, match="greater than 0"):
+            Logarithm().coordinate(wrong)
+
+
+@pytest.mark.parametrize("u", [np.array([[900.0, -900.0, 0.0]]), np.array([[-1e5, -1e5, -1e5]])])
+def test_fractions_add_up_to_1_wherever_the_coordinates_are(u):
+    parameter = Softmax().parameter(u)
+    assert (parameter >= 0.0).all() and parameter.sum() == pytest.approx(1.0, rel=1e-15)
+    assert np.isfinite(Softmax().adjoint(u, np.ones((1, 3)))).all()
+
+
+def test_pure_particles_have_coordinates_nearby():
+    pure = np.eye(3)[[0, 2, 1]]
+    u = Softmax().coordinate(pure)
+    assert np.isfinite(u).all() and np.abs(u.sum(axis=1)).max() < 1e-12
+    assert np.abs(Softmax().parameter(u) - pure).max() < 3.0 * SMALLEST
+
+
+def test_a_common_shift_of_coordinates_changes_no_fraction():
+    u = random_array(5, 3)
+    np.testing.assert_allclose(Softmax().parameter(u + 7.0), Softmax().parameter(u), rtol=1e-13)
+    assert np.abs(Softmax().adjoint(u, random_array(5, 3, seed=1)).sum(axis=1)).max() < 1e-15
+
+
+@pytest.mark.parametrize(("steps", "knots"), [(11, 4), (9, 2), (100, 33), (5, 5)])
+def test_between_knots_is_a_straight_line(steps, knots):
+    u = random_array(knots, 3)
+    path = Knots(steps, knots).parameter(u)
+    wanted = [np.interp(np.linspace(0, 1, steps), np.linspace(0, 1, knots), column) for column in u.T]
+    np.testing.assert_allclose(path, np.transpose(wanted), rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(path[[0, -1]], u[[0, -1]])
+    np.testing.assert_allclose(Knots(steps, knots).parameter(np.full((knots, 2), 9.81)), 9.81, rtol=1e-14)
+
+
+def test_knots_are_the_nearest_path():
+    path, knots = random_array(12, 2), Knots(12, 3)
+    u = knots.coordinate(path)
+    rest = knots.parameter(u) - path
+    assert np.linalg.norm(rest) > 1.0 and np.abs(knots.adjoint(u, rest)).max() < 1e-13
+
+
+@pytest.fixture(scope="module")
+def problem():
+    simulation = Simulation(plane_of_three(), precision="float64")
+    random = np.random.default_rng(5)
+    target = 0.2 + 0.1 * random.random(simulation.positions.shape)
+    return Problem(simulation, STEPS, losses.FinalPositions(target))
+
+
+COORDINATES = {
+    "gravity": Knots(STEPS, 3),
+    "mass_fractions": Softmax(),
+    "viscosity": Logarithm(),
+    "time_step": Logarithm(),
+}
+
+
+def start_of(problem):
+    parameters = problem.simulation.parameters()
+    c = parameters["mass_fractions"]
+    mixed = 0.8 * c + 0.2 * np.random.default_rng(2).dirichlet(np.ones(3), len(c))
+    rows = parameters["gravity"] + 0.5 * random_array(STEPS, 2)
+    velocities = 0.3 * random_array(*parameters["initial_velocities"].shape)
+    return {
+        "gravity": rows,
+        "mass_fractions": mixed,
+        "viscosity": parameters["viscosity"],
+        "time_step": parameters["time_step"],
+        "initial_velocities": velocities,
+    }
+
+
+@pytest.mark.parametrize("what", ["gravity", "mass_fractions", "viscosity", "time_step", "initial_velocities", "all"])
+def test_the_gradient_in_coordinates_is_the_limit_of_differences(problem, what):
+    search = Reparametrised(problem, COORDINATES)
+    u = search.coordinate(start_of(problem))
+    assert {name: np.shape(value) for name, value in u.items()} == {
+        "gravity": (3, 2),
+        "mass_fractions": (64, 3),
+        "viscosity": (3,),
+        "time_step": (),
+        "initial_velocities": (64, 2),
+    }
+    loss, gradient = search.value_and_gradient(u)
+    assert loss == search.value(u) == problem.value(search.parameters(u))
+    chosen = [what] if what != "all" else list(u)
+    sizes = {"time_step": 0.05}
+    directions = {name: sizes.get(name, 0.3) * random_array(*np.shape(u[name]), seed=7) for name in chosen}
+    derivative = sum((gradient[name] * directions[name]).sum() for name in chosen)
+    differences = []
+    for h in (1e-2, 1e-3, 1e-4, 1e-5):
+        ahead, behind = (
+            search.value({name: value + sign * h * directions.get(name, 0.0) for name, value in u.items()})
+            for sign in (1, -1)
+        )
+        differences.append((ahead - behind) / (2.0 * h))
+    assert min(abs(found - derivative) for found in differences) < 1e-6 * abs(derivative)
+
+
+def test_without_coordinates_it_is_the_problem_itself(problem):
+    point = start_of(problem)
+    search = Reparametrised(problem, {})
+    assert search.parameters(point) == point and search.coordinate(point) == point
+    (loss, gradient), (wanted, exact) = search.value_and_gradient(point), problem.value_and_gradient(point)
+    assert loss == wanted and all(gradient[name].tobytes() == exact[name].tobytes() for name in point)
+
+
+def test_coordinates_of_parameters_that_are_not_given_do_no_harm(problem):
+    search = Reparametrised(problem, COORDINATES)
+    _, gradient = search.value_and_gradient({"viscosity": np.log(problem.simulation.parameters()["viscosity"])})
+    assert gradient.keys() == {"viscosity"}
+
+
+def test_fingerprints_tell_coordinates_apart(problem):
+    other = Problem(Simulation(plane(), precision="float64"), STEPS, lambda x, v, loss: None)
+    searches = [
+        Reparametrised(problem, {}),
+        Reparametrised(problem, {"gravity": Knots(STEPS, 3)}),
+        Reparametrised(problem, {"gravity": Knots(STEPS, 4)}),
+        Reparametrised(problem, {"viscosity": Logarithm()}),
+        Reparametrised(problem, {"time_step": Logarithm()}),
+        Reparametrised(other, {"viscosity": Logarithm()}),
+    ]
+    assert len({search.fingerprint for search in searches}) == len(searches)
+    turned = {name: COORDINATES[name] for name in reversed(COORDINATES)}
+    assert Reparametrised(problem, COORDINATES).fingerprint == Reparametrised(problem, turned).fingerprint
