@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.controls import Arrays
+from cortado.controls import NOT_NEGATIVE, Arrays
 from cortado.errors import InputError
 from cortado.losses import FinalPositions, Frames, Image, Loss, TrajectoryEnd
 from cortado.particles import TABLES
@@ -126,8 +126,10 @@ def _coordinates(task: Task, start: Arrays) -> dict[str, Coordinates]:
 
 
 def _bounds(task: Task) -> dict[str, tuple[Any, Any]]:
-    """Bounds hold for knots as they do for what lies between them, and for logarithms after they are taken."""
-    found = {}
+    """Bounds hold for knots as they do for what lies between them, and for logarithms after they are taken. A parameter
+    that cannot be negative has 0 as a bound."""
+    free = [name for name in task.start if name in NOT_NEGATIVE and name not in task.optimise.logarithmic]
+    found: dict[str, tuple[Any, Any]] = dict.fromkeys(free, (0.0, None))
     for name, pair in (task.optimise.bounds or {}).items():
         lower, upper = (np.log(b) if name in task.optimise.logarithmic else b for b in pair)
         found[name] = (lower, upper)

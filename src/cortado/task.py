@@ -271,6 +271,7 @@ def _check_bounds(name: str, pair: np.ndarray, optimise: OptimiseTable, start: M
         raise SceneError(None, field, pair.tolist(), "two entries, the lower one not above the upper one")
     if name in optimise.logarithmic and (pair <= 0.0).any():
         raise SceneError(None, field, pair.tolist(), "greater than 0, as the parameter is changed by factors")
+    _check_range(name, field, pair)
     shape = _shapes(name, scene, 0)[0] if isinstance(value, str) else value.shape
     if optimise.knots is not None and name in TABLES and len(shape) == 2:
         shape = (optimise.knots, shape[1])
