@@ -166,6 +166,10 @@ BAD_TASKS = [
      "optimise.bounds.initial_positions"),
     ("bounds of fractions", _TABLES, _both("mass_fractions", _PURE, "bounds.mass_fractions = [0.0, 1.0]"),
      "optimise.bounds.mass_fractions"),
+    ("negative bound of viscosity", _TABLES, _both("viscosity", 0.1, "bounds.viscosity = [-1.0, 1.0]"),
+     "optimise.bounds.viscosity"),
+    ("density down to zero", _TABLES, _both("rest_density", 900.0, "bounds.rest_density = [0.0, 1e3]"),
+     "optimise.bounds.rest_density"),
     ("bound of a logarithm that is zero", _TABLES,
      _both("viscosity", 0.1, 'logarithmic = ["viscosity"]\nbounds.viscosity = [0.0, 1.0]'),
      "optimise.bounds.viscosity"),
@@ -173,3 +177,94 @@ BAD_TASKS = [
     ("negative noise", "loss_reduction = 2.0", "psnr = -3.0", "optimise.check.psnr"),
     ("hidden parameters of a picture", _TARGET, 'loss = "image"\npicture = "heart"', "optimise.check.parameter_error"),
 ]  # fmt: skip
+
+PLANE_PICTURE = f"""\
+{TINY_SCENE.replace("viscosity = 0.05", "viscosity = 0.05" + chr(10) + "colour = [0.9, 0.8, 0.7]")}
+[render]
+view = "plane"
+resolution = [20, 16]
+background = [0.3, 0.2, 0.1]
+
+[problem]
+steps = 0
+loss = "image"
+distance = "pyramid"
+picture = "heart"
+
+[optimise]
+start.initial_positions = "random"
+learning_rate = 0.02
+iterations = 4
+
+[optimise.check]
+psnr = 3.0
+"""
+"""The same particles are moved into a picture; no time passes."""
+
+TINY_LATTE = """\
+name = "tiny latte"
+dimension = 3
+
+[discretisation]
+spacing = 0.0035
+
+[[phase]]
+name = "coffee"
+rest_density = 1000.0
+viscosity = 0.02
+colour = [0.20, 0.09, 0.04]
+
+[[phase]]
+name = "milk"
+rest_density = 900.0
+viscosity = 0.04
+colour = [0.95, 0.92, 0.85]
+
+[[fluid]]
+shape = "cylinder"
+base = [0.0, 0.0, 0.0]
+radius = 0.0105
+height = 0.007
+phase = "coffee"
+
+[[fluid]]
+shape = "cylinder"
+base = [0.0, 0.007, 0.0]
+radius = 0.006
+height = 0.0035
+phase = "milk"
+
+[container]
+shape = "cylinder"
+base = [0.0, 0.0, 0.0]
+radius = 0.0105
+height = 0.03
+
+[mixture]
+mobility = 1e-5
+
+[solver]
+time_step = 0.002
+minimum_iterations = 3
+maximum_iterations = 3
+
+[render]
+view = "top"
+resolution = [16, 12]
+
+[problem]
+steps = 6
+loss = "image"
+target.gravity = [[0.0, -9.81, 4.0], [4.0, -9.81, 0.0]]
+
+[optimise]
+start.gravity = [[0.0, -9.81, 0.0], [0.0, -9.81, 0.0]]
+knots = 3
+learning_rate = 0.5
+iterations = 3
+
+[optimise.check]
+parameter_error = 2.0
+"""
+"""A small cup that is swung around, seen from above."""
+LATTE_PARTICLES = 73

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 import cortado.commands.optimise
 import cortado.commands.run
 from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
-from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, TINY_SCENE
+from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
 from cortado import Problem, Scene, Trajectory
 from cortado.cli import main
 
@@ -355,6 +356,118 @@ def test_a_finished_optimisation_goes_on(cortado_command):
     longer = ["--resume", "--set", "optimise.iterations=8"]
     assert (code, cortado_command("optimise", "task.toml", "--out", "found", *longer)[0]) == (0, 0)
     assert [row["iteration"] for row in metrics("found")] == list(range(9))
+
+
+# ---- images ------------------------------------------------------------------------------------------------------
+
+
+def figures(run):
+    return {path.name for path in (Path(run) / "figures").iterdir()}
+
+
+def test_places_are_found_for_a_picture(cortado_command):
+    Path("task.toml").write_text(PLANE_PICTURE)
+    code, out, err = cortado_command("optimise", "task.toml", "--out", "found")
+    assert (code, err) == (0, "") and "the image is matched to " in out and " dB. The results are in " in out
+    assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
+    assert figures("found") == {"loss.png", "images.png", "progress.png"}
+    page = Path("found/report.html").read_text()
+    assert page.count("<img") == 3 and "image, PSNR [dB]" in page and "<video" not in page
+    losses = [row["loss"] for row in metrics("found")]
+    assert len(losses) == 5 and losses[-1] < losses[0]
+
+
+def test_a_cup_is_swung_until_it_looks_as_it_should(cortado_command):
+    Path("task.toml").write_text(TINY_LATTE)
+    code, out, err = cortado_command("optimise", "task.toml", "--out", "found")
+    assert (code, err) == (0, "") and "gravity within " in out and "the image is matched to " in out
+    wanted = {"loss.png", "images.png", "progress.png", "gravity.png"}
+    assert figures("found") == wanted | ({"found.mp4"} if find_spec("av") else set())
+    page = Path("found/report.html").read_text()
+    assert page.count("<img") == 4 and page.count("<video") == (1 if find_spec("av") else 0)
+    assert len(metrics("found")) == 4
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["problem.frames=3", "problem.distance=pyramid"],
+        [
+            "problem.target.colours=[[0.9,0.1,0.1],[0.1,0.9,0.1]]",
+            "optimise.start={colours=[[0.5,0.5,0.5],[0.4,0.4,0.4]]}",
+        ],
+        [
+            "problem.target.viscosity=[0.1,0.2]",
+            "optimise.start.viscosity=[0.2,0.1]",
+            'optimise.logarithmic=["viscosity"]',
+        ],
+        ["problem.target.mobility=2e-5", "optimise.start={mobility=1e-5}", "optimise.learning_rate=2e-5"],
+        ["render.view=volume", "render.position=[0.05,0.05,0.05]", "render.look_at=[0,0.005,0]"],
+    ],
+    ids=["frames", "colours", "factors", "a number", "a camera"],
+)
+def test_other_tasks_of_images(cortado_command, overrides):
+    has_rows = not any(override.startswith("optimise.start={") for override in overrides)
+    Path("task.toml").write_text(TINY_LATTE if has_rows else TINY_LATTE.replace("knots = 3", ""))
+    easy = ["optimise.iterations=1", "optimise.check.parameter_error=1e9"]
+    options = [word for override in [*overrides, *easy] for word in ("--set", override)]
+    code, _, err = cortado_command("optimise", "task.toml", "--out", "found", *options)
+    assert (code, err) == (0, "") and figures("found") >= {"images.png", "progress.png"}
+
+
+def test_an_image_that_is_not_matched_fails_and_keeps_its_files(cortado_command):
+    Path("task.toml").write_text(PLANE_PICTURE)
+    strict = ["--set", "optimise.check.psnr=80"]
+    code, out, err = cortado_command("optimise", "task.toml", "--out", "found", *strict)
+    assert (code, out, len(err.splitlines())) == (1, "", 1)
+    assert err.startswith("The image is matched to ") and " dB, but the task asks for 80 dB. " in err
+    assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
+
+
+def test_an_optimisation_of_images_resumes_bit_for_bit(cortado_command, monkeypatch):
+    Path("task.toml").write_text(TINY_LATTE)
+    with monkeypatch.context() as patch:
+        patch.setattr(cortado.commands.optimise, "track", interrupting(after=1))
+        assert cortado_command("optimise", "task.toml", "--out", "stopped")[0] == 130
+    assert len(metrics("stopped")) == 2
+    assert cortado_command("optimise", "task.toml", "--out", "stopped", "--resume")[0] == 0
+    cortado_command("optimise", "task.toml", "--out", "whole")
+    assert_same_optimisation("stopped", "whole")
+    for name in ("images.png", "progress.png"):
+        stopped, whole = (Path(run) / "figures" / name for run in ("stopped", "whole"))
+        assert stopped.read_bytes() == whole.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("text", "override"),
+    [
+        (PLANE_PICTURE, "problem.picture=rosetta"),
+        (TINY_LATTE, "optimise.knots=2"),
+    ],
+)
+def test_another_image_is_not_resumed(cortado_command, text, override):
+    Path("task.toml").write_text(text)
+    cortado_command("optimise", "task.toml", "--out", "found", "--set", "optimise.iterations=1")
+    code, out, err = cortado_command("optimise", "task.toml", "--out", "found", "--resume", "--set", override)
+    assert (code, out, len(err.splitlines())) == (2, "", 1) and "resume" in err
+    assert len(metrics("found")) == 2
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("problem.picture=absent.png", "absent.png cannot be read"),
+        ("problem.picture=task.toml", "task.toml cannot be read"),
+        ("render.view=top", "render.view is 'top'"),
+        ("render.resolution=[4,4]", "render.resolution"),
+        ("optimise.bounds.initial_positions=[[0,0,0],[1,1,1]]", "optimise.bounds.initial_positions"),
+        ('container={shape="none"}', "has no container to fill"),
+    ],
+)
+def test_a_wrong_task_of_images_is_refused(cortado_command, folder, override, words):
+    Path("task.toml").write_text(PLANE_PICTURE)
+    assert_refused(cortado_command("optimise", "task.toml", "--out", "found", "--set", override), words)
+    assert_nothing_made(folder)
 
 
 # ---- gradients and bench -----------------------------------------------------------------------------------------

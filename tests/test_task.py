@@ -1,6 +1,7 @@
 """Tasks: good ones load, bad ones end in one sentence, and a result is judged as its task asks."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -118,6 +119,15 @@ def test_random_values_are_drawn_later(task_file):
         task_file, [f"problem.target={{initial_positions={places}}}", 'optimise.start={initial_positions="random"}']
     )
     assert task.start == {"initial_positions": "random"}
+
+
+EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_is_a_task(path):
+    task = load_task(path)
+    assert task.scene.name and task.start.keys() >= (task.optimise.bounds or {}).keys()
 
 
 # ---- bad tasks ---------------------------------------------------------------------------------------------------
