@@ -30,7 +30,7 @@ def slope(name, q):
 
 def blend(c, rest_density, viscosity):
     """Rest densities and viscosities (n,) of particles with mass fractions c (n, phases)."""
-    return 1 / (c / rest_density).sum(1), (c * viscosity).sum(1)
+    return 1 / (c / rest_density).sum(1), np.exp((c * np.log(viscosity)).sum(1))
 
 
 def harmonic(a):

@@ -450,13 +450,16 @@ class Blend(Operation):
         found = launch(self.kernels.blend, **{**values, "rho_0": np.zeros(N), "mu": np.zeros(N)})
         return {**found, "c_new": self.in_scene_order(values["c"])}
 
+    def materials(self, values):
+        return {name: array for name, array in self.forward(values).items() if name in ("rho_0", "mu")}
+
     def tangent(self, values, dots):
-        given = {**values, **dotted(dots), "rho_0": self.forward(values)["rho_0"]}
+        given = {**values, **dotted(dots), **self.materials(values)}
         found = launch(self.kernels.blend_tangent, **given, rho_0_dot=np.zeros(N), mu_dot=np.zeros(N))
         return {"rho_0": found["rho_0_dot"], "mu": found["mu_dot"], "c_new": self.in_scene_order(dots["c"])}
 
     def adjoint(self, values, bars):
-        given = {**values, "rho_0": self.forward(values)["rho_0"], "order": self.order, "c_scene_bar": bars["c_new"]}
+        given = {**values, **self.materials(values), "order": self.order, "c_scene_bar": bars["c_new"]}
         given |= {f"{name}_bar": bars[name] for name in ("rho_0", "mu")} | {"c_bar": np.zeros((N, 3))}
         sums = {
             name: np.stack([values] * 3, axis=1) for name, values in zeros("rest_density_bar", "viscosity_bar").items()

@@ -64,7 +64,7 @@ def point_of(simulation, seed=3):
     return {**point, "initial_positions": disturbed, "initial_velocities": velocities, "mass_fractions": mixed}
 
 
-def directions_of(point, seed=4):
+def directions_of(point, seed=5):
     random = np.random.default_rng(seed)
     found = {}
     for name, value in point.items():

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.optimize import brentq
@@ -30,18 +31,23 @@ def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimensi
     return float((1.0 - SLACK) / kernel.weight(distances, dimension, support).sum())
 
 
-def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+def pressure_stiffness(
+    kernel: SmoothingKernel, spacing: float, support: float, dimension: int, density_ratio: float = 1.0
+) -> float:
     """k = delta dt^2 (report eq. 7, put right; Solenthaler and Pajarola 2009):
 
     delta = 1 / (beta (S . S + sum_j G_ij . G_ij)), beta = 2 m^2 dt^2 / rho_0^2, S = sum_j G_ij,
 
-    lowered where the pressure iteration would diverge with it: where its `greatest_rate` is above `RATE_LIMIT`.
+    lowered where the pressure iteration would diverge with it: where its `greatest_rate` is above `RATE_LIMIT`, and by
+    2 / (1 + ratio) for fluids of several densities, as a heavy particle's pressure moves a light neighbour that many
+    times as far.
     """
     gradients = kernel.gradient(lattice_offsets(spacing, support, dimension), support)
     total = gradients.sum(axis=0)
     volume = rest_volume(kernel, spacing, support, dimension)
     prototype = 1.0 / (2.0 * volume**2 * (total @ total + (gradients**2).sum()))
-    return float(prototype * min(1.0, RATE_LIMIT / greatest_rate(kernel, spacing, support, dimension)))
+    rate = greatest_rate(kernel, spacing, support, dimension)
+    return float(prototype * min(1.0, RATE_LIMIT / rate) * 2.0 / (1.0 + density_ratio))
 
 
 RATE_LIMIT = 1.5
@@ -135,6 +141,7 @@ def wall_rigidity(kernel: SmoothingKernel, spacing: float, support: float, dimen
     return float(2.0 * (kernel.gradient(lattice_offsets(spacing, support, dimension), support) ** 2).sum())
 
 
+@cache
 def laplacian_evenness(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
     """What the Laplacian 2 V sum_j (u_i - u_j) F_ij must be multiplied with to be that of a parabola on the lattice.
 
@@ -145,6 +152,7 @@ def laplacian_evenness(kernel: SmoothingKernel, spacing: float, support: float, 
     return float(-1.0 / (volume * (shear_factor(kernel, offsets, support) * offsets[:, 0] ** 2).sum()))
 
 
+@cache
 def laplacian_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
     """The greatest eigenvalue [1 / m2] of the Laplacian on the lattice, without its sign."""
     offsets = lattice_offsets(spacing, support, dimension)

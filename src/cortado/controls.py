@@ -3,7 +3,7 @@
 n counts fluid particles in the order in which the scene lists them, d is the scene's dimension.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -70,8 +70,12 @@ class Controls:
         """(phases, 3) the colours of the phases."""
         return values.get("colours", self._scene["colours"])
 
-    def begin(self, rollout: Rollout, values: Arrays) -> None:
-        """Give a rollout its first state and its parameters: ``values``, and the scene's for what is not among them."""
+    def begin(self, rollout: Rollout, values: Arrays, varied: Iterable[str] = ()) -> None:
+        """Give a rollout its first state and its parameters: ``values``, and the scene's for what is not among them.
+
+        ``varied`` are parameters that a derivative is wanted for: with the mobility among them there is a substep of
+        diffusion even where it is 0.
+        """
         simulation, parameters = self._simulation, rollout.parameters
         if values.keys().isdisjoint(STATES):
             rollout.initial.assign(simulation.state)
@@ -80,8 +84,9 @@ class Controls:
         chosen = {name: values.get(name, self._scene[name]) for name in (*MATERIALS, *NUMBERS)}
         parameters.set_tables(**{name: values.get(name, self._scene[name]) for name in TABLES})
         parameters.set_constants(**chosen, masses=masses(*self._composition(values)))
-        diffusion = ("time_step", "mobility", "interface_width")
-        rollout.solver.diffuse(simulation.substeps(**{name: float(chosen[name]) for name in diffusion}))
+        diffusion = ("time_step", "mobility", "interface_width", "rest_density")
+        needed = simulation.substeps(**{name: chosen[name] for name in diffusion})
+        rollout.substeps = max(needed, 1) if "mobility" in varied and self._phases > 1 else needed
 
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
         """A direction by name as tangents of the first state and of the parameters, at ``values``."""
@@ -139,9 +144,9 @@ class Controls:
 
     def _check_range(self, name: str, array: np.ndarray, what: str) -> None:
         if name in POSITIVE and (array <= 0.0).any():
-            raise InputError(f"{what} {name} is {shown(array.min())}, but must be greater than 0.")
+            raise InputError(f"{what} {name} is {shown(float(array.min()))}, but must be greater than 0.")
         if name in NOT_NEGATIVE and (array < 0.0).any():
-            raise InputError(f"{what} {name} is {shown(array.min())}, but must be at least 0.")
+            raise InputError(f"{what} {name} is {shown(float(array.min()))}, but must be at least 0.")
         if name == "mass_fractions":
             miss = np.abs(array.sum(axis=1) - 1.0)
             if miss.max() > SUM_TOLERANCE:

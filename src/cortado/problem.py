@@ -83,7 +83,7 @@ class Problem:
     def value_and_gradient(self, parameters: Values, policy: Policy | None = None) -> tuple[float, Arrays]:
         """The loss and its derivatives: for each parameter given, an array of its shape (float64)."""
         values = self._controls.checked(parameters)
-        ends = self._ends(values, self._losses, keep=True)
+        ends = self._ends(values, self._losses, keep=True, varied=values)
         bars = {step: self._adjoint(step, end) for step, end in ends.items()}
         derivative = self._derivative(Exact() if policy is None else policy)
         first = self._rollout.backward(derivative, {step: bar.state for step, bar in bars.items()})
@@ -96,7 +96,7 @@ class Problem:
         """The derivative of the loss along ``directions`` (any of the parameters), by forward mode."""
         values = self._controls.checked(parameters)
         along = self._controls.checked(directions, "direction")
-        ends = self._ends(values, self._losses, keep=False)
+        ends = self._ends(values, self._losses, keep=False, varied=along)
         bars = {step: self._adjoint(step, end) for step, end in ends.items()}
         dot, parameters_dot = self._controls.direction(self._rollout, values, along)
         terms = [np.sum(bar.colours * along["colours"]) for bar in bars.values()] if "colours" in along else []
@@ -120,7 +120,9 @@ class Problem:
         """(steps,) pressure iterations of the last evaluation."""
         return self._rollout.iterations
 
-    def _ends(self, values: Arrays, steps: Iterable[int], keep: bool) -> dict[int, TrajectoryEnd]:
+    def _ends(
+        self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()
+    ) -> dict[int, TrajectoryEnd]:
         """States by the number of steps before them; ``keep`` checkpoints for a way back."""
         wanted, colours = set(steps), self._controls.colours(values)
         ends: dict[int, TrajectoryEnd] = {}
@@ -129,7 +131,7 @@ class Problem:
             if step in wanted:
                 ends[step] = TrajectoryEnd(state, self.simulation.dimension, colours)
 
-        self._controls.begin(self._rollout, values)
+        self._controls.begin(self._rollout, values, varied)
         observe(0, self._rollout.initial)
         self._rollout.forward(observe, keep)
         return ends

@@ -60,6 +60,8 @@ class Rollout:
         self._device = solver.search.device
         self.initial = solver.new_state()
         self.parameters = solver.new_parameters(steps)
+        self.substeps = 0
+        """Explicit steps of diffusion within each step."""
         self._records = (
             wp.zeros(max(steps, 1), dtype=wp.int32, device=self._device),
             wp.zeros(max(steps, 1), dtype=solver.discretisation.precision.pair, device=self._device),
@@ -82,6 +84,7 @@ class Rollout:
         back. Raises `DivergedError` after the good states were observed."""
         self._states = {0: self.initial}
         state, step = self.initial, 0
+        self.solver.diffuse(self.substeps)
         self._forget_stale_graphs()
         self.solver.reset()
         try:
@@ -152,6 +155,7 @@ class Rollout:
 
     def backward(self, derivative: StepDerivative, bars: Mapping[int, State]) -> State:
         """The adjoint of the first state, for ``bars``, adjoints of states by their number; `forward` has run."""
+        self.solver.diffuse(self.substeps)
         derivative.begin()
         self._forget_stale_graphs()
         self._bar.clear()
@@ -179,6 +183,7 @@ class Rollout:
     def tangent(self, dot: State, parameters_dot: Parameters, observe: Observer) -> None:
         """From ``dot``, the tangent of the first state, to that of every state, given to ``observe``; `forward` has
         run."""
+        self.solver.diffuse(self.substeps)
         derivative = PcisphTangent(self.solver)
         state = self.initial.like()
         state.assign(self.initial)

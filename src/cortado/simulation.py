@@ -114,7 +114,7 @@ class Simulation:
             iterations=rollout.iterations,
             density_errors=rollout.errors[:, 0],
             converged=converged,
-            substeps=rollout.solver.mixture.substeps,
+            substeps=rollout.substeps,
         )
 
     def rollout(self, steps: int, controls: Mapping[str, Any] | None = None) -> Rollout:
@@ -146,7 +146,9 @@ class Simulation:
             arrays |= {name: arrays[name][0] for name in MATERIALS}
         return arrays
 
-    def substeps(self, time_step: float, mobility: float, interface_width: float) -> int:
+    def substeps(
+        self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
+    ) -> int:
         """Explicit steps of diffusion within a time step that are stable under these parameters."""
         diffusion = self.solver.mixture.phases.diffusion
         if diffusion is None:
@@ -156,12 +158,12 @@ class Simulation:
             self.scene.discretisation.spacing,
             self.scene.discretisation.support_radius,
             self.dimension,
-            greatest_mobility=mobility * diffusion.mobility.greatest(len(self.scene.phase)),
-            interface_width=interface_width,
+            greatest_mobility=float(mobility) * diffusion.mobility.greatest(len(self.scene.phase)),
+            interface_width=float(interface_width),
             curvature=self.scene.mixture.strength * diffusion.energy.curvature,
-            density_ratio=self._density_ratio,
+            density_ratio=float(np.max(rest_density) / np.min(rest_density)),
         )
-        return int(np.ceil(time_step / limit))
+        return int(np.ceil(float(time_step) / limit))
 
     @property
     def _density_ratio(self) -> float:
@@ -208,7 +210,7 @@ class Simulation:
             normalisation=kernel.normalisation(dimension, support),
             self_weight=float(kernel.weight(np.zeros(1), dimension, support)[0]),
             volume=volume,
-            stiffness=pressure_stiffness(kernel, spacing, support, dimension),
+            stiffness=pressure_stiffness(kernel, spacing, support, dimension, self._density_ratio),
             rigidity=wall_rigidity(kernel, spacing, support, dimension) / layer.push,
             wall_push=layer.push,
             evenness=laplacian_evenness(kernel, spacing, support, dimension),

@@ -1,9 +1,10 @@
 """What a particle of several phases is made of: its mass fractions c, and what follows from them.
 
-    1 / rho_0i = sum_k c_k,i / rho_0k,    mu_i = sum_k c_k,i mu_k
+    1 / rho_0i = sum_k c_k,i / rho_0k,    ln mu_i = sum_k c_k,i ln mu_k    (Arrhenius 1887)
 
 Masses are constant (Yang et al. 2015 and the report's Algorithm 3 leave open whether mass or volume is; with mass
-fractions it is the mass), so that a particle's rest volume follows its rest density.
+fractions it is the mass), so that a particle's rest volume follows its rest density. The logarithms keep the viscosity
+positive where fractions stray out of [0, 1].
 """
 
 from functools import cache
@@ -30,6 +31,12 @@ def mixture_kernels(precision: Precision, phases: int) -> SimpleNamespace:
     Materials of the phases are arrays (phases,).
     """
     real, fractions = precision.real, precision.fractions(phases)
+    tiny = wp.constant(real(precision.tiny))
+
+    @wp.func
+    def logarithm(viscosity: real) -> real:
+        """tiny stands in for a phase without viscosity, of which any amount makes a mixture thin."""
+        return wp.log(viscosity + tiny)
 
     @wp.kernel(module=mixture_module(precision, phases, True))
     def sort_fractions(
@@ -62,12 +69,12 @@ def mixture_kernels(precision: Precision, phases: int) -> SimpleNamespace:
     ):
         i = wp.tid()
         specific_volume = real(0.0)
-        mu_i = real(0.0)
+        power = real(0.0)
         for k in range(wp.static(phases)):
             specific_volume += c[i][k] / rest_density[k]
-            mu_i += c[i][k] * viscosity[k]
+            power += c[i][k] * logarithm(viscosity[k])
         rho_0[i] = real(1.0) / specific_volume
-        mu[i] = mu_i
+        mu[i] = wp.exp(power)
 
     @wp.kernel(module=mixture_module(precision, phases, False), enable_backward=False)
     def blend_tangent(
@@ -78,18 +85,19 @@ def mixture_kernels(precision: Precision, phases: int) -> SimpleNamespace:
         viscosity: wp.array(dtype=real),
         viscosity_dot: wp.array(dtype=real),
         rho_0: wp.array(dtype=real),
+        mu: wp.array(dtype=real),
         # out
         rho_0_dot: wp.array(dtype=real),
         mu_dot: wp.array(dtype=real),
     ):
         i = wp.tid()
         change = real(0.0)
-        mu_dot_i = real(0.0)
+        power_dot = real(0.0)
         for k in range(wp.static(phases)):
             change += (c_dot[i][k] - c[i][k] * rest_density_dot[k] / rest_density[k]) / rest_density[k]
-            mu_dot_i += c_dot[i][k] * viscosity[k] + c[i][k] * viscosity_dot[k]
+            power_dot += c_dot[i][k] * logarithm(viscosity[k]) + c[i][k] * viscosity_dot[k] / (viscosity[k] + tiny)
         rho_0_dot[i] = -rho_0[i] * rho_0[i] * change
-        mu_dot[i] = mu_dot_i
+        mu_dot[i] = mu[i] * power_dot
 
     @wp.kernel(module=mixture_module(precision, phases, False), enable_backward=False)
     def blend_adjoint(
@@ -98,6 +106,7 @@ def mixture_kernels(precision: Precision, phases: int) -> SimpleNamespace:
         rest_density: wp.array(dtype=real),
         viscosity: wp.array(dtype=real),
         rho_0: wp.array(dtype=real),
+        mu: wp.array(dtype=real),
         rho_0_bar: wp.array(dtype=real),
         mu_bar: wp.array(dtype=real),
         c_scene_bar: wp.array(dtype=fractions),
@@ -111,12 +120,15 @@ def mixture_kernels(precision: Precision, phases: int) -> SimpleNamespace:
         i = wp.tid()
         c_bar_i = c_scene_bar[order[i]]
         rest_density_bar_i = rest_density_bar[i]
+        viscosity_bar_i = viscosity_bar[i]
+        power_bar = mu_bar[i] * mu[i]
         for k in range(wp.static(phases)):
             by_volume = rho_0_bar[i] * rho_0[i] * rho_0[i] / rest_density[k]
-            c_bar_i[k] = c_bar_i[k] - by_volume + mu_bar[i] * viscosity[k]
+            c_bar_i[k] = c_bar_i[k] - by_volume + power_bar * logarithm(viscosity[k])
             rest_density_bar_i[k] = rest_density_bar_i[k] + by_volume * c[i][k] / rest_density[k]
+            viscosity_bar_i[k] = viscosity_bar_i[k] + power_bar * c[i][k] / (viscosity[k] + tiny)
         rest_density_bar[i] = rest_density_bar_i
-        viscosity_bar[i] = viscosity_bar[i] + mu_bar[i] * c[i]
+        viscosity_bar[i] = viscosity_bar_i
         c_bar[i] = c_bar_i
 
     return SimpleNamespace(

@@ -127,7 +127,7 @@ class MixtureAdjoint:
         launch, kernels, diffusion, order = mixture.launch, mixture.kernels, mixture.diffusion, mixture.search.order
         launch(
             kernels.blend_adjoint,
-            [order, mixture.c[mixture.substeps], p.rest_density, p.viscosity, f.rho_0, b.rho_0, b.mu]
+            [order, mixture.c[mixture.substeps], p.rest_density, p.viscosity, f.rho_0, f.mu, b.rho_0, b.mu]
             + [new_fractions_bar],
             [self._rest_density_bar, self._viscosity_bar, self._c_bar],
         )
@@ -189,7 +189,7 @@ class MixtureTangent:
         launch(
             kernels.blend_tangent,
             [mixture.c[mixture.substeps], self._last_dot, p.rest_density, q.rest_density, p.viscosity, q.viscosity]
-            + [f.rho_0],
+            + [f.rho_0, f.mu],
             [d.rho_0, d.mu],
         )
 
