@@ -34,6 +34,8 @@ from cortado.solvers.mixture import Phases
 from cortado.solvers.pcisph import Lattice, Pcisph, PressureSolve
 from cortado.trajectory import Trajectory
 
+MOST_SUBSTEPS = 10_000
+"""Explicit steps of diffusion in a time step; beyond it the mobility is taken for a mistake."""
 VISCOSITIES = {"pairwise": pairwise_viscosity, "laminar": laminar_viscosity}
 
 
@@ -149,7 +151,8 @@ class Simulation:
     def substeps(
         self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
     ) -> int:
-        """Explicit steps of diffusion within a time step that are stable under these parameters."""
+        """Explicit steps of diffusion within a time step that are stable under these parameters; raises `InputError`
+        where there would be more than `MOST_SUBSTEPS`."""
         diffusion = self.solver.mixture.phases.diffusion
         if diffusion is None:
             return 0
@@ -163,7 +166,13 @@ class Simulation:
             curvature=self.scene.mixture.strength * diffusion.energy.curvature,
             density_ratio=float(np.max(rest_density) / np.min(rest_density)),
         )
-        return int(np.ceil(float(time_step) / limit))
+        number = float(np.ceil(float(time_step) / limit))
+        if number > MOST_SUBSTEPS:
+            raise InputError(
+                f"mobility is {float(mobility):g} m2/s, which takes {number:.3g} explicit steps of diffusion within each "
+                f"time step, but must not take more than {MOST_SUBSTEPS}: lower it, or interface_width or time_step."
+            )
+        return int(number)
 
     @property
     def _density_ratio(self) -> float:

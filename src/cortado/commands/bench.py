@@ -11,7 +11,7 @@ import warp as wp
 from cortado.losses import FinalPositions
 from cortado.problem import Problem
 from cortado.scene import BoxContainer, BoxFluid, Discretisation, Forces, Phase, Scene, Solver
-from cortado.simulation import Simulation
+from cortado.simulation import Simulation, check_steps
 
 REPEATS = 3
 """The best of so many runs counts."""
@@ -36,7 +36,7 @@ def dam_break(particles: int) -> Scene:
 def bench_dam_break(particles: int, steps: int, device: str, precision: str, as_json: bool) -> str:
     """Times and memory of the forward run and of its gradient, as text."""
     simulation = Simulation(dam_break(particles), device, precision)
-    problem = Problem(simulation, steps, FinalPositions(simulation.positions))
+    problem = Problem(simulation, check_steps(steps), FinalPositions(simulation.positions))
     start = {"gravity": np.array(simulation.scene.forces.gravity)}
     forward = _best(lambda: problem.value(start), simulation.device)
     gradient = _best(lambda: problem.value_and_gradient(start), simulation.device)

@@ -9,13 +9,13 @@ from cortado.errors import ComputationError
 from cortado.losses import FinalPositions
 from cortado.problem import Problem
 from cortado.scene import load_scene
-from cortado.simulation import Simulation
+from cortado.simulation import Simulation, check_steps
 
 
 def check_scene(scene_file: Path, steps: int, overrides: list[str], device: str, as_json: bool, seed: int) -> str:
     """The certificate as text; raises `ComputationError` when an adjoint is wrong."""
     simulation = Simulation(load_scene(scene_file, overrides), device, "float64")
-    problem = Problem(simulation, steps, FinalPositions(simulation.positions))
+    problem = Problem(simulation, check_steps(steps), FinalPositions(simulation.positions))
     certificate = certify(problem, seed)
     text = json.dumps(certificate.as_dict(), indent=2) if as_json else _table(certificate)
     if not certificate.right:
