@@ -19,14 +19,16 @@ CLEARNESS = 8.0
 """A volume is seen into as far as the scene is wide over this, unless the scene says more."""
 
 
-def scene_renderer(simulation: Simulation) -> Renderer:
-    """A renderer for the particles of a simulation, as the table [render] of its scene wants it, or from above."""
+def scene_renderer(simulation: Simulation, share: float = 1.0) -> Renderer:
+    """A renderer for the particles of a simulation, as the table [render] of its scene wants it, or from above; with
+    that share of the extinction."""
     scene = simulation.scene
     lower, upper = _extent(simulation)
     dimension = simulation.dimension
+    cell = scene.discretisation.spacing * FINENESS[dimension]
     table = scene.render if scene.render is not None else Render().in_dimension(dimension)
     return Renderer(
-        _view(table, lower, upper, scene.discretisation.spacing, dimension),
+        _view(table, lower, upper, scene.discretisation.spacing, cell, share),
         lower,
         upper,
         smoothing=simulation.smoothing,
@@ -37,22 +39,25 @@ def scene_renderer(simulation: Simulation) -> Renderer:
         precision=simulation.precision,
         device=simulation.device,
         dimension=dimension,
-        cell=scene.discretisation.spacing * FINENESS[dimension],
+        cell=cell,
     )
 
 
-def _view(table: Render, lower: np.ndarray, upper: np.ndarray, spacing: float, dimension: int) -> View:
+def _view(table: Render, lower: np.ndarray, upper: np.ndarray, spacing: float, cell: float, share: float) -> View:
+    dimension = len(lower)
     options: dict[str, Any] = {"background": table.background}
     resolution = (table.resolution[0], table.resolution[1])
     if table.view != "volume":
-        if table.extinction is not None:
-            options["opacity"] = table.extinction * spacing
-        return TopView(tuple(lower), tuple(upper), spacing, resolution, UP[dimension], **options)
+        opacity = TopView.opacity if table.extinction is None else table.extinction * spacing
+        # In 2-D the one layer of nodes is a cell thick, and has to be as opaque as a layer of particles.
+        thickness = cell if dimension == 2 else spacing
+        up_axis, options["opacity"] = UP[dimension], share * opacity
+        return TopView(tuple(lower), tuple(upper), thickness, resolution, up_axis, **options)
     assert table.position is not None and table.look_at is not None and table.field_of_view is not None
     up = tuple(np.eye(3)[UP[dimension]])
     camera = Perspective(table.position, table.look_at, up, table.field_of_view, resolution=resolution)
     extinction = CLEARNESS / float(np.max(upper - lower)) if table.extinction is None else table.extinction
-    return Volume(camera, extinction, **options)
+    return Volume(camera, share * extinction, **options)
 
 
 def _extent(simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
