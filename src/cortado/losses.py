@@ -148,8 +148,9 @@ class Image:
         self.renderer, self.distance = renderer, SquaredDifference() if distance is None else distance
         self.target = np.array(target, dtype=np.float64)
         self.target.setflags(write=False)
-        self.fingerprint = f"{self.distance.fingerprint} {sha256(self.target.tobytes()).hexdigest()}"
-        """Tells one target from another, for checkpoints."""
+        parts = (self.distance.fingerprint, sha256(self.target.tobytes()).hexdigest())
+        self.fingerprint = " ".join((*parts, getattr(renderer, "fingerprint", "")))
+        """Tells one target, or one view of it, from another, for checkpoints."""
         self._seen: tuple[TrajectoryEnd, float] | None = None
 
     def image(self, end: TrajectoryEnd) -> np.ndarray:

@@ -79,6 +79,11 @@ class Renderer:
         self._rendered = False
 
     @property
+    def fingerprint(self) -> str:
+        """Tells one view from another, for checkpoints."""
+        return repr(self.view)
+
+    @property
     def shape(self) -> tuple[int, int, int]:
         """Of a picture: rows, columns, 3."""
         columns, rows = self.view.camera.resolution
