@@ -27,7 +27,8 @@ class Assignment:
 
     task: Task
     problem: Problem
-    search: Reparametrised
+    searches: tuple[Reparametrised, ...]
+    """One after the other, through thicker and thicker fluid, in the same coordinates; the last is the task's own."""
     start: Arrays
     """Coordinates to begin with."""
     bounds: dict[str, tuple[Any, Any]]
@@ -36,6 +37,11 @@ class Assignment:
     """None where positions are compared."""
     targets: dict[int, np.ndarray]
     """Images (rows, columns, 3) or positions (n, d) [m] by the number of steps before them."""
+
+    @property
+    def search(self) -> Reparametrised:
+        """The last one."""
+        return self.searches[-1]
 
     def image(self, end: TrajectoryEnd) -> np.ndarray:
         """The picture (rows, columns, 3) of a state."""
@@ -50,22 +56,29 @@ class Assignment:
 def assignment(task: Task, device: str, precision: str) -> Assignment:
     """The task on a device; raises `InputError` for a picture that cannot be read."""
     simulation = Simulation(task.scene, device, precision)
-    renderer = scene_renderer(simulation) if task.problem.loss == "image" else None
-    targets = _targets(task, simulation, renderer)
+    start = {name: _start(name, value, simulation) for name, value in task.start.items()}
+    found = _coordinates(task, start)
+    searches = []
+    for share in task.optimise.extinctions:
+        renderer = scene_renderer(simulation, share) if task.problem.loss == "image" else None
+        targets = _targets(task, simulation, renderer)
+        problem = Problem(simulation, task.problem.steps, _frames(task, targets, renderer))
+        searches.append(Reparametrised(problem, found))
+    bounds = _bounds(task)
+    coordinates = searches[-1].coordinate(start)
+    for name, (lower, upper) in bounds.items():
+        coordinates[name] = np.clip(coordinates[name], lower, upper)  # what is random, or a little outside by round-off
+    return Assignment(task, problem, tuple(searches), coordinates, bounds, renderer, targets)
+
+
+def _frames(task: Task, targets: dict[int, np.ndarray], renderer: Renderer | None) -> Frames:
     losses: dict[int, Loss] = {}
     for step, target in targets.items():
         if renderer is None:
             losses[step] = FinalPositions(target)
         else:
             losses[step] = Image(renderer, target, DISTANCES[task.problem.distance])
-    problem = Problem(simulation, task.problem.steps, Frames(losses))
-    start = {name: _start(name, value, simulation) for name, value in task.start.items()}
-    search = Reparametrised(problem, _coordinates(task, start))
-    bounds = _bounds(task)
-    coordinates = search.coordinate(start)
-    for name, (lower, upper) in bounds.items():
-        coordinates[name] = np.clip(coordinates[name], lower, upper)  # what is random, or a little outside by round-off
-    return Assignment(task, problem, search, coordinates, bounds, renderer, targets)
+    return Frames(losses)
 
 
 def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> dict[int, np.ndarray]:

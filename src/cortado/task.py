@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -17,7 +18,7 @@ from cortado.particles import TABLES
 from cortado.reparametrisation import Knots
 from cortado.sampling import fluid_particles
 from cortado.scene import Scene, read_toml, scene_from_dict
-from cortado.scene_kinds import MISSING, Choice, Count, Kind, Quantity, Text, as_number, wrong
+from cortado.scene_kinds import MISSING, Choice, Count, Kind, Quantity, Text, as_number, as_sequence, wrong
 from cortado.scene_tables import Table, sentences
 
 OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
@@ -69,6 +70,21 @@ class Names(Kind):
         if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) and name in NAMES for name in value):
             raise wrong((), value, self.wanted)
         return tuple(value)
+
+
+@dataclass(frozen=True)
+class Shares(Kind):
+    """Numbers that grow to 1."""
+
+    wanted = "a list of numbers greater than 0, each greater than the one before, the last of them 1"
+
+    def check(self, value: Any) -> tuple[float, ...]:
+        numbers = [as_number(entry) for entry in as_sequence(value) or ()]
+        shares = [number for number in numbers if number is not None and number > 0.0]
+        growing = all(a < b for a, b in pairwise(shares))
+        if not shares or len(shares) < len(numbers) or not growing or shares[-1] != 1.0:
+            raise wrong((), value, self.wanted)
+        return tuple(shares)
 
 
 def _is_numeric(value: Any) -> bool:
@@ -138,12 +154,15 @@ class OptimiseTable(Table):
     """Parameters that are changed by factors."""
     bounds: Annotated[dict[str, Any] | None, Values()] = None
     """By name: two entries, the lower and the upper bound."""
+    extinctions: Annotated[tuple[float, ...], Shares()] = (1.0,)
+    """Of one search after the other, each from where the last one ended, relative to the scene's: through thinner fluid
+    a picture tells how much there is, and particles that hide behind each other have to part."""
     optimiser: Annotated[str, Choice(tuple(OPTIMISERS))] = "adam"
     """Name of the algorithm."""
     learning_rate: Annotated[float, Quantity(above=0.0)]
     """In units of the parameters; for L-BFGS the size of its first step."""
     iterations: Annotated[int, Count(1, 10_000_000)]
-    """Updates at most."""
+    """Updates at most, of each search."""
     check: CheckTable = CheckTable()
     """What the run has to reach."""
 
@@ -249,6 +268,9 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
         if not isinstance(start[name], str) and (start[name] <= 0.0).any():
             raise SceneError(None, f"optimise.start.{name}", float(start[name].min()), "greater than 0")
     given = optimise.check.model_fields_set
+    if problem.loss != "image" and len(optimise.extinctions) > 1:
+        wanted = "left out, as positions are compared"
+        raise SceneError(None, "optimise.extinctions", list(optimise.extinctions), wanted)
     if problem.loss != "image" and "psnr" in given:
         raise SceneError(None, "optimise.check.psnr", optimise.check.psnr, "left out, as positions are compared")
     if problem.picture is not None and "parameter_error" in given:

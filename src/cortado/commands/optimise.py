@@ -1,7 +1,7 @@
 """``cortado optimise``: find what a task asks for, resume the search, and judge the result."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ class Verdict:
     """What an optimisation reached, against what the task asks for."""
 
     reduction: float
-    """First loss / best loss; infinite where the best is 0."""
+    """Loss of the start / best loss; infinite where the best is 0."""
     errors: dict[str, float]
     """By parameter: distance (L2) from the hidden one, relative to its size unless that is 0."""
     psnr: float | None
@@ -61,7 +61,8 @@ def optimise_task(
     if made.renderer is not None:
         last, target = max(made.targets.items())
         noise = psnr(made.image(made.problem.states(found, [last])[last]), target)
-    verdict = judge(made.task, result, found, noise)
+    first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
+    verdict = judge(made.task, result, found, noise, first)
     figures = task_figures(made, result, folder.figures)
     write_report(folder, made.task.scene.name, _rows(made, found, result, verdict), figures)
     if verdict.failures:
@@ -70,14 +71,20 @@ def optimise_task(
 
 
 def judge(
-    task: Task, result: Result, found: dict[str, np.ndarray] | None = None, noise: float | None = None
+    task: Task,
+    result: Result,
+    found: dict[str, np.ndarray] | None = None,
+    noise: float | None = None,
+    first: float | None = None,
 ) -> Verdict:
     """Hold a result against the task's [optimise.check].
 
-    ``found``: its parameters, where the result has coordinates; ``noise``: the peak signal-to-noise ratio reached [dB].
+    ``found``: its parameters, where the result has coordinates; ``noise``: the peak signal-to-noise ratio reached [dB];
+    ``first``: the loss of the start, where the history begins with another loss.
     """
     check, found = task.optimise.check, result.parameters if found is None else found
-    reduction = result.history[0].loss / result.loss if result.loss > 0.0 else math.inf
+    first = result.history[0].loss if first is None else first
+    reduction = first / result.loss if result.loss > 0.0 else math.inf
     errors = {name: _distance(value, task.hidden[name]) for name, value in found.items() if name in task.hidden}
     failures = []
     if reduction < check.loss_reduction:
@@ -101,23 +108,30 @@ def _distance(found: ArrayLike, hidden: ArrayLike) -> float:
 def _search(made: Assignment, folder: RunFolder, resume: bool) -> Result:
     settings = made.task.optimise
     known = len(folder.read_metrics()) if resume else 0
-    with track(settings.iterations + 1, "optimise") as advance:
+    history: list[Record] = []
+    start = made.start
+    with track(len(made.searches) * (settings.iterations + 1), "optimise") as advance:
 
         def note(record: Record) -> None:
+            record = replace(record, iteration=len(history))
             if record.iteration >= known:
                 folder.append_metrics(iteration=record.iteration, loss=record.loss, gradient_norm=record.gradient_norm)
+            history.append(record)
             advance(loss=record.loss)
 
-        return optimise(
-            made.search,
-            made.start,
-            settings.algorithm(),
-            settings.iterations,
-            bounds=made.bounds,
-            checkpoint=folder.checkpoint,
-            resume=resume,
-            on_iteration=note,
-        )
+        for k, search in enumerate(made.searches):
+            result = optimise(
+                search,
+                start,
+                settings.algorithm(),
+                settings.iterations,
+                bounds=made.bounds,
+                checkpoint=folder.checkpoint / str(k) if k else folder.checkpoint,
+                resume=resume,
+                on_iteration=note,
+            )
+            start = result.last_parameters
+    return replace(result, history=tuple(history), evaluations=len(history))
 
 
 def _summary(result: Result, verdict: Verdict) -> str:
@@ -134,7 +148,7 @@ def _rows(made: Assignment, found: dict[str, np.ndarray], result: Result, verdic
         ("particles", made.problem.simulation.particles),
         ("steps", made.problem.steps),
         ("iterations", len(losses) - 1),
-        ("first loss", f"{losses[0]:.4g}"),
+        ("first loss", f"{verdict.reduction * result.loss:.4g}"),
         ("best loss", f"{result.loss:.4g}"),
         ("loss reduction", f"{verdict.reduction:.4g}"),
     ]
