@@ -18,6 +18,7 @@ from cortado.cells import Grid
 from cortado.launching import TreeSum, add, sum_and_maximum, sum_of
 from cortado.masses import masses, masses_adjoint, masses_tangent
 from cortado.neighbours import NeighbourSearch
+from cortado.physics.contrast import contrast_kernels
 from cortado.physics.density import density_kernels
 from cortado.physics.diffusion import Diffusion, diffusion_kernels
 from cortado.physics.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
@@ -44,6 +45,7 @@ class Kernels:
 
     density = density_kernels(DISCRETISATION)
     walls = wall_kernels(DISCRETISATION)
+    contrast = contrast_kernels(DISCRETISATION)
     pressure = pressure_kernels(DISCRETISATION)
     force = pressure_force_kernels(DISCRETISATION)
     integration = integration_kernels(FLOAT64)
@@ -221,6 +223,29 @@ class WallYield(Operation):
     def adjoint(self, values, bars):
         values = {**values, "y": self.forward(values)["y"]}
         return {"x": launch(Kernels.walls.adjoint, s=self.s, **values, y_bar=bars["y"], **zeros("x_bar"))["x_bar"]}
+
+
+class Contrast(Operation):
+    """What heavy particles among lighter ones make of the yield."""
+
+    inputs, outputs = ("x", "m", "wall_y"), ("y",)
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.start["wall_y"] = self.start.pop("y")
+
+    def forward(self, values):
+        return launch(Kernels.contrast.forward, s=self.s, **values, t=np.zeros(N), y=np.zeros(N))
+
+    def tangent(self, values, dots):
+        given = {**values, **dotted(dots), **{name: self.forward(values)[name] for name in ("t", "y")}}
+        return {"y": launch(Kernels.contrast.tangent, s=self.s, **given, y_dot=np.zeros(N))["y_dot"]}
+
+    def adjoint(self, values, bars):
+        given = {**values, **{name: self.forward(values)[name] for name in ("t", "y")}}
+        bar = launch(Kernels.contrast.factor_adjoint, s=self.s, **given, y_bar=bars["y"], t_bar=np.zeros(N))
+        found = launch(Kernels.contrast.adjoint, s=self.s, **given, t_bar=bar["t_bar"], **zeros("x_bar", "m_bar"))
+        return {"x": found["x_bar"], "m": found["m_bar"], "wall_y": bar["y_bar"]}
 
 
 class Viscosity(Operation):
@@ -572,6 +597,7 @@ class FiveIterations(Iterations):
 ADJOINT = [
     Density,
     WallYield,
+    Contrast,
     Pairwise,
     PairwiseWithFriction,
     Laminar,

@@ -7,9 +7,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from cortado import image_losses as image_losses
     from cortado import losses as losses
     from cortado import optimisers as optimisers
+    from cortado import pictures as pictures
     from cortado import policies as policies
+    from cortado import render as render
     from cortado.errors import ComputationError as ComputationError
     from cortado.errors import CortadoError as CortadoError
     from cortado.errors import DivergedError as DivergedError
@@ -24,7 +27,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_MODULES = ("losses", "optimisers", "policies")
+_MODULES = ("image_losses", "losses", "optimisers", "pictures", "policies", "render")
 _HOMES = {
     "ComputationError": "errors",
     "CortadoError": "errors",

@@ -31,23 +31,19 @@ def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimensi
     return float((1.0 - SLACK) / kernel.weight(distances, dimension, support).sum())
 
 
-def pressure_stiffness(
-    kernel: SmoothingKernel, spacing: float, support: float, dimension: int, density_ratio: float = 1.0
-) -> float:
+def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
     """k = delta dt^2 (report eq. 7, put right; Solenthaler and Pajarola 2009):
 
     delta = 1 / (beta (S . S + sum_j G_ij . G_ij)), beta = 2 m^2 dt^2 / rho_0^2, S = sum_j G_ij,
 
-    lowered where the pressure iteration would diverge with it: where its `greatest_rate` is above `RATE_LIMIT`, and by
-    2 / (1 + ratio) for fluids of several densities, as a heavy particle's pressure moves a light neighbour that many
-    times as far.
+    lowered where the pressure iteration would diverge with it: where its `greatest_rate` is above `RATE_LIMIT`.
     """
     gradients = kernel.gradient(lattice_offsets(spacing, support, dimension), support)
     total = gradients.sum(axis=0)
     volume = rest_volume(kernel, spacing, support, dimension)
     prototype = 1.0 / (2.0 * volume**2 * (total @ total + (gradients**2).sum()))
     rate = greatest_rate(kernel, spacing, support, dimension)
-    return float(prototype * min(1.0, RATE_LIMIT / rate) * 2.0 / (1.0 + density_ratio))
+    return float(prototype * min(1.0, RATE_LIMIT / rate))
 
 
 RATE_LIMIT = 1.5

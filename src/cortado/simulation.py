@@ -174,11 +174,6 @@ class Simulation:
             )
         return int(number)
 
-    @property
-    def _density_ratio(self) -> float:
-        densities = [phase.rest_density for phase in self.scene.phase]
-        return max(densities) / min(densities)
-
     def converged(self, rollout: Rollout) -> np.ndarray:
         """(steps,) whether the density error came below the tolerances; always, with a fixed number of iterations."""
         solve = self.solver.pressure
@@ -219,7 +214,7 @@ class Simulation:
             normalisation=kernel.normalisation(dimension, support),
             self_weight=float(kernel.weight(np.zeros(1), dimension, support)[0]),
             volume=volume,
-            stiffness=pressure_stiffness(kernel, spacing, support, dimension, self._density_ratio),
+            stiffness=pressure_stiffness(kernel, spacing, support, dimension),
             rigidity=wall_rigidity(kernel, spacing, support, dimension) / layer.push,
             wall_push=layer.push,
             evenness=laplacian_evenness(kernel, spacing, support, dimension),

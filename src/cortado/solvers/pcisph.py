@@ -14,6 +14,7 @@ import warp as wp
 from cortado.launching import Launcher, sum_and_maximum
 from cortado.neighbours import SKIN, NeighbourSearch
 from cortado.particles import Fields, Parameters, State
+from cortado.physics.contrast import contrast_kernels
 from cortado.physics.convergence import NO_PARTICLE, convergence_kernels
 from cortado.physics.density import density_kernels
 from cortado.physics.integration import integration_kernels
@@ -65,6 +66,7 @@ class Kernels:
 
     density: SimpleNamespace
     walls: SimpleNamespace
+    contrast: SimpleNamespace
     pressure: SimpleNamespace
     force: SimpleNamespace
     integration: SimpleNamespace
@@ -76,6 +78,7 @@ class Kernels:
         return cls(
             density_kernels(discretisation),
             wall_kernels(discretisation),
+            contrast_kernels(discretisation),
             pressure_kernels(discretisation),
             pressure_force_kernels(discretisation),
             integration_kernels(discretisation.precision),
@@ -137,7 +140,13 @@ class Pcisph:
 
         self.emitter = Emitter(nozzle, precision, self.launch, self.new_state(requires_grad)) if nozzle else None
         self.fields = Fields.zeros(particles, precision, device, requires_grad)
-        self.wall_yield = wp.zeros(particles, dtype=precision.real, device=device, requires_grad=requires_grad)
+
+        def numbers() -> wp.array:
+            return wp.zeros(particles, dtype=precision.real, device=device, requires_grad=requires_grad)
+
+        self.wall_yield, self.contrast = numbers(), numbers()
+        self.pressure_yield = numbers() if phases.count > 1 else self.wall_yield
+        """(n,) what delta is multiplied with [-]: beside walls, and with several phases among lighter neighbours."""
         self.accelerations = [vectors() for _ in range(len(self.terms) + 1)]
         """``accelerations[t]``: of the first t terms; the first is 0 and never written."""
         self.iterates = Iterates(particles, precision, device, requires_grad)
@@ -271,6 +280,10 @@ class Pcisph:
         self.launch(self.kernels.density.forward, [s, f.x], [f.n])
         self.mixture.step(s, f, parameters, state.mass_fractions)
         self.launch(self.kernels.walls.forward, [s, f.x], [self.wall_yield])
+        if self.mixture.phases.count > 1:
+            self.launch(
+                self.kernels.contrast.forward, [s, f.x, f.m, self.wall_yield], [self.contrast, self.pressure_yield]
+            )
         moment = self.moment(parameters)
         for t, term in enumerate(self.terms):
             term.accelerate(moment, self.accelerations[t], self.accelerations[t + 1])
@@ -311,7 +324,7 @@ class Pcisph:
         pressure = it.p[max(slot, 1)]
         self.launch(
             self.kernels.pressure.forward,
-            [s, self.lattice.stiffness, p.time_step, f.n, f.m, f.rho_0, self.wall_yield]
+            [s, self.lattice.stiffness, p.time_step, f.n, f.m, f.rho_0, self.pressure_yield]
             + [it.x_star[before], pressure_before],
             [pressure, it.c[before], self._errors],
         )

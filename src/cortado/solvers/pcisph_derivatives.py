@@ -27,9 +27,9 @@ class PcisphAdjoint:
         precision, particles, device = solver.discretisation.precision, solver.search.particles, solver.search.device
         self._solver = solver
         self._bar = Fields.zeros(particles, precision, device)
-        vectors, scalars = _scratch(solver, 3, 3)
+        vectors, scalars = _scratch(solver, 3, 4)
         self._push_bar, self._acceleration_bar, self._scalars_bar = vectors
-        self._p_bar, self._y_bar, self._r = scalars
+        self._p_bar, self._y_bar, self._r, self._t_bar = scalars
         self._sum = sum_of(precision.vector, particles, device)
         self._mixture = MixtureAdjoint(solver.mixture)
         self._emitter = EmitterAdjoint(solver.emitter) if solver.emitter else None
@@ -71,7 +71,7 @@ class PcisphAdjoint:
         for k in reversed(range(iterations)):
             launch(
                 kernels.force.adjoint,
-                [s, solver.lattice.stiffness, time_step, f.x, f.n, f.m, f.rho_0, solver.wall_yield]
+                [s, solver.lattice.stiffness, time_step, f.x, f.n, f.m, f.rho_0, solver.pressure_yield]
                 + [it.p[k], it.p[k + 1], it.c[k], self._push_bar],
                 [b.x, b.n, b.m, b.rho_0, self._y_bar, self._p_bar, self._scalars_bar, self._r],
             )
@@ -84,6 +84,10 @@ class PcisphAdjoint:
         moment, adjoints = solver.moment(parameters), Adjoints(b, bar)
         for term in reversed(solver.terms):
             term.adjoint(moment, self._acceleration_bar, adjoints)
+        if solver.mixture.phases.count > 1:
+            t, y = solver.contrast, solver.pressure_yield
+            launch(kernels.contrast.factor_adjoint, [s, t, y], [self._y_bar, self._t_bar])
+            launch(kernels.contrast.adjoint, [s, f.x, f.m, self._t_bar], [b.x, b.m])
         launch(kernels.walls.adjoint, [s, f.x, solver.wall_yield, self._y_bar], [b.x])
         self._mixture.step(
             s, f, b, parameters, self._scalars_bar, new_state_bar.mass_fractions, state_bar.mass_fractions
@@ -100,9 +104,9 @@ class PcisphTangent:
         precision, particles, device = solver.discretisation.precision, solver.search.particles, solver.search.device
         self._solver = solver
         self._dot = Fields.zeros(particles, precision, device)
-        vectors, scalars = _scratch(solver, len(solver.terms) + 3, 5)
+        vectors, scalars = _scratch(solver, len(solver.terms) + 3, 6)
         self._x_star_dot, self._v_star_dot, *self._accelerations_dot = vectors
-        self._zero_pressure, *self._p_dot, self._c_dot, self._y_dot = scalars
+        self._zero_pressure, *self._p_dot, self._c_dot, self._y_dot, self._wall_y_dot = scalars
         self._mixture = MixtureTangent(solver.mixture)
 
     def step(
@@ -119,7 +123,12 @@ class PcisphTangent:
         )
         launch(kernels.density.tangent, [s, f.x, d.x], [d.n])
         self._mixture.step(s, f, d, parameters, dot, state_dot.mass_fractions)
-        launch(kernels.walls.tangent, [s, f.x, d.x, solver.wall_yield], [self._y_dot])
+        if solver.mixture.phases.count > 1:
+            t, y = solver.contrast, solver.pressure_yield
+            launch(kernels.walls.tangent, [s, f.x, d.x, solver.wall_yield], [self._wall_y_dot])
+            launch(kernels.contrast.tangent, [s, f.x, d.x, f.m, d.m, t, y, self._wall_y_dot], [self._y_dot])
+        else:
+            launch(kernels.walls.tangent, [s, f.x, d.x, solver.wall_yield], [self._y_dot])
         for t, term in enumerate(solver.terms):
             before, after = self._accelerations_dot[t], self._accelerations_dot[t + 1]
             term.tangent(solver.moment(parameters), d, dot, before, after)
@@ -134,7 +143,7 @@ class PcisphTangent:
             launch(
                 kernels.pressure.tangent,
                 [s, solver.lattice.stiffness, time_step, dot.time_step, f.n, d.n, f.m, d.m, f.rho_0, d.rho_0]
-                + [solver.wall_yield, self._y_dot, it.x_star[k], self._x_star_dot]
+                + [solver.pressure_yield, self._y_dot, it.x_star[k], self._x_star_dot]
                 + [it.p[k], p_dot_before, it.p[k + 1]],
                 [p_dot, self._c_dot],
             )

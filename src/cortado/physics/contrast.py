@@ -1,0 +1,143 @@
+"""How much a heavy particle among lighter ones may be pushed by one pressure iteration.
+
+delta is made for particles of one mass. The pressure of a particle with lighter neighbours moves these further, by
+the ratio of the masses, and where the answer of its own density is more than twice what is wanted the iteration
+diverges. So its yield is multiplied with
+
+    1 / (1 + e(t_i)),   t_i = V sum_j W_ij (m_i / m_j - 1),   e(t) = t^2 / (2 (t + a)) for t > 0, else 0,
+
+which is 1 among particles of its own mass or heavier ones, and tends to the mean 1 / (1 + t / 2) that the lattice asks
+for. a makes it smooth at 0.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
+
+SOFTNESS = 0.2
+"""a [-]"""
+
+
+@cache
+def contrast_kernels(discretisation: Discretisation) -> SimpleNamespace:
+    """Kernels ``forward``, ``tangent``, and the two of the way back: ``factor_adjoint``, then ``adjoint``."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    surroundings = surroundings_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    separation, weight, gradient = pair.separation, pair.weight, pair.gradient
+    a = wp.constant(real(SOFTNESS))
+
+    @wp.func
+    def contrast_sum(i: int, x: wp.array(dtype=vector), m: wp.array(dtype=real), s: surroundings) -> real:
+        """t_i / V"""
+        x_i = x[i]
+        m_i = m[i]
+        total = real(0.0)
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for u in range(UNROLL):
+                j = s.neighbours[k + u, i]
+                total += weight(separation(x_i, x[j], s), s) * (m_i / m[j] - real(1.0))
+        return total
+
+    @wp.func
+    def excess(t: real) -> real:
+        """e(t)"""
+        if t > real(0.0):
+            return real(0.5) * t * t / (t + a)
+        return real(0.0)
+
+    @wp.func
+    def excess_slope(t: real) -> real:
+        """e'(t)"""
+        if t > real(0.0):
+            return real(0.5) * t * (t + real(2.0) * a) / ((t + a) * (t + a))
+        return real(0.0)
+
+    @wp.kernel(module=discretisation.module(True, "contrast"))
+    def contrast(
+        s: surroundings,
+        x: wp.array(dtype=vector),
+        m: wp.array(dtype=real),
+        wall_y: wp.array(dtype=real),
+        # out
+        t: wp.array(dtype=real),
+        y: wp.array(dtype=real),
+    ):
+        i = s.first + wp.tid()
+        total = contrast_sum(i, x, m, s)
+        t[i] = s.volume * total
+        y[i] = wall_y[i] / (real(1.0) + excess(s.volume * total))
+
+    @wp.kernel(module=discretisation.module(False, "contrast"), enable_backward=False)
+    def contrast_tangent(
+        s: surroundings,
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        m: wp.array(dtype=real),
+        m_dot: wp.array(dtype=real),
+        t: wp.array(dtype=real),
+        y: wp.array(dtype=real),
+        wall_y_dot: wp.array(dtype=real),
+        # out
+        y_dot: wp.array(dtype=real),
+    ):
+        i = s.first + wp.tid()
+        m_i = m[i]
+        t_dot = real(0.0)
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for u in range(UNROLL):
+                j = s.neighbours[k + u, i]
+                x_ij = separation(x[i], x[j], s)
+                ratio = m_i / m[j]
+                t_dot += wp.dot(gradient(x_ij, s), x_dot[i] - x_dot[j]) * (ratio - real(1.0))
+                t_dot += weight(x_ij, s) * ratio * (m_dot[i] / m_i - m_dot[j] / m[j])
+        part = real(1.0) / (real(1.0) + excess(t[i]))
+        y_dot[i] = part * (wall_y_dot[i] - y[i] * excess_slope(t[i]) * s.volume * t_dot)
+
+    @wp.kernel(module=discretisation.module(False, "contrast"), enable_backward=False)
+    def factor_adjoint(
+        s: surroundings,
+        t: wp.array(dtype=real),
+        y: wp.array(dtype=real),
+        # in and out
+        y_bar: wp.array(dtype=real),
+        # out
+        t_bar: wp.array(dtype=real),
+    ):
+        """``y_bar`` becomes the adjoint of the yield beside walls."""
+        i = s.first + wp.tid()
+        part = real(1.0) / (real(1.0) + excess(t[i]))
+        t_bar[i] = -y_bar[i] * y[i] * part * excess_slope(t[i])
+        y_bar[i] = y_bar[i] * part
+
+    @wp.kernel(module=discretisation.module(False, "contrast"), enable_backward=False)
+    def contrast_adjoint(
+        s: surroundings,
+        x: wp.array(dtype=vector),
+        m: wp.array(dtype=real),
+        t_bar: wp.array(dtype=real),
+        # in and out
+        x_bar: wp.array(dtype=vector),
+        m_bar: wp.array(dtype=real),
+    ):
+        i = s.first + wp.tid()
+        m_i = m[i]
+        x_sum = vector()
+        m_sum = real(0.0)
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for u in range(UNROLL):
+                j = s.neighbours[k + u, i]
+                x_ij = separation(x[i], x[j], s)
+                own = t_bar[i] * m_i / m[j]
+                other = t_bar[j] * m[j] / m_i
+                x_sum += (own - t_bar[i] + other - t_bar[j]) * gradient(x_ij, s)
+                m_sum += weight(x_ij, s) * (own - other)
+        x_bar[i] = x_bar[i] + s.volume * x_sum
+        m_bar[i] = m_bar[i] + s.volume * m_sum / m_i
+
+    return SimpleNamespace(
+        forward=contrast, tangent=contrast_tangent, factor_adjoint=factor_adjoint, adjoint=contrast_adjoint
+    )
