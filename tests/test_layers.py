@@ -15,8 +15,8 @@ LAYERS = """
     errors
     image_losses srgb masses
     precision smoothing calibration cells
-    physics.surroundings physics.density physics.walls physics.contrast physics.integration physics.gravity physics.nozzle
-    physics.pressure physics.viscosity physics.free_energy physics.diffusion physics.mixture
+    physics.surroundings physics.density physics.walls physics.contrast physics.integration physics.gravity
+    physics.nozzle physics.pressure physics.viscosity physics.free_energy physics.diffusion physics.mixture
     physics.convergence physics.reduction physics.matching
     physics.tint physics.colour_field physics.interpolation physics.rays physics.absorption
     launching neighbours particles

@@ -6,8 +6,8 @@
     constant     m = 1
     degenerate   m = (z + sqrt(z^2 + delta^2)) / 2,   z = sum_(k<l) c_k c_l: where phases touch
 
-For two phases the double well is c_1^2 c_2^2. The other generalisation, sum_(k < l) c_k^2 c_l^2, pulls a third phase into
-the interface of two, and lets equal parts of three or more stay mixed.
+For two phases the double well is c_1^2 c_2^2. The other generalisation, sum_(k < l) c_k^2 c_l^2, pulls a third phase
+into the interface of two, and lets equal parts of three or more stay mixed.
 
 delta keeps the mobility positive, and smooth, where a fraction strays out of [0, 1]: a negative one would feed the
 excursion. It leaves a pure phase delta / 2, and z <= 1 / 4 for two phases is hardly touched.
