@@ -13,7 +13,7 @@ $(VENV)/.ready: pyproject.toml
 	touch $@
 
 demo: setup
-	$(BIN)/cortado optimise examples/recover_gravity_small.toml --out runs/demo --overwrite
+	$(BIN)/cortado optimise examples/latte_art_small.toml --out runs/demo --overwrite
 
 test: lint types unit
 

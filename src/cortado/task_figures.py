@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from cortado.assignment import Assignment
-from cortado.controls import UNITS
+from cortado.controls import MATERIALS, UNITS
 from cortado.figures import curve, images, loss_curve, parameters, particles
 from cortado.optimisation import Result
 from cortado.particles import TABLES
@@ -82,5 +82,7 @@ def _parameter(made: Assignment, result: Result, name: str, folder: Path) -> Fig
     values = [made.search.parameters(record.parameters)[name] for record in result.history]
     history = [np.broadcast_arrays(value, hidden)[0] for value in values]
     hidden = np.broadcast_to(hidden, history[0].shape)
-    path = parameters(history, hidden, folder / f"{name}.png", title=name, unit=UNITS[name])
+    phases = [phase.name for phase in made.task.scene.phase]
+    names = phases if name in MATERIALS and len(phases) > 1 else None
+    path = parameters(history, hidden, folder / f"{name}.png", names=names, title=name, unit=UNITS[name])
     return [(f"The parameter {name} during the optimisation, and the hidden one.", path)]
