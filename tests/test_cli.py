@@ -365,6 +365,15 @@ def figures(run):
     return {path.name for path in (Path(run) / "figures").iterdir()}
 
 
+def test_a_run_is_rendered_as_its_scene_asks(cortado_command, folder):
+    (folder / "latte.toml").write_text(TINY_LATTE)
+    code, _, err = cortado_command("run", "latte.toml", "--steps", 2, "--out", "a")
+    assert code == 0, err
+    assert (folder / "a" / "figures" / "rendered.png").exists()
+    assert (folder / "a" / "figures" / "run.mp4").exists() == bool(find_spec("av"))
+    assert Trajectory.load(folder / "a" / "trajectory.vtkhdf").mass_fractions.shape[2] == 2
+
+
 def test_places_are_found_for_a_picture(cortado_command):
     Path("task.toml").write_text(PLANE_PICTURE)
     code, out, err = cortado_command("optimise", "task.toml", "--out", "found")

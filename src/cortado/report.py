@@ -12,6 +12,8 @@ from pathlib import Path
 from cortado.errors import InputError
 from cortado.run_folder import RunFolder, write_atomically
 
+Figures = list[tuple[str, str | Path]]
+"""(caption, path) of each picture or video"""
 _KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".svg": "image/svg+xml", ".gif": "image/gif"}
 _VIDEOS = {".mp4": "video/mp4", ".webm": "video/webm"}
 

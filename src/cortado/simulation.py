@@ -169,8 +169,8 @@ class Simulation:
         number = float(np.ceil(float(time_step) / limit))
         if number > MOST_SUBSTEPS:
             raise InputError(
-                f"mobility is {float(mobility):g} m2/s, which takes {number:.3g} explicit steps of diffusion within "
-                f"each time step, but must not take more than {MOST_SUBSTEPS}: lower it, or interface_width or time_step."
+                f"mobility is {float(mobility):g} m2/s, which takes {number:.3g} explicit steps of diffusion in a "
+                f"time step, but must not take more than {MOST_SUBSTEPS}: lower it, interface_width or time_step."
             )
         return int(number)
 

@@ -10,16 +10,13 @@ from cortado.controls import MATERIALS, UNITS
 from cortado.figures import curve, images, loss_curve, parameters, particles
 from cortado.optimisation import Result
 from cortado.particles import TABLES
-from cortado.video import write_video
+from cortado.report import Figures
+from cortado.video import MOST_FRAMES, write_video
 
 MOST_CURVES = 12
 """Parameters with more components get no picture of their own."""
 MOMENTS = 6
 """Images on the way."""
-MOST_FRAMES = 120
-"""Frames of a video."""
-
-Figures = list[tuple[str, str | Path]]
 
 
 def task_figures(made: Assignment, result: Result, folder: Path) -> Figures:

@@ -15,6 +15,8 @@ from cortado.errors import InputError
 from cortado.run_folder import write_atomically
 from cortado.srgb import to_srgb
 
+MOST_FRAMES = 120
+"""Frames of a report's video."""
 QUALITY = "18"
 """Constant rate factor of x264: 0 loses nothing, 51 nearly everything; at 18 the eye sees no difference."""
 

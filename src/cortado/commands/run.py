@@ -1,19 +1,22 @@
 """``cortado run``: a scene, forward."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from cortado.errors import DivergedError
-from cortado.figures import density_errors, particles
+from cortado.figures import density_errors, images, particles
 from cortado.particles import State
 from cortado.progress import track
-from cortado.report import write_report
+from cortado.render.scene_renderer import scene_renderer
+from cortado.report import Figures, write_report
 from cortado.rollout import Rollout
 from cortado.run_folder import RunFolder
 from cortado.scene import Scene, load_scene
 from cortado.simulation import Simulation, check_steps, not_converged_sentence
 from cortado.trajectory import Trajectory, fraction_fields, fraction_names
+from cortado.video import MOST_FRAMES, write_video
 from cortado.vtkhdf import TrajectoryWriter
 
 
@@ -82,11 +85,31 @@ def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolde
                 )
 
 
+def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], folder: Path) -> Figures:
+    """Pictures of a scene that says how it is rendered, and a video where it can be written."""
+    renderer, state = scene_renderer(simulation), simulation.solver.new_state()
+    colours = simulation.parameters()["colours"]
+
+    def image(frame: int) -> np.ndarray:
+        fractions = trajectory.mass_fractions
+        composition = simulation.mass_fractions if fractions is None else fractions[frame]
+        state.set(trajectory.positions[frame], trajectory.velocities[frame], composition)
+        return renderer.render(state.positions, state.mass_fractions, colours)
+
+    titles = [f"t = {trajectory.times[frame]:.3f} s" for frame in shown]
+    path = images([image(frame) for frame in shown], titles, folder / "rendered.png")
+    figures: Figures = [("The same, rendered.", path)]
+    if len(trajectory.times) > 1 and find_spec("av"):
+        frames = range(0, len(trajectory.times), -(-len(trajectory.times) // MOST_FRAMES))
+        figures.append(("The run.", write_video(folder / "run.mp4", map(image, frames), 20)))
+    return figures
+
+
 def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder) -> None:
     trajectory = Trajectory.load(folder.trajectory)
     shown = sorted({0, len(trajectory.times) // 2, len(trajectory.times) - 1})
     speeds = [np.linalg.norm(trajectory.velocities[frame], axis=1) for frame in shown]
-    figures = [
+    figures: Figures = [
         (
             "The fluid at the start, half-way and at the end, seen along the third axis.",
             particles(
@@ -99,6 +122,8 @@ def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder) -> 
             ),
         )
     ]
+    if scene.render is not None:
+        figures += _rendered(simulation, trajectory, shown, folder.figures)
     if len(trajectory.density_errors) and scene.forces.pressure:
         path = folder.figures / "density_errors.png"
         density_errors(trajectory, path, tolerance=scene.solver.density_tolerance)
