@@ -1,7 +1,7 @@
 """Fluid that comes out of a nozzle: particles are led along it until they pass its opening, and then are free.
 
-A particle that starts u upstream of the opening, o beside the axis, is led after step n, at t = n dt, while
-s = u - w t > 0, w = Q / A:
+A particle that starts u upstream of the opening, o beside the axis, is led after step n = 0, 1, ..., at t = (n + 1)
+dt, while s = u - w t > 0, w = Q / A:
 
     x = q_n + o - s e,   v = (q_n - q_(n-1)) / dt + w e
 
