@@ -24,6 +24,8 @@ Rows = list[tuple[str, object]]
 class Verdict:
     """What an optimisation reached, against what the task asks for."""
 
+    first: float
+    """Loss of the start."""
     reduction: float
     """Loss of the start / best loss; infinite where the best is 0."""
     errors: dict[str, float]
@@ -67,7 +69,7 @@ def optimise_task(
     write_report(folder, made.task.scene.name, _rows(made, found, result, verdict), figures)
     if verdict.failures:
         raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
-    return f"{_summary(result, verdict)} The results are in {folder.path}; open report.html."
+    return f"{_summary(made, result, verdict)} The results are in {folder.path}; open report.html."
 
 
 def judge(
@@ -96,7 +98,7 @@ def judge(
         for name, error in errors.items()
         if error > check.parameter_error
     ]
-    return Verdict(reduction, errors, noise, failures)
+    return Verdict(first, reduction, errors, noise, failures)
 
 
 def _distance(found: ArrayLike, hidden: ArrayLike) -> float:
@@ -134,21 +136,26 @@ def _search(made: Assignment, folder: RunFolder, resume: bool) -> Result:
     return replace(result, history=tuple(history), evaluations=len(history))
 
 
-def _summary(result: Result, verdict: Verdict) -> str:
+def _iterations(made: Assignment, result: Result) -> int:
+    """Of all searches, each of which evaluates its start besides."""
+    return len(result.history) - len(made.searches)
+
+
+def _summary(made: Assignment, result: Result, verdict: Verdict) -> str:
     reached = [f"{name} within {100 * error:.3g}% of the hidden one" for name, error in verdict.errors.items()]
     if verdict.psnr is not None:
         reached.insert(0, f"the image is matched to {verdict.psnr:.3g} dB")
-    text = f"The loss fell {verdict.reduction:.3g} times in {len(result.history) - 1} iterations"
+    fell = f"fell {verdict.reduction:.3g} times" if result.loss > 0.0 else f"went from {verdict.first:.3g} to 0"
+    text = f"The loss {fell} in {_iterations(made, result)} iterations"
     return f"{'; '.join([text, ', '.join(reached)]) if reached else text}."
 
 
 def _rows(made: Assignment, found: dict[str, np.ndarray], result: Result, verdict: Verdict) -> Rows:
-    losses = [record.loss for record in result.history]
     rows: Rows = [
         ("particles", made.problem.simulation.particles),
         ("steps", made.problem.steps),
-        ("iterations", len(losses) - 1),
-        ("first loss", f"{verdict.reduction * result.loss:.4g}"),
+        ("iterations", _iterations(made, result)),
+        ("first loss", f"{verdict.first:.4g}"),
         ("best loss", f"{result.loss:.4g}"),
         ("loss reduction", f"{verdict.reduction:.4g}"),
     ]
