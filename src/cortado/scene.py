@@ -8,7 +8,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
@@ -117,6 +117,7 @@ class Solver(Table):
 class Scene(Table):
     """Everything that a simulation starts from."""
 
+    beside: ClassVar = OTHER_TABLES
     name: Annotated[str, Text()] = "scene"
     """Shown in titles."""
     dimension: Annotated[int, Count(2, 3)]

@@ -6,7 +6,7 @@ A wrong value ends in a `SceneError`, whether the scene comes from a file or is 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
@@ -21,6 +21,8 @@ class Table(BaseModel):
     """A table of the scene: frozen, without unknown keys, and with a `SceneError` for whatever is wrong."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+    beside: ClassVar[tuple[str, ...]] = ()
+    """Tables of others that a file may hold beside its keys; only for advice."""
 
     def __init__(self, /, **data: Any):
         with sentences():
@@ -38,7 +40,7 @@ class Table(BaseModel):
             raise wrong((), data, "a table")
         for key in data:
             if key not in cls.model_fields:
-                raise _unknown_key(str(key), list(cls.model_fields))
+                raise _unknown_key(str(key), [*cls.model_fields, *(name for name in cls.beside if name != key)])
         for name, field in cls.model_fields.items():
             if field.is_required() and name not in data:
                 kinds = [kind.wanted for kind in field.metadata if isinstance(kind, Kind)]
