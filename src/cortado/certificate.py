@@ -126,7 +126,7 @@ def _points(problem: Problem) -> list[tuple[str, np.ndarray, Any]]:
     viscosity = np.where(values["viscosity"] > 0.0, values["viscosity"], 0.01)
     points = [
         ("gravity", gravity, 0.1 * size),
-        ("gravity over time", np.tile(gravity, (problem.steps, 1)), 0.1 * size),
+        *([("gravity over time", np.tile(gravity, (problem.steps, 1)), 0.1 * size)] if problem.steps > 0 else []),
         ("initial_positions", values["initial_positions"], 0.1 * problem.simulation.scene.discretisation.spacing),
         ("initial_velocities", values["initial_velocities"], 0.1),
         ("viscosity", viscosity, 0.1 * viscosity),

@@ -159,7 +159,7 @@ def parameter_shapes(name: str, steps: int, phases: int, positions: tuple[int, .
     """The shapes that a parameter may have, () for a number, where positions are (n, d)."""
     n, d = positions
     if name in TABLES:
-        return [(d,), (steps, d)]
+        return [(d,), (steps, d)] if steps > 0 else [(d,)]
     if name in MATERIALS:
         return [() if phases == 1 else (phases,)]
     several = {"mass_fractions": (n, phases), "colours": (phases, 3)}

@@ -310,8 +310,7 @@ def _check_bounds(name: str, pair: np.ndarray, optimise: OptimiseTable, start: M
 
 def _shapes(name: str, scene: Scene, steps: int) -> list[tuple[int, ...]]:
     """The shapes that a parameter may have; () is a number."""
-    shapes = parameter_shapes(name, steps, len(scene.phase), fluid_particles(scene).positions.shape)
-    return [shape for shape in shapes if 0 not in shape]
+    return parameter_shapes(name, steps, len(scene.phase), fluid_particles(scene).positions.shape)
 
 
 def _in_words(shapes: Sequence[tuple[int, ...]]) -> str:
