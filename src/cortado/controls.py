@@ -83,7 +83,7 @@ class Controls:
             rollout.initial.set(*(values.get(name, self._scene[name]) for name in STATES))
         chosen = {name: values.get(name, self._scene[name]) for name in (*MATERIALS, *NUMBERS)}
         parameters.set_tables(**{name: values.get(name, self._scene[name]) for name in TABLES})
-        parameters.set_constants(**chosen, masses=masses(*self._composition(values)))
+        parameters.set_constants(**chosen, masses=self._masses(values))
         diffusion = ("time_step", "mobility", "interface_width", "rest_density")
         needed = simulation.substeps(**{name: chosen[name] for name in diffusion})
         rollout.substeps = max(needed, 1) if "mobility" in varied and self._phases > 1 else needed
@@ -120,6 +120,19 @@ class Controls:
                 if name in found:
                     found[name] = found[name] + bar
         return {name: found[name].reshape(values[name].shape) for name in values if name in found}
+
+    def _masses(self, values: Arrays) -> np.ndarray:
+        """(n,) of the particles; fractions a little below 0, as diffusion leaves them, may still make one negative."""
+        fractions, density = self._composition(values)
+        with np.errstate(divide="ignore"):
+            found = masses(fractions, density)
+        bad = np.flatnonzero(~(np.isfinite(found) & (found > 0.0)))
+        if bad.size:
+            raise InputError(
+                f"mass_fractions of particle {bad[0]} are {fractions[bad[0]].tolist()}, but must be such that its "
+                "volume, the sum of the fractions over the rest densities of the phases, is greater than 0."
+            )
+        return found
 
     def _composition(self, values: Arrays) -> tuple[np.ndarray, np.ndarray]:
         fractions, density = (values.get(name, self._scene[name]) for name in ("mass_fractions", "rest_density"))
