@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
-from cortado.errors import InputError
+from cortado.errors import InputError, shown
 from cortado.image_losses import ImageLoss, SquaredDifference
 from cortado.launching import sum_of
 from cortado.particles import State, to_device
@@ -146,7 +146,7 @@ class Image:
         """``target`` (rows, columns, 3), linear RGB; ``distance``: `cortado.image_losses.SquaredDifference`, the
         default (the report's 6.2.2), or `Pyramid`, whose gradient leads shapes to each other that do not overlap."""
         self.renderer, self.distance = renderer, SquaredDifference() if distance is None else distance
-        self.target = np.array(target, dtype=np.float64)
+        self.target = _target_image(target, getattr(renderer, "shape", None))
         self.target.setflags(write=False)
         parts = (self.distance.fingerprint, sha256(self.target.tobytes()).hexdigest())
         self.fingerprint = " ".join((*parts, getattr(renderer, "fingerprint", "")))
@@ -171,6 +171,21 @@ class Image:
         wp.copy(bar.positions, found.positions)
         wp.copy(bar.mass_fractions, found.fractions)
         return EndAdjoint(bar, found.colours)
+
+
+def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:
+    """A copy (rows, columns, 3) in float64, or an `InputError`; ``shape``: of the renderer's pictures, if known."""
+    try:
+        image = np.array(target, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"target is {shown(target)}, but must be a picture (rows, columns, 3).") from None
+    if image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise InputError(f"target has shape {image.shape}, but must be a picture (rows, columns, 3).")
+    if shape is not None and image.shape != shape:
+        raise InputError(f"target has shape {image.shape}, but must have that of the renderer's pictures, {shape}.")
+    if not np.isfinite(image).all():
+        raise InputError("target has a value that is not finite, but must be made of finite numbers.")
+    return image
 
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
