@@ -132,7 +132,10 @@ class Problem:
                 ends[step] = TrajectoryEnd(state, self.simulation.dimension, colours)
 
         self._controls.begin(self._rollout, values, varied)
-        observe(0, self._rollout.initial)
+        if 0 in wanted:
+            first = self._rollout.initial.like()
+            first.assign(self._rollout.initial)
+            observe(0, first)  # a copy, as the next evaluation overwrites the rollout's
         self._rollout.forward(observe, keep)
         return ends
 
