@@ -111,10 +111,13 @@ class Problem:
 
     @property
     def fingerprint(self) -> str:
-        """Which problem this is, in a checksum: scene, precision, steps, ``fingerprint`` of the loss; for a loss
-        without one only its type is known."""
-        text = f"{self.simulation.scene.to_json()} {self.simulation.precision.name} {self.steps} "
-        return sha256((text + fingerprint(self.loss)).encode()).hexdigest()
+        """Which problem this is, in a checksum: scene, first positions (which may be in a file), free energy (by its
+        name and curvature), precision, steps, ``fingerprint`` of the loss; for a loss without one only its type is
+        known."""
+        simulation, energy = self.simulation, self.simulation.free_energy
+        text = f"{simulation.scene.to_json()} {simulation.precision.name} {self.steps} {fingerprint(self.loss)}"
+        text += f" {energy.name} {energy.curvature}"
+        return sha256(text.encode() + simulation.positions.tobytes()).hexdigest()
 
     def iterations(self) -> np.ndarray:
         """(steps,) pressure iterations of the last evaluation."""

@@ -80,8 +80,9 @@ class Renderer:
 
     @property
     def fingerprint(self) -> str:
-        """Tells one view from another, for checkpoints."""
-        return repr(self.view)
+        """Tells one view from another, for checkpoints, and one grid of nodes."""
+        nodes = self._field.nodes
+        return f"{self.view!r} {tuple(nodes.origin)} {nodes.cell} {tuple(nodes.shape)}"
 
     @property
     def shape(self) -> tuple[int, int, int]:
