@@ -7,7 +7,11 @@ import pytest
 
 from cortado import InputError, Problem, Scene, Simulation, losses
 from cortado.image_losses import Pyramid, SquaredDifference
+from cortado.precision import FLOAT64
+from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
+from cortado.render.views import TopView
+from cortado.smoothing import CUBIC_SPLINE
 from scenes import plane_of_three, two_layers
 
 RESOLUTION = [20, 16]
@@ -173,11 +177,28 @@ def test_fingerprints_tell_targets_and_distances_apart():
 
 
 def test_a_target_of_another_size_is_a_sentence():
-    problem, renderer = case("plane")
-    wrong = Problem(problem.simulation, 1, losses.Image(renderer, np.zeros((16, 21, 3))))
-    for refused in (wrong.value, wrong.value_and_gradient):
-        with pytest.raises(InputError, match=r"its target \(16, 21, 3\): they must be the same\.$"):
-            refused({})
+    _, renderer = case("plane")
+    for target, wanted in [
+        (
+            np.zeros((16, 21, 3)),
+            r"shape \(16, 21, 3\), but must have that of the renderer's pictures, \(16, 20, 3\)\.$",
+        ),
+        (np.zeros((16, 20)), r"shape \(16, 20\), but must be a picture \(rows, columns, 3\)\.$"),
+        (np.full((16, 20, 3), np.nan), r"not finite, but must be made of finite numbers\.$"),
+        ("heart", r"^target is 'heart', but must be a picture"),
+    ]:
+        with pytest.raises(InputError, match=wanted):
+            losses.Image(renderer, target)
+
+
+def test_fingerprints_tell_grids_of_one_view_apart():
+    given = {"smoothing": CUBIC_SPLINE, "support": 0.2, "volume": 1e-3, "particles": 5, "phases": 1}
+    view = TopView((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.1, (20, 16))
+    made = [
+        Renderer(view, np.zeros(3), upper, **given, precision=FLOAT64, device="cpu", cell=cell)
+        for upper, cell in (([1.0, 1.0, 1.0], 0.1), ([1.0, 1.0, 1.0], 0.05), ([1.0, 2.0, 1.0], 0.1))
+    ]
+    assert len({renderer.fingerprint for renderer in made}) == 3
 
 
 def cup() -> Scene:

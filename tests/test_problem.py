@@ -1,13 +1,16 @@
 """What a Problem promises besides right derivatives: clean state, clear sentences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from cortado import InputError, Problem, Simulation, losses, policies
 from cortado.certificate import Comparison, certify
 from cortado.particles import State
+from cortado.physics.free_energy import MISCIBLE
 from cortado.rollout import checkpoint_interval
-from scenes import plane, splash
+from scenes import plane, plane_of_three, splash
 
 GRAVITY = {"gravity": np.array([0.0, -9.81, 0.0])}
 
@@ -183,3 +186,32 @@ def test_certificates_of_right_gradients():
 )
 def test_certificates_of_wrong_gradients(wrong):
     assert not wrong.right
+
+
+def test_a_first_state_is_not_overwritten_by_the_next_evaluation(simulation):
+    problem, x = Problem(simulation, 0, losses.FinalPositions(simulation.positions)), simulation.positions
+    first = problem.end({"initial_positions": x + 0.01})
+    problem.end({"initial_positions": x})
+    np.testing.assert_array_equal(first.positions, x + 0.01)
+
+
+def test_without_steps_there_are_no_rows(simulation):
+    problem = Problem(simulation, 0, losses.FinalPositions(np.zeros_like(simulation.positions)))
+    with pytest.raises(InputError, match=r"has shape \(0, 3\), but must be \(3,\) in"):
+        problem.value({"gravity": np.zeros((0, 3))})
+    assert not problem.value_and_gradient(GRAVITY)[1]["gravity"].any()
+    assert certify(problem).right
+
+
+def test_a_fingerprint_knows_the_free_energy():
+    scene, own = plane_of_three(), replace(MISCIBLE, name="own")
+    made = [Simulation(scene), Simulation(scene, free_energy=own), Simulation(scene, free_energy=MISCIBLE)]
+    assert len({Problem(s, 1, losses.FinalPositions(s.positions)).fingerprint for s in made}) == 3
+
+
+def test_a_particle_without_volume_is_a_sentence():
+    simulation = Simulation(plane_of_three())
+    fractions = simulation.mass_fractions.copy()
+    fractions[5] = [3.0, -2.0, 0.0]
+    with pytest.raises(InputError, match=r"^mass_fractions of particle 5 are \[3.0, -2.0, 0.0\], but must be such"):
+        simulation.run(1, {"mass_fractions": fractions, "rest_density": [1000.0, 100.0, 1000.0]})

@@ -179,6 +179,7 @@ def test_what_is_not_reached_is_said(task_file):
 def test_a_loss_of_zero_cannot_be_lowered(task_file, losses):
     verdict = judge(load_task(task_file), result({"gravity": [1.5, -9.81]}, losses))
     assert verdict.reduction == math.inf and verdict.failures == []
+    assert verdict.first == losses[0]
 
 
 def test_next_to_a_hidden_zero_the_distance_counts(task_file):
@@ -213,3 +214,10 @@ def test_an_image_is_judged_by_its_noise(task_file):
 def test_what_is_found_is_judged_not_its_coordinates(task_file):
     verdict = judge(load_task(task_file), result({"gravity": [9.0, 9.0]}, [4.0, 1.0]), {"gravity": [1.5, -9.81]})
     assert verdict.errors == {"gravity": 0.0}
+
+
+@pytest.mark.parametrize("table", ["problem", "optimise"])
+def test_a_misspelt_table_of_a_task_is_recognised(task_file, table):
+    task_file.write_text(GOOD_TASK.replace(f"[{table}", f"[{table}s"))
+    with pytest.raises(SceneError, match=rf"{table}s is not a key of the scene; did you mean {table}\?"):
+        load_task(task_file)
