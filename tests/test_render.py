@@ -476,3 +476,55 @@ def test_the_derivative_has_the_shape_of_the_picture():
     picture(made, scene())
     with pytest.raises(InputError, match="image_bar has shape"):
         made.adjoint(np.zeros((3, 3, 3)))
+
+
+# ---- periods -----------------------------------------------------------------------------------------------------
+
+PERIODS = np.array([UPPER[0] - LOWER[0], 0.0, UPPER[2] - LOWER[2]])
+LOOK = {name: view for name, view in VIEWS.items() if name != "within"}
+periodic_views = pytest.mark.parametrize("view", LOOK.values(), ids=LOOK.keys())
+
+
+def wandered(turns: int) -> dict[str, np.ndarray]:
+    """Particles some of which have left the region by up to so many periods."""
+    values = scene()
+    values["positions"] += PERIODS * np.random.default_rng(8).integers(-turns, turns + 1, (N, 3))
+    return values
+
+
+def test_images_fill_a_periodic_field():
+    made, values = renderer(VIEWS["top"], periods=PERIODS), wandered(2)
+    picture(made, values)
+    steps = np.stack(np.meshgrid(*[(-1, 0, 1) if period else (0,) for period in PERIODS], indexing="ij"), -1)
+    shifts = steps.reshape(-1, 3) * PERIODS
+    wanted = sum(
+        twin_field(made.nodes(), {**scene(), "positions": scene()["positions"] + shift}, CUBIC_SPLINE, 3)
+        for shift in shifts
+    )
+    coverage, colour = made.field()
+    np.testing.assert_allclose(coverage, wanted[..., 3], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(colour, wanted[..., :3], rtol=0, atol=1e-12)
+
+
+@periodic_views
+def test_the_derivative_of_a_periodic_picture_is_its_slope(view):
+    made, values = renderer(view, periods=PERIODS), wandered(1)
+    bar = weights(made)
+    picture(made, values)
+    found, random = gradient(made.adjoint(bar)), np.random.default_rng(6)
+    for name in ("positions", "fractions", "colours"):
+        way = random.standard_normal(values[name].shape)
+        h = 1e-6
+
+        def moved(step: float, name: str = name, way: np.ndarray = way) -> float:
+            return float((bar * picture(made, {**values, name: values[name] + step * way})).sum())
+
+        slope = (moved(h) - moved(-h)) / (2 * h)
+        assert (found[name] * way).sum() == pytest.approx(slope, rel=1e-6, abs=1e-7), name
+
+
+def test_a_period_has_room_for_two_supports():
+    with pytest.raises(
+        InputError, match=r"^periods is \[0\.3, 0\.0, 0\.0\], but must be 0 or greater than two support"
+    ):
+        renderer(VIEWS["top"], periods=[0.3, 0.0, 0.0])

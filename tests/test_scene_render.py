@@ -7,7 +7,11 @@ import pytest
 
 from bad_scenes import GOOD_SCENE, RENDER, plane
 from cortado.errors import SceneError
+from cortado.particles import to_device
+from cortado.precision import FLOAT64
+from cortado.render.scene_renderer import scene_renderer
 from cortado.scene import Render, Scene, scene_from_dict
+from cortado.simulation import Simulation
 
 
 def space(**render) -> Scene:
@@ -55,3 +59,14 @@ def test_only_the_view_of_the_volume_has_a_camera():
     )
     with pytest.raises(SceneError, match=wanted):
         Render(field_of_view=30)
+
+
+def test_fluid_that_went_round_is_still_seen():
+    box = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.5, 1.0], "periodic": [True, False]}
+    simulation = Simulation(Scene(**plane(render={"resolution": [20, 16]}, container=box)), precision="float64")
+    renderer, c = scene_renderer(simulation), simulation.state.mass_fractions
+    shift, colours = np.array([3 * 1.5, 0.0]), simulation.parameters()["colours"]
+    here, there = (to_device(simulation.positions + k * shift, FLOAT64, simulation.device) for k in (0, 1))
+    pictures = [renderer.render(x, c, colours) for x in (here, there)]
+    np.testing.assert_allclose(*pictures, atol=1e-12)
+    assert np.ptp(pictures[0]) > 0.5

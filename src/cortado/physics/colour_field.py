@@ -3,6 +3,7 @@
     A_g = V sum_j W(x_g - x_j),    P_g = V sum_j W(x_g - x_j) colour_j
 
 The coverage A is 1 within a filled fluid. P is the colour times the coverage; neither is ever divided by the other.
+Along a periodic axis the images of a particle count like itself.
 Both sums are gathers: of particles, cell by cell, on the way there, of the nodes within the support on the way back.
 """
 
@@ -38,6 +39,13 @@ def nodes_type(precision: Precision) -> Any:
         """1 / cell [1 / m]."""
         shape: wp.vec3i
         """Number of nodes along x, y and z."""
+        periodic: wp.int32
+        period: vector
+        """[m], 0 along an axis that is not periodic; greater than two supports."""
+        turn: vector
+        """1 / period [1 / m], or 0."""
+        images: wp.vec3i
+        """How many images of a particle, one period after the other, may be felt by nodes."""
 
     Nodes.__name__ = Nodes.__qualname__ = f"Nodes_{precision.name}"
     return wp.struct(Nodes)
@@ -45,7 +53,8 @@ def nodes_type(precision: Precision) -> Any:
 
 @cache
 def node_functions(precision: Precision) -> SimpleNamespace:
-    """Warp function ``place``: where a node is [m]."""
+    """Warp functions ``place``: where a node is [m]; ``nearest``: a separation from the nearest image; ``image``: where
+    one of the images of a particle is that nodes may feel."""
     real, vector = precision.real, precision.vector
     nodes_struct = nodes_type(precision)
 
@@ -53,7 +62,23 @@ def node_functions(precision: Precision) -> SimpleNamespace:
     def place(i: int, j: int, k: int, nodes: nodes_struct) -> vector:
         return nodes.origin + nodes.cell * vector(real(i), real(j), real(k))
 
-    return SimpleNamespace(place=place)
+    @wp.func
+    def nearest(x: vector, nodes: nodes_struct) -> vector:
+        if nodes.periodic != 0:
+            t = wp.cw_mul(x, nodes.turn)
+            return x - wp.cw_mul(vector(wp.round(t[0]), wp.round(t[1]), wp.round(t[2])), nodes.period)
+        return x
+
+    @wp.func
+    def image(number: int, x: vector, h: real, nodes: nodes_struct) -> vector:
+        """The first is the lowest that reaches up to the first node along every axis; h is the support."""
+        t = wp.cw_mul(x - nodes.origin + vector(h, h, h), nodes.turn)
+        n_x = nodes.images[0]
+        n_y = nodes.images[1]
+        q = vector(real(number % n_x), real((number // n_x) % n_y), real(number // (n_x * n_y)))
+        return x + wp.cw_mul(q - vector(wp.floor(t[0]), wp.floor(t[1]), wp.floor(t[2])), nodes.period)
+
+    return SimpleNamespace(place=place, nearest=nearest, image=image)
 
 
 @cache
@@ -65,7 +90,8 @@ def colour_field_kernels(discretisation: Discretisation) -> SimpleNamespace:
     cells, smooth = cell_functions(precision), smoothing_functions(discretisation.smoothing, precision)
     wrap, cell_of, below, above = cells.wrap, cells.cell_of, cells.below, cells.above
     weight, gradient = smooth.weight, smooth.gradient
-    place = node_functions(precision).place
+    node = node_functions(precision)
+    place, nearest, image = node.place, node.nearest, node.image
     module = discretisation.module(False, "colour_field")
 
     @wp.func
@@ -75,6 +101,7 @@ def colour_field_kernels(discretisation: Discretisation) -> SimpleNamespace:
         x_g: vector,
         x: wp.array(dtype=vector),
         colour: wp.array(dtype=vector),
+        nodes: nodes_struct,
         grid: grid_type,
         h: real,
         sigma: real,
@@ -85,7 +112,7 @@ def colour_field_kernels(discretisation: Discretisation) -> SimpleNamespace:
         for o in range(below(n), above(n)):
             cell = row + wrap(c_x + o, n)
             for j in range(grid.starts[cell], grid.starts[cell + 1]):
-                x_gj = x_g - x[j]
+                x_gj = nearest(x_g - x[j], nodes)
                 if wp.dot(x_gj, x_gj) < h * h:
                     total += weight(x_gj, h, sigma) * ink(colour[j][0], colour[j][1], colour[j][2], real(1.0))
         return total
@@ -111,7 +138,7 @@ def colour_field_kernels(discretisation: Discretisation) -> SimpleNamespace:
         for o_z in range(below(n_z), above(n_z)):
             for o_y in range(below(n_y), above(n_y)):
                 row = (wrap(c[2] + o_z, n_z) * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]
-                total += row_sum(row, c[0], x_g, x, colour, grid, h, sigma)
+                total += row_sum(row, c[0], x_g, x, colour, nodes, grid, h, sigma)
         field[k, j, i] = volume * total
 
     @wp.func
@@ -136,18 +163,20 @@ def colour_field_kernels(discretisation: Discretisation) -> SimpleNamespace:
         p = wp.tid()
         x_p = x[p]
         ink_p = ink(colour[p][0], colour[p][1], colour[p][2], real(1.0))
-        s = nodes.frequency * (x_p - nodes.origin)
         r = nodes.frequency * h
         x_bar = vector()
         ink_bar = ink()
-        for k in range(first_node(s[2] - r, nodes.shape[2]), first_node(s[2] + r, nodes.shape[2])):
-            for j in range(first_node(s[1] - r, nodes.shape[1]), first_node(s[1] + r, nodes.shape[1])):
-                for i in range(first_node(s[0] - r, nodes.shape[0]), first_node(s[0] + r, nodes.shape[0])):
-                    x_gp = place(i, j, k, nodes) - x_p
-                    if wp.dot(x_gp, x_gp) < h * h:
-                        bar = field_bar[k, j, i]
-                        ink_bar += weight(x_gp, h, sigma) * bar
-                        x_bar += -wp.dot(bar, ink_p) * gradient(x_gp, h, sigma)
+        for q in range(nodes.images[0] * nodes.images[1] * nodes.images[2]):
+            x_q = image(q, x_p, h, nodes)
+            s = nodes.frequency * (x_q - nodes.origin)
+            for k in range(first_node(s[2] - r, nodes.shape[2]), first_node(s[2] + r, nodes.shape[2])):
+                for j in range(first_node(s[1] - r, nodes.shape[1]), first_node(s[1] + r, nodes.shape[1])):
+                    for i in range(first_node(s[0] - r, nodes.shape[0]), first_node(s[0] + r, nodes.shape[0])):
+                        x_gq = place(i, j, k, nodes) - x_q
+                        if wp.dot(x_gq, x_gq) < h * h:
+                            bar = field_bar[k, j, i]
+                            ink_bar += weight(x_gq, h, sigma) * bar
+                            x_bar += -wp.dot(bar, ink_p) * gradient(x_gq, h, sigma)
         x_scene_bar[order[p]] = volume * x_bar
         colour_scene_bar[order[p]] = volume * vector(ink_bar[0], ink_bar[1], ink_bar[2])
 

@@ -21,10 +21,12 @@ MOST_CELLS = 2**20
 """Of the grid in which particles are sorted."""
 
 
-def nodes_over(lower: np.ndarray, upper: np.ndarray, cell: float, support: float, precision: Precision) -> Any:
+def nodes_over(
+    lower: np.ndarray, upper: np.ndarray, periods: np.ndarray, cell: float, support: float, precision: Precision
+) -> Any:
     """The struct of nodes of that distance [m] over a region (d,) to (d,) [m], and beyond as far as particles in it
-    are felt. In 2-D they are one layer."""
-    margin = int(np.ceil(support / cell))
+    are felt, but not along axes with a period [m]. In 2-D they are one layer."""
+    margin = np.where(periods > 0.0, 0, int(np.ceil(support / cell)))
     counts = np.ceil((upper - lower) / cell * (1 - 1e-12)) + 2 * margin + 1
     if np.prod(counts) > MOST_NODES:
         raise InputError(
@@ -35,6 +37,11 @@ def nodes_over(lower: np.ndarray, upper: np.ndarray, cell: float, support: float
     nodes.origin = precision.vector(*(lower - margin * cell), *[0.0] * flat)
     nodes.cell, nodes.frequency = cell, 1.0 / cell
     nodes.shape = wp.vec3i(*(int(n) for n in counts), *[1] * flat)
+    turns = np.divide(1.0, periods, out=np.zeros(len(periods)), where=periods > 0.0)
+    images = np.floor((cell * (counts - 1) + 2 * support) * turns) + 1
+    nodes.periodic = int(periods.any())
+    nodes.period, nodes.turn = (precision.vector(*values, *[0.0] * flat) for values in (periods, turns))
+    nodes.images = wp.vec3i(*(int(n) for n in images), *[1] * flat)
     return nodes
 
 
@@ -45,6 +52,7 @@ class ColourField:
         self,
         lower: np.ndarray,
         upper: np.ndarray,
+        periods: np.ndarray,
         cell: float,
         smoothing: SmoothingKernel,
         support: float,
@@ -59,7 +67,7 @@ class ColourField:
         self._tint = tint_kernels(precision, phases)
         self._field = colour_field_kernels(Discretisation(smoothing, precision))
         self._launch = partial(wp.launch, device=device, record_tape=False)
-        grid = Grid.around(lower, upper, np.zeros(len(lower)), support, MOST_CELLS)
+        grid = Grid.around(lower, upper, periods, support, MOST_CELLS)
         self._sort = CellSort(grid, particles, precision, device)
         self._kernel = [support, smoothing.normalisation(len(lower), support), volume]
         zeros, mix, palette = (
@@ -73,7 +81,7 @@ class ColourField:
         self._fractions, self._fractions_bar = (zeros(particles, dtype=mix) for _ in range(2))
         self._colours, self._colours_bar = zeros(1, dtype=palette), zeros(particles, dtype=palette)
         self._sum = sum_of(palette, particles, device)
-        self.nodes = nodes_over(lower, upper, cell, support, precision)
+        self.nodes = nodes_over(lower, upper, periods, cell, support, precision)
         """The struct that kernels see."""
         self.values = zeros(tuple(self.nodes.shape)[::-1], dtype=ink_type(precision))
         """(nz, ny, nx) colour times coverage, and coverage [-]."""

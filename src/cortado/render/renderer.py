@@ -56,8 +56,12 @@ class Renderer:
         device: Any,
         dimension: int = 3,
         cell: float | None = None,
+        periods: Sequence[float] | np.ndarray | None = None,
     ):
         """Fluid is seen from ``lower`` to ``upper`` (d,) [m], and by the support radius [m] beyond.
+
+        Along an axis with a period (``periods`` (d,) [m], 0 without one) fluid is seen wherever an image of it is
+        between ``lower`` and ``upper``.
 
         ``volume`` is the rest volume of a particle [m^d], ``cell`` the distance of nodes [m], by default half the
         support radius.
@@ -71,10 +75,18 @@ class Renderer:
         low, high = np.array(vector("lower", lower, dimension)), np.array(vector("upper", upper, dimension))
         if not (high >= low).all():
             raise InputError(f"upper is {shown(high.tolist())}, but must not be below lower, {shown(low.tolist())}.")
+        turns = np.zeros(dimension) if periods is None else np.array(vector("periods", periods, dimension))
+        if ((turns != 0.0) & (turns <= 2.0 * support)).any():
+            raise InputError(
+                f"periods is {shown(turns.tolist())}, but must be 0 or greater than two support radii, "
+                f"{2.0 * support:g} m."
+            )
         self.view = view
         self._particles, self._phases, self._precision = particles, phases, precision
         device = wp.get_device(device)
-        self._field = ColourField(low, high, cell, smoothing, support, volume, particles, phases, precision, device)
+        self._field = ColourField(
+            low, high, turns, cell, smoothing, support, volume, particles, phases, precision, device
+        )
         self._rays = RayMarcher(view, self._field.nodes, precision, device)
         self._rendered = False
 
@@ -82,7 +94,7 @@ class Renderer:
     def fingerprint(self) -> str:
         """Tells one view from another, for checkpoints, and one grid of nodes."""
         nodes = self._field.nodes
-        return f"{self.view!r} {tuple(nodes.origin)} {nodes.cell} {tuple(nodes.shape)}"
+        return f"{self.view!r} {tuple(nodes.origin)} {nodes.cell} {tuple(nodes.shape)} {tuple(nodes.period)}"
 
     @property
     def shape(self) -> tuple[int, int, int]:

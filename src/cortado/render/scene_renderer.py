@@ -40,6 +40,7 @@ def scene_renderer(simulation: Simulation, share: float = 1.0) -> Renderer:
         device=simulation.device,
         dimension=dimension,
         cell=cell,
+        periods=scene.container.periods(dimension)[1],
     )
 
 
