@@ -30,7 +30,7 @@ LAYERS = """
     evaluations optimisers optimisation
     run_folder progress pictures video
     figures.canvas figures.curves figures.particle_sets figures.side_by_side figures report
-    task assignment task_figures certificate
+    task_tables task assignment task_figures certificate
     commands.* cli
 """
 """From the foundations to the command line; ``package.*`` stands for modules that do not import one another.

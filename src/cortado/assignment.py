@@ -16,7 +16,8 @@ from cortado.render.scene_renderer import scene_renderer
 from cortado.reparametrisation import Coordinates, Knots, Logarithm, Reparametrised, Softmax
 from cortado.scene_containers import CylinderContainer
 from cortado.simulation import Simulation
-from cortado.task import DISTANCES, RANDOM, Task
+from cortado.task import Task
+from cortado.task_tables import DISTANCES, RANDOM
 
 DRAWN = {"heart": heart, "rosetta": rosetta}
 
