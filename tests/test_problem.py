@@ -215,3 +215,10 @@ def test_a_particle_without_volume_is_a_sentence():
     fractions[5] = [3.0, -2.0, 0.0]
     with pytest.raises(InputError, match=r"^mass_fractions of particle 5 are \[3.0, -2.0, 0.0\], but must be such"):
         simulation.run(1, {"mass_fractions": fractions, "rest_density": [1000.0, 100.0, 1000.0]})
+
+
+def test_a_free_energy_that_does_not_fit_is_a_sentence(simulation):
+    with pytest.raises(InputError, match=r"^free_energy is 'miscible', but must be a FreeEnergy"):
+        Simulation(plane_of_three(), free_energy="miscible")
+    with pytest.raises(InputError, match=r"must be left out, as the scene has only one phase\.$"):
+        Simulation(simulation.scene, free_energy=MISCIBLE)

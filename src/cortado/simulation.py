@@ -53,6 +53,11 @@ class Simulation:
         replaces the one that the scene names."""
         if not isinstance(scene, Scene):
             raise InputError(f"scene is {shown(scene)}, but must be a cortado.Scene, such as load_scene gives.")
+        if free_energy is not None and not isinstance(free_energy, FreeEnergy):
+            wanted = "a FreeEnergy, of cortado.physics.free_energy"
+            raise InputError(f"free_energy is {shown(free_energy)}, but must be {wanted}.")
+        if free_energy is not None and len(scene.phase) == 1:
+            raise InputError("free_energy is given, but must be left out, as the scene has only one phase.")
         self.scene = scene
         self.device = _device(device)
         self.precision = precision_named(precision)
