@@ -30,9 +30,9 @@ def test_momentum_is_kept_in_free_space(make):
     made = make(**FREE, forces={"gravity": gravity, "viscosity": "pairwise"})
     simulation = Simulation(made, precision="float64")
     rollout = simulation.rollout(200)
-    rollout.initial.set(simulation.positions, stirred(simulation))
-    x_0, v_0 = rollout.initial.numpy(simulation.dimension)
-    x, v = rollout.forward().numpy(simulation.dimension)
+    rollout.initial.set(simulation.positions, stirred(simulation), simulation.mass_fractions)
+    x_0, v_0, _ = rollout.initial.numpy(simulation.dimension)
+    x, v, _ = rollout.forward().numpy(simulation.dimension)
     assert np.linalg.norm(v - v_0) > 0.05 * np.linalg.norm(v_0)  # forces did act
     assert np.linalg.norm(v.sum(0) - v_0.sum(0)) < 1e-10 * np.abs(v_0).sum()
     spin = angular_momentum(x_0, v_0)
@@ -133,7 +133,7 @@ def test_a_lost_particle_ends_the_run():
     rollout = simulation.rollout(40)
     velocities = np.zeros_like(simulation.positions)
     velocities[17] = [1e9, 0.0, 0.0]
-    rollout.initial.set(simulation.positions, velocities)
+    rollout.initial.set(simulation.positions, velocities, simulation.mass_fractions)
     with pytest.raises(DivergedError) as caught:
         rollout.forward()
     assert (caught.value.step, caught.value.particle) == (1, 17)

@@ -128,7 +128,7 @@ def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder) -> 
         path = folder.figures / "density_errors.png"
         density_errors(trajectory, path, tolerance=scene.solver.density_tolerance)
         figures.append(("Average density error of each step, and the tolerance asked.", path))
-    substeps = simulation.solver.mixture.substeps
+    substeps = simulation.solver.mixture.substeps  # of the run that has just ended
     rows = [
         ("particles", simulation.particles),
         *([("substeps of diffusion in each step", substeps)] if substeps else []),

@@ -44,14 +44,16 @@ def convergence_kernels(precision: Precision) -> SimpleNamespace:
         bound: real,
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
+        rho_0: wp.array(dtype=real),
         # out
         bad: wp.array(dtype=wp.int32),
     ):
-        """``bad``: the first particle, in scene order, not finite or further than ``bound`` from ``origin`` [m]."""
+        """``bad``: the first particle, in scene order, not finite, further than ``bound`` from ``origin`` [m], or of a
+        mixture without a volume."""
         i = wp.tid()
         x_i = x[i] - origin
         size = wp.max(wp.max(wp.abs(x_i[0]), wp.abs(x_i[1])), wp.abs(x_i[2]))
-        if not (size < bound and wp.isfinite(v[i])):
+        if not (size < bound and wp.isfinite(v[i]) and rho_0[i] > real(0.0)):
             wp.atomic_min(bad, 0, order[i])
 
     @wp.kernel(module=module, enable_backward=False)

@@ -232,7 +232,8 @@ class Pcisph:
         f, c = self.iterates, self.kernels.convergence
         self.launch(
             c.check,
-            [self.search.order, self.search.origin, 1e6 * self.lattice.support, f.x_star[0], f.v_star[0]],
+            [self.search.order, self.search.origin, 1e6 * self.lattice.support, f.x_star[0], f.v_star[0]]
+            + [self.fields.rho_0],
             [self.bad_particle],
         )
         self.launch(
