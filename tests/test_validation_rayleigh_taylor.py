@@ -283,7 +283,8 @@ def lattice_correction(kernel: str, support: float, depth: float, waves: int = 1
 
 
 def test_what_the_lattice_takes_from_gravity():
-    """A tenth of its push in `rayleigh_taylor`; all of it, or as much again too much, in `test_a_stiff_lattice_cannot_show_it`."""
+    """A tenth of its push in `rayleigh_taylor`; all of it, or as much again too much, in
+    `test_a_stiff_lattice_cannot_show_it`."""
     assert 0.0 < lattice_correction("wendland_c4", 4.0, 0.5) < 0.12
     assert lattice_correction("wendland_c2", 2.6, 0.5) > 2.0
     assert lattice_correction("cubic_spline", 3.0, 0.5) < -2.0
