@@ -16,7 +16,8 @@ LAYERS = """
     image_losses srgb masses
     precision smoothing calibration cells
     physics.surroundings physics.density physics.walls physics.contrast physics.integration physics.gravity
-    physics.nozzle physics.pressure physics.viscosity physics.free_energy physics.diffusion physics.mixture
+    physics.nozzle physics.pressure physics.viscosity physics.free_energy physics.spreading physics.diffusion
+    physics.mixture
     physics.convergence physics.reduction physics.matching
     physics.tint physics.colour_field physics.interpolation physics.rays physics.absorption
     launching neighbours particles
@@ -24,7 +25,7 @@ LAYERS = """
     shapes scene_kinds scene_tables scene_toml scene_points
     scene_fluids scene_emitter scene_mixture scene_render scene_containers scene_stability scene_checks scene sampling
     vtkhdf trajectory
-    solvers.forces solvers.mixture solvers.emitter solvers.pcisph solvers.pcisph_derivatives
+    solvers.forces solvers.mixture solvers.emitter solvers.pcisph_parts solvers.pcisph solvers.pcisph_derivatives
     rollout policies losses controls simulation problem
     render.scene_renderer reparametrisation
     evaluations optimisers optimisation

@@ -31,7 +31,8 @@ from cortado.smoothing import smoothing_kernel
 from cortado.solvers.emitter import Nozzle
 from cortado.solvers.forces import ForceTerm, Gravity, laminar_viscosity, pairwise_viscosity
 from cortado.solvers.mixture import Phases
-from cortado.solvers.pcisph import Lattice, Pcisph, PressureSolve
+from cortado.solvers.pcisph import Pcisph
+from cortado.solvers.pcisph_parts import Lattice, PressureSolve
 from cortado.trajectory import Trajectory
 
 MOST_SUBSTEPS = 10_000

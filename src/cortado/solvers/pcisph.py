@@ -5,8 +5,6 @@ and keeps every intermediate value, for `cortado.solvers.pcisph_derivatives`. No
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -14,98 +12,12 @@ import warp as wp
 from cortado.launching import Launcher, sum_and_maximum
 from cortado.neighbours import SKIN, NeighbourSearch
 from cortado.particles import Fields, Parameters, State
-from cortado.physics.contrast import contrast_kernels
-from cortado.physics.convergence import NO_PARTICLE, convergence_kernels
-from cortado.physics.density import density_kernels
-from cortado.physics.integration import integration_kernels
-from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
+from cortado.physics.convergence import NO_PARTICLE
 from cortado.physics.surroundings import Discretisation, surroundings_type
-from cortado.physics.walls import wall_kernels
 from cortado.solvers.emitter import Emitter, Nozzle
 from cortado.solvers.forces import ForceTerm, Moment
 from cortado.solvers.mixture import Mixture, Phases
-
-
-@dataclass(frozen=True)
-class Lattice:
-    """Constants of the rest lattice and of the kernel on it."""
-
-    support: float
-    """Support radius h [m]."""
-    normalisation: float
-    """sigma [1 / m^d]."""
-    self_weight: float
-    """W(0) [1 / m^d]."""
-    volume: float
-    """Rest volume V_0 of a particle [m^d]."""
-    stiffness: float
-    """k [m2]: delta = k / dt^2 [Pa m3 / kg] (report eq. 7, put right) for a filled neighbourhood."""
-    rigidity: float
-    """[1 / m^(2 d + 2)], see `cortado.physics.walls`."""
-    wall_push: float
-    """[-], see `cortado.calibration.WallLayer`."""
-    evenness: float
-    """[-], see `cortado.calibration.laplacian_evenness`."""
-
-
-@dataclass(frozen=True)
-class PressureSolve:
-    """When the pressure loop may stop."""
-
-    minimum_iterations: int
-    maximum_iterations: int
-    tolerance: float
-    """Bound on the average of (rho* - rho_0)+ / rho_0."""
-    greatest_tolerance: float
-    """Bound on the maximum of the same; infinite where none is asked for."""
-
-
-@dataclass(frozen=True)
-class Kernels:
-    """The kernels of a step, each topic with its forward, tangent and adjoint."""
-
-    density: SimpleNamespace
-    walls: SimpleNamespace
-    contrast: SimpleNamespace
-    pressure: SimpleNamespace
-    force: SimpleNamespace
-    integration: SimpleNamespace
-    convergence: SimpleNamespace
-
-    @classmethod
-    def of(cls, discretisation: Discretisation) -> "Kernels":
-        """Those for a smoothing kernel and a precision."""
-        return cls(
-            density_kernels(discretisation),
-            wall_kernels(discretisation),
-            contrast_kernels(discretisation),
-            pressure_kernels(discretisation),
-            pressure_force_kernels(discretisation),
-            integration_kernels(discretisation.precision),
-            convergence_kernels(discretisation.precision),
-        )
-
-
-class Iterates:
-    """Predicted states and pressures of the iterations of one step; a single slot is overwritten each time."""
-
-    def __init__(self, particles: int, precision: Any, device: Any, requires_grad: bool):
-        self._make = lambda dtype: wp.zeros(particles, dtype=dtype, device=device, requires_grad=requires_grad)
-        self._real, self._vector = precision.real, precision.vector
-        self.x_star: list[wp.array] = []
-        self.v_star: list[wp.array] = []
-        self.p: list[wp.array] = [self._make(self._real)]
-        """``p[k]`` before iteration k; ``p[0]`` is 0 and never written."""
-        self.c: list[wp.array] = []
-        self.reserve(1)
-
-    def reserve(self, iterations: int) -> None:
-        """Room for every value of so many iterations."""
-        while len(self.x_star) <= iterations:
-            self.x_star.append(self._make(self._vector))
-            self.v_star.append(self._make(self._vector))
-            self.p.append(self._make(self._real))
-            self.c.append(self._make(self._real))
+from cortado.solvers.pcisph_parts import Iterates, Kernels, Lattice, PressureSolve
 
 
 class Pcisph:
