@@ -222,3 +222,10 @@ def test_a_free_energy_that_does_not_fit_is_a_sentence(simulation):
         Simulation(plane_of_three(), free_energy="miscible")
     with pytest.raises(InputError, match=r"must be left out, as the scene has only one phase\.$"):
         Simulation(simulation.scene, free_energy=MISCIBLE)
+
+
+def test_a_difference_is_believed_no_further_than_its_own_round_off():
+    """A derivative 1e-11 of the loss: differences of step 1e-3 are good to 1e-12 of it, those of 1e-2 to 1e-13."""
+    noisy = (1.5e-11, 1.05e-11, 1.05e-11, 3e-11, 0.0, 9e-11, 4e-10, 0.0)
+    assert Comparison("g", 1.0e-11, 1.0e-11, noisy, 1e-13).right
+    assert not Comparison("g", 1.0e-11, 1.0e-11, (1.05e-11, 1.05e-11, *noisy[2:]), 1e-13).right

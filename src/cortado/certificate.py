@@ -16,6 +16,8 @@ PLATEAU = 1e-3
 """Two neighbouring differences this near to each other, relative, are believed; and so near must the adjoint be."""
 ROUND_OFF = 1e-13
 """Derivatives along a direction below so much of the loss are taken as 0."""
+DIFFERENCE_ROUND_OFF = 0.01
+"""Round-off of a central difference of step h is taken as this part of the floor, over h: 1e-15 of the loss."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +45,24 @@ class Comparison:
     @property
     def plateau(self) -> float | None:
         """The central difference where two neighbouring steps agree best; None where none agree (chaos, round-off)."""
-        pairs = list(zip(self.differences, self.differences[1:], strict=False))
-        a, b = min(pairs, key=lambda pair: self._distance(*pair))
-        return a if self._distance(a, b) < PLATEAU else None
+        number = self._plateau
+        return None if number is None else self.differences[number]
 
     @property
     def right(self) -> bool:
-        """Whether nothing speaks against the adjoint."""
-        believed = self.plateau
-        near = believed is None or self._distance(self.adjoint, believed) < PLATEAU
-        return bool(self.disagreement < AGREEMENT and near)
+        """Whether nothing speaks against the adjoint: neither forward mode nor a difference that is to be believed,
+        to `PLATEAU` or its own round-off."""
+        number = self._plateau
+        if number is None or not self.disagreement < AGREEMENT:
+            return bool(self.disagreement < AGREEMENT)
+        believed, round_off = self.differences[number], DIFFERENCE_ROUND_OFF * self.floor / STEPS[number]
+        return bool(self._distance(self.adjoint, believed) < PLATEAU or abs(self.adjoint - believed) < round_off)
+
+    @property
+    def _plateau(self) -> int | None:
+        distances = [self._distance(a, b) for a, b in zip(self.differences, self.differences[1:], strict=False)]
+        number = int(np.argmin(distances))
+        return number if distances[number] < PLATEAU else None
 
     def _distance(self, a: float, b: float) -> float:
         """Relative; 0 where both numbers are below the floor."""
