@@ -14,8 +14,10 @@ ROOT = Path(cortado.__file__).parent
 LAYERS = """
     errors
     image_losses srgb masses
-    precision smoothing calibration cells
-    physics.surroundings physics.density physics.walls physics.contrast physics.integration physics.gravity
+    smoothing calibration
+    precision cells
+    physics.smoothing_functions physics.surroundings
+    physics.density physics.walls physics.contrast physics.integration physics.gravity
     physics.nozzle physics.pressure physics.viscosity physics.free_energy physics.spreading physics.diffusion
     physics.mixture
     physics.convergence physics.reduction physics.matching
@@ -24,6 +26,7 @@ LAYERS = """
     render.cameras render.views render.fields render.marching render.renderer
     shapes scene_kinds scene_tables scene_toml scene_points
     scene_fluids scene_emitter scene_mixture scene_render scene_containers scene_stability scene_checks scene sampling
+    discrete_scene
     vtkhdf trajectory
     solvers.forces solvers.mixture solvers.emitter solvers.pcisph_parts solvers.pcisph solvers.pcisph_derivatives
     rollout policies losses controls simulation problem
@@ -204,3 +207,14 @@ def test_import_is_light():
     program = "import sys, cortado; print(*(n for n in ('warp', 'matplotlib', 'scipy') if n in sys.modules))"
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     assert not found, f"import cortado alone imports {', '.join(found)}"
+
+
+WITHOUT_WARP = ["errors", "masses", "smoothing", "calibration", "scene", "sampling", "discrete_scene"]
+"""What an engine without Warp stands on."""
+
+
+@pytest.mark.parametrize("module", WITHOUT_WARP)
+def test_the_discretisation_is_without_warp(module):
+    program = f"import sys, cortado.{module}; print('warp' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert found == ["False"], f"cortado.{module} imports Warp on the way"

@@ -19,8 +19,9 @@ from cortado.calibration import (
     wall_rigidity,
 )
 from cortado.errors import InputError
+from cortado.physics.smoothing_functions import smoothing_functions
 from cortado.precision import FLOAT32, FLOAT64
-from cortado.smoothing import KERNELS, smoothing_functions, smoothing_kernel
+from cortado.smoothing import KERNELS, smoothing_kernel
 
 SUPPORT = 0.13
 SPACING = 0.05

@@ -7,16 +7,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.calibration import (
-    WallLayer,
-    diffusion_limit,
-    laplacian_evenness,
-    pressure_stiffness,
-    rest_volume,
-    wall_layer,
-    wall_rigidity,
-)
+from cortado.calibration import WallLayer, diffusion_limit
 from cortado.controls import MATERIALS, Controls
+from cortado.discrete_scene import DiscreteScene, discretise
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.neighbours import SKIN, Grid, NeighbourSearch
 from cortado.particles import State, padded
@@ -25,14 +18,13 @@ from cortado.physics.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
 from cortado.physics.surroundings import Discretisation
 from cortado.precision import precision_named
 from cortado.rollout import Rollout
-from cortado.sampling import boundary_particles, boundary_volumes, fluid_particles, period
+from cortado.sampling import FluidSample
 from cortado.scene import Scene
-from cortado.smoothing import smoothing_kernel
 from cortado.solvers.emitter import Nozzle
 from cortado.solvers.forces import ForceTerm, Gravity, laminar_viscosity, pairwise_viscosity
 from cortado.solvers.mixture import Phases
 from cortado.solvers.pcisph import Pcisph
-from cortado.solvers.pcisph_parts import Lattice, PressureSolve
+from cortado.solvers.pcisph_parts import PressureSolve
 from cortado.trajectory import Trajectory
 
 MOST_SUBSTEPS = 10_000
@@ -62,22 +54,19 @@ class Simulation:
         self.scene = scene
         self.device = _device(device)
         self.precision = precision_named(precision)
-        self._sample = sample = fluid_particles(scene)
-        self.positions = sample.positions
+        discrete = discretise(scene)
+        self.positions = discrete.fluid.positions
         """(n, d) first positions [m]."""
-        self.velocities = sample.velocities
+        self.velocities = discrete.fluid.velocities
         """(n, d) first velocities [m / s]."""
-        self.mass_fractions = np.eye(len(scene.phase))[sample.phase]
+        self.mass_fractions = np.eye(len(scene.phase))[discrete.fluid.phase]
         """(n, phases) first mass fractions [-]."""
-        self.particles = len(sample.positions)
+        self.particles = len(self.positions)
         self.free_energy = FREE_ENERGIES[scene.mixture.free_energy] if free_energy is None else free_energy
-        self.smoothing = smoothing_kernel(scene.discretisation.kernel)
-        layer = wall_layer(
-            self.smoothing, scene.discretisation.spacing, scene.discretisation.support_radius, scene.dimension
-        )
-        self.walls = boundary_particles(scene, layer.depth)
+        self.smoothing = discrete.kernel
+        self.walls = discrete.walls.positions
         """(b, d) wall particles [m]."""
-        self.solver = self._solver(layer)
+        self.solver = self._solver(discrete)
         self.state = self.solver.new_state()
         """The first state on the device."""
         self.state.set(self.positions, self.velocities, self.mass_fractions)
@@ -188,21 +177,13 @@ class Simulation:
         average, greatest = rollout.errors.T
         return (average <= solve.tolerance) & (greatest <= solve.greatest_tolerance)
 
-    def _solver(self, layer: WallLayer) -> Pcisph:
-        scene, dimension = self.scene, self.scene.dimension
-        kernel = self.smoothing
-        spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
-        discretisation = Discretisation(kernel, self.precision)
-        lower, lengths = period(scene)
-        volume = rest_volume(kernel, spacing, support, dimension)
-        volumes = layer.factor * boundary_volumes(
-            self.walls, lambda r: kernel.weight(r, dimension, support), support, lower, lengths
-        )
+    def _solver(self, discrete: DiscreteScene) -> Pcisph:
+        discretisation, support = Discretisation(discrete.kernel, self.precision), discrete.lattice.support
         everything = np.concatenate([self.positions, self.walls])
         grid = Grid.around(
             everything.min(axis=0),
             everything.max(axis=0),
-            lengths,
+            discrete.periods,
             reach=(1.0 + SKIN) * support,
             most=max(4 * self.particles, 512),
         )
@@ -210,31 +191,28 @@ class Simulation:
             discretisation,
             grid,
             padded(self.walls),
-            volumes / volume,
+            discrete.walls.weights,
             self.particles,
-            first_capacity(support / spacing, dimension),
+            first_capacity(support / self.scene.discretisation.spacing, self.dimension),
             self.device,
         )
-        lattice = Lattice(
-            support=support,
-            normalisation=kernel.normalisation(dimension, support),
-            self_weight=float(kernel.weight(np.zeros(1), dimension, support)[0]),
-            volume=volume,
-            stiffness=pressure_stiffness(kernel, spacing, support, dimension),
-            rigidity=wall_rigidity(kernel, spacing, support, dimension) / layer.push,
-            wall_push=layer.push,
-            evenness=laplacian_evenness(kernel, spacing, support, dimension),
+        return Pcisph(
+            discretisation,
+            discrete.lattice,
+            search,
+            self._terms(discretisation, discrete.wall_layer),
+            self._pressure(),
+            [*discrete.periods, *np.zeros(3 - self.dimension)],
+            self._phases(discretisation),
+            self._nozzle(discrete.fluid),
         )
-        periods = [*lengths, *np.zeros(3 - dimension)]
-        terms, phases = self._terms(discretisation, layer), self._phases(discretisation)
-        return Pcisph(discretisation, lattice, search, terms, self._pressure(), periods, phases, self._nozzle())
 
-    def _nozzle(self) -> Nozzle | None:
-        scene, sample = self.scene, self._sample.emitter
+    def _nozzle(self, fluid: FluidSample) -> Nozzle | None:
+        scene, sample = self.scene, fluid.emitter
         if scene.emitter is None or sample is None:
             return None
         return Nozzle(
-            first=self._sample.emitted.start,
+            first=fluid.emitted.start,
             upstream=sample.upstream,
             offsets=sample.offsets,
             direction=np.array(scene.emitter.direction),

@@ -14,9 +14,9 @@ from typing import Any
 import warp as wp
 
 from cortado.cells import cell_functions, cell_grid_type
+from cortado.physics.smoothing_functions import smoothing_functions
 from cortado.physics.surroundings import Discretisation
 from cortado.precision import Precision
-from cortado.smoothing import smoothing_functions
 
 
 @cache

@@ -7,8 +7,9 @@ from typing import Any
 
 import warp as wp
 
+from cortado.physics.smoothing_functions import smoothing_functions
 from cortado.precision import Precision
-from cortado.smoothing import SmoothingKernel, smoothing_functions
+from cortado.smoothing import SmoothingKernel
 
 UNROLL = 4
 """Fluid neighbours that a loop takes at a time, so that their loads overlap; lists are filled up to a multiple of it

@@ -9,6 +9,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.discrete_scene import Lattice
 from cortado.launching import Launcher, sum_and_maximum
 from cortado.neighbours import SKIN, NeighbourSearch
 from cortado.particles import Fields, Parameters, State
@@ -17,7 +18,7 @@ from cortado.physics.surroundings import Discretisation, surroundings_type
 from cortado.solvers.emitter import Emitter, Nozzle
 from cortado.solvers.forces import ForceTerm, Moment
 from cortado.solvers.mixture import Mixture, Phases
-from cortado.solvers.pcisph_parts import Iterates, Kernels, Lattice, PressureSolve
+from cortado.solvers.pcisph_parts import Iterates, Kernels, PressureSolve
 
 
 class Pcisph:

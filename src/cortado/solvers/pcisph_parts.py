@@ -1,4 +1,4 @@
-"""What a PCISPH solver is made of: constants of the lattice, when to stop, kernels, and room for its iterates."""
+"""What a PCISPH solver is made of: when to stop, kernels, and room for its iterates."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -13,28 +13,6 @@ from cortado.physics.integration import integration_kernels
 from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
 from cortado.physics.surroundings import Discretisation
 from cortado.physics.walls import wall_kernels
-
-
-@dataclass(frozen=True)
-class Lattice:
-    """Constants of the rest lattice and of the kernel on it."""
-
-    support: float
-    """Support radius h [m]."""
-    normalisation: float
-    """sigma [1 / m^d]."""
-    self_weight: float
-    """W(0) [1 / m^d]."""
-    volume: float
-    """Rest volume V_0 of a particle [m^d]."""
-    stiffness: float
-    """k [m2]: delta = k / dt^2 [Pa m3 / kg] (report eq. 7, put right) for a filled neighbourhood."""
-    rigidity: float
-    """[1 / m^(2 d + 2)], see `cortado.physics.walls`."""
-    wall_push: float
-    """[-], see `cortado.calibration.WallLayer`."""
-    evenness: float
-    """[-], see `cortado.calibration.laplacian_evenness`."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,101 @@
+"""A scene cut into particles: first particles, walls, and the constants of the lattice. NumPy in float64 throughout.
+
+It is the same for every device, every precision and every engine.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cortado.calibration import (
+    WallLayer,
+    laplacian_evenness,
+    pressure_stiffness,
+    rest_volume,
+    wall_layer,
+    wall_rigidity,
+)
+from cortado.sampling import FluidSample, boundary_particles, boundary_volumes, fluid_particles, period
+from cortado.scene import Scene
+from cortado.shapes import Points
+from cortado.smoothing import SmoothingKernel, smoothing_kernel
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Constants of the rest lattice and of the kernel on it."""
+
+    support: float
+    """Support radius h [m]."""
+    normalisation: float
+    """sigma [1 / m^d]."""
+    self_weight: float
+    """W(0) [1 / m^d]."""
+    volume: float
+    """Rest volume V_0 of a particle [m^d]."""
+    stiffness: float
+    """k [m2]: delta = k / dt^2 [Pa m3 / kg] (report eq. 7, put right) for a filled neighbourhood."""
+    rigidity: float
+    """2 sum_j G_j . G_j / push [1 / m^(2 d + 2)]: the scale of the yield, see `cortado.physics.walls`."""
+    wall_push: float
+    """[-], see `cortado.calibration.WallLayer`."""
+    evenness: float
+    """[-], see `cortado.calibration.laplacian_evenness`."""
+
+    @classmethod
+    def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int, wall_push: float) -> "Lattice":
+        """Those of a kernel with a support radius [m] on a lattice with a spacing [m]."""
+        return cls(
+            support=support,
+            normalisation=kernel.normalisation(dimension, support),
+            self_weight=float(kernel.weight(np.zeros(1), dimension, support)[0]),
+            volume=rest_volume(kernel, spacing, support, dimension),
+            stiffness=pressure_stiffness(kernel, spacing, support, dimension),
+            rigidity=wall_rigidity(kernel, spacing, support, dimension) / wall_push,
+            wall_push=wall_push,
+            evenness=laplacian_evenness(kernel, spacing, support, dimension),
+        )
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Wall particles."""
+
+    positions: Points
+    """(b, d) [m]"""
+    weights: Points
+    """(b,) w_b = factor V_b / V [-]: what each counts for, a fluid particle being 1."""
+
+
+@dataclass(frozen=True)
+class DiscreteScene:
+    """What a solver starts from, besides what the scene says itself."""
+
+    kernel: SmoothingKernel
+    """The smoothing kernel W."""
+    lattice: Lattice
+    """Constants."""
+    fluid: FluidSample
+    """The first fluid particles."""
+    wall_layer: WallLayer
+    """Where the walls lie and how they push and drag; also for a scene without walls."""
+    walls: Walls
+    """The wall particles; none without a container."""
+    periods: Points
+    """(d,) lengths of the period [m], 0 along an axis that is not periodic."""
+
+
+def discretise(scene: Scene) -> DiscreteScene:
+    """Cut a scene into particles. Raises `InputError` if a file with points is gone since the scene was read."""
+    kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
+    spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
+    layer = wall_layer(kernel, spacing, support, dimension)
+    lattice = Lattice.of(kernel, spacing, support, dimension, layer.push)
+    walls = boundary_particles(scene, layer.depth)
+    lower, lengths = period(scene)
+    volumes = layer.factor * boundary_volumes(
+        walls, lambda r: kernel.weight(r, dimension, support), support, lower, lengths
+    )
+    return DiscreteScene(
+        kernel, lattice, fluid_particles(scene), layer, Walls(walls, volumes / lattice.volume), lengths
+    )
