@@ -14,7 +14,7 @@ ROOT = Path(cortado.__file__).parent
 LAYERS = """
     errors
     image_losses srgb masses
-    smoothing calibration
+    smoothing calibration parameter_values
     precision cells
     physics.smoothing_functions physics.surroundings
     physics.density physics.walls physics.contrast physics.integration physics.gravity

@@ -9,8 +9,9 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cortado.calibration import SKIN
 from cortado.cells import Grid
-from cortado.neighbours import SKIN, NeighbourSearch
+from cortado.neighbours import NeighbourSearch
 from cortado.physics.surroundings import UNROLL, Discretisation, surroundings_type
 from cortado.precision import FLOAT32, FLOAT64, Precision
 from cortado.smoothing import CUBIC_SPLINE

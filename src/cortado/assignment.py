@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from cortado.controls import NOT_NEGATIVE, Arrays
 from cortado.errors import InputError
 from cortado.losses import FinalPositions, Frames, Image, Loss, TrajectoryEnd
-from cortado.particles import TABLES
+from cortado.parameter_values import NOT_NEGATIVE, TABLES, Arrays
 from cortado.pictures import heart, read_picture, rosetta
 from cortado.problem import Problem
 from cortado.render.renderer import Renderer

@@ -17,6 +17,10 @@ def lattice_offsets(spacing: float, support: float, dimension: int) -> np.ndarra
     return offsets[np.linalg.norm(offsets, axis=1) < support]
 
 
+SKIN = 0.03
+"""How far neighbour lists reach beyond the support radius, relative to it: density is also taken at predicted
+positions."""
+
 SLACK = 1e-4
 """How far the lattice stays below the rest density, relative.
 

@@ -18,9 +18,6 @@ from cortado.cells import CellSort, Grid, cell_functions, cell_grid_type
 from cortado.launching import MOST_PARTS, Launcher
 from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
 
-SKIN = 0.03
-"""How far the lists reach beyond the support radius, relative to it."""
-
 
 @cache
 def _fill_kernel(discretisation: Discretisation) -> Any:

@@ -6,6 +6,7 @@ from typing import Any, Self
 import numpy as np
 import warp as wp
 
+from cortado.parameter_values import TABLES
 from cortado.precision import Precision
 
 
@@ -74,10 +75,6 @@ class State(Arrays):
             self.velocities.numpy()[:, :dimension].copy(),
             self.mass_fractions.numpy().copy(),
         )
-
-
-TABLES = ("gravity", "nozzle_path")
-"""Parameters that are a vector for each step."""
 
 
 @dataclass(frozen=True)

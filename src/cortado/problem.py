@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from cortado.controls import NAMES, UNITS, Arrays, Controls, Values
+from cortado.controls import Controls
 from cortado.errors import InputError
 from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd, as_loss, fingerprint
+from cortado.parameter_values import NAMES, UNITS, Arrays, Values
 from cortado.particles import State
 from cortado.policies import Exact, Policy
 from cortado.rollout import MEMORY_BUDGET, Rollout, StepDerivative

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from cortado.controls import Arrays
 from cortado.errors import InputError
+from cortado.parameter_values import Arrays
 from cortado.policies import Policy
 from cortado.problem import Problem
 

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.calibration import WallLayer, diffusion_limit
-from cortado.controls import MATERIALS, Controls
+from cortado.calibration import SKIN, WallLayer, diffusion_limit
+from cortado.controls import Controls
 from cortado.discrete_scene import DiscreteScene, discretise
 from cortado.errors import CortadoWarning, InputError, shown
-from cortado.neighbours import SKIN, Grid, NeighbourSearch
+from cortado.neighbours import Grid, NeighbourSearch
+from cortado.parameter_values import MATERIALS
 from cortado.particles import State, padded
 from cortado.physics.diffusion import Diffusion
 from cortado.physics.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy

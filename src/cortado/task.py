@@ -8,9 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from cortado.controls import NOT_NEGATIVE, OF_EMITTER, POSITIVE, SUM_TOLERANCE, Arrays, parameter_shapes
 from cortado.errors import Phrase, SceneError
-from cortado.particles import TABLES
+from cortado.parameter_values import (
+    NOT_NEGATIVE,
+    OF_EMITTER,
+    POSITIVE,
+    SUM_TOLERANCE,
+    TABLES,
+    Arrays,
+    parameter_shapes,
+)
 from cortado.reparametrisation import Knots
 from cortado.sampling import fluid_particles
 from cortado.scene import Scene, read_toml, scene_from_dict

@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from cortado.assignment import Assignment
-from cortado.controls import MATERIALS, UNITS
 from cortado.figures import curve, images, loss_curve, parameters, particles
 from cortado.optimisation import Result
-from cortado.particles import TABLES
+from cortado.parameter_values import MATERIALS, TABLES, UNITS
 from cortado.report import Figures
 from cortado.video import MOST_FRAMES, write_video
 

@@ -8,10 +8,10 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import model_validator
 
-from cortado.controls import NAMES
 from cortado.errors import Phrase
 from cortado.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisers import LBFGS, Adam, GradientDescent, Optimiser
+from cortado.parameter_values import NAMES
 from cortado.scene_kinds import MISSING, Choice, Count, Kind, Quantity, Text, as_number, as_sequence, wrong
 from cortado.scene_tables import Table
 

@@ -9,9 +9,10 @@ from typing import Any
 
 import warp as wp
 
+from cortado.calibration import SKIN
 from cortado.discrete_scene import Lattice
 from cortado.launching import Launcher, sum_and_maximum
-from cortado.neighbours import SKIN, NeighbourSearch
+from cortado.neighbours import NeighbourSearch
 from cortado.particles import Fields, Parameters, State
 from cortado.physics.convergence import NO_PARTICLE
 from cortado.physics.surroundings import Discretisation, surroundings_type
