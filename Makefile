@@ -1,15 +1,18 @@
-# make demo: set up and run the main job on the CPU; make test: set up and run lint, types and tests.
+# make demo: set up and run the main job on the CPU; make test: set up and run lint, types and tests;
+# make sanitize: check the C++ engine with sanitizers.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test lint types unit clean
+.PHONY: setup demo test lint types unit sanitize clean
 
 setup: $(VENV)/.ready
 
-$(VENV)/.ready: pyproject.toml
+$(VENV)/.ready: pyproject.toml $(shell find cpp -type f)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	@$(BIN)/python -c 'import cortado.reference._engine' 2>/dev/null || \
+		echo 'Installed without the reference engine (C++): CONTRIBUTING.md says how to see why.'
 	touch $@
 
 demo: setup
@@ -25,6 +28,12 @@ types: setup
 
 unit: setup
 	$(BIN)/pytest
+
+sanitize: setup
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check cmeel-eigen
+	cmake -S cpp -B build/sanitize -DCORTADO_SANITIZE=ON -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python
+	cmake --build build/sanitize --parallel
+	build/sanitize/check_engine
 
 clean:
 	rm -rf $(VENV) runs build dist
