@@ -20,6 +20,7 @@ LAYERS = """
     physics.density physics.walls physics.contrast physics.integration physics.gravity
     physics.nozzle physics.pressure physics.viscosity physics.free_energy physics.spreading physics.diffusion
     physics.mixture
+    physics.frozen_pressure physics.adjoint_filters
     physics.convergence physics.reduction physics.matching
     physics.tint physics.colour_field physics.interpolation physics.rays physics.absorption
     launching neighbours particles
@@ -29,7 +30,10 @@ LAYERS = """
     discrete_scene
     vtkhdf trajectory
     solvers.forces solvers.mixture solvers.emitter solvers.pcisph_parts solvers.pcisph solvers.pcisph_derivatives
-    rollout policies losses controls simulation problem
+    solvers.adjoint_filters
+    rollout
+    policies.policy policies.exact policies.strength policies.filters policies.ensemble policies
+    losses controls simulation problem
     render.scene_renderer reparametrisation
     evaluations optimisers optimisation
     run_folder progress pictures video

@@ -1,6 +1,7 @@
 """Parameters in, loss out; loss and gradient; and the derivative along a direction."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any
 
@@ -11,8 +12,8 @@ from cortado.errors import InputError
 from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd, as_loss, fingerprint
 from cortado.parameter_values import NAMES, UNITS, Arrays, Values
 from cortado.particles import State
-from cortado.policies import Exact, Policy
-from cortado.rollout import MEMORY_BUDGET, Rollout, StepDerivative
+from cortado.policies import AdjointPolicy, Estimate, Exact, Policy
+from cortado.rollout import MEMORY_BUDGET, Observer, Rollout, StepDerivative
 from cortado.simulation import Simulation, check_steps
 from cortado.trajectory import Trajectory
 
@@ -62,7 +63,7 @@ class Problem:
         self._losses: dict[int, Loss] = {step: as_loss(one) for step, one in by_step.items()}
         self._controls = Controls(simulation, self.steps)
         self._rollout = Rollout(simulation.solver, self.steps, memory_budget)
-        self._derivatives: dict[Policy, StepDerivative] = {}
+        self._derivatives: dict[AdjointPolicy, StepDerivative] = {}
 
     def value(self, parameters: Values) -> float:
         """The loss, forward only."""
@@ -83,15 +84,26 @@ class Problem:
 
     def value_and_gradient(self, parameters: Values, policy: Policy | None = None) -> tuple[float, Arrays]:
         """The loss and its derivatives: for each parameter given, an array of its shape (float64)."""
+        found = self.estimate(parameters, policy)
+        return found.loss, found.gradient
+
+    def estimate(self, parameters: Values, policy: Policy | None = None, observe: Observer | None = None) -> Estimate:
+        """The same, with what the policy (`policies.Exact` by default) reports.
+
+        ``observe`` is given the number and the adjoint of every state, from the last to the first, by policies that go
+        back through a run; `policies.AdjointNorms` is such an observer.
+        """
+        policy = Exact() if policy is None else policy
+        if isinstance(policy, type) or not hasattr(policy, "estimate"):
+            raise InputError(f"policy is {policy!r}, but must be an object such as cortado.policies.Exact().")
+        return policy.estimate(self, parameters, observe)
+
+    def passage(self, parameters: Values) -> "Passage":
+        """A forward run that can be gone back through, until the next evaluation: what policies work with."""
         values = self._controls.checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         bars = {step: self._adjoint(step, end) for step, end in ends.items()}
-        derivative = self._derivative(Exact() if policy is None else policy)
-        first = self._rollout.backward(derivative, {step: bar.state for step, bar in bars.items()})
-        gradient = self._controls.gradient(values, first, derivative.parameters())
-        if "colours" in values:
-            gradient["colours"] = np.sum([bar.colours for bar in bars.values()], axis=0)
-        return self._total(ends), {name: gradient[name] for name in values}
+        return Passage(self._total(ends), self._rollout, values, bars, self._controls, self._derivatives)
 
     def tangent(self, parameters: Values, directions: Values) -> float:
         """The derivative of the loss along ``directions`` (any of the parameters), by forward mode."""
@@ -163,9 +175,29 @@ class Problem:
         state.set(*arrays)
         return EndAdjoint(state, no_colours)
 
-    def _derivative(self, policy: Policy) -> StepDerivative:
-        if isinstance(policy, type) or not hasattr(policy, "derivative"):
-            raise InputError(f"policy is {policy!r}, but must be an object such as cortado.policies.Exact().")
+
+@dataclass(frozen=True)
+class Passage:
+    """A forward run of a problem with its loss, and the ways back through it."""
+
+    loss: float
+    rollout: Rollout
+    _values: Arrays
+    _bars: Mapping[int, EndAdjoint]
+    _controls: Controls
+    _derivatives: dict[AdjointPolicy, StepDerivative]
+
+    def derivative(self, policy: AdjointPolicy) -> StepDerivative:
+        """The policy's backward step, made once for each problem."""
         if policy not in self._derivatives:
-            self._derivatives[policy] = policy.derivative(self._rollout)
+            self._derivatives[policy] = policy.derivative(self.rollout)
         return self._derivatives[policy]
+
+    def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:
+        """The gradient; ``observe`` is given the number and the adjoint of every state, from the last to the first."""
+        bars, values = self._bars, self._values
+        first = self.rollout.backward(derivative, {step: bar.state for step, bar in bars.items()}, observe)
+        gradient = self._controls.gradient(values, first, derivative.parameters())
+        if "colours" in values:
+            gradient["colours"] = np.sum([bar.colours for bar in bars.values()], axis=0)
+        return {name: gradient[name] for name in values}

@@ -32,6 +32,8 @@ class StepDerivative(Protocol):
 
     capturable: bool
     """Whether a step may be captured as a graph."""
+    solver: Pcisph
+    """Whose fields hold the recorded step after `step`."""
 
     def begin(self) -> None:
         """Forget the parameters' adjoints of an earlier way back."""
@@ -153,8 +155,11 @@ class Rollout:
 
     # ---- derivatives ---------------------------------------------------------------------------------------------
 
-    def backward(self, derivative: StepDerivative, bars: Mapping[int, State]) -> State:
-        """The adjoint of the first state, for ``bars``, adjoints of states by their number; `forward` has run."""
+    def backward(self, derivative: StepDerivative, bars: Mapping[int, State], observe: Observer | None = None) -> State:
+        """The adjoint of the first state, for ``bars``, adjoints of states by their number; `forward` has run.
+
+        ``observe`` is given the adjoint of every state, from the last to the first; the next step overwrites it.
+        """
         self.solver.diffuse(self.substeps)
         derivative.begin()
         self._forget_stale_graphs()
@@ -163,6 +168,8 @@ class Rollout:
             if n in bars:
                 for bar, total in zip(bars[n].arrays(), self._bar.arrays(), strict=True):
                     add(bar, total)
+            if observe is not None:
+                observe(n, self._bar)
             if n > 0:
                 self._buffer.assign(self._restore(n - 1))
                 self.solver.step_number.fill_(n - 1)

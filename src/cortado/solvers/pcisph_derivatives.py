@@ -1,9 +1,12 @@
 """Tangent and adjoint of a recorded PCISPH step: the report's Algorithm 2, put right, and its transpose."""
 
+from typing import Any
+
 import warp as wp
 
 from cortado.launching import sum_of
 from cortado.particles import Fields, Parameters, State
+from cortado.physics.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.emitter import EmitterAdjoint
 from cortado.solvers.forces import Adjoints
 from cortado.solvers.mixture import MixtureAdjoint, MixtureTangent
@@ -21,11 +24,15 @@ def _scratch(solver: Pcisph, vectors: int, scalars: int) -> tuple[list[wp.array]
 
 
 class PcisphAdjoint:
-    """Reverse mode, one step at a time; every neighbour sum is a gather, so that no atomics are needed."""
+    """Reverse mode, one step at a time; every neighbour sum is a gather, so that no atomics are needed.
 
-    def __init__(self, solver: Pcisph):
+    With frozen positions accelerations do not depend on x(t): v' does on v alone, x' = x + dt v' on both.
+    """
+
+    def __init__(self, solver: Pcisph, frozen_positions: bool = False):
         precision, particles, device = solver.discretisation.precision, solver.search.particles, solver.search.device
-        self._solver = solver
+        self._solver, self._frozen = solver, frozen_positions
+        self._frozen_force = frozen_force_adjoint(solver.discretisation) if frozen_positions else None
         self._bar = Fields.zeros(particles, precision, device)
         vectors, scalars = _scratch(solver, 3, 4)
         self._push_bar, self._acceleration_bar, self._scalars_bar = vectors
@@ -68,12 +75,14 @@ class PcisphAdjoint:
             [order, time_step, f.m, f.v, it.v_star[iterations], free_bar.positions, free_bar.velocities],
             [self._scalars_bar, b.x, b.v, b.n, b.m, b.rho_0, b.mu, self._push_bar, self._y_bar, self._p_bar],
         )
+        of_geometry = [] if self._frozen else [b.x, b.n]
+        force: Any = self._frozen_force if self._frozen else kernels.force.adjoint
         for k in reversed(range(iterations)):
             launch(
-                kernels.force.adjoint,
+                force,
                 [s, solver.lattice.stiffness, time_step, f.x, f.n, f.m, f.rho_0, solver.pressure_yield]
                 + [it.p[k], it.p[k + 1], it.c[k], self._push_bar],
-                [b.x, b.n, b.m, b.rho_0, self._y_bar, self._p_bar, self._scalars_bar, self._r],
+                [*of_geometry, b.m, b.rho_0, self._y_bar, self._p_bar, self._scalars_bar, self._r],
             )
             launch(
                 kernels.pressure.adjoint,
@@ -88,12 +97,18 @@ class PcisphAdjoint:
             t, y = solver.contrast, solver.pressure_yield
             launch(kernels.contrast.factor_adjoint, [s, t, y], [self._y_bar, self._t_bar])
             launch(kernels.contrast.adjoint, [s, f.x, f.m, self._t_bar], [b.x, b.m])
-        launch(kernels.walls.adjoint, [s, f.x, solver.wall_yield, self._y_bar], [b.x])
+        if not self._frozen:
+            launch(kernels.walls.adjoint, [s, f.x, solver.wall_yield, self._y_bar], [b.x])
         self._mixture.step(
             s, f, b, parameters, self._scalars_bar, new_state_bar.mass_fractions, state_bar.mass_fractions
         )
-        launch(kernels.density.adjoint, [s, f.x, b.n], [b.x])
         launch(kernels.integration.collect_masses, [order, b.m], [bar.masses])
+        if self._frozen:
+            launch(kernels.integration.unsort, [order, b.x, b.v], [self._push_bar, state_bar.velocities])
+            if free_bar is not state_bar:
+                wp.copy(state_bar.positions, free_bar.positions)  # not b.x, to which others have added
+            return
+        launch(kernels.density.adjoint, [s, f.x, b.n], [b.x])
         launch(kernels.integration.unsort, [order, b.x, b.v], [state_bar.positions, state_bar.velocities])
 
 

@@ -1,35 +1,51 @@
-"""How a rollout is differentiated: objects to be given to `Problem.value_and_gradient`."""
+"""Policies that differentiate the discrete step as it is, or as if positions were frozen within it."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import warp as wp
 
 from cortado.particles import Parameters, State
+from cortado.policies.policy import AdjointPolicy
 from cortado.rollout import Rollout, StepDerivative
 from cortado.solvers.pcisph_derivatives import PcisphAdjoint
 
 
-class Policy(Protocol):
-    """A way to go back through a rollout."""
-
-    def derivative(self, rollout: Rollout) -> StepDerivative:
-        """The backward step for one rollout."""
-
-
 @dataclass(frozen=True)
-class Exact:
+class Exact(AdjointPolicy):
     """The exact adjoint of the discrete step, by gathers: no atomics, the same bits every time.
 
-    Cost: each step once more forward, and about twice the neighbour sums of a step backward.
+    Formula: the transposed derivative of the step. Bias: none; but where neighbouring trajectories separate it grows as
+    they do, by a constant factor a step. Cost: each step once more forward, and about twice the neighbour sums of a
+    step backward.
     """
 
     def derivative(self, rollout: Rollout) -> StepDerivative:
-        return _ExactStep(rollout)
+        return _AdjointStep(rollout, frozen_positions=False)
 
 
 @dataclass(frozen=True)
-class Tape:
+class VelocityOnly(AdjointPolicy):
+    """The adjoint of a step in which no force depends on positions.
+
+    Formula: for a new state with adjoints x^ and v^,
+
+        v^ <- B^T (v^ + dt x^),   x^ <- x^,   B = dv' / dv at fixed positions:
+
+    pressure and viscosity answer to velocities, neighbours and weights stay. B hardly amplifies, as viscosity damps and
+    pressure takes away what would compress, so that the adjoint grows at most linearly with the steps.
+
+    Bias: whatever pushes back a displaced fluid is missing, gravity waves for one; directions decay over times in which
+    the fluid sloshes. Cost: less than `Exact`, as there is no Hessian of the smoothing kernel. Prior art: the default
+    of DiffFR (Li et al. 2023).
+    """
+
+    def derivative(self, rollout: Rollout) -> StepDerivative:
+        return _AdjointStep(rollout, frozen_positions=True)
+
+
+@dataclass(frozen=True)
+class Tape(AdjointPolicy):
     """The exact adjoint again, by Warp's own automatic differentiation of the forward kernels.
 
     The report's autograd: slower than `Exact`, with atomics on a GPU, and kept to check it.
@@ -39,13 +55,13 @@ class Tape:
         return _TapeStep(rollout)
 
 
-class _ExactStep:
+class _AdjointStep:
     capturable = True
 
-    def __init__(self, rollout: Rollout):
+    def __init__(self, rollout: Rollout, frozen_positions: bool):
         solver = rollout.solver
-        self._solver, self._parameters = solver, rollout.parameters
-        self._adjoint = PcisphAdjoint(solver)
+        self.solver, self._parameters = solver, rollout.parameters
+        self._adjoint = PcisphAdjoint(solver, frozen_positions)
         self._bar = solver.new_parameters(rollout.steps)
 
     def begin(self) -> None:
@@ -53,7 +69,7 @@ class _ExactStep:
         self._bar.clear()
 
     def step(self, state: State, iterations: int, bar: State) -> None:
-        self._solver.record(state, self._parameters, iterations)
+        self.solver.record(state, self._parameters, iterations)
         self._adjoint.step(iterations, bar, bar, self._parameters, self._bar)
 
     def parameters(self) -> Parameters:
@@ -67,20 +83,20 @@ class _TapeStep:
     def __init__(self, rollout: Rollout):
         solver = rollout.solver
         self._given, self._parameters = solver, rollout.parameters
-        self._solver = solver.differentiable()
-        self._before, self._after = (self._solver.new_state(requires_grad=True) for _ in range(2))
-        self._own = self._solver.new_parameters(rollout.steps, requires_grad=True)
+        self.solver = solver.differentiable()
+        self._before, self._after = (self.solver.new_state(requires_grad=True) for _ in range(2))
+        self._own = self.solver.new_parameters(rollout.steps, requires_grad=True)
 
     def begin(self) -> None:
-        self._solver.grow(self._given.search.capacity)
-        self._solver.diffuse(self._given.mixture.substeps)
+        self.solver.grow(self._given.search.capacity)
+        self.solver.diffuse(self._given.mixture.substeps)
         self._own.assign(self._parameters)
         for array in self._own.arrays():
             array.grad.zero_()
 
     def step(self, state: State, iterations: int, bar: State) -> None:
         self._before.assign(state)
-        wp.copy(self._solver.step_number, self._given.step_number)
+        wp.copy(self.solver.step_number, self._given.step_number)
         tape = wp.Tape()
         try:
             self._back(tape, iterations, bar)
@@ -89,8 +105,8 @@ class _TapeStep:
 
     def _back(self, tape: wp.Tape, iterations: int, bar: State) -> None:
         with tape:
-            self._solver.record(self._before, self._own, iterations)
-            self._solver.recorded(iterations, self._own, self._after)
+            self.solver.record(self._before, self._own, iterations)
+            self.solver.recorded(iterations, self._own, self._after)
         tape.backward(grads=dict(zip(self._after.arrays(), bar.arrays(), strict=True)))
         for own, total in zip(self._before.arrays(), bar.arrays(), strict=True):
             wp.copy(total, own.grad)

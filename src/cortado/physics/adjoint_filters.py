@@ -1,0 +1,79 @@
+"""What may be done to the adjoint a of a state between two backward steps: an average over neighbours, and a drag.
+
+    average:  a_i += strength sum_j w_ij (a_j - a_i),   w_ij = V W_ij / max(n_i, n_j)
+    drag:     a_i *= exp(-rate dt)
+
+The weights of the average are symmetric, so that sum_i a_i is kept; and as sum_j V W_ij < n_i, those of a particle add
+up to less than 1: for 0 <= strength <= 1 the square norm cannot grow. Long waves of a hardly feel it, those of the
+length of a few spacings decay: a viscosity of the adjoint.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
+
+
+@cache
+def adjoint_filter_kernels(discretisation: Discretisation) -> SimpleNamespace:
+    """Kernels ``average`` and ``drag`` of vectors (n,) in the scene's order, and ``squares`` of two of them."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    surroundings = surroundings_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    separation, weight, vectors, numbers = pair.separation, pair.weight, pair.vectors, pair.numbers
+    module = discretisation.module(False, "adjoint_filters")
+
+    @wp.kernel(module=module, enable_backward=False)
+    def average(
+        s: surroundings,
+        order: wp.array(dtype=wp.int32),
+        strength: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        n: wp.array(dtype=real),
+        a: wp.array(dtype=vector),
+        # out
+        a_new: wp.array(dtype=vector),
+    ):
+        """``x`` and ``n`` are sorted, ``a`` is in the scene's order. A strength of 0 copies bit for bit."""
+        i = s.first + wp.tid()
+        x_i = x[i]
+        n_i = n[i]
+        a_i = a[order[i]]
+        if strength[0] == real(0.0):
+            a_new[order[i]] = a_i
+            return
+        total = vector()
+        for k in range(0, s.fluid_count[i], UNROLL):
+            x_j = vectors(x, k, i, s)
+            n_j = numbers(n, k, i, s)
+            for u in range(UNROLL):
+                w_ij = s.volume * weight(separation(x_i, x_j[u], s), s) / wp.max(n_i, n_j[u])
+                total += w_ij * (a[order[s.neighbours[k + u, i]]] - a_i)
+        a_new[order[i]] = a_i + strength[0] * total
+
+    @wp.kernel(module=module, enable_backward=False)
+    def drag(
+        rate: real,
+        time_step: wp.array(dtype=real),
+        # in and out
+        a: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        a[i] = wp.exp(-rate * time_step[0]) * a[i]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def squares(
+        a: wp.array(dtype=vector),
+        b: wp.array(dtype=vector),
+        # out
+        found: wp.array(dtype=wp.vec2d),
+    ):
+        """|a_i|^2 and |b_i|^2, in float64: adjoints grow beyond what a square in float32 may be."""
+        i = wp.tid()
+        a_i = wp.vec3d(a[i])
+        b_i = wp.vec3d(b[i])
+        found[i] = wp.vec2d(wp.dot(a_i, a_i), wp.dot(b_i, b_i))
+
+    return SimpleNamespace(average=average, drag=drag, squares=squares)

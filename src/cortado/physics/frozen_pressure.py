@@ -1,0 +1,81 @@
+"""The adjoint of the pressure force (`cortado.physics.pressure`) with respect to pressures alone, at frozen positions.
+
+Without the Hessian of the smoothing kernel, which is most of the exact adjoint's work.
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
+
+
+@cache
+def frozen_force_adjoint(discretisation: Discretisation) -> Any:
+    """The kernel: the exact one, but for what it adds to the adjoints of positions and densities."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    surroundings = surroundings_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    separation, gradient, vectors, numbers = pair.separation, pair.gradient, pair.vectors, pair.numbers
+
+    @wp.kernel(module=discretisation.module(False, "frozen_pressure"), enable_backward=False)
+    def adjoint(
+        s: surroundings,
+        stiffness: real,
+        time_step: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        n: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        rho_0: wp.array(dtype=real),
+        y: wp.array(dtype=real),
+        p_in: wp.array(dtype=real),
+        p_out: wp.array(dtype=real),
+        c: wp.array(dtype=real),
+        push_bar: wp.array(dtype=vector),
+        # in and out
+        m_bar: wp.array(dtype=real),
+        rho_0_bar: wp.array(dtype=real),
+        y_bar: wp.array(dtype=real),
+        p_bar: wp.array(dtype=real),
+        scalars_bar: wp.array(dtype=vector),
+        # out
+        r: wp.array(dtype=real),
+    ):
+        """From ``push_bar``, the adjoint of the pressure acceleration over m, to those of p and (r) of n*."""
+        i = s.first + wp.tid()
+        x_i = x[i]
+        c_i = c[i]
+        push_bar_i = push_bar[i]
+        stretch = real(0.0)
+        work = real(0.0)
+        for k in range(0, s.fluid_count[i], UNROLL):
+            x_j = vectors(x, k, i, s)
+            c_j = numbers(c, k, i, s)
+            push_bar_j = vectors(push_bar, k, i, s)
+            for u in range(UNROLL):
+                g_ij = gradient(separation(x_i, x_j[u], s), s)
+                stretch += wp.dot(g_ij, push_bar_i - push_bar_j[u])
+                work += (c_i + c_j[u]) * wp.dot(g_ij, push_bar_i)
+        for k in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[k, i]
+            g_ib = gradient(separation(x_i, s.wall_positions[b], s), s)
+            wall_stretch = s.wall_push * s.wall_weights[b] * wp.dot(g_ib, push_bar_i)
+            stretch += wall_stretch
+            work += c_i * wall_stretch
+        m_i = m[i]
+        p_i = p_out[i]
+        delta = y[i] * stiffness / (time_step[0] * time_step[0])
+        p_bar_i = real(0.0)
+        if p_i > real(0.0):
+            p_bar_i = p_bar[i] - s.volume * stretch / (n[i] * n[i])
+        excess_bar = delta * p_bar_i
+        excess = (p_i - p_in[i]) / delta
+        m_bar[i] = m_bar[i] + (s.volume * work + excess_bar * (excess + rho_0[i])) / m_i
+        rho_0_bar[i] = rho_0_bar[i] - excess_bar
+        y_bar[i] = y_bar[i] + excess_bar * excess / y[i]
+        p_bar[i] = p_bar_i
+        r[i] = m_i * excess_bar
+        scalars_bar[i] = scalars_bar[i] - vector(real(2.0) * excess_bar * excess / time_step[0], real(0.0), real(0.0))
+
+    return adjoint

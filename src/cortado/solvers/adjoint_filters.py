@@ -1,0 +1,72 @@
+"""Filters of the adjoint of a state between two backward steps, and its norms (`cortado.physics.adjoint_filters`)."""
+
+from collections.abc import Iterable
+
+import numpy as np
+import warp as wp
+
+from cortado.launching import sum_of
+from cortado.particles import Parameters, State
+from cortado.physics.adjoint_filters import adjoint_filter_kernels
+from cortado.solvers.pcisph import Pcisph
+
+FIELDS = ("positions", "velocities")
+"""Fields of a `State` that can be filtered."""
+
+
+class Average:
+    """Blends fields of an adjoint with their average over the neighbours that the solver holds."""
+
+    def __init__(self, solver: Pcisph, fields: Iterable[str]):
+        self._solver, self._fields = solver, tuple(fields)
+        self._kernel = adjoint_filter_kernels(solver.discretisation).average
+        self._before = solver.new_state()
+        self._strength = wp.zeros(1, dtype=solver.discretisation.precision.real, device=solver.search.device)
+
+    def set_strength(self, strength: float) -> None:
+        """From now on; from 0, which leaves everything as it is, to 1."""
+        self._strength.fill_(strength)
+
+    def __call__(self, bar: State, parameters: Parameters) -> None:
+        """Blend the adjoint of the state whose step the solver has recorded."""
+        solver = self._solver
+        moment = solver.moment(parameters)
+        for name in self._fields:
+            before, after = getattr(self._before, name), getattr(bar, name)
+            wp.copy(before, after)
+            moment.launch(
+                self._kernel,
+                [moment.surroundings, solver.search.order, self._strength] + [moment.fields.x, moment.fields.n, before],
+                [after],
+            )
+
+
+class Drag:
+    """Multiplies the adjoint of velocities by exp(-rate dt)."""
+
+    def __init__(self, solver: Pcisph, rate: float):
+        self._launch, self._rate = solver.launch, rate
+        self._kernel = adjoint_filter_kernels(solver.discretisation).drag
+
+    def __call__(self, bar: State, parameters: Parameters) -> None:
+        self._launch(self._kernel, [self._rate, parameters.time_step], [bar.velocities])
+
+
+class AdjointNorms:
+    """An observer of a way back that keeps the norms of adjoints, on the device until they are asked for."""
+
+    def __init__(self, solver: Pcisph, steps: int):
+        particles, device = solver.search.particles, solver.search.device
+        self._launch = solver.launch
+        self._kernel = adjoint_filter_kernels(solver.discretisation).squares
+        self._squares = wp.zeros(particles, dtype=wp.vec2d, device=device)
+        self._sum = sum_of(wp.vec2d, particles, device)
+        self._history = wp.zeros(steps + 1, dtype=wp.vec2d, device=device)
+
+    def __call__(self, step: int, bar: State) -> None:
+        self._launch(self._kernel, [bar.positions, bar.velocities], [self._squares])
+        wp.copy(self._history, self._sum(self._squares), dest_offset=step, count=1)
+
+    def numpy(self) -> np.ndarray:
+        """(steps + 1, 2) norms over all particles of the adjoints of positions and of velocities, state by state."""
+        return np.sqrt(self._history.numpy())

@@ -1,0 +1,471 @@
+"""Policies: each does to the adjoint what its formula says, and nothing else."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import warp as wp
+
+from cortado import InputError, Problem, Simulation, losses, policies
+from cortado.policies.strength import LADDER, growth, smallest_sufficient
+from cortado.solvers.adjoint_filters import Average
+from reference import complex_step
+from scenes import plane, plane_of_three, scene, splash
+from test_emitter import jet, pour
+from test_step import twin
+
+MAKERS = {
+    "3-D": scene,
+    "2-D": plane,
+    "periodic": lambda: plane(
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]},
+        forces={"gravity": [1.0, -9.81], "viscosity": "laminar"},
+    ),
+    "three phases": plane_of_three,
+    "emitter": jet,
+    "emitter, two phases": pour,
+}
+kinds = pytest.mark.parametrize("kind", MAKERS)
+
+
+class Mixed:
+    """A linear loss of positions, velocities and fractions, with random weights."""
+
+    def __init__(self, simulation, seed=0):
+        random = np.random.default_rng(seed)
+        arrays = (simulation.positions, simulation.velocities, simulation.mass_fractions)
+        self.weights = tuple(random.standard_normal(array.shape) for array in arrays)
+
+    def value(self, end):
+        arrays = (end.positions, end.velocities, end.mass_fractions)
+        return float(sum((w * array).sum() for w, array in zip(self.weights, arrays, strict=True)))
+
+    def adjoint(self, end):
+        return self.weights
+
+
+@cache
+def simulation_of(kind, precision="float64"):
+    return Simulation(MAKERS[kind](), precision=precision)
+
+
+def point_of(simulation, seed=0):
+    """The scene's parameters on a lattice that is disturbed, and moving."""
+    random, shape = np.random.default_rng(seed), simulation.positions.shape
+    names = ["gravity", "viscosity", "rest_density", "time_step"]
+    names += ["mass_fractions", "mobility", "interface_width"] if len(simulation.scene.phase) > 1 else []
+    names += ["nozzle_path", "flow_rate"] if simulation.scene.emitter else []
+    point = {name: simulation.parameters()[name] for name in names}
+    spacing = simulation.scene.discretisation.spacing
+    point["initial_positions"] = simulation.positions + 0.05 * spacing * random.standard_normal(shape)
+    point["initial_velocities"] = simulation.velocities + 0.3 * random.standard_normal(shape)
+    return point
+
+
+# ---- against the slow twin ------------------------------------------------------------------------------------------
+
+
+STEPS, DT = 4, 0.0021
+BLOCKS = {2: [0.15, 0.2], 3: [0.1, 0.1, 0.15]}
+
+
+class Twin:
+    """Steps of the slow twin, of 12 particles in a corner with viscosity that matters, and their Jacobians."""
+
+    def __init__(self, d):
+        made = scene(
+            dimension=d,
+            phase=[{"name": "honey", "rest_density": 1000.0, "viscosity": 5.0}],
+            fluid=[{"shape": "box", "lower": [0.0] * d, "upper": BLOCKS[d], "phase": "honey"}],
+            container={"shape": "box", "lower": [0.0] * d, "upper": [0.3] * d},
+            forces={"gravity": [0.3, -9.81, 0.1][:d]},
+        )
+        self.simulation = Simulation(made, precision="float64")
+        point = point_of(self.simulation)
+        self.point = {name: point[name] for name in ("initial_positions", "initial_velocities")}
+        self.slow, self.shape = twin(self.simulation), self.simulation.positions.shape
+        self.volume, self.gravity = self.simulation.solver.lattice.volume, np.asarray(made.forces.gravity)
+        self.states = [np.concatenate([array.ravel() for array in self.point.values()])]
+        self.jacobians = []
+        for _ in range(STEPS):
+            state = self.states[-1]
+            self.jacobians.append(np.array([complex_step(self.step, [state], [e]) for e in np.eye(len(state))]).T)
+            self.states.append(self.step(state))
+
+    def step(self, state):
+        x, v = state.reshape(2, *self.shape)
+        ones = np.ones(len(x))
+        found = self.slow.step(x, v, self.gravity, 1000.0 * self.volume * ones, 1000.0 * ones, 5.0 * ones, DT, 5)
+        return np.concatenate([array.ravel() for array in found])
+
+    def detached(self, jacobian):
+        """That of (x, v) -> (x + dt v', v'), where v' knows v alone."""
+        n = len(jacobian) // 2
+        b = jacobian[n:, n:]
+        return np.block([[np.eye(n), DT * b], [np.zeros((n, n)), b]])
+
+    def averaging(self, state, strength):
+        """(n, n) what a filter of the adjoint of one coordinate is."""
+        x = state[: state.size // 2].reshape(self.shape)
+        n = self.volume * self.slow.density(x, *self.slow.near(x))
+        w = self.volume * self.slow.weight(x, x) / np.maximum(n[:, None], n[None, :])
+        return np.eye(len(x)) + strength * (w - np.diag(w.sum(axis=1)))
+
+    def adjoint(self, bar, policy):
+        """The gradient with respect to the first state, for the adjoint of the last."""
+        frozen = isinstance(getattr(policy, "base", policy), policies.VelocityOnly)
+        for state, jacobian in zip(reversed(self.states[:-1]), reversed(self.jacobians), strict=True):
+            bar = (self.detached(jacobian) if frozen else jacobian).T @ bar
+            x_bar, v_bar = bar.reshape(2, *self.shape)
+            if isinstance(policy, policies.Damped):
+                v_bar = np.exp(-policy.rate * DT) * v_bar
+            if isinstance(policy, policies.AdjointSmoothing):
+                averaging = self.averaging(state, policy.strength)
+                x_bar = averaging @ x_bar if "positions" in policy.fields else x_bar
+                v_bar = averaging @ v_bar if "velocities" in policy.fields else v_bar
+            bar = np.concatenate([x_bar.ravel(), v_bar.ravel()])
+        return bar
+
+
+twin_of = cache(Twin)
+POLICIES = (
+    policies.Exact(),
+    policies.VelocityOnly(),
+    policies.AdjointSmoothing(0.3),
+    policies.AdjointSmoothing(0.7, fields=["velocities"]),
+    policies.AdjointSmoothing(0.7, fields=["positions"]),
+    policies.AdjointSmoothing(0.3, base=policies.VelocityOnly()),
+    policies.AdjointSmoothing(0.3, base=policies.Tape()),
+    policies.Damped(100.0),
+)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("policy", POLICIES, ids=repr)
+def test_gradients_equal_those_of_the_twin(policy, dimension):
+    slow = twin_of(dimension)
+    loss = Mixed(slow.simulation)
+    _, found = Problem(slow.simulation, STEPS, loss).value_and_gradient(slow.point, policy)
+    last = np.concatenate([w.ravel() for w in loss.weights[:2]])
+    wanted, exact = slow.adjoint(last, policy), slow.adjoint(last, policies.Exact())
+    gradient = np.concatenate([found[name].ravel() for name in slow.point])
+    np.testing.assert_allclose(gradient, wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())
+    assert (np.linalg.norm(wanted - exact) > 0.01 * np.linalg.norm(exact)) == (policy != policies.Exact())
+
+
+# ---- velocities only ------------------------------------------------------------------------------------------------
+
+
+@kinds
+def test_velocity_only_leaves_out_positions_and_nothing_else(kind):
+    """Of one step everything but the first positions' derivative is exact; theirs is that without forces."""
+    simulation = simulation_of(kind)
+    problem, point = Problem(simulation, 1, Mixed(simulation)), point_of(simulation)
+    _, exact = problem.value_and_gradient(point)
+    _, found = problem.value_and_gradient(point, policies.VelocityOnly())
+    first = exact.pop("initial_positions")
+    for name, wanted in exact.items():
+        np.testing.assert_allclose(found[name], wanted, rtol=0, atol=1e-12 * np.abs(wanted).max(), err_msg=name)
+    alone = problem.loss.weights[0].copy()
+    if simulation.scene.emitter:
+        alone[~moved(problem, point)] = 0.0
+    np.testing.assert_array_equal(found["initial_positions"], alone)
+    assert np.linalg.norm(first - alone) > 0.01 * np.linalg.norm(alone)
+
+
+def moved(problem, point):
+    """(n,) which particles of a step are free: those that a change of all velocities moves."""
+    changed = {**point, "initial_velocities": point["initial_velocities"] + 1.0}
+    return (problem.end(point).positions != problem.end(changed).positions).any(axis=1)
+
+
+@pytest.mark.parametrize("make", [splash, plane])
+def test_velocity_only_grows_at_most_linearly(make):
+    simulation = Simulation(make(), precision="float64")
+    steps = 300
+    problem, dt = Problem(simulation, steps, losses.FinalPositions(simulation.positions + 0.1)), 0.0021
+    point = {"initial_positions": point_of(simulation)["initial_positions"]}
+    norms = norms_of(problem, point, policies.VelocityOnly())
+    np.testing.assert_allclose(norms[:, 0], norms[-1, 0], rtol=1e-13)
+    back = steps - np.arange(steps + 1)
+    assert (norms[:, 1] <= 1.05 * back * dt * norms[:, 0]).all()
+    exact = norms_of(problem, point, policies.Exact())
+    assert exact[0, 1] > 10.0 * steps * dt * exact[-1, 0]
+
+
+def norms_of(problem, point, policy):
+    norms = policies.AdjointNorms(problem.simulation.solver, problem.steps)
+    problem.estimate(point, policy, norms)
+    return norms.numpy()
+
+
+# ---- smoothing ------------------------------------------------------------------------------------------------------
+
+
+def random_bar(simulation, seed=2):
+    bar, random = simulation.solver.new_state(), np.random.default_rng(seed)
+    arrays = (simulation.positions, simulation.velocities, simulation.mass_fractions)
+    values = [random.standard_normal(array.shape) + 1.0 for array in arrays]
+    bar.set(*values)
+    return bar, values
+
+
+def averaged(simulation, strength, fields=("positions", "velocities")):
+    """An adjoint before and after, with the positions (n, d) it belongs to and the number densities there."""
+    solver, point = simulation.solver, point_of(simulation)
+    rollout = simulation.rollout(1, point)
+    solver.diffuse(rollout.substeps)
+    solver.step_number.zero_()
+    solver.record(rollout.initial, rollout.parameters, 2)
+    bar, values = random_bar(simulation)
+    average = Average(solver, fields)
+    average.set_strength(strength)
+    average(bar, rollout.parameters)
+    n = np.empty(simulation.particles)
+    n[solver.search.order.numpy()[: simulation.particles]] = solver.fields.n.numpy()
+    return values, bar.numpy(simulation.dimension), point["initial_positions"], n
+
+
+@kinds
+def test_an_average_equals_the_twins(kind):
+    simulation = simulation_of(kind)
+    before, after, x, n = averaged(simulation, 0.4)
+    separation = x[:, None] - x[None, :]
+    if kind == "periodic":
+        separation[..., 0] -= 0.4 * np.round(separation[..., 0] / 0.4)
+    support = simulation.scene.discretisation.support_radius
+    w = simulation.smoothing.weight(np.linalg.norm(separation, axis=-1), simulation.dimension, support)
+    w = simulation.solver.lattice.volume * w / np.maximum(n[:, None], n[None, :])
+    for a, found in zip(before[:2], after[:2], strict=True):
+        wanted = a + 0.4 * (w @ a - w.sum(axis=1)[:, None] * a)
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-13)
+        assert np.abs(found - a).max() > 0.1
+    np.testing.assert_array_equal(after[2], before[2])
+
+
+@kinds
+@pytest.mark.parametrize("strength", [0.1, 1.0])
+def test_an_average_keeps_sums_and_does_not_grow(kind, strength):
+    before, after, _, _ = averaged(simulation_of(kind), strength)
+    for a, found in zip(before[:2], after[:2], strict=True):
+        np.testing.assert_allclose(found.sum(axis=0), a.sum(axis=0), rtol=1e-13)
+        assert (np.linalg.norm(found, axis=0) < np.linalg.norm(a, axis=0)).all()
+
+
+def test_an_average_leaves_other_fields_alone():
+    before, after, _, _ = averaged(simulation_of("3-D"), 1.0, ["velocities"])
+    np.testing.assert_array_equal(after[0], before[0])
+    assert (after[1] != before[1]).all()
+
+
+@kinds
+@pytest.mark.parametrize(
+    "policy", [policies.AdjointSmoothing(0), policies.AdjointSmoothing("auto"), policies.Damped(0.0)], ids=repr
+)
+def test_without_strength_a_policy_is_exact_bit_for_bit(kind, policy):
+    """Also with "auto" over a few steps, in which nothing grows."""
+    simulation = simulation_of(kind)
+    problem, point = Problem(simulation, 5, losses.FinalPositions(simulation.positions + 0.1)), point_of(simulation)
+    _, exact = problem.value_and_gradient(point)
+    found = problem.estimate(point, policy)
+    assert not found.strength
+    for name, wanted in exact.items():
+        assert found.gradient[name].tobytes() == wanted.tobytes(), name
+
+
+@kinds
+@pytest.mark.parametrize("policy", [policies.AdjointSmoothing(0.2), policies.VelocityOnly()], ids=repr)
+def test_the_same_bits_twice_and_float32_is_near(kind, policy):
+    gradients = []
+    for precision in ("float64", "float64", "float32"):
+        simulation = Simulation(MAKERS[kind](), precision=precision)
+        loss = losses.FinalPositions(simulation.positions + 0.1)
+        gradients.append(Problem(simulation, 20, loss).value_and_gradient(point_of(simulation), policy)[1])
+    for name, wanted in gradients[0].items():
+        assert wanted.tobytes() == gradients[1][name].tobytes(), name
+    for name in ("gravity", "initial_velocities"):
+        size = np.linalg.norm(gradients[0][name])
+        assert np.linalg.norm(gradients[2][name] - gradients[0][name]) < 1e-2 * size, name
+
+
+# ---- the strength of a smoothing ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def chaotic():
+    simulation = Simulation(splash(), precision="float64")
+    return Problem(simulation, 300, losses.CentreOfMassAlong([1.0, 0.0, 0.0]))
+
+
+def test_auto_finds_the_smallest_sufficient_strength(chaotic):
+    point = {"gravity": np.array([0.5, -9.81, 0.0])}
+    auto = chaotic.estimate(point, policies.AdjointSmoothing())
+    assert auto.strength in LADDER
+    assert np.linalg.norm(chaotic.value_and_gradient(point)[1]["gravity"]) > 30 * np.linalg.norm(
+        auto.gradient["gravity"]
+    )
+    fixed = chaotic.estimate(point, policies.AdjointSmoothing(auto.strength))
+    assert auto.gradient["gravity"].tobytes() == fixed.gradient["gravity"].tobytes()
+    chosen = LADDER.index(auto.strength)
+    for strength in LADDER[: chosen + 1]:
+        history = norms_of(chaotic, point, policies.AdjointSmoothing(strength))
+        assert (smallest_sufficient(lambda _, h=history: h, DT) == 0.0) == (strength == auto.strength)
+
+
+def test_growth_is_in_e_folds():
+    steps, dt = 100, 0.01
+    back = steps - np.arange(steps + 1)
+    assert growth(np.stack([np.exp(0.05 * back), 0 * back], axis=1), dt) == pytest.approx(5.0)
+    flight = np.stack([np.ones(steps + 1), back * dt], axis=1)
+    assert 0.0 < growth(flight, dt) < 0.5
+    assert growth(np.zeros((steps + 1, 2)), dt) == 0.0
+    assert growth(np.full((steps + 1, 2), np.inf), dt) == np.inf
+
+
+# ---- observers ------------------------------------------------------------------------------------------------------
+
+
+def test_every_adjoint_of_a_state_can_be_observed():
+    simulation = simulation_of("2-D")
+    problem, point = Problem(simulation, 7, Mixed(simulation)), point_of(simulation)
+    seen = {}
+    norms = policies.AdjointNorms(simulation.solver, 7)
+
+    def observe(step, bar):
+        seen[step] = bar.numpy(2)
+        norms(step, bar)
+
+    found = problem.estimate(point, policies.AdjointSmoothing(0.1), observe)
+    assert list(seen) == [7, 6, 5, 4, 3, 2, 1, 0]
+    for k, name in enumerate(("initial_positions", "initial_velocities")):
+        np.testing.assert_array_equal(seen[7][k], problem.loss.weights[k])
+        np.testing.assert_array_equal(seen[0][k], found.gradient[name])
+        wanted = [np.linalg.norm(seen[step][k]) for step in range(8)]
+        np.testing.assert_allclose(norms.numpy()[:, k], wanted, rtol=1e-13)
+
+
+# ---- ensembles ------------------------------------------------------------------------------------------------------
+
+
+class Stub:
+    """A function of two parameters in place of a problem."""
+
+    def __init__(self, function, simulation):
+        self.function, self.simulation, self.calls = function, simulation, []
+
+    def value(self, parameters):
+        self.calls.append(parameters)
+        return float(self.function(parameters))
+
+
+POINT = {"gravity": np.array([[1.0, -2.0], [0.5, 3.0]]), "viscosity": np.array(0.7)}
+
+
+def quadratic(p):
+    g, mu = p["gravity"], p["viscosity"]
+    return 3.0 * g[0, 0] ** 2 - g[0, 1] * g[1, 0] + 2.0 * mu * g[1, 1] + mu**2
+
+
+def test_smoothed_differences_of_a_quadratic_are_exact():
+    stub = Stub(quadratic, simulation_of("2-D"))
+    found = policies.Smoothed({"gravity": 0.5, "viscosity": 0.1}, samples=3).estimate(stub, POINT)
+    assert found.loss == quadratic(POINT)
+    np.testing.assert_allclose(found.gradient["gravity"], [[6.0, -0.5], [2.0, 1.4]], rtol=1e-12)
+    np.testing.assert_allclose(found.gradient["viscosity"], 7.4, rtol=1e-12)
+    assert max(np.abs(error).max() for error in found.standard_error.values()) < 1e-12
+    assert len(stub.calls) == 1 + 2 * 5 * 3
+
+
+def test_smoothing_takes_waves_off_that_are_narrower_than_the_spread():
+    """L = u + sin(k u) / k: its gradient at 0 is 2, that of its average 1 + sin(k r) / (k r)."""
+    stub = Stub(lambda p: p["viscosity"] + np.sin(40.0 * p["viscosity"]) / 40.0, simulation_of("2-D"))
+    found = policies.Smoothed(0.3).estimate(stub, {"viscosity": 0.0})
+    assert found.gradient["viscosity"] == pytest.approx(1.0 + np.sin(12.0) / 12.0)
+
+
+def test_standard_errors_tell_how_gradients_scatter():
+    first = simulation_of("2-D").positions
+
+    def noisy(p):
+        x = p.get("initial_positions", first)
+        return quadratic(p) + 1e4 * p["gravity"][0, 0] * (x[3, 0] - first[3, 0])
+
+    stub = Stub(noisy, simulation_of("2-D"))
+    runs = [policies.Smoothed(0.5, samples=20, seed=seed).estimate(stub, POINT) for seed in range(40)]
+    scatter = np.std([run.gradient["gravity"] for run in runs], axis=0, ddof=1)
+    believed = np.sqrt(np.mean([run.standard_error["gravity"] ** 2 for run in runs], axis=0))
+    np.testing.assert_allclose(believed, scatter, rtol=0.4)
+    assert runs[0].gradient["gravity"].tobytes() != runs[1].gradient["gravity"].tobytes()
+    again = policies.Smoothed(0.5, samples=20, seed=0).estimate(stub, POINT)
+    assert runs[0].gradient["gravity"].tobytes() == again.gradient["gravity"].tobytes()
+
+
+def test_before_chaos_smoothed_and_exact_agree():
+    simulation = Simulation(splash(), precision="float64")
+    problem = Problem(simulation, 60, losses.CentreOfMass([0.1, 0.1, 0.1]))
+    point = {"gravity": np.array([0.5, -9.81, 0.0])}
+    _, exact = problem.value_and_gradient(point)
+    found = problem.estimate(point, policies.Smoothed(0.1, samples=4, disorder=0.001))
+    assert np.linalg.norm(found.gradient["gravity"] - exact["gravity"]) < 0.02 * np.linalg.norm(exact["gravity"])
+
+
+# ---- centre of mass -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("masses", [None, np.linspace(1.0, 2.0, 64)])
+@pytest.mark.parametrize("make", [losses.CentreOfMass, losses.CentreOfMassAlong])
+def test_centres_of_mass_and_their_gradients(make, masses):
+    simulation = simulation_of("2-D")
+    x, v = (point_of(simulation)[name] for name in ("initial_positions", "initial_velocities"))
+    loss = make([0.3, -0.2], masses)
+    problem = Problem(simulation, 0, loss)
+    centre = np.average(x, axis=0, weights=masses)
+    value = ((centre - [0.3, -0.2]) ** 2).sum() if make is losses.CentreOfMass else centre @ [0.3, -0.2]
+    found, gradient = problem.value_and_gradient({"initial_positions": x, "initial_velocities": v})
+    assert found == pytest.approx(value, rel=1e-13)
+    assert not gradient["initial_velocities"].any()
+    direction = np.random.default_rng(4).standard_normal(x.shape)
+    ahead, behind = (problem.value({"initial_positions": x + h * direction}) for h in (1e-5, -1e-5))
+    assert (gradient["initial_positions"] * direction).sum() == pytest.approx((ahead - behind) / 2e-5, rel=1e-8)
+    assert loss.fingerprint != make([0.3, -0.1], masses).fingerprint
+
+
+# ---- mistakes -------------------------------------------------------------------------------------------------------
+
+MISTAKES = {
+    "strength above 1": lambda p: policies.AdjointSmoothing(1.5),
+    "strength NaN": lambda p: policies.AdjointSmoothing(float("nan")),
+    "strength in words": lambda p: policies.AdjointSmoothing("strong"),
+    "no fields": lambda p: policies.AdjointSmoothing(fields=()),
+    "a field that is none": lambda p: policies.AdjointSmoothing(fields=("densities",)),
+    "rate below 0": lambda p: policies.Damped(-1.0),
+    "one sample": lambda p: policies.Smoothed(samples=1),
+    "disorder below 0": lambda p: policies.Smoothed(disorder=-0.1),
+    "spread 0": lambda p: p.estimate({"viscosity": 1.0}, policies.Smoothed(0.0)),
+    "spread without a name": lambda p: p.estimate({"viscosity": 1.0}, policies.Smoothed({"gravity": 1.0})),
+    "too many numbers": lambda p: p.estimate({"initial_positions": p.simulation.positions}, policies.Smoothed()),
+    "masses of others": lambda p: Problem(p.simulation, 1, losses.CentreOfMass([0.0] * 3, np.ones(7))).value({}),
+    "no masses": lambda p: losses.CentreOfMass([0.0] * 3, np.zeros(7)),
+    "target's shape": lambda p: Problem(p.simulation, 1, losses.CentreOfMass([0.0] * 2)).value({}),
+    "direction's shape": lambda p: Problem(p.simulation, 1, losses.CentreOfMassAlong([0.0] * 2)).value({}),
+    "target a number": lambda p: losses.CentreOfMass(1.0),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_is_a_sentence(chaotic, mistake):
+    with pytest.raises(InputError) as caught:
+        mistake(chaotic)
+    sentence = str(caught.value)
+    assert "\n" not in sentence and sentence.endswith(".") and len(sentence) < 300
+
+
+def test_a_filter_stays_off_a_users_tape():
+    simulation = simulation_of("2-D")
+    problem = Problem(simulation, 2, losses.FinalPositions(simulation.positions))
+    recorded = []
+    for policy in (policies.Exact(), policies.AdjointSmoothing(0.1)):
+        with wp.Tape() as tape:
+            problem.estimate({"gravity": [0.0, -9.81]}, policy)
+        recorded.append(len(tape.launches))
+    assert recorded[0] == recorded[1]
