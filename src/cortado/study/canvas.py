@@ -1,0 +1,39 @@
+"""Pictures of the study, in the look of all other pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cortado.errors import InputError
+from cortado.figures.canvas import _STYLE
+from cortado.run_folder import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def blank(width: float = 9.0, height: float = 5.2) -> Figure:
+    """An empty figure of so many inches; `cortado.figures.canvas` has the colours."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    figure = Figure(figsize=(width, height), dpi=150, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12))
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(draw: Callable[[], Figure], path: Path) -> None:
+    """Draw in our style, and write the picture in one go."""
+    import matplotlib
+
+    content = BytesIO()
+    with matplotlib.rc_context(_STYLE):
+        draw().savefig(content, format="png")
+    try:
+        write_atomically(path, content.getvalue())
+    except OSError as problem:
+        raise InputError(f"The picture {path} cannot be written: {problem}.") from problem

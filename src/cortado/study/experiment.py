@@ -1,0 +1,90 @@
+"""What an experiment is: a kind, which measures, draws and judges, with the settings from a file."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
+
+from cortado import scene_kinds, scene_tables
+from cortado.progress import Advance
+from cortado.scene import Scene
+from cortado.scene_kinds import Text, as_sequence, wrong
+from cortado.study.tables import Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Settings(scene_tables.Table):
+    """What the file of an experiment holds beside its kind; each kind adds its own. The kinds of values of
+    `cortado.scene_kinds` make sentences of what is wrong."""
+
+    title: Annotated[str, Text()]
+    """Above the picture."""
+
+
+class SceneSettings(Settings):
+    """Settings of an experiment with a scene."""
+
+    scene: Scene
+    """In the file a path relative to it, or a table: its key ``file`` is such a path, everything else is put into that
+    scene, as `cortado.study.scenes.varied` does; without ``file`` the table is a scene."""
+
+
+class DeviceSettings(SceneSettings):
+    """Settings of an experiment that runs on a device; the others use the reference engine."""
+
+    device: Annotated[str, Text()] = "cpu"
+    """"cpu", or "cuda:0" for the first GPU."""
+
+
+@dataclass(frozen=True)
+class Several(scene_kinds.Kind):
+    """At least one value of a kind, in a list: ``Annotated[tuple[float, ...], Several(Quantity("s", above=0.0))]``."""
+
+    kind: scene_kinds.Kind
+
+    @property
+    def wanted(self) -> str:
+        return f"a list of at least one entry, each {self.kind.wanted}"
+
+    def check(self, value: Any) -> tuple[Any, ...]:
+        entries = as_sequence(value)
+        if not entries:
+            raise wrong((), value, self.wanted)
+        return scene_kinds.Components(self.kind).check(entries)
+
+
+class Progress(Protocol):
+    """Shows how far a measurement is: ``with progress(total) as advance: ... advance(n)``, in units of your choice that
+    take about the same time each."""
+
+    def __call__(self, total: int) -> AbstractContextManager[Advance]: ...
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of experiment."""
+
+    name: str
+    """What files call it."""
+    settings: type[Settings]
+    """What its files hold."""
+    measure: Callable[[Any, Progress], Table]
+    """Settings -> measurements."""
+    draw: Callable[[Table, Any], "Figure"]
+    """Measurements, settings -> a picture, begun with `cortado.study.canvas.blank`."""
+    verdict: Callable[[Table, Any], list[str]]
+    """Measurements, settings -> sentences, with numbers and their uncertainty."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A kind with its settings."""
+
+    name: str
+    """The file's, without its ending."""
+    kind: Kind
+    settings: Settings
+    reduced: bool
+    """Whether the file's [reduced] settings are in place."""

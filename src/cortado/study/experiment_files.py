@@ -1,0 +1,56 @@
+"""From a file in ``experiments/`` to an experiment."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cortado.errors import SceneError
+from cortado.scene import Scene, read_toml, scene_from_dict
+from cortado.scene_kinds import MISSING, Choice
+from cortado.scene_tables import sentences
+from cortado.study.experiment import Experiment
+from cortado.study.kinds import KINDS
+from cortado.study.scenes import merged
+
+
+def load_experiment(path: str | os.PathLike[str], reduced: bool = False, overrides: Sequence[str] = ()) -> Experiment:
+    """Read an experiment; raises `SceneError` in one sentence.
+
+    Args:
+        path: the file; paths in it are relative to it.
+        reduced: put the settings of its table [reduced] in place of others.
+        overrides: replacements such as ``steps=100``.
+    """
+    file = os.fspath(path)
+    data = read_toml(path, overrides)
+    replaced = data.pop("reduced", {})
+    if not isinstance(replaced, Mapping):
+        raise SceneError(file, "reduced", replaced, "a table of settings that replace others")
+    if reduced:
+        data |= replaced
+    name = data.pop("kind", MISSING)
+    if name not in KINDS:
+        raise SceneError(file, "kind", name, Choice(tuple(KINDS)).wanted)
+    kind = KINDS[name]
+    if "scene" in kind.settings.model_fields and "scene" in data:
+        data["scene"] = _scene(data["scene"], file)
+    try:
+        with sentences():
+            settings = kind.settings.model_validate(data, context={"folder": Path(file).parent})
+    except SceneError as error:
+        raise error.in_file(file) from None
+    return Experiment(Path(file).stem, kind, settings, reduced)
+
+
+def _scene(value: Any, file: str) -> Scene:
+    table = {"file": value} if isinstance(value, str) else value
+    if not isinstance(table, Mapping):
+        raise SceneError(file, "scene", value, "the path of a scene, or a table of what differs from one")
+    changes = {key: entry for key, entry in table.items() if key != "file"}
+    if "file" not in table:
+        return scene_from_dict(changes, file)
+    if not isinstance(table["file"], str):
+        raise SceneError(file, "scene.file", table["file"], "the path of a scene")
+    base = Path(file).parent / table["file"]
+    return scene_from_dict(merged(read_toml(base), changes), os.fspath(base))

@@ -1,0 +1,23 @@
+"""Scenes that differ from another one in a few values."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from cortado.scene import Scene, scene_from_dict
+
+
+def varied(scene: Scene, **changes: Any) -> Scene:
+    """The scene with values replaced: ``varied(scene, forces={"viscosity": "none"}, phase={"viscosity": 2.0})``.
+
+    A table replaces the keys that it has; beside a list of tables it does so in each of them.
+    """
+    return scene_from_dict(merged(scene.model_dump(), changes))
+
+
+def merged(data: Any, changes: Any) -> Any:
+    """Data with changes put in, table by table."""
+    if isinstance(data, (list, tuple)) and data and isinstance(changes, Mapping):
+        return [merged(entry, changes) for entry in data]
+    if isinstance(data, Mapping) and isinstance(changes, Mapping):
+        return {**data, **{key: merged(data.get(key), value) for key, value in changes.items()}}
+    return changes
