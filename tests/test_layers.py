@@ -39,7 +39,8 @@ LAYERS = """
     run_folder progress pictures video
     figures.canvas figures.curves figures.particle_sets figures.side_by_side figures report
     task_tables task assignment task_figures certificate
-    study.tables study.scenes study.experiment study.canvas study.* study.kinds study.experiment_files study.results
+    study.tables study.scenes study.experiment study.canvas study.comparison study.reference_losses study.sources
+    study.* study.kinds study.experiment_files study.results
     commands.* cli
 """
 """From the foundations to the command line; ``package.*`` stands for modules that do not import one another.

@@ -1,0 +1,63 @@
+"""How near two gradients are, and how quickly a norm grows."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Gradient = Mapping[str, ArrayLike]
+WINDOWS = 4
+"""Parts of a history whose slopes tell how certain the slope of the whole is."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A gradient held against another one, all numbers of all parameters as one vector."""
+
+    relative_l2: float
+    """|found - truth| / |truth|"""
+    cosine: float
+    """Of the angle between them."""
+    norm_ratio: float
+    """|found| / |truth|"""
+
+
+def compare(found: Gradient, truth: Gradient) -> Comparison:
+    """Hold a gradient against another one of the same parameters."""
+    a, b = (np.concatenate([np.ravel(g[name]) for name in truth]).astype(np.float64) for g in (found, truth))
+    size = np.linalg.norm(b)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return Comparison(
+            relative_l2=float(np.linalg.norm(a - b) / size),
+            cosine=float(a @ b / size / np.linalg.norm(a)),
+            norm_ratio=float(np.linalg.norm(a) / size),
+        )
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Of a norm that is multiplied by exp(rate) a step."""
+
+    rate: float
+    """e-folds a step: the slope of a line through the norm's logarithm."""
+    error: float
+    """Standard error of it, from the slopes of `WINDOWS` parts."""
+
+    def __str__(self) -> str:
+        return f"{self.rate:.4f} ± {self.error:.4f} per step"
+
+
+def growth(steps: ArrayLike, norms: ArrayLike) -> Growth:
+    """The growth of norms (k,) over steps (k,); what is zero or not finite is left out."""
+    x, sizes = np.asarray(steps, dtype=float), np.asarray(norms, dtype=float)
+    shown = np.isfinite(sizes) & (sizes > 0.0)
+    x, y = x[shown], np.log(sizes[shown])
+    if len(x) < 2 * WINDOWS:
+        return Growth(np.nan, np.nan)
+    slopes = [_slope(*part) for part in zip(np.array_split(x, WINDOWS), np.array_split(y, WINDOWS), strict=True)]
+    return Growth(_slope(x, y), float(np.std(slopes, ddof=1) / np.sqrt(WINDOWS)))
+
+
+def _slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
+    return float(np.polyfit(x, y, 1)[0])

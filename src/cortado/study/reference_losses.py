@@ -1,0 +1,41 @@
+"""Losses of a problem for the reference engine."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado import losses, reference
+from cortado.errors import InputError
+from cortado.losses import EndAdjoint, TrajectoryEnd, as_loss
+from cortado.particles import State
+from cortado.problem import Problem
+from cortado.reference.digits import Digits
+
+
+def reference_loss(problem: Problem) -> reference.Loss:
+    """The loss of a problem's last state: final positions with all digits, any other in the problem's precision."""
+    if isinstance(problem.loss, losses.Frames):
+        raise InputError("loss has frames, but must be one of the last state for the reference engine.")
+    if isinstance(problem.loss, losses.FinalPositions):
+        return reference.FinalPositions(problem.loss.target)
+    return _OnDevice(problem)
+
+
+class _OnDevice:
+    def __init__(self, problem: Problem):
+        self._simulation, self._loss = problem.simulation, as_loss(problem.loss)
+
+    def value(self, positions: Digits, velocities: Digits) -> float:
+        return float(self._loss.value(self._end(positions, velocities)))
+
+    def adjoint(self, positions: Digits, velocities: Digits) -> tuple[NDArray[Any], NDArray[Any]]:
+        bar = self._loss.adjoint(self._end(positions, velocities))
+        state = bar.state if isinstance(bar, EndAdjoint) else bar
+        found = state.numpy(self._simulation.dimension) if isinstance(state, State) else state
+        return np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.float64)
+
+    def _end(self, positions: Digits, velocities: Digits) -> TrajectoryEnd:
+        given, state = self._simulation.parameters(), self._simulation.solver.new_state()
+        state.set(positions.high, velocities.high, given["mass_fractions"])
+        return TrajectoryEnd(state, self._simulation.dimension, given["colours"])
