@@ -28,6 +28,7 @@ LAYERS = """
     shapes scene_kinds scene_tables scene_toml scene_points
     scene_fluids scene_emitter scene_mixture scene_render scene_containers scene_stability scene_checks scene sampling
     discrete_scene
+    reference.digits reference.engine reference.losses reference.histories reference.simulation reference
     vtkhdf trajectory
     solvers.forces solvers.mixture solvers.emitter solvers.pcisph_parts solvers.pcisph solvers.pcisph_derivatives
     solvers.adjoint_filters
@@ -215,7 +216,7 @@ def test_import_is_light():
     assert not found, f"import cortado alone imports {', '.join(found)}"
 
 
-WITHOUT_WARP = ["errors", "masses", "smoothing", "calibration", "scene", "sampling", "discrete_scene"]
+WITHOUT_WARP = ["errors", "masses", "smoothing", "calibration", "scene", "sampling", "discrete_scene", "reference"]
 """What an engine without Warp stands on."""
 
 

@@ -1,0 +1,93 @@
+// A scene's constants in the precision of a run, and the sums over neighbours that a step and its derivatives share.
+#pragma once
+
+#include <memory>
+
+#include "pairs.hpp"
+
+namespace cortado {
+
+enum class Viscosity { none, pairwise, laminar };
+
+template <class Scalar, int D>
+struct Model {
+    using Real = typename RealOf<Scalar>::type;
+
+    Smoothing<Scalar> smoothing;
+    Period<Scalar, D> period;
+    std::array<double, 3> periods;
+    double reach;
+    Scalar volume, self_weight, stiffness, rigidity, wall_push, evenness, size_floor;
+    Scalar rest_density, time_step, friction, kappa;
+    Viscosity viscosity;
+    bool pressure;
+    int minimum_iterations, maximum_iterations;
+    Real density_tolerance, maximum_density_tolerance;
+    Vectors<Real, D> wall_positions;
+    Values<Scalar> wall_weights;
+    Cells<D> wall_cells;
+    int threads;
+
+    Model(const Scene& s, int threads)
+        : smoothing(s.kernel, s.support, s.normalisation),
+          period(s.periods),
+          periods(s.periods),
+          reach(s.reach),
+          volume(Real(s.volume)),
+          self_weight(smoothing.weight(Scalar(0))),
+          stiffness(Real(s.stiffness)),
+          rigidity(Real(s.rigidity)),
+          wall_push(Real(s.wall_push)),
+          evenness(Real(s.evenness)),
+          size_floor(Real(1) / Real(100) * smoothing.h_squared),
+          rest_density(Real(s.rest_density)),
+          time_step(Real(s.time_step)),
+          friction(Real(s.friction)),
+          kappa(Real(s.viscosity == "pairwise" ? 2 * (D + 2) : 2)),
+          viscosity(s.viscosity == "pairwise"  ? Viscosity::pairwise
+                    : s.viscosity == "laminar" ? Viscosity::laminar
+                                               : Viscosity::none),
+          pressure(s.pressure),
+          minimum_iterations(s.minimum_iterations),
+          maximum_iterations(s.maximum_iterations),
+          density_tolerance(Real(s.density_tolerance)),
+          maximum_density_tolerance(Real(s.maximum_density_tolerance)),
+          wall_positions(joined_vectors<Real, D>(high_only(s.wall_positions))),
+          wall_weights(s.wall_weights.begin(), s.wall_weights.end()),
+          wall_cells(cells_of<Real, D>(wall_positions, s.reach, s.periods)),
+          threads(threads) {}
+
+    // phi of the viscosity, of a pair at rest and its gradient: see docs/discretisation.md.
+    Vector<Scalar, D> phi(const Pair<Scalar, D>& pair, const Vector<Scalar, D>& v) const {
+        const Scalar r_squared = pair.x.dot(pair.x), size = r_squared + size_floor;
+        if (viscosity == Viscosity::pairwise) return (v.dot(pair.x) / size * pair.a) * pair.x;
+        return (evenness * pair.a * r_squared / size) * v;
+    }
+
+    // sum_j W(x_j) + sum_b w_b W(x_b) over lists, at other positions than those that the lists are of.
+    Scalar weights(std::size_t i, const Pairs<Scalar, D>& fluid, const Pairs<Scalar, D>& walls,
+                   const Vectors<Scalar, D>& x) const {
+        Scalar total(0);
+        for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
+            const Vector<Scalar, D> x_ij = period.nearest(x[i] - x[pair->other]);
+            const Scalar r_squared = x_ij.dot(x_ij);
+            if (smoothing.near(r_squared)) total += smoothing.weight(smoothing.q_of(r_squared));
+        }
+        for (auto pair = walls.begin_of(i); pair != walls.end_of(i); ++pair) {
+            const Vector<Scalar, D> x_ib = period.nearest(x[i] - wall_positions[pair->other].template cast<Scalar>());
+            const Scalar r_squared = x_ib.dot(x_ib);
+            if (smoothing.near(r_squared))
+                total += wall_weights[pair->other] * smoothing.weight(smoothing.q_of(r_squared));
+        }
+        return total;
+    }
+
+private:
+    static Numbers high_only(const std::vector<double>& values) {
+        Numbers numbers(values.size());
+        numbers.high = values;
+        return numbers;
+    }
+};
+
+}  // namespace cortado
