@@ -41,6 +41,7 @@ LAYERS = """
     figures.canvas figures.curves figures.particle_sets figures.side_by_side figures report
     task_tables task assignment task_figures certificate
     study.tables study.scenes study.experiment study.canvas study.comparison study.reference_losses study.sources
+    study.gravity_tangents study.term_sizes
     study.* study.kinds study.experiment_files study.results
     commands.* cli
 """

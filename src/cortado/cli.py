@@ -19,7 +19,7 @@ from cortado.errors import ComputationError, CortadoError, CortadoWarning, Input
 
 app = SubcommandApp()
 gradients = SubcommandApp()
-app.command(gradients, name="gradients", help="Check the gradients of a scene.")
+app.command(gradients, name="gradients", help="Check the gradients of a scene; the gradient study.")
 
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Overrides = Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")]
@@ -110,6 +110,50 @@ def check(
     from cortado.commands.check import check_scene
 
     print(check_scene(scene, steps, list(overrides), device, json, seed))
+
+
+@gradients.command
+def figure(
+    experiment: Annotated[Positional[Path], arg(metavar="EXPERIMENT.toml")],
+    out: Path | None = None,
+    overrides: Overrides = (),
+    reduced: bool = False,
+    redraw: bool = False,
+) -> None:
+    """Measure and draw one experiment of the gradient study.
+
+    Args:
+        experiment: The experiment's file, such as experiments/figure_7.toml.
+        out: Folder for its numbers, its picture and its verdict; runs/NAME if left out.
+        overrides: Replace a setting, such as steps=100; may be given again.
+        reduced: The quick form, with the settings that the file has in [reduced].
+        redraw: Draw and judge the numbers that are there again.
+    """
+    _start_warp()
+    from cortado.commands.figure import measure_figure
+
+    print(measure_figure(experiment, out, list(overrides), reduced, redraw))
+
+
+@gradients.command
+def study(
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")] = Path("experiments"),
+    out: Path = Path("runs/study"),
+    only: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (),
+    reduced: bool = False,
+) -> None:
+    """Measure and draw all experiments; those that are there already, with the same settings, are not repeated.
+
+    Args:
+        folder: Where the experiments are.
+        out: Folder of the results, with a folder for each experiment.
+        only: The name of an experiment, such as figure_4; may be given again.
+        reduced: The quick form of each.
+    """
+    _start_warp()
+    from cortado.commands.study import run_study
+
+    print(run_study(folder, out, reduced, list(only)))
 
 
 @app.command

@@ -22,6 +22,10 @@ class Settings(scene_tables.Table):
     title: Annotated[str, Text()]
     """Above the picture."""
 
+    def identity(self) -> dict[str, Any]:
+        """What decides the measurement, for JSON: with the same, it need not be repeated."""
+        return self.model_dump(mode="json")
+
 
 class SceneSettings(Settings):
     """Settings of an experiment with a scene."""
@@ -31,7 +35,7 @@ class SceneSettings(Settings):
     scene, as `cortado.study.scenes.varied` does; without ``file`` the table is a scene."""
 
 
-class DeviceSettings(SceneSettings):
+class DeviceSettings(Settings):
     """Settings of an experiment that runs on a device; the others use the reference engine."""
 
     device: Annotated[str, Text()] = "cpu"

@@ -70,4 +70,4 @@ class Results:
 
 
 def _identity(experiment: Experiment) -> dict[str, Any]:
-    return {"kind": experiment.kind.name, "settings": experiment.settings.model_dump(mode="json")}
+    return {"kind": experiment.kind.name, "settings": experiment.settings.identity()}

@@ -1,0 +1,102 @@
+"""The report's Figure 4: the norm of the gradient against gravity, by finite differences and analytic, in every
+precision."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+
+from cortado.figures.canvas import DASHED, FAINT, PALETTE
+from cortado.scene_kinds import Choice, Count, Quantity
+from cortado.study.canvas import blank
+from cortado.study.experiment import Kind, Progress, SceneSettings, Several
+from cortado.study.gravity_tangents import COST, LABEL, along_gravity
+from cortado.study.sources import ReferenceTangent
+from cortado.study.tables import Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DIFFERENCES, ANALYTIC = "finite differences", "analytic"
+
+
+class GravityAndPrecision(SceneSettings):
+    """Settings."""
+
+    steps: Annotated[int, Count(1, 1_000_000)]
+    """After which the gradient is looked at."""
+    gravities: Annotated[tuple[float, ...], Several(Quantity("m/s2", above=0.0))]
+    """Sizes, along the scene's direction [m / s2]."""
+    precisions: Annotated[tuple[str, ...], Several(Choice(tuple(COST)))]
+    """The last one is what the others are held against."""
+    difference: Annotated[float, Quantity("m/s2", above=0.0)]
+    """Step of the finite differences [m / s2]."""
+
+
+def measure(settings: GravityAndPrecision, progress: Progress) -> Table:
+    rows = []
+    with progress(2 * len(settings.gravities) * sum(COST[precision] for precision in settings.precisions)) as advance:
+        for precision in settings.precisions:
+            sources = {
+                DIFFERENCES: ReferenceTangent(precision, "finite_difference", difference=settings.difference),
+                ANALYTIC: ReferenceTangent(precision),
+            }
+            for gravity in settings.gravities:
+                for method, source in sources.items():
+                    history, distance = along_gravity(settings.scene, settings.steps, source, gravity)
+                    assert history.position_norms is not None
+                    norm = history.position_norms[-1]
+                    keys = {"method": method, "precision": precision, "gravity": gravity}
+                    rows.append({**keys, "norm": norm, "distance": distance})
+                    advance(COST[precision])
+    return Table.joined(rows)
+
+
+def draw(table: Table, settings: GravityAndPrecision) -> "Figure":
+    figure = blank(12.0, 5.2)
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, method in zip(panels, (DIFFERENCES, ANALYTIC), strict=True):
+        for k, precision in enumerate(settings.precisions):
+            rows = table.where(method=method, precision=precision)
+            style = {"marker": "osD^"[k], "markersize": 9 - 2 * k, "color": PALETTE[k], "label": precision}
+            axes.plot(rows["gravity"], rows["norm"], **style)
+        axes.set(yscale="log", xlabel="gravity [m/s²]")
+    panels[0].set(title=f"Finite differences, step {settings.difference:g} m/s²", ylabel=LABEL)
+    panels[1].set_title("Analytic")
+    rows = table.where(method=DIFFERENCES, precision=settings.precisions[-1])
+    level = rows["distance"] / (2.0 * settings.difference)
+    panels[0].plot(rows["gravity"], level, **DASHED, color=FAINT, label="two unrelated states / (2 step)")
+    panels[0].legend(loc="upper left")
+    figure.suptitle(f"{settings.title} (after {settings.steps} steps)", weight="bold")
+    return figure
+
+
+def verdict(table: Table, settings: GravityAndPrecision) -> list[str]:
+    *others, truth = settings.precisions
+    differences, exact = (table.where(method=m, precision=truth) for m in (DIFFERENCES, ANALYTIC))
+    gravity = exact["gravity"]
+    spread = max((_factor(table, DIFFERENCES, p, truth).max() for p in others), default=1.0)
+    share = differences["norm"][-3:] * 2.0 * settings.difference / differences["distance"][-3:]
+    sentences = [
+        f"Finite differences of step {settings.difference:g} m/s² lie between {differences['norm'].min():.3g} and "
+        f"{differences['norm'].max():.3g} s², whatever the gravity, and precisions agree within a factor {spread:.2f}.",
+        f"They are that flat because they are saturated: at the three strongest gravities the two runs are "
+        f"{share.mean():.2f} ± {share.std():.2f} of the distance between two unrelated states apart.",
+        f"The analytic gradient grows from {exact['norm'].min():.3g} to {exact['norm'].max():.3g} s² between "
+        f"{gravity[0]:g} and {gravity[-1]:g} m/s², {np.log(exact['norm'][-1] / exact['norm'][0]):.1f} e-folds.",
+    ]
+    for precision in others:
+        factor = _factor(table, ANALYTIC, precision, truth)
+        sentences.append(
+            f"Analytic in {precision}, against {truth}: at most a factor {factor[0]:.3g} off at {gravity[0]:g} m/s², "
+            f"{factor.max():.3g} at {gravity[factor.argmax()]:g} m/s²."
+        )
+    return sentences
+
+
+def _factor(table: Table, method: str, precision: str, truth: str) -> np.ndarray:
+    """By which the norms in two precisions differ, at least 1, by gravity."""
+    found, expected = (table.where(method=method, precision=p)["norm"] for p in (precision, truth))
+    return np.exp(np.abs(np.log(found / expected)))
+
+
+GRAVITY_AND_PRECISION = Kind("gravity_and_precision", GravityAndPrecision, measure, draw, verdict)

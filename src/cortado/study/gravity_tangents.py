@@ -1,0 +1,39 @@
+"""Runs of the reference engine with their derivative by the size of gravity: what the report's Figures 4 to 7 show."""
+
+from typing import Any
+
+import numpy as np
+
+from cortado.errors import InputError
+from cortado.reference import History
+from cortado.scene import Scene
+from cortado.study.sources import ReferenceTangent
+
+COST = {"float32": 1, "float64": 1, "float80": 3, "float128": 60}
+"""Time of a step, about, in that of float64."""
+LABEL = "|dx/dg|  [s²]"
+
+
+def along_gravity(
+    scene: Scene, steps: int, source: ReferenceTangent, gravity: float | None = None
+) -> tuple[History, float]:
+    """The tangents along the direction of gravity, whose size ``gravity`` [m / s2] may replace; and the distance of the
+    last state from one in which the same places are taken by other particles [m], as those of two unrelated runs are.
+    """
+    direction = np.array(scene.forces.gravity)
+    size = float(np.linalg.norm(direction))
+    if size == 0.0:
+        raise InputError("forces.gravity of the scene is zero, but must have a direction.")
+    direction /= size
+    at = {"gravity": (size if gravity is None else gravity) * direction}
+    history = source.run(scene, steps, at, {"gravity": direction})
+    last = np.asarray(history.positions[-1])
+    shuffled = np.random.default_rng(0).permutation(last)
+    return history, float(np.linalg.norm(last - shuffled))
+
+
+def row(history: History, distance: float, **keys: Any) -> dict[str, Any]:
+    """Norms of all states, for a table."""
+    assert history.position_norms is not None
+    steps = np.arange(len(history.position_norms))
+    return {**keys, "step": steps, "norm": history.position_norms, "distance": distance}

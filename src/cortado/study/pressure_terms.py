@@ -1,0 +1,98 @@
+"""The report's Figure 7: the two terms of the pressure force's derivative, each alone.
+
+Twice: a tangent that is propagated with one term only, and what each term does in one step to the exact tangent.
+"""
+
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+
+from cortado.figures.canvas import PALETTE
+from cortado.reference import Terms
+from cortado.scene_kinds import Choice, Count
+from cortado.study.canvas import blank
+from cortado.study.comparison import growth
+from cortado.study.experiment import Kind, Progress, SceneSettings, Several
+from cortado.study.gravity_tangents import COST, LABEL, along_gravity, row
+from cortado.study.sources import ReferenceTangent
+from cortado.study.tables import Table
+from cortado.study.term_sizes import term_sizes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FULL, HESSIAN, DENSITY = "both terms", "Hessian term alone", "density term alone"
+TERMS = {FULL: Terms(), HESSIAN: Terms(density=False), DENSITY: Terms(hessian=False)}
+PROPAGATED, ONE_STEP = "propagated", "in one step"
+
+
+class PressureTerms(SceneSettings):
+    """Settings."""
+
+    steps: Annotated[int, Count(8, 1_000_000)]
+    """Of the run."""
+    precisions: Annotated[tuple[str, ...], Several(Choice(tuple(COST)))]
+    """Of the reference engine."""
+    impact: Annotated[int, Count(0, 1_000_000)]
+    """The step from which on growth is measured: when the fluid has hit the floor."""
+
+
+def measure(settings: PressureTerms, progress: Progress) -> Table:
+    scene, steps, rows = settings.scene, settings.steps, []
+    last = settings.precisions[-1]
+    with progress(len(TERMS) * (sum(COST[precision] for precision in settings.precisions) + COST[last])) as advance:
+        for precision in settings.precisions:
+            for name, terms in TERMS.items():
+                history, distance = along_gravity(scene, steps, ReferenceTangent(precision, terms=terms))
+                rows.append(row(history, distance, quantity=PROPAGATED, precision=precision, terms=name))
+                advance(COST[precision])
+        for name, norms in term_sizes(scene, steps, last, TERMS).items():
+            keys = {"quantity": ONE_STEP, "precision": last, "terms": name}
+            rows.append({**keys, "step": np.arange(steps), "norm": norms, "distance": np.nan})
+            advance(COST[last])
+    return Table.joined(rows)
+
+
+def draw(table: Table, settings: PressureTerms) -> "Figure":
+    figure = blank(12.5, 5.4)
+    left, right = figure.subplots(1, 2)
+    for axes, quantity in ((left, PROPAGATED), (right, ONE_STEP)):
+        for dashes, precision in zip(("-", (0, (4, 3)), ":", "-."), settings.precisions, strict=False):
+            for k, name in enumerate(TERMS):
+                rows = table.where(quantity=quantity, precision=precision, terms=name)
+                rows = rows.chosen(rows["norm"] > 0.0)
+                style = {"linestyle": dashes, "color": PALETTE[k], "label": f"{name}, {precision}"}
+                axes.plot(rows["step"], rows["norm"], **style)
+        axes.set(yscale="log", xlabel="step")
+    left.set(title="The tangent, propagated with these terms", ylabel=LABEL)
+    right.set(title=f"What they do to the exact tangent in one step, {settings.precisions[-1]}", ylabel="|da/dg|  [-]")
+    left.legend(loc="upper left")
+    figure.suptitle(settings.title, weight="bold")
+    return figure
+
+
+def verdict(table: Table, settings: PressureTerms) -> list[str]:
+    sentences = []
+    for precision in settings.precisions:
+        at = {}
+        for name in TERMS:
+            rows = table.where(quantity=PROPAGATED, precision=precision, terms=name)
+            late = rows.chosen(rows["step"] >= settings.impact)
+            at[name] = f"{rows['norm'][-1]:.3g} s² ({growth(late['step'], late['norm'])})"
+        sentences.append(
+            f"In {precision} a tangent of {settings.steps} steps ends at {at[FULL]} with both terms, {at[HESSIAN]} "
+            f"with the Hessian term alone, {at[DENSITY]} with the density term alone."
+        )
+    sizes = {
+        name: rows["norm"][rows["step"] >= settings.impact]
+        for (name,), rows in table.where(quantity=ONE_STEP).groups("terms")
+    }
+    low, median, high = np.quantile(sizes[DENSITY] / sizes[HESSIAN], (0.25, 0.5, 0.75))
+    sentences.append(
+        f"In one step from the exact tangent, from step {settings.impact} on, the density term is {median:.2g} times "
+        f"as large as the Hessian term (quartiles {low:.2g} to {high:.2g})."
+    )
+    return sentences
+
+
+PRESSURE_TERMS = Kind("pressure_terms", PressureTerms, measure, draw, verdict)

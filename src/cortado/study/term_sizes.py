@@ -1,0 +1,33 @@
+"""What the terms of the pressure force's derivative do to the exact tangent in one step."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.reference import Simulation, Terms
+from cortado.scene import Scene
+
+
+def term_sizes(scene: Scene, steps: int, precision: str, cases: Mapping[str, Terms]) -> dict[str, NDArray[np.float64]]:
+    """For each choice of terms (steps,) norms over all particles of the derivative of the acceleration by pressure
+    along the exact tangent to the size of gravity."""
+    engine = Simulation(scene, precision)
+    gravity = np.array(scene.forces.gravity)
+    at, along = {"gravity": gravity}, {"gravity": gravity / np.linalg.norm(gravity)}
+    exact = engine.tangent(at, along, steps)
+    assert exact.position_tangents is not None and exact.velocity_tangents is not None
+    found = {name: np.zeros(steps) for name in cases}
+    for k in range(steps):
+        states = {"initial_positions": exact.positions[k], "initial_velocities": exact.velocities[k]}
+        dots = {"initial_positions": exact.position_tangents[k], "initial_velocities": exact.velocity_tangents[k]}
+
+        def velocity(terms: Terms, states: dict = states, dots: dict = dots) -> NDArray[np.float64]:
+            history = engine.tangent({**at, **states}, {**along, **dots}, 1, terms=terms)
+            assert history.velocity_tangents is not None
+            return np.asarray(history.velocity_tangents[-1])
+
+        without = velocity(Terms(pressure=False))
+        for name, terms in cases.items():
+            found[name][k] = np.linalg.norm(velocity(terms) - without) / scene.solver.time_step
+    return found
