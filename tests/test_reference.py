@@ -1,5 +1,6 @@
 """The reference engine: the Warp engine's numbers from independent code, and derivatives that agree."""
 
+import json
 import shutil
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import pytest
 
 import reference as twins
 from cortado import DivergedError, InputError, Problem, Simulation, losses, reference
+from cortado.commands.bench import bench_reference
 from cortado.reference import Digits, Terms
 from scenes import plane, scene, splash, two_layers
 
@@ -364,3 +366,9 @@ def test_without_the_extension_module_there_is_one_sentence():
     )
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert "install a C++17 compiler" in found and found.count("\n") == 1
+
+
+def test_bench_times_it():
+    rows = json.loads(bench_reference(100, 2, "float32", as_json=True))
+    assert rows["particles"] == 125 and rows["threads"] >= 1
+    assert rows["speed_up"] == rows["forward_ms_per_step_one_thread"] / rows["forward_ms_per_step"] > 0.0

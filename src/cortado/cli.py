@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
@@ -158,22 +158,31 @@ def study(
 
 @app.command
 def bench(
-    particles: int = 8000, steps: int = 20, device: str = "cpu", precision: str = "float32", json: bool = False
+    particles: int = 8000,
+    steps: int = 20,
+    device: str = "cpu",
+    precision: str = "float32",
+    engine: Literal["warp", "reference"] = "warp",
+    json: bool = False,
 ) -> None:
-    """Time a dam break, forward and with its gradient.
+    """Time a dam break, forward and with its derivatives.
 
     Args:
         particles: Number of fluid particles, about.
         steps: Number of time steps.
         device: "cpu", or "cuda:0" for the first GPU.
-        precision: "float32" or "float64".
+        precision: "float32" or "float64"; of the reference engine also "float80" and "float128".
+        engine: The one in Warp, or the reference engine in C++.
         json: Print JSON for machines instead of a table.
     """
     _require_at_least(1, particles, "--particles")
     _start_warp()
-    from cortado.commands.bench import bench_dam_break
+    from cortado.commands.bench import bench_dam_break, bench_reference
 
-    print(bench_dam_break(particles, steps, device, precision, json))
+    if engine == "reference":
+        print(bench_reference(particles, steps, precision, json))
+    else:
+        print(bench_dam_break(particles, steps, device, precision, json))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

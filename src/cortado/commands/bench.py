@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado import reference
 from cortado.losses import FinalPositions
 from cortado.problem import Problem
 from cortado.scene import BoxContainer, BoxFluid, Discretisation, Forces, Phase, Scene, Solver
@@ -54,14 +55,42 @@ def bench_dam_break(particles: int, steps: int, device: str, precision: str, as_
     }
     if not simulation.device.is_cpu:
         rows["bytes_per_particle"] = wp.get_mempool_used_mem_high(simulation.device) / simulation.particles
+    return _text(rows, as_json)
+
+
+def bench_reference(particles: int, steps: int, precision: str, as_json: bool) -> str:
+    """Times of the reference engine, on one core and on all, as text."""
+    scene, steps = dam_break(particles), check_steps(steps)
+    alone, together = reference.Simulation(scene, precision, threads=1), reference.Simulation(scene, precision)
+    loss = reference.FinalPositions(alone.positions)
+    down = {"gravity": scene.forces.gravity}
+    forward = _best(lambda: alone.run(steps, record_every=steps))
+    parallel = _best(lambda: together.run(steps, record_every=steps))
+    rows: dict[str, Any] = {
+        "engine": "reference",
+        "precision": precision,
+        "threads": together.threads,
+        "particles": len(alone.positions),
+        "steps": steps,
+        "iterations_per_step": 5,
+        "forward_ms_per_step_one_thread": 1e3 * forward / steps,
+        "forward_ms_per_step": 1e3 * parallel / steps,
+        "speed_up": forward / parallel,
+        "tangent_ms_per_step": 1e3 * _best(lambda: together.tangent(down, down, steps, record_every=steps)) / steps,
+        "gradient_ms_per_step": 1e3 * _best(lambda: together.gradient(down, steps, loss, record_every=steps)) / steps,
+    }
+    return _text(rows, as_json)
+
+
+def _text(rows: dict[str, Any], as_json: bool) -> str:
     if as_json:
         return json.dumps(rows, indent=2)
     return "\n".join(
-        f"{name:24} {value:.4g}" if isinstance(value, float) else f"{name:24} {value}" for name, value in rows.items()
+        f"{name:30} {value:.4g}" if isinstance(value, float) else f"{name:30} {value}" for name, value in rows.items()
     )
 
 
-def _best(work: Callable[[], object], device: Any) -> float:
+def _best(work: Callable[[], object], device: Any = "cpu") -> float:
     """Seconds of the fastest of a few runs, after one that compiles and fills the caches."""
     work()
     times = []

@@ -73,8 +73,8 @@ class Simulation:
         if threads is None:
             least = LEAST_PARALLEL.get(precision, 1000)
             threads = min(len(os.sched_getaffinity(0)), 1 + len(self.positions) // least)
-        threads = _positive("threads", threads)
-        self._engine = extension().make_engine(precision, _engine_scene(scene, discrete), threads)
+        self.threads = _positive("threads", threads)
+        self._engine = extension().make_engine(precision, _engine_scene(scene, discrete), self.threads)
 
     def run(
         self,
