@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -39,8 +40,9 @@ def bench_dam_break(particles: int, steps: int, device: str, precision: str, as_
     simulation = Simulation(dam_break(particles), device, precision)
     problem = Problem(simulation, check_steps(steps), FinalPositions(simulation.positions))
     start = {"gravity": np.array(simulation.scene.forces.gravity)}
-    forward = _best(lambda: problem.value(start), simulation.device)
-    gradient = _best(lambda: problem.value_and_gradient(start), simulation.device)
+    wait = partial(wp.synchronize_device, simulation.device)
+    forward = _best(lambda: problem.value(start), wait)
+    gradient = _best(lambda: problem.value_and_gradient(start), wait)
     rows: dict[str, Any] = {
         "device": simulation.device.name,
         "precision": precision,
@@ -90,14 +92,14 @@ def _text(rows: dict[str, Any], as_json: bool) -> str:
     )
 
 
-def _best(work: Callable[[], object], device: Any = "cpu") -> float:
-    """Seconds of the fastest of a few runs, after one that compiles and fills the caches."""
+def _best(work: Callable[[], object], wait: Callable[[], object] = lambda: None) -> float:
+    """Seconds of the fastest of a few runs, after one that compiles and fills the caches; ``wait`` for the device."""
     work()
     times = []
     for _ in range(REPEATS):
-        wp.synchronize_device(device)
+        wait()
         start = time.perf_counter()
         work()
-        wp.synchronize_device(device)
+        wait()
         times.append(time.perf_counter() - start)
     return min(times)
