@@ -486,30 +486,44 @@ def test_a_right_gradient_passes_the_check(cortado_command):
     code, out, err = cortado_command("gradients", "check", "scene.toml", "--steps", 3)
     assert (code, err) == (0, "") and "64 particles, 3 steps" in out
     rows = [line for line in out.splitlines() if line.rstrip(" │").endswith("right")]
-    assert len(rows) == 7 and "WRONG" not in out
+    assert len(rows) == 6 and "WRONG" not in out
+    assert "The adjoint is right: reverse and forward mode agree to 1" in out
+    assert out.endswith("For 3 steps use policies.Exact().\n")
 
 
 def test_the_check_speaks_json(cortado_command):
     code, out, _ = cortado_command("gradients", "check", "scene.toml", "--steps", 3, "--json")
     certificate = json.loads(out)
-    assert code == 0 and certificate["right"] is True
-    assert {row["parameter"] for row in certificate["comparisons"]} >= {"gravity", "initial_positions", "viscosity"}
+    assert code == 0 and certificate["right"] is True and certificate["wrong"] == []
+    assert certificate["shares"].keys() >= {"gravity", "initial_positions", "viscosity"}
+    assert certificate["horizon"] == 3 and certificate["policy"] == "Exact()"
+
+
+@pytest.mark.parametrize("loss", ["centre-of-mass", "image"])
+def test_the_check_writes_a_figure(cortado_command, folder, loss):
+    code, out, err = cortado_command(
+        *("gradients", "check", "scene.toml", "--steps", 2, "--loss", loss, "--out", "a/b"),
+        *("--parameters", "gravity", "initial_velocities"),
+    )
+    assert (code, err) == (0, "") and out.splitlines()[-1] == f"The results are in {folder / 'a' / 'b'}"
+    assert {path.name for path in Path("a/b").iterdir()} == {"certificate.png", "certificate.json"}
+    assert json.loads(Path("a/b/certificate.json").read_text())["right"] is True
 
 
 @pytest.mark.parametrize("json_option", [[], ["--json"]])
 def test_a_planted_error_fails_the_check(cortado_command, monkeypatch, json_option):
-    right = Problem.value_and_gradient
+    right = Problem.estimate
 
-    def wrong(self, parameters, policy=None):
-        loss, gradient = right(self, parameters, policy)
-        if "initial_velocities" in gradient:
-            gradient["initial_velocities"][0, 1] *= -1.0
-        return loss, gradient
+    def wrong(self, *arguments, **options):
+        found = right(self, *arguments, **options)
+        if "initial_velocities" in found.gradient:
+            found.gradient["initial_velocities"][0, 1] *= -1.0
+        return found
 
-    monkeypatch.setattr(Problem, "value_and_gradient", wrong)
+    monkeypatch.setattr(Problem, "estimate", wrong)
     code, out, err = cortado_command("gradients", "check", "scene.toml", "--steps", 3, *json_option)
     assert (code, err) == (1, "The adjoint is wrong for: initial_velocities.\n")
-    assert json.loads(out)["right"] is False if json_option else out.count("WRONG") == 1
+    assert json.loads(out)["right"] is False if json_option else out.count("WRONG") == 2
 
 
 def test_bench_speaks_json_and_words(cortado_command):
@@ -527,6 +541,10 @@ def test_bench_speaks_json_and_words(cortado_command):
     [
         (["gradients", "check", "scene.toml", "--steps", "0"], "steps is 0"),
         (["gradients", "check", "scene.toml", "--seed", "-1"], "--seed is -1"),
+        (["gradients", "check", "scene.toml", "--loss", "sum"], "--loss is 'sum', but must be one of positions, "),
+        (["gradients", "check", "scene.toml", "--parameters", "g"], "parameter 'g' is unknown, but must be one of"),
+        (["gradients", "check", "scene.toml", "--change", "-1"], "change is -1.0, but must be greater than 0"),
+        (["gradients", "check", "scene.toml", "--out", "scene.toml"], "The folder scene.toml cannot be made"),
         (["gradients", "check", "absent.toml"], "cannot be read"),
         (["bench", "--particles", "-5"], "--particles is -5"),
         (["bench", "--particles", "8", "--steps", "0"], "steps is 0"),

@@ -39,7 +39,9 @@ LAYERS = """
     evaluations optimisers optimisation
     run_folder progress pictures video
     figures.canvas figures.curves figures.particle_sets figures.side_by_side figures report
-    task_tables task assignment task_figures certificate
+    task_tables task assignment task_figures
+    certificate.course certificate.changes certificate.rightness certificate.horizon certificate.agreement
+    certificate.certificate certificate figures.gradient_check
     study.tables study.scenes study.experiment study.canvas study.comparison study.reference_losses study.sources
     study.gravity_tangents study.term_sizes
     study.* study.kinds study.experiment_files study.results

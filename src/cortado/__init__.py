@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from cortado import pictures as pictures
     from cortado import policies as policies
     from cortado import render as render
+    from cortado.certificate import certify as certify
     from cortado.errors import ComputationError as ComputationError
     from cortado.errors import CortadoError as CortadoError
     from cortado.errors import DivergedError as DivergedError
@@ -38,6 +39,7 @@ _HOMES = {
     "SceneError": "errors",
     "Simulation": "simulation",
     "Trajectory": "trajectory",
+    "certify": "certificate",
     "load_scene": "scene",
     "optimise": "optimisation",
 }

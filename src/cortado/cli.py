@@ -90,16 +90,24 @@ def optimise(
 def check(
     scene: Scene,
     steps: int = 50,
+    parameters: tuple[str, ...] = ("gravity",),
+    loss: str = "positions",
+    change: float = 0.05,
+    out: Path | None = None,
     overrides: Overrides = (),
     device: str = "cpu",
     json: bool = False,
     seed: int = 0,
 ) -> None:
-    """Check the gradient of the final positions: reverse mode, forward mode and finite differences, in float64.
+    """Check the gradients of a scene, in float64: are they right, how long do they mean something, what to use beyond.
 
     Args:
         scene: The scene file.
         steps: Number of time steps.
+        parameters: What is to be changed; the adjoint is checked for everything.
+        loss: How far the fluid has come, by "positions" of particles, "centre-of-mass" or "image".
+        change: A meaningful change of a parameter, relative to its size.
+        out: Folder for a figure and the numbers.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
         device: "cpu", or "cuda:0" for the first GPU.
         json: Print JSON for machines instead of a table.
@@ -109,7 +117,7 @@ def check(
     _start_warp()
     from cortado.commands.check import check_scene
 
-    print(check_scene(scene, steps, list(overrides), device, json, seed))
+    print(check_scene(scene, steps, parameters, loss, change, out, list(overrides), device, json, seed))
 
 
 @gradients.command

@@ -1,0 +1,78 @@
+"""Which gradient points the way: those of the policies, against that of the loss smoothed over meaningful changes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cortado.errors import DivergedError
+from cortado.parameter_values import Arrays
+from cortado.policies import AdjointSmoothing, Estimate, Exact, Policy, Smoothed, VelocityOnly
+from cortado.problem import Problem
+
+MOST_NUMBERS = 12
+"""Numbers that a smoothed gradient is taken of: each costs two runs a sample."""
+SAMPLES = 2
+ALIKE = 0.5
+"""Cosine below which a gradient does not point the way."""
+POLICIES: tuple[Policy, ...] = (Exact(), AdjointSmoothing(), VelocityOnly())
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A policy's gradient beside the smoothed one, every number in units of its meaningful change."""
+
+    policy: str
+    """As it is written in Python, after ``policies.``"""
+    cosine: float
+    size: float
+    """Over that of the smoothed gradient."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How near gradients are to the smoothed one."""
+
+    noise: float
+    """Standard error of the smoothed gradient, relative."""
+    policies: tuple[Judged, ...]
+    """`Exact` comes first."""
+
+    @property
+    def best(self) -> Judged | None:
+        """The policy, other than `Exact`, that points the way best; None where none does."""
+        best = max(self.policies[1:], key=lambda judged: judged.cosine)
+        return best if best.cosine > ALIKE else None
+
+
+def agreement(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) -> Agreement | None:
+    """Of all these parameters together; None where they are too many numbers for a smoothed gradient, or where the loss
+    does not feel them."""
+    if sum(value.size for value in values.values()) > MOST_NUMBERS:
+        return None
+    spread = {name: float(size.mean()) for name, size in sizes.items()}
+    try:
+        smoothed = Smoothed(spread, SAMPLES).estimate(problem, values)
+    except DivergedError:
+        return None
+
+    def numbers(gradient: Arrays) -> np.ndarray:
+        return np.concatenate([spread[name] * gradient[name].ravel() for name in values])
+
+    reference, error = numbers(smoothed.gradient), numbers(smoothed.standard_error or {})
+    length = float(np.linalg.norm(reference))
+
+    def judged(policy: Policy) -> Judged:
+        found = Estimate(0.0, exact) if policy == Exact() else problem.estimate(values, policy)
+        gradient = numbers(found.gradient)
+        size = float(np.linalg.norm(gradient))
+        cosine = float(gradient @ reference) / (size * length) if 0.0 < size < np.inf else 0.0
+        return Judged(_written(policy, found), cosine, size / length)
+
+    if not length > 0.0:
+        return None
+    return Agreement(float(np.linalg.norm(error)) / length, tuple(map(judged, POLICIES)))
+
+
+def _written(policy: Policy, found: Estimate) -> str:
+    inside = f"strength={found.strength:g}" if found.strength is not None else ""
+    return f"{type(policy).__name__}({inside})"

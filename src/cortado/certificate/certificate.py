@@ -1,0 +1,137 @@
+"""The certificate of a problem's gradients: are they right, how long do they mean something, and what to use beyond."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from cortado.certificate.agreement import Agreement, agreement
+from cortado.certificate.changes import CHANGE, coherent_directions, directions, everything, point, scales
+from cortado.certificate.course import Course
+from cortado.certificate.horizon import Horizon, horizon
+from cortado.certificate.rightness import Comparison, balanced, compare
+from cortado.errors import InputError, shown
+from cortado.parameter_values import Arrays, Values
+from cortado.policies import AdjointNorms
+from cortado.policies.strength import growth
+from cortado.problem import Problem
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What `certify` found."""
+
+    particles: int
+    steps: int
+    loss: float
+    shares: dict[str, float]
+    """For every parameter how much a meaningful change of it changes the loss, by the adjoint."""
+    comparison: Comparison
+    """Of all parameters together."""
+    wrong: tuple[str, ...]
+    """Parameters with a wrong derivative; empty where the adjoint is right."""
+    norms: np.ndarray
+    """(steps + 1,) of the exact adjoint of every state."""
+    growth: float
+    """e-folds of the exact adjoint a step."""
+    horizons: tuple[Horizon, ...]
+    """For every parameter that was asked for."""
+    agreement: Agreement | None
+    """Of all of these together with the smoothed gradient."""
+
+    @property
+    def right(self) -> bool:
+        """Whether every adjoint is right."""
+        return not self.wrong
+
+    @property
+    def horizon(self) -> int:
+        """The last step up to which the exact gradient means something, for all the parameters asked for."""
+        return min(one.measured for one in self.horizons)
+
+    @property
+    def policy(self) -> str:
+        """Which to use for these parameters and that many steps, as it is written in Python."""
+        if all(one.lasts for one in self.horizons):
+            return "Exact()"
+        if self.agreement is None:
+            return "AdjointSmoothing()"
+        best = self.agreement.best
+        return "Smoothed()" if best is None else best.policy
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        c, found = self.comparison, asdict(self)
+        found["comparison"] |= {"disagreement": c.disagreement, "miss": c.miss, "last_believed": c.last_believed}
+        for one, made in zip(self.horizons, found["horizons"], strict=True):
+            made |= {"measured": one.measured, "predicted": one.predicted}
+        found |= {"right": self.right, "horizon": self.horizon, "policy": self.policy}
+        return _plain(found)
+
+
+def certify(
+    problem: Problem, parameters: Values | Sequence[str] = ("gravity",), change: float = CHANGE, seed: int = 0
+) -> Certificate:
+    """Check the gradients of a problem, in float64 as a rule.
+
+    Whether the adjoint is right is asked of every parameter that the scene has. How long it means something, and which
+    policy to use beyond, of ``parameters``: values, or names of the scene's.
+
+    Args:
+        change: what a meaningful change of a parameter is, in its own size; of positions in spacings, of velocities in
+            those of a fall over the height of the fluid.
+        seed: of the random directions.
+    """
+    if not 0.0 < change < 1.0:
+        raise InputError(f"change is {shown(change)}, but must be greater than 0 and less than 1.")
+    chosen, random = point(problem, parameters), np.random.default_rng(seed)
+    course, values = Course(problem), everything(problem, chosen)
+    norms = AdjointNorms(problem.simulation.solver, problem.steps)
+    exact = problem.estimate({**chosen, **values}, observe=norms)
+    along = directions(values, scales(problem, values, change), random)
+    comparison, wrong = _rightness(course, values, exact.gradient, along)
+
+    sizes = scales(problem, chosen, change)
+    changes = coherent_directions(problem, chosen, sizes, random)
+    time = float(values["time_step"]) * max(problem.steps, 1)
+    return Certificate(
+        particles=problem.simulation.particles,
+        steps=problem.steps,
+        loss=exact.loss,
+        shares={name: abs(float((exact.gradient[name] * along[name]).sum())) for name in along},
+        comparison=comparison,
+        wrong=wrong,
+        norms=np.hypot(norms.numpy()[:, 0], norms.numpy()[:, 1] / time),
+        growth=growth(norms.numpy(), float(values["time_step"])) / max(problem.steps, 1),
+        horizons=tuple(horizon(course, chosen, name, changes[name]) for name in chosen),
+        agreement=agreement(problem, chosen, sizes, _of(chosen, exact.gradient)),
+    )
+
+
+def _of(chosen: Arrays, gradient: Arrays) -> Arrays:
+    """The gradient in the shapes of the chosen parameters: tables may be one vector for all steps."""
+    return {
+        name: gradient[name] if gradient[name].shape == value.shape else gradient[name].sum(axis=0)
+        for name, value in chosen.items()
+    }
+
+
+def _rightness(course: Course, values: Arrays, gradient: Arrays, along: Arrays) -> tuple[Comparison, tuple[str, ...]]:
+    """The comparison of all parameters together, and, where it fails, those that fail alone."""
+    together = compare(course, values, gradient, balanced(gradient, along))
+    if together.right:
+        return together, ()
+    alone = {name: compare(course, values, gradient, {name: along[name]}) for name in along}
+    return together, tuple(name for name in along if not alone[name].right) or tuple(along)
+
+
+def _plain(found: Any) -> Any:
+    """With arrays as lists, and None for what is not finite."""
+    if isinstance(found, dict):
+        return {name: _plain(value) for name, value in found.items()}
+    if isinstance(found, (list, tuple, np.ndarray)):
+        return [_plain(value) for value in found]
+    if isinstance(found, (float, np.floating)):
+        return float(found) if np.isfinite(found) else None
+    return found.item() if isinstance(found, np.generic) else found

@@ -1,0 +1,85 @@
+"""The picture of a certificate: is the adjoint right, and how long does it mean something."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE, drawing
+
+if TYPE_CHECKING:
+    from cortado.certificate import Certificate
+    from cortado.certificate.agreement import Agreement
+    from cortado.certificate.horizon import Horizon
+
+
+def gradient_check(certificate: Certificate, path: str | Path) -> Path:
+    """Four panels: differences against the adjoint, the adjoint's growth, its horizon, and policies.
+
+    The horizon is shown for the parameter with the nearest.
+    """
+    nearest = min(certificate.horizons, key=lambda horizon: horizon.measured)
+    with drawing(path, 12.0, 8.4) as figure:
+        (differences, growth), (horizon, policies) = figure.subplots(2, 2)
+        _differences(differences, certificate)
+        _growth(growth, certificate)
+        _horizon(horizon, nearest)
+        _policies(policies, certificate.agreement)
+        verdict = "right" if certificate.right else "WRONG"
+        figure.suptitle(
+            f"The adjoint is {verdict}; {certificate.particles} particles, {certificate.steps} steps", weight="bold"
+        )
+    return Path(path)
+
+
+def _differences(axes: Any, certificate: Certificate) -> None:
+    c = certificate.comparison
+    steps, misses = c.steps[: len(c.differences)], c.misses
+    shown = sorted({*np.linspace(0, len(c.moments) - 1, 4).round().astype(int)})
+    for k, moment in enumerate(shown):
+        axes.loglog(steps, np.maximum(misses[:, moment], 1e-16), "o-", color=PALETTE[k], label=str(c.moments[moment]))
+    axes.axhline(max(c.disagreement, 1e-16), **DASHED, color=FAINT)
+    axes.text(steps[-1], max(c.disagreement, 1e-16), "reverse mode", color=FAINT, va="bottom")
+    axes.set(title="Central differences against forward mode", xlabel="step of the difference")
+    axes.set_ylabel("relative distance")
+    axes.legend(title="after step", loc="best", ncols=2, fontsize=9)
+
+
+def _growth(axes: Any, certificate: Certificate) -> None:
+    steps = np.arange(certificate.steps + 1)
+    there = certificate.norms > 0.0
+    axes.semilogy(steps[there], certificate.norms[there], color=PALETTE[0])
+    if there.any():
+        logs = np.log(certificate.norms[there])
+        line = logs.mean() - certificate.growth * (steps[there] - steps[there].mean())
+        axes.semilogy(steps[there], np.exp(line), **DASHED, color=PALETTE[6])
+    axes.set(title=f"The adjoint grows by e^({certificate.growth:.3g}) a step, backwards", xlabel="step")
+    axes.set_ylabel("norm of the adjoint of a state")
+
+
+def _horizon(axes: Any, horizon: Horizon) -> None:
+    for values, label, colour in ((horizon.exact, "exact", 6), (horizon.difference, "of a meaningful change", 0)):
+        size = np.abs(values)
+        there = size > 0.0
+        axes.semilogy(horizon.moments[there], size[there], "o-", markersize=3.5, color=PALETTE[colour], label=label)
+    for step, label, shade in ((horizon.measured, "measured", INK), (horizon.predicted, "predicted", FAINT)):
+        if step is not None:
+            axes.axvline(step, **DASHED, color=shade, label=f"{label} horizon: {step}")
+    axes.set(title=f"Derivative of the loss along {horizon.parameter}", xlabel="step at which the run ends")
+    axes.set_ylabel("size")
+    axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.92), fontsize=9)
+
+
+def _policies(axes: Any, agreement: Agreement | None) -> None:
+    if agreement is None:
+        axes.set_axis_off()
+        axes.text(0.5, 0.5, "too many numbers for a smoothed gradient", ha="center", color=FAINT)
+        return
+    for k, judged in enumerate(agreement.policies):
+        axes.barh(-k, judged.cosine, color=PALETTE[k], height=0.42)
+        axes.text(0.0, -k + 0.25, f"{judged.policy}: {judged.cosine:.2f}, size x {judged.size:.2g}", va="bottom")
+    axes.axvline(0.0, color=FAINT, linewidth=1.0)
+    axes.set(title="Gradients against the smoothed one", xlabel="cosine", xlim=(-1.02, 1.02), yticks=[])
+    axes.set_ylim(0.6 - len(agreement.policies), 0.6)

@@ -1,0 +1,218 @@
+"""The certificate: no false alarm, horizons that can be foreseen, and advice. What it catches: `test_plants`."""
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado import InputError, Problem, Simulation, losses
+from cortado.certificate import Comparison, certify
+from cortado.certificate.agreement import Agreement, Judged
+from cortado.certificate.horizon import Horizon
+from scenes import plane, plane_of_three, scene, splash, two_layers
+from test_emitter import jet, pour
+
+SPLINES = {name: {"spacing": 0.05, "support": 2.6, "kernel": name} for name in ("wendland_c2", "wendland_c4")}
+RIGHT = {
+    "3-D, cubic spline, splash": splash,
+    "3-D, Wendland C2": lambda: scene(discretisation=SPLINES["wendland_c2"]),
+    "3-D, Wendland C4, laminar, no slip": lambda: scene(
+        discretisation=SPLINES["wendland_c4"],
+        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "laminar"},
+        container={"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"},
+    ),
+    "3-D, without walls": lambda: scene(container={"shape": "none"}),
+    "3-D, without pressure": lambda: scene(forces={"gravity": [0.0, -9.81, 0.0], "pressure": False}),
+    "3-D, two fluids that mix": two_layers,
+    "3-D, two fluids from a nozzle": pour,
+    "2-D": plane,
+    "2-D, Wendland C2, iterations by tolerance": lambda: plane(
+        discretisation=SPLINES["wendland_c2"],
+        solver={"time_step": 0.002, "minimum_iterations": 2, "maximum_iterations": 30, "density_tolerance": 0.001},
+    ),
+    "2-D, periodic, laminar": lambda: plane(
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]},
+        forces={"gravity": [1.0, -9.81], "viscosity": "laminar"},
+    ),
+    "2-D, three fluids that mix": plane_of_three,
+    "2-D, nozzle": jet,
+    "2-D, without viscosity": lambda: plane(phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.0}]),
+}
+
+
+def problem_of(made, steps, loss=None):
+    simulation = Simulation(made, precision="float64")
+    return Problem(simulation, steps, losses.FinalPositions(simulation.positions) if loss is None else loss(simulation))
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_right_gradients_are_found_right(name):
+    found = certify(problem_of(RIGHT[name](), 30))
+    c = found.comparison
+    assert found.right, (found.wrong, c.disagreement, c.miss)
+    assert c.disagreement < 1e-10 and c.last_believed == 30 and c.miss < 1e-4
+    assert "gravity" in found.shares and found.shares["time_step"] > 0.0
+    assert all(isinstance(value, (int, float, str, list, dict, type(None))) for value in found.as_dict().values())
+    json.dumps(found.as_dict(), allow_nan=False)
+
+
+def centre(simulation):
+    return losses.CentreOfMass([0.3, 0.1])
+
+
+@cache
+def long():
+    """300 steps of a splash in the plane, long beyond its horizon."""
+    return certify(problem_of(plane(), 300, centre), ["gravity"])
+
+
+def test_beyond_the_horizon_another_policy_is_advised():
+    found = long()
+    (horizon,) = found.horizons
+    assert found.right and not horizon.lasts
+    assert 0.6 < horizon.predicted / horizon.measured < 1.6
+    assert found.growth > 0.02
+    exact, *others = found.agreement.policies
+    best = max(others, key=lambda judged: judged.cosine)
+    assert found.policy == best.policy and best.cosine > 0.9 and 0.1 < best.size < 10.0
+    assert exact.size > 3.0
+
+
+def test_within_the_horizon_the_exact_gradient_is_advised():
+    found = certify(problem_of(plane(), 40))
+    assert found.policy == "Exact()" and found.horizon == 40
+    exact, *_ = found.agreement.policies
+    assert exact.policy == "Exact()" and exact.cosine > 0.99 and exact.size == pytest.approx(1.0, abs=0.1)
+    assert found.horizons[0].predicted is None
+
+
+def test_parameters_may_be_values_and_many_numbers():
+    problem = problem_of(plane(), 20)
+    velocities = problem.simulation.velocities + [0.3, 0.0]
+    found = certify(problem, {"initial_velocities": velocities, "gravity": np.tile([0.5, -9.0], (20, 1))})
+    assert found.right and found.agreement is None
+    assert [horizon.parameter for horizon in found.horizons] == ["initial_velocities", "gravity"]
+    assert found.loss == problem.value({"initial_velocities": velocities, "gravity": [0.5, -9.0]})
+
+
+def test_frames_are_judged_where_they_are():
+    def frames(simulation):
+        return losses.Frames({step: losses.FinalPositions(simulation.positions) for step in (5, 9, 12)})
+
+    problem = problem_of(plane(), 15, frames)
+    found = certify(problem)
+    assert found.right and found.comparison.moments.tolist() == [5, 9, 12]
+    assert found.comparison.losses[-1] == pytest.approx(found.loss)
+    slope = problem.tangent({"gravity": [0.0, -9.81]}, {"gravity": [0.0, 1.0]})
+    gradient = problem.value_and_gradient({"gravity": np.array([0.0, -9.81])})[1]["gravity"]
+    assert slope == pytest.approx(gradient[1])
+
+
+def test_without_steps_nothing_is_claimed():
+    found = certify(problem_of(plane(), 0, lambda simulation: losses.FinalPositions(0.9 * simulation.positions)))
+    assert found.right and found.agreement is None and found.comparison.moments.tolist() == [0]
+
+
+def test_it_is_part_of_the_public_face():
+    assert cortado.certify is certify
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"parameters": ["gravitas"]}, "parameter 'gravitas' is unknown, but must be one of gravity, "),
+        ({"parameters": []}, "parameters is empty, but must have at least one of gravity, "),
+        ({"parameters": ["nozzle_path"]}, "parameter 'nozzle_path' is unknown"),
+        ({"parameters": {"gravity": [1.0, 2.0, 3.0]}}, r"parameter gravity has shape \(3,\), but must be"),
+        ({"change": 0.0}, "change is 0.0, but must be greater than 0 and less than 1."),
+    ],
+)
+def test_wrong_arguments_are_sentences(arguments, words):
+    with pytest.raises(InputError, match=words):
+        certify(problem_of(plane(), 3), **arguments)
+
+
+# ---- verdicts ----------------------------------------------------------------------------------------------------
+
+
+def comparison(adjoint=1.0, tangents=(0.5, 1.0), differences=((0.5, 1.0),) * 3, loss=1.0):
+    return Comparison(
+        moments=np.array([1, 2]),
+        losses=np.array([0.5 * loss, loss]),
+        adjoint=adjoint,
+        size=1e-3 * abs(tangents[-1]),
+        tangents=np.array(tangents),
+        differences=np.array(differences),
+        steps=np.array([1e-2, 1e-3, 1e-4])[: len(differences)],
+    )
+
+
+@pytest.mark.parametrize(
+    "right",
+    [
+        comparison(),
+        comparison(adjoint=1.0 + 1e-10),
+        comparison(tangents=(0.5, 7.0), adjoint=7.0, differences=((0.5, 2.0), (0.5, -1.0), (0.5, 0.3))),
+        comparison(adjoint=1e-16, tangents=(0.0, -1e-16), differences=((0.0, 3e-13), (0.0, 2e-12), (0.0, 1e-11))),
+        comparison(differences=((0.5, 1.1), (0.5, 1.001), (0.5, 1.0001))),
+    ],
+)
+def test_what_is_right(right):
+    assert right.right
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        comparison(adjoint=np.nan),
+        comparison(adjoint=-1.0),
+        comparison(adjoint=0.0),
+        comparison(adjoint=1.0 + 1e-6),
+        comparison(adjoint=1.00001, tangents=(0.5, 1.00001)),
+        comparison(tangents=(0.6, 7.0), adjoint=7.0, differences=((0.5, 2.0), (0.5, -1.0), (0.5, 0.3))),
+        comparison(tangents=(0.5, np.nan)),
+    ],
+)
+def test_what_is_wrong(wrong):
+    assert not wrong.right
+
+
+def horizon(exact, difference, strain=(0.1, 0.2, 0.4)):
+    exact, difference, strain = map(np.array, (exact, difference, strain))
+    return Horizon("gravity", np.array([10, 20, 30]), exact, difference, strain)
+
+
+@pytest.mark.parametrize(
+    ("exact", "step"),
+    [
+        ((1.0, 2.1, 3.0), 30),
+        ((1.0, 2.0, 9.0), 20),
+        ((1.0, 9.0, 3.0), 10),
+        ((9.0, 9.0, 3.0), 0),
+        ((1.0, 2.0, np.nan), 20),
+    ],
+)
+def test_the_measured_horizon(exact, step):
+    found = horizon(exact, (1.0, 2.0, 3.0))
+    assert found.measured == step and found.lasts == (step == 30)
+
+
+def test_the_predicted_horizon():
+    same = (1.0, 1.0, 1.0)
+    assert horizon(same, same).predicted == 30
+    assert horizon(same, same, strain=(0.1, 0.1, 0.2)).predicted is None
+
+
+def test_the_advice():
+    far = horizon((1.0, 9.0, 9.0), (1.0, 1.0, 1.0))
+    found = replace(long(), horizons=(far,))
+    judged = [Judged("Exact()", 0.99, 9.0), Judged("AdjointSmoothing(strength=0.1)", 0.8, 1.0)]
+    for cosine, wanted in ((0.9, "VelocityOnly()"), (0.7, "AdjointSmoothing(strength=0.1)")):
+        both = (*judged, Judged("VelocityOnly()", cosine, 1.0))
+        assert replace(found, agreement=Agreement(0.1, both)).policy == wanted
+    lost = (judged[0], Judged("AdjointSmoothing(strength=0.1)", 0.1, 1.0), Judged("VelocityOnly()", 0.2, 1.0))
+    assert replace(found, agreement=Agreement(0.1, lost)).policy == "Smoothed()"
+    assert replace(found, agreement=None).policy == "AdjointSmoothing()"
