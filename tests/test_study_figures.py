@@ -10,12 +10,16 @@ from PIL import Image
 
 from bad_scenes import assert_one_sentence
 from cortado.cli import main
+from cortado.reference import Simulation, Terms
 from cortado.study.experiment_files import load_experiment
 from cortado.study.forces import ABLATIONS, FULL
 from cortado.study.gravity_and_precision import ANALYTIC, DIFFERENCES
 from cortado.study.image_horizon import ADJOINT, TAPE
 from cortado.study.pressure_terms import ONE_STEP, PROPAGATED
+from cortado.study.scenes import varied
 from cortado.study.tables import Table
+from cortado.study.term_sizes import term_sizes
+from scenes import scene
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 FIGURES = ["figure_1", "figure_2_small", "figure_3_small", "figure_4", "figure_5", "figure_6", "figure_7"]
@@ -117,6 +121,16 @@ def test_terms_differ_once_there_is_pressure(measured):
     sizes = {name: rows["norm"][130:] for (name,), rows in table.where(quantity=ONE_STEP).groups("terms")}
     both, hessian, density = sizes.values()
     assert (both <= 3.0 * (hessian + density)).all() and (density > hessian).mean() > 0.8
+
+
+def test_sizes_of_terms_are_those_of_the_exact_tangent():
+    fluid = varied(scene(), forces={"viscosity": "none"})
+    sizes = term_sizes(fluid, 6, "float64", {"all": Terms()})["all"]
+    down = {"gravity": (0.0, -1.0, 0.0)}
+    exact = Simulation(fluid).tangent({"gravity": fluid.forces.gravity}, down, 6).velocity_tangents.high
+    by_pressure = np.diff(exact, axis=0) / fluid.solver.time_step - down["gravity"]
+    np.testing.assert_allclose(sizes, np.linalg.norm(by_pressure, axis=(1, 2)), rtol=1e-9, atol=1e-12)
+    assert (sizes[:4] > 0.1).all()
 
 
 # ---- files -------------------------------------------------------------------------------------------------------

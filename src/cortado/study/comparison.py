@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Gradient = Mapping[str, ArrayLike]
 WINDOWS = 4
-"""Parts of a history whose slopes tell how certain the slope of the whole is."""
+"""Parts of a history, at most, whose slopes tell how certain the slope of the whole is."""
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,15 @@ class Growth:
 
 
 def growth(steps: ArrayLike, norms: ArrayLike) -> Growth:
-    """The growth of norms (k,) over steps (k,); what is zero or not finite is left out."""
+    """The growth of norms (k,) over steps (k,), nan where there are fewer than 4; zeros and infinities are left out."""
     x, sizes = np.asarray(steps, dtype=float), np.asarray(norms, dtype=float)
     shown = np.isfinite(sizes) & (sizes > 0.0)
     x, y = x[shown], np.log(sizes[shown])
-    if len(x) < 2 * WINDOWS:
+    parts = min(WINDOWS, len(x) // 2)
+    if parts < 2:
         return Growth(np.nan, np.nan)
-    slopes = [_slope(*part) for part in zip(np.array_split(x, WINDOWS), np.array_split(y, WINDOWS), strict=True)]
-    return Growth(_slope(x, y), float(np.std(slopes, ddof=1) / np.sqrt(WINDOWS)))
+    slopes = [_slope(*part) for part in zip(np.array_split(x, parts), np.array_split(y, parts), strict=True)]
+    return Growth(_slope(x, y), float(np.std(slopes, ddof=1) / np.sqrt(parts)))
 
 
 def _slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:

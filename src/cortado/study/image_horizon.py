@@ -103,7 +103,7 @@ def verdict(table: Table, settings: ImageHorizon) -> list[str]:
     left = int(horizons[~near][0]) if not near.all() else None
     sentences = [
         f"Autograd and the adjoint by gathers, which share no code, agree to {np.median(off):.1e} (median; at most "
-        f"{off.max():.1e}): what grows is no fault of automatic differentiation.",
+        f"{off.max():.1e}) in {settings.precision}: what grows is no fault of automatic differentiation.",
         f"Finite differences of step {min(settings.differences):g} m/s² are within {AGREEMENT:.0%} of the gradient "
         + (f"until they leave it at {left} steps." if left else f"at all horizons up to {horizons[-1]} steps."),
     ]

@@ -57,7 +57,7 @@ def draw(table: Table, settings: PressureTerms) -> "Figure":
     figure = blank(12.5, 5.4)
     left, right = figure.subplots(1, 2)
     for axes, quantity in ((left, PROPAGATED), (right, ONE_STEP)):
-        for dashes, precision in zip(("-", (0, (4, 3)), ":", "-."), settings.precisions, strict=False):
+        for dashes, precision in zip(("-", (0, (4, 3)), ":", "-."), reversed(settings.precisions), strict=False):
             for k, name in enumerate(TERMS):
                 rows = table.where(quantity=quantity, precision=precision, terms=name)
                 rows = rows.chosen(rows["norm"] > 0.0)
@@ -74,14 +74,17 @@ def draw(table: Table, settings: PressureTerms) -> "Figure":
 def verdict(table: Table, settings: PressureTerms) -> list[str]:
     sentences = []
     for precision in settings.precisions:
-        at = {}
+        ends, rates = {}, {}
         for name in TERMS:
             rows = table.where(quantity=PROPAGATED, precision=precision, terms=name)
             late = rows.chosen(rows["step"] >= settings.impact)
-            at[name] = f"{rows['norm'][-1]:.3g} s² ({growth(late['step'], late['norm'])})"
+            ends[name], rates[name] = rows["norm"][-1], growth(late["step"], late["norm"])
+        found = [f"{ends[name]:.3g} s² with the {name} ({rates[name]})" for name in (HESSIAN, DENSITY)]
         sentences.append(
-            f"In {precision} a tangent of {settings.steps} steps ends at {at[FULL]} with both terms, {at[HESSIAN]} "
-            f"with the Hessian term alone, {at[DENSITY]} with the density term alone."
+            f"In {precision} a tangent of {settings.steps} steps ends at {ends[FULL]:.3g} s² with both terms "
+            f"({rates[FULL]}), at {found[0]}, at {found[1]}: without the Hessian term it is "
+            f"{ends[DENSITY] / ends[FULL]:.2g} times as large, without the density term "
+            f"{ends[HESSIAN] / ends[FULL]:.2g} times."
         )
     sizes = {
         name: rows["norm"][rows["step"] >= settings.impact]
