@@ -74,29 +74,29 @@ def verdict(table: Table, settings: GravityAndPrecision) -> list[str]:
     *others, truth = settings.precisions
     differences, exact = (table.where(method=m, precision=truth) for m in (DIFFERENCES, ANALYTIC))
     gravity = exact["gravity"]
-    spread = max((_factor(table, DIFFERENCES, p, truth).max() for p in others), default=1.0)
+    spread = max((_distance(table, DIFFERENCES, p, truth).max() for p in others), default=0.0)
     share = differences["norm"][-3:] * 2.0 * settings.difference / differences["distance"][-3:]
     sentences = [
         f"Finite differences of step {settings.difference:g} m/s² lie between {differences['norm'].min():.3g} and "
-        f"{differences['norm'].max():.3g} s², whatever the gravity, and precisions agree within a factor {spread:.2f}.",
-        f"They are that flat because they are saturated: at the three strongest gravities the two runs are "
+        f"{differences['norm'].max():.3g} s² for all gravities, and precisions agree to {spread:.1g}.",
+        f"They are that flat because they saturate: at the three strongest gravities the two runs are "
         f"{share.mean():.2f} ± {share.std():.2f} of the distance between two unrelated states apart.",
         f"The analytic gradient grows from {exact['norm'].min():.3g} to {exact['norm'].max():.3g} s² between "
         f"{gravity[0]:g} and {gravity[-1]:g} m/s², {np.log(exact['norm'][-1] / exact['norm'][0]):.1f} e-folds.",
     ]
     for precision in others:
-        factor = _factor(table, ANALYTIC, precision, truth)
+        off = _distance(table, ANALYTIC, precision, truth)
         sentences.append(
-            f"Analytic in {precision}, against {truth}: at most a factor {factor[0]:.3g} off at {gravity[0]:g} m/s², "
-            f"{factor.max():.3g} at {gravity[factor.argmax()]:g} m/s²."
+            f"The analytic gradient in {precision} is {off[0]:.1g} off that in {truth}, relative, at {gravity[0]:g} m/s², "
+            f"and at most {off.max():.1g}, at {gravity[off.argmax()]:g} m/s²."
         )
     return sentences
 
 
-def _factor(table: Table, method: str, precision: str, truth: str) -> np.ndarray:
-    """By which the norms in two precisions differ, at least 1, by gravity."""
+def _distance(table: Table, method: str, precision: str, truth: str) -> np.ndarray:
+    """Relative, of the norms in two precisions, by gravity."""
     found, expected = (table.where(method=method, precision=p)["norm"] for p in (precision, truth))
-    return np.exp(np.abs(np.log(found / expected)))
+    return np.abs(found / expected - 1.0)
 
 
 GRAVITY_AND_PRECISION = Kind("gravity_and_precision", GravityAndPrecision, measure, draw, verdict)
