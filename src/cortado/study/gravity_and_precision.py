@@ -87,8 +87,8 @@ def verdict(table: Table, settings: GravityAndPrecision) -> list[str]:
     for precision in others:
         off = _distance(table, ANALYTIC, precision, truth)
         sentences.append(
-            f"The analytic gradient in {precision} is {off[0]:.1g} off that in {truth}, relative, at {gravity[0]:g} m/s², "
-            f"and at most {off.max():.1g}, at {gravity[off.argmax()]:g} m/s²."
+            f"The analytic gradient in {precision} is {off[0]:.1g} off that in {truth}, relative, at "
+            f"{gravity[0]:g} m/s², and at most {off.max():.1g}, at {gravity[off.argmax()]:g} m/s²."
         )
     return sentences
 
