@@ -3,7 +3,7 @@
 Twice: a tangent that is propagated with one term only, and what each term does in one step to the exact tangent.
 """
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -61,7 +61,9 @@ def draw(table: Table, settings: PressureTerms) -> "Figure":
             for k, name in enumerate(TERMS):
                 rows = table.where(quantity=quantity, precision=precision, terms=name)
                 rows = rows.chosen(rows["norm"] > 0.0)
-                style = {"linestyle": dashes, "color": PALETTE[k], "label": f"{name}, {precision}"}
+                style: dict[str, Any] = {"linestyle": dashes, "color": PALETTE[k], "label": f"{name}, {precision}"}
+                if quantity == ONE_STEP and name == FULL:
+                    style |= {"linewidth": 5.0, "alpha": 0.45}  # the density term lies on it
                 axes.plot(rows["step"], rows["norm"], **style)
         axes.set(yscale="log", xlabel="step")
     left.set(title="The tangent, propagated with these terms", ylabel=LABEL)
