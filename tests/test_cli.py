@@ -521,7 +521,8 @@ def test_a_planted_error_fails_the_check(cortado_command, monkeypatch, json_opti
         return found
 
     monkeypatch.setattr(Problem, "estimate", wrong)
-    code, out, err = cortado_command("gradients", "check", "scene.toml", "--steps", 3, *json_option)
+    code, out, err = cortado_command("gradients", "check", "scene.toml", "--steps", 3, "--out", "wrong", *json_option)
+    assert Path("wrong/certificate.png").exists()
     assert (code, err) == (1, "The adjoint is wrong for: initial_velocities.\n")
     assert json.loads(out)["right"] is False if json_option else out.count("WRONG") == 2
 

@@ -36,7 +36,7 @@ class Certificate:
     growth: float
     """e-folds of the exact adjoint a step."""
     horizons: tuple[Horizon, ...]
-    """For every parameter that was asked for."""
+    """For every parameter that was asked for; none where the adjoint is wrong."""
     agreement: Agreement | None
     """Of all of these together with the smoothed gradient."""
 
@@ -48,11 +48,13 @@ class Certificate:
     @property
     def horizon(self) -> int:
         """The last step up to which the exact gradient means something, for all the parameters asked for."""
-        return min(one.measured for one in self.horizons)
+        return min((one.measured for one in self.horizons), default=0)
 
     @property
     def policy(self) -> str:
         """Which to use for these parameters and that many steps, as it is written in Python."""
+        if not self.right:
+            return "Smoothed()"
         if all(one.lasts for one in self.horizons):
             return "Exact()"
         if self.agreement is None:
@@ -93,6 +95,7 @@ def certify(
     comparison, wrong = _rightness(course, values, exact.gradient, along)
 
     sizes = scales(problem, chosen, change)
+    asked = {} if wrong else chosen
     changes = coherent_directions(problem, chosen, sizes, random)
     time = float(values["time_step"]) * max(problem.steps, 1)
     return Certificate(
@@ -104,8 +107,8 @@ def certify(
         wrong=wrong,
         norms=np.hypot(norms.numpy()[:, 0], norms.numpy()[:, 1] / time),
         growth=growth(norms.numpy(), float(values["time_step"])) / max(problem.steps, 1),
-        horizons=tuple(horizon(course, chosen, name, changes[name]) for name in chosen),
-        agreement=agreement(problem, chosen, sizes, _of(chosen, exact.gradient)),
+        horizons=tuple(horizon(course, chosen, name, changes[name]) for name in asked),
+        agreement=agreement(problem, asked, sizes, _of(chosen, exact.gradient)) if asked else None,
     )
 
 

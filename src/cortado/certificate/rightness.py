@@ -40,7 +40,7 @@ class Comparison:
     tangents: np.ndarray
     """(moments,) by forward mode."""
     differences: np.ndarray
-    """(tried, moments) central differences."""
+    """(tried, moments) central differences; none where reverse mode is wrong already."""
     steps: np.ndarray
     """(tried,) of the differences, in units of the direction."""
 
@@ -67,7 +67,7 @@ class Comparison:
     @property
     def believed(self) -> np.ndarray:
         """(moments,) whether two neighbouring differences agree up to there; where none do, chaos hides the limit."""
-        return np.asarray(self.gaps.min(axis=0) < PLATEAU)
+        return np.asarray(self.gaps.min(axis=0, initial=np.inf) < PLATEAU)
 
     @property
     def last_believed(self) -> int | None:
@@ -85,6 +85,8 @@ class Comparison:
     @property
     def differences_agree(self) -> bool:
         """Whether forward mode is the limit of differences wherever there is one to be seen."""
+        if not self.believed.any():
+            return True
         best, moments = self.gaps.argmin(axis=0), np.arange(len(self.moments))
         allowed = np.maximum(SLACK * self.gaps[best, moments], RESOLUTION)
         return bool((self.misses[best + 1, moments] <= allowed)[self.believed].all())
@@ -96,7 +98,7 @@ class Comparison:
 
     def _worst(self, distances: np.ndarray) -> np.ndarray:
         """The greatest so far over the greatest derivative so far."""
-        size = np.maximum.accumulate(np.abs(self.differences[-len(distances) :]), axis=1)
+        size = np.maximum.accumulate(np.abs(self.differences[len(self.differences) - len(distances) :]), axis=1)
         worst = np.maximum.accumulate(distances, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.nan_to_num(worst / size, nan=np.inf, posinf=np.inf)
@@ -134,7 +136,7 @@ def compare(course: Course, values: Arrays, gradient: Arrays, along: Arrays) -> 
         )
 
     best = np.inf
-    for h in STEPS:
+    for h in STEPS if comparison().disagreement < AGREEMENT else ():
         found.append(course.difference(values, along, h))
         gap = comparison().gaps[-1, -1] if len(found) > 1 else np.inf
         if gap < RESOLUTION / SLACK or (best < PLATEAU and gap > best):

@@ -77,18 +77,22 @@ def _written(certificate: Certificate, found: str, out: Path, as_json: bool) -> 
 
 def _lines(certificate: Certificate, loss: str) -> list[str]:
     comparison, steps = certificate.comparison, certificate.steps
+    lines = [
+        f"{certificate.particles} particles, {steps} steps, float64, {loss}",
+        _table(["parameter", "a change of it changes the loss by", "adjoint"], _parameters(certificate)),
+    ]
     digits = f"reverse and forward mode agree to {_digits(comparison.disagreement)} digits"
     if comparison.miss is None:
         differences = "no difference is reliable here"
     else:
         differences = f"with differences to {_digits(comparison.miss)}, up to step {comparison.last_believed}"
-    verdict = "right" if certificate.right else "WRONG"
+    if not certificate.right:
+        return [*lines, f"The adjoint is WRONG: {digits}, {differences}."]
     return [
-        f"{certificate.particles} particles, {steps} steps, float64, {loss}",
-        _table(["parameter", "a change of it changes the loss by", "adjoint"], _parameters(certificate)),
-        f"The adjoint is {verdict}: {digits}, {differences}.",
-        _table(["parameter", "predicted horizon", "measured horizon"], _horizons(certificate)),
+        *lines,
+        f"The adjoint is right: {digits}, {differences}.",
         f"The adjoint of a state grows by e^{certificate.growth:.4f} a step.",
+        _table(["parameter", "predicted horizon", "measured horizon"], _horizons(certificate)),
         *_policies(certificate),
         f"Up to step {certificate.horizon} of {steps} the exact gradient means something. For {steps} steps use "
         f"policies.{certificate.policy}.",

@@ -18,14 +18,13 @@ if TYPE_CHECKING:
 def gradient_check(certificate: Certificate, path: str | Path) -> Path:
     """Four panels: differences against the adjoint, the adjoint's growth, its horizon, and policies.
 
-    The horizon is shown for the parameter with the nearest.
+    The horizon is shown for the parameter with the nearest. What a wrong adjoint leaves unasked stays empty.
     """
-    nearest = min(certificate.horizons, key=lambda horizon: horizon.measured)
     with drawing(path, 12.0, 8.4) as figure:
         (differences, growth), (horizon, policies) = figure.subplots(2, 2)
         _differences(differences, certificate)
         _growth(growth, certificate)
-        _horizon(horizon, nearest)
+        _horizon(horizon, min(certificate.horizons, key=lambda one: one.measured, default=None))
         _policies(policies, certificate.agreement)
         verdict = "right" if certificate.right else "WRONG"
         figure.suptitle(
@@ -36,7 +35,10 @@ def gradient_check(certificate: Certificate, path: str | Path) -> Path:
 
 def _differences(axes: Any, certificate: Certificate) -> None:
     c = certificate.comparison
-    steps, misses = c.steps[: len(c.differences)], c.misses
+    if not len(c.steps):
+        _empty(axes, f"reverse and forward mode differ by {c.disagreement:.1e}")
+        return
+    steps, misses = c.steps, c.misses
     shown = sorted({*np.linspace(0, len(c.moments) - 1, 4).round().astype(int)})
     for k, moment in enumerate(shown):
         axes.loglog(steps, np.maximum(misses[:, moment], 1e-16), "o-", color=PALETTE[k], label=str(c.moments[moment]))
@@ -59,7 +61,10 @@ def _growth(axes: Any, certificate: Certificate) -> None:
     axes.set_ylabel("norm of the adjoint of a state")
 
 
-def _horizon(axes: Any, horizon: Horizon) -> None:
+def _horizon(axes: Any, horizon: Horizon | None) -> None:
+    if horizon is None:
+        _empty(axes, "no horizon of a wrong adjoint")
+        return
     for values, label, colour in ((horizon.exact, "exact", 6), (horizon.difference, "of a meaningful change", 0)):
         size = np.abs(values)
         there = size > 0.0
@@ -74,8 +79,7 @@ def _horizon(axes: Any, horizon: Horizon) -> None:
 
 def _policies(axes: Any, agreement: Agreement | None) -> None:
     if agreement is None:
-        axes.set_axis_off()
-        axes.text(0.5, 0.5, "too many numbers for a smoothed gradient", ha="center", color=FAINT)
+        _empty(axes, "no smoothed gradient to compare with")
         return
     for k, judged in enumerate(agreement.policies):
         axes.barh(-k, judged.cosine, color=PALETTE[k], height=0.42)
@@ -83,3 +87,8 @@ def _policies(axes: Any, agreement: Agreement | None) -> None:
     axes.axvline(0.0, color=FAINT, linewidth=1.0)
     axes.set(title="Gradients against the smoothed one", xlabel="cosine", xlim=(-1.02, 1.02), yticks=[])
     axes.set_ylim(0.6 - len(agreement.policies), 0.6)
+
+
+def _empty(axes: Any, words: str) -> None:
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, words, ha="center", color=FAINT, transform=axes.transAxes)

@@ -1,0 +1,217 @@
+"""A copy of the package in which the sign of any one term of any adjoint can be flipped while it runs.
+
+Every term is multiplied by ``_sign(number)``, which is -1 for the one number that stands at a fixed address in memory,
+and 1 for all others: kernels are compiled once for all plants. `plant_all` writes the copy; this file as a program,
+with the copy on the path, says for every plant which scene gives it away.
+"""
+
+import ast
+import ctypes
+import json
+import mmap
+import shutil
+import sys
+from pathlib import Path
+
+ADDRESS = 0x5000_0000_0000
+MODULE = f'''"""The sign of a term, flipped where its number is the one in memory."""
+
+import ctypes
+
+import warp as wp
+
+
+@wp.func_native("return *((volatile int*){ADDRESS}) == number ? -1.0 : 1.0;")
+def sign(number: int) -> wp.float64: ...
+
+
+def host_sign(number: int) -> float:
+    return -1.0 if ctypes.c_int.from_address({ADDRESS}).value == number else 1.0
+'''
+IMPORTS = {True: "from cortado.planted import sign as _sign", False: "from cortado.planted import host_sign as _sign"}
+WHOLE_NUMBERS = {"i", "j", "b", "before"}
+"""Variables that are indices."""
+CONSTANTS = ("real(0.0)", "real(0.5)", "real(1.0)", "vector()")
+"""Not planted: 0 and 1, and the derivative at the corner of mu_ij, where both viscosities are 0 and none is moved."""
+
+
+STEPS = 3
+"""Of the runs that are judged."""
+
+
+class Planter(ast.NodeTransformer):
+    """Wraps the terms of functions of these names, and lists them."""
+
+    def __init__(self, names: set[str], first: int):
+        self.names, self.first = names, first
+        self.found: list[tuple[str, str]] = []
+        """Function and term, one for each plant."""
+        self._outer: list[str] = []
+        self._function = ""
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
+        self._outer.append(node.name)
+        name = ".".join(self._outer)
+        self._function = name if name in self.names else ""
+        node.body = [self.visit(statement) for statement in node.body]
+        self._outer.pop()
+        self._function = ""
+        return node
+
+    def visit_For(self, node: ast.For) -> ast.AST:
+        if self._function:
+            node.body = [self.visit(statement) for statement in node.body]
+            return node
+        return self.generic_visit(node)
+
+    def visit_If(self, node: ast.If) -> ast.AST:
+        if self._function:
+            node.body = [self.visit(statement) for statement in node.body]
+            node.orelse = [self.visit(statement) for statement in node.orelse]
+            return node
+        return self.generic_visit(node)
+
+    def visit_Assign(self, node: ast.Assign) -> ast.AST:
+        target = node.targets[0]
+        if self._function and not (isinstance(target, ast.Name) and target.id in WHOLE_NUMBERS):
+            node.value = self._terms(node.value, isinstance(target, ast.Subscript), ast.unparse(target))
+        return node
+
+    def visit_AugAssign(self, node: ast.AugAssign) -> ast.AST:
+        if self._function:
+            node.value = self._terms(node.value, True)
+        return node
+
+    def visit_Return(self, node: ast.Return) -> ast.AST:
+        if self._function and isinstance(node.value, ast.Tuple):
+            node.value.elts = [self._terms(element, not isinstance(element, ast.Name)) for element in node.value.elts]
+        elif self._function and node.value is not None:
+            node.value = self._terms(node.value, True)
+        return node
+
+    def _terms(self, node: ast.expr, whole: bool, target: str = "") -> ast.expr:
+        """With every operand of a sum wrapped, and a value that is no sum if it is ``whole``."""
+        if isinstance(node, ast.BinOp) and isinstance(node.op, (ast.Add, ast.Sub)):
+            node.left, node.right = self._terms(node.left, True, target), self._terms(node.right, True, target)
+            return node
+        if ast.unparse(node) in (target, *CONSTANTS):
+            return node
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "vector":
+            node.args = [self._terms(argument, True) for argument in node.args]
+            return node
+        text = ast.unparse(node)
+        node = self._inside(node)
+        return self._wrapped(node, text) if whole else node
+
+    def _inside(self, node: ast.expr) -> ast.expr:
+        """With the sums within a product or a function's arguments planted; what is divided by has no sign to lose."""
+        if isinstance(node, ast.BinOp):
+            node.left = self._terms(node.left, False)
+            node.right = node.right if isinstance(node.op, ast.Div) else self._terms(node.right, False)
+        elif isinstance(node, ast.UnaryOp):
+            node.operand = self._terms(node.operand, False)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) != "real":
+            node.args = [self._terms(argument, False) for argument in node.args]
+        return node
+
+    def _wrapped(self, node: ast.expr, text: str) -> ast.expr:
+        number = self.first + len(self.found)
+        self.found.append((self._function, text))
+        return ast.BinOp(ast.parse(f"_sign({number})", mode="eval").body, ast.Mult(), node)
+
+
+def plant_all(package: Path, copy: Path, functions: dict[str, set[str]]) -> list[tuple[str, str, str]]:
+    """Copy the package with terms wrapped in functions of modules; (module, function, term) of every plant."""
+    shutil.copytree(package, copy / "cortado", ignore=shutil.ignore_patterns("__pycache__"))
+    (copy / "cortado" / "planted.py").write_text(MODULE)
+    plants: list[tuple[str, str, str]] = []
+    for module, names in functions.items():
+        path = copy / "cortado" / (module.replace(".", "/") + ".py")
+        tree = ast.parse(path.read_text())
+        planter = Planter(names, len(plants))
+        tree = planter.visit(tree)
+        tree.body.insert(1, ast.parse(IMPORTS[module.startswith("physics.")]).body[0])
+        path.write_text(ast.unparse(ast.fix_missing_locations(tree)))
+        plants += [(module, *one) for one in planter.found]
+    return plants
+
+
+# ---- in the copy -------------------------------------------------------------------------------------------------
+
+
+def number_in_memory() -> ctypes.c_int:
+    """The number at `ADDRESS`."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    libc.mmap.restype, libc.mmap.argtypes = ctypes.c_void_p, [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 4]
+    protection, fixed = mmap.PROT_READ | mmap.PROT_WRITE, 0x10
+    assert (
+        libc.mmap(ADDRESS, mmap.PAGESIZE, protection, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | fixed, -1, 0) == ADDRESS
+    )
+    return ctypes.c_int.from_address(ADDRESS)
+
+
+def judge(plants: list[int], scenes: dict[str, dict]) -> dict[str, str | None]:
+    """For every plant the first scene, of those given by name, whose certificate is "wrong"; None where none is."""
+    import cortado
+
+    number = number_in_memory()
+    number.value = -1
+    cases = {}
+    for name, tables in scenes.items():
+        cases[name] = case(cortado.Scene(**tables["scene"]), tables["loss"])
+        problem, point = cases[name]
+        assert cortado.certify(problem, point).right, f"a false alarm: {name}"
+    found: dict[str, str | None] = {}
+    for plant in plants:
+        number.value = plant
+        found[str(plant)] = next((name for name in cases if not cortado.certify(*cases[name]).right), None)
+    return found
+
+
+def case(scene, loss: str):
+    """A problem of a few steps, and a point at which nothing is symmetric, at rest or pure."""
+    import numpy as np
+
+    from cortado import Problem, Simulation, losses
+
+    simulation, random = Simulation(scene, precision="float64"), np.random.default_rng(1)
+    spacing = scene.discretisation.spacing
+    shape, phases = simulation.positions.shape, len(scene.phase)
+    point = {
+        "initial_positions": simulation.positions + 0.03 * spacing * random.standard_normal(shape),
+        "initial_velocities": simulation.velocities + 0.3 * random.standard_normal(shape),
+    }
+    if phases > 1:
+        fractions = 0.2 + random.random((shape[0], phases))
+        point["mass_fractions"] = fractions / fractions.sum(axis=1, keepdims=True)
+    if scene.emitter is not None:
+        point["nozzle_path"] = scene.emitter.outlet + 0.1 * spacing * random.standard_normal((STEPS, shape[1]))
+    target = simulation.positions + 0.1 * random.standard_normal(shape)
+    made = losses.FinalPositions(target) if loss == "positions" else Everything(target, random.standard_normal(phases))
+    return Problem(simulation, STEPS, made), point
+
+
+class Everything:
+    """A loss of positions, velocities and fractions."""
+
+    def __init__(self, target, weights):
+        self.target, self.weights = target, weights
+
+    def value(self, end) -> float:
+        c = (end.mass_fractions**2 @ self.weights).mean()
+        return float(((end.positions - self.target) ** 2).mean() + 0.01 * (end.velocities**2).mean() + 0.01 * c)
+
+    def adjoint(self, end):
+        x, v, c = end.positions - self.target, end.velocities, end.mass_fractions
+        return 2.0 / x.size * x, 0.02 / v.size * v, 0.02 / len(c) * c * self.weights
+
+
+if __name__ == "__main__":
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR
+    request = json.loads(Path(sys.argv[1]).read_text())
+    import cortado
+
+    assert Path(cortado.__file__).is_relative_to(Path(sys.argv[1]).parent), "this is not the copy"
+    Path(sys.argv[2]).write_text(json.dumps(judge(request["plants"], request["scenes"])))

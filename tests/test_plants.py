@@ -1,0 +1,185 @@
+"""A sign flipped in any term of any adjoint, one at a time, is found by the certificate (`planting` flips them)."""
+
+import ast
+import json
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import cortado
+from cortado import Problem, Simulation
+from cortado.launching import Launcher
+from cortado.rollout import Rollout
+from planting import case, plant_all
+from scenes import HONEY, MIXING, OIL, plane
+
+ROOT = Path(cortado.__file__).parent
+
+ADJOINTS = {
+    "physics.density": {
+        "density_sums.weights_adjoint": 5,
+        "density_kernels.density_adjoint": 1,
+    },
+    "physics.walls": {"wall_kernels.wall_yield_adjoint": 1},
+    "physics.contrast": {"contrast_kernels.factor_adjoint": 2, "contrast_kernels.contrast_adjoint": 10},
+    "physics.pressure": {
+        "pressure_kernels.pressure_adjoint": 4,
+        "pressure_force_kernels.pressure_force_adjoint": 28,
+    },
+    "physics.viscosity": {
+        "pairwise_functions.adjoint_x": 4,
+        "pairwise_functions.adjoint_v": 1,
+        "laminar_functions.adjoint_x": 1,
+        "laminar_functions.adjoint_v": 1,
+        "viscosity_kernels.viscosity_adjoint": 19,
+    },
+    "physics.integration": {
+        "prediction_functions.adjoint": 5,
+        "integration_kernels.begin_adjoint": 6,
+        "integration_kernels.acceleration_adjoint": 1,
+        "integration_kernels.collect_masses": 1,
+    },
+    "physics.gravity": {"gravity_kernels.gravity_adjoint": 1},
+    "physics.mixture": {"mixture_kernels.blend_adjoint": 7},
+    "physics.spreading": {"spreading_functions.spread_adjoint": 12},
+    "physics.diffusion": {
+        "diffusion_kernels.scale_adjoint": 1,
+        "diffusion_kernels.flux_adjoint": 9,
+        "diffusion_kernels.potential_adjoint": 6,
+    },
+    "physics.nozzle": {"nozzle_kernels.lead_adjoint": 4, "nozzle_kernels.collect": 7},
+    "masses": {"masses_adjoint": 2},
+}
+"""Functions of adjoints by module, and how many terms each has: what is planted."""
+SHARED = {
+    "physics.smoothing_functions": {"_cubic_spline.bend": 5, "smoothing_functions.hessian_product": 3},
+    "physics.surroundings": {"pair_functions.factor_gradient": 4},
+    "physics.contrast": {"contrast_kernels.excess_slope": 3},
+    "physics.viscosity": {"viscosity_kernels.share": 1},
+    "physics.free_energy": {"_double_well.bend": 3, "_miscible.bend": 1, "_degenerate.slope": 4},
+    "physics.matching": {"matching_kernels.difference": 3},
+}
+"""Derivatives that forward mode uses too, so that only differences can tell."""
+ELSEWHERE = {
+    "physics.absorption": "the renderer: tests/test_render.py",
+    "physics.colour_field": "the renderer: tests/test_render.py",
+    "physics.interpolation": "the renderer: tests/test_render.py",
+    "physics.rays": "the renderer: tests/test_render.py",
+    "physics.tint": "the renderer: tests/test_render.py",
+    "physics.frozen_pressure": "a policy that is not exact: tests/test_policies.py",
+    "physics.adjoint_filters": "policies that are not exact: tests/test_policies.py",
+}
+"""Modules with adjoints that no plant is in, and why."""
+
+
+def of_both(module: str) -> dict[str, int]:
+    return {**ADJOINTS.get(module, {}), **SHARED.get(module, {})}
+
+
+PLANTED = {module: of_both(module) for module in sorted({*ADJOINTS, *SHARED})}
+
+NOZZLE = {"phase": "oil", "outlet": [0.16, 0.24], "radius": 0.05, "length": 0.11, "flow_rate": 0.2}
+ROOM = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.3, 0.6], "slip": "no"}
+POOL = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.3, 0.2], "phase": "water"}
+PHASES = [{"name": "water", "rest_density": 1000.0, "viscosity": 2.0}, {**OIL, "viscosity": 8.0}]
+SOLVER = {"time_step": 0.002, "minimum_iterations": 3, "maximum_iterations": 3}
+
+
+def small(viscosity: str, **changes):
+    """24 particles in a pool and a few in a nozzle, in the plane."""
+    forces = {"gravity": [1.0, -9.81], "viscosity": viscosity}
+    tables = {"fluid": [POOL], "container": ROOM, "phase": PHASES, "solver": SOLVER, "forces": forces}
+    return plane(**{**tables, "emitter": NOZZLE, **changes})
+
+
+SCENES = {
+    "laminar, double well": (small("laminar", mixture=MIXING), "everything"),
+    "pairwise, miscible": (
+        small("pairwise", mixture={**MIXING, "free_energy": "miscible", "mobility_form": "constant"}),
+        "everything",
+    ),
+    "one phase": (small("pairwise", phase=[HONEY], fluid=[{**POOL, "phase": "honey"}], emitter=None), "positions"),
+}
+
+
+@cache
+def planted(folder: Path) -> list[tuple[str, str, str]]:
+    return plant_all(ROOT, folder, {module: set(names) for module, names in PLANTED.items()})
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory):
+    return tmp_path_factory.mktemp("planted")
+
+
+def test_every_term_is_listed(copy):
+    found: dict[str, dict[str, int]] = {module: {} for module in PLANTED}
+    for module, function, _ in planted(copy):
+        found[module][function] = found[module].get(function, 0) + 1
+    assert found == PLANTED
+
+
+def qualified(node: ast.AST, outer: str = ""):
+    """Names of all functions below a node, with those around them."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.FunctionDef):
+            yield outer + child.name
+            yield from qualified(child, f"{outer}{child.name}.")
+        else:
+            yield from qualified(child, outer)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "physics").glob("*.py")), ids=lambda path: path.stem)
+def test_every_adjoint_is_planted(path):
+    module = f"physics.{path.stem}"
+    if module not in ELSEWHERE:
+        names = {name for name in qualified(ast.parse(path.read_text())) if "adjoint" in name.split(".")[-1]}
+        assert names <= PLANTED.get(module, {}).keys()
+
+
+def test_every_kernel_on_the_way_back_is_planted(monkeypatch):
+    seen: dict[str, set[str]] = {"forward": set(), "backward": set()}
+    launch, way = Launcher.__call__, ["forward"]
+
+    def keep(self, kernel, *arguments, **options):
+        seen[way[0]].add(kernel.key)
+        launch(self, kernel, *arguments, **options)
+
+    back = Rollout.backward
+
+    def backward(*arguments, **options):
+        way[0] = "backward"
+        found = back(*arguments, **options)
+        way[0] = "forward"
+        return found
+
+    monkeypatch.setattr(Launcher, "__call__", keep)
+    monkeypatch.setattr(Rollout, "backward", backward)
+    for made, loss in SCENES.values():
+        problem, point = case(made, loss)
+        problem.value_and_gradient({**problem.simulation.parameters(), **point})
+    names = {name.split(".")[-1] for functions in ADJOINTS.values() for name in functions}
+    alone = {key.split("__locals__")[-1] for key in seen["backward"] - seen["forward"]}
+    assert alone <= names and len(alone) > 15, alone - names
+
+
+def test_every_plant_is_found(copy, tmp_path):
+    plants, request, answer = planted(copy), copy / "request.json", tmp_path / "answer.json"
+    scenes = {name: {"scene": made.model_dump(mode="json"), "loss": loss} for name, (made, loss) in SCENES.items()}
+    request.write_text(json.dumps({"plants": list(range(len(plants))), "scenes": scenes}))
+    program = [sys.executable, str(Path(__file__).with_name("planting.py")), str(request), str(answer)]
+    environment = {"PYTHONPATH": str(copy), "PATH": "", "HOME": str(Path.home())}
+    subprocess.run(program, env=environment, check=True, timeout=1200)
+    found = json.loads(answer.read_text())
+    hidden = [" | ".join(plants[int(number)]) for number, scene in found.items() if scene is None]
+    assert len(found) == len(plants) and not hidden, "\n".join(hidden)
+
+
+def test_the_copy_without_a_plant_is_right():
+    for made, loss in SCENES.values():
+        problem, point = case(made, loss)
+        assert isinstance(problem, Problem) and isinstance(problem.simulation, Simulation)
+        assert cortado.certify(problem, point).right
