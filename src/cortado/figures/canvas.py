@@ -15,7 +15,7 @@ PALETTE = ("#3d6b8e", "#c0763b", "#5b8a5a", "#8c5f7d", "#a89a4b", "#6b7a80", "#a
 """Muted colours that stay apart in print and for most eyes."""
 INK, FAINT = "#2b2a28", "#8a857c"
 DASHED: dict[str, Any] = {"linestyle": (0, (5, 4)), "linewidth": 1.2}
-_STYLE = {
+STYLE = {
     "font.size": 11,
     "axes.titlesize": 12,
     "axes.edgecolor": FAINT,
@@ -44,7 +44,7 @@ def drawing(path: str | Path, width: float = 9.0, height: float = 5.2) -> Iterat
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     content = BytesIO()
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12)
         figure = Figure(figsize=(width, height), dpi=150, layout=layout)
         FigureCanvasAgg(figure)

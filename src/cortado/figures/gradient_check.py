@@ -74,7 +74,7 @@ def _horizon(axes: Any, horizon: Horizon | None) -> None:
             axes.axvline(step, **DASHED, color=shade, label=f"{label} horizon: {step}")
     axes.set(title=f"Derivative of the loss along {horizon.parameter}", xlabel="step at which the run ends")
     axes.set_ylabel("size")
-    axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.92), fontsize=9)
+    axes.legend(loc="lower right", fontsize=9, frameon=True, framealpha=1.0, edgecolor="none")
 
 
 def _policies(axes: Any, agreement: Agreement | None) -> None:
@@ -83,7 +83,7 @@ def _policies(axes: Any, agreement: Agreement | None) -> None:
         return
     for k, judged in enumerate(agreement.policies):
         axes.barh(-k, judged.cosine, color=PALETTE[k], height=0.42)
-        axes.text(0.0, -k + 0.25, f"{judged.policy}: {judged.cosine:.2f}, size x {judged.size:.2g}", va="bottom")
+        axes.text(-1.0, -k + 0.25, f"{judged.policy}: {judged.cosine:.2f}, size x {judged.size:.2g}", va="bottom")
     axes.axvline(0.0, color=FAINT, linewidth=1.0)
     axes.set(title="Gradients against the smoothed one", xlabel="cosine", xlim=(-1.02, 1.02), yticks=[])
     axes.set_ylim(0.6 - len(agreement.policies), 0.6)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cortado.errors import InputError
-from cortado.figures.canvas import _STYLE
+from cortado.figures.canvas import STYLE
 from cortado.run_folder import write_atomically
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def save(draw: Callable[[], Figure], path: Path) -> None:
     import matplotlib
 
     content = BytesIO()
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         draw().savefig(content, format="png")
     try:
         write_atomically(path, content.getvalue())
