@@ -44,6 +44,8 @@ LAYERS = """
     certificate.certificate certificate figures.gradient_check
     study.tables study.scenes study.experiment study.canvas study.comparison study.reference_losses study.sources
     study.gravity_tangents study.term_sizes
+    study.estimates study.shades study.starts study.spatial_scales study.lyapunov_spectrum study.lyapunov_exponents
+    study.one_kernel_loops
     study.* study.kinds study.experiment_files study.results
     commands.* cli
 """

@@ -1,0 +1,174 @@
+"""Lyapunov exponents of a flow and of its variants, by two ways that share nothing but the step.
+
+Tangents are pushed along a run and made orthonormal again and again; and two runs, of which one starts a hair's breadth
+away, part. The second knows nothing of derivatives: where both agree, growth is the fluid's. Tangents can also leave
+out a term of the derivative, which says what each of them does to the growth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from cortado import scene_tables
+from cortado.reference import Simulation, Terms
+from cortado.scene import Scene
+from cortado.scene_kinds import Choice, Components, Count, Quantity, Tables, Text
+from cortado.study.estimates import growth_rate, norms
+from cortado.study.experiment import Progress, SceneSettings, Several
+from cortado.study.lyapunov_spectrum import growth_by_segment
+from cortado.study.scenes import varied
+from cortado.study.starts import perturbed, side_by_side
+from cortado.study.tables import Table
+
+Term = Choice(("viscosity", "pressure", "hessian", "density"))
+
+
+class Variant(scene_tables.Table):
+    """One thing changed in the scene, or in the derivative."""
+
+    panel: Annotated[str, Text()]
+    """Of the picture, where it belongs."""
+    label: Annotated[str, Text()]
+    """Of a curve in it, or of a bar if there is no ``x``."""
+    x: Annotated[float | None, Quantity()] = None
+    """Where on the curve."""
+    scene: Mapping[str, Any] = Field(default_factory=dict)
+    """What differs from the scene."""
+    without: Annotated[tuple[str, ...], Several(Term)] = ()
+    """Terms of the tangent that are left out (`cortado.reference.Terms`)."""
+
+
+class LyapunovSettings(SceneSettings):
+    """Exponents of the scene and of its variants."""
+
+    fall: Annotated[float, Quantity("m", above=0.0)]
+    """Height of the fall: times are counted in the time that it takes, (2 fall / g)^(1/2), so that variants of gravity
+    are seen at the same stage."""
+    window: Annotated[tuple[float, ...], Components(Quantity("falls", least=0.0))]
+    """Two: where exponents are measured."""
+    seeds: Annotated[int, Count(1, 100)]
+    perturbation: Annotated[float, Quantity("spacings", least=0.0)]
+    """Of the first positions."""
+    vectors: Annotated[int, Count(1, 1000)]
+    """Tangents of a variant."""
+    spectrum: Annotated[int, Count(1, 10_000)]
+    """Tangents of the scene itself, once."""
+    segment: Annotated[int, Count(1, 1000)]
+    """Steps between two orthonormalisations."""
+    velocity_time: Annotated[float, Quantity("s", above=0.0)]
+    """What velocities are multiplied with in the norm of a tangent."""
+    separation: Annotated[float, Quantity("m", above=0.0)]
+    """Of two runs at the start, each coordinate about so much."""
+    linear: Annotated[float, Quantity("m", above=0.0)]
+    """Distance of two runs, over all particles, up to which they count."""
+    variants: Annotated[tuple[Variant, ...], Tables("variants")]
+
+
+def window_steps(settings: LyapunovSettings, scene: Scene) -> tuple[int, int]:
+    """The window in steps, whole segments."""
+    gravity = float(np.linalg.norm(scene.forces.gravity))
+    falls = np.sqrt(2.0 * settings.fall / gravity) / scene.solver.time_step
+    first, last = (round(edge * falls / settings.segment) * settings.segment for edge in settings.window)
+    return first, max(last, first + 2 * settings.segment)
+
+
+def measure(settings: LyapunovSettings, progress: Progress) -> Table:
+    """Columns: panel, label, x, seed, way ("tangent" or "pair"), index of the exponent, window ("all", "first half",
+    "second half"), rate [1 / step] and rate_in_time [1 / s]."""
+    cases: dict[str, tuple[Scene, tuple[str, ...]]] = {}
+    keys = []
+    for variant in settings.variants:
+        scene = varied(settings.scene, **variant.scene) if variant.scene else settings.scene
+        keys.append(scene.to_json() + " ".join(variant.without))
+        cases[keys[-1]] = scene, variant.without
+    tasks = [
+        partial(_exponents, settings, scene, without, settings.vectors, seed)
+        for scene, without in cases.values()
+        for seed in range(settings.seeds)
+    ]
+    tasks.append(partial(_exponents, settings, settings.scene, (), settings.spectrum, 0))
+    with progress(len(tasks)) as advance:
+        *found, spectrum = side_by_side(tasks, advance)
+    by_case = {key: found[k * settings.seeds : (k + 1) * settings.seeds] for k, key in enumerate(cases)}
+    named = [
+        (variant.panel, variant.label, np.nan if variant.x is None else variant.x, seed, rows)
+        for variant, key in zip(settings.variants, keys, strict=True)
+        for seed, rows in enumerate(by_case[key])
+    ]
+    named.append(("spectrum", "base", np.nan, 0, spectrum))
+    return Table.joined(
+        {"panel": panel, "label": label, "x": x, "seed": seed, **row}
+        for panel, label, x, seed, rows in named
+        for row in rows
+    )
+
+
+def _exponents(
+    settings: LyapunovSettings, scene: Scene, without: tuple[str, ...], vectors: int, seed: int
+) -> list[dict[str, Any]]:
+    simulation = Simulation(scene, threads=1)
+    start = perturbed(simulation, seed, settings.perturbation)
+    first, last = window_steps(settings, scene)
+    middle = (first + last) // (2 * settings.segment) * settings.segment
+    terms = Terms(**dict.fromkeys(without, False))
+    logarithms = _growth(settings, simulation, start, terms, vectors, last, seed)
+    rows = []
+
+    def keep(way: str, index: int, window: str, rate: float) -> None:
+        row = {"way": way, "index": index, "window": window, "rate": rate}
+        rows.append({**row, "rate_in_time": rate / scene.solver.time_step})
+
+    for window, begin, end in (("all", first, last), ("first half", first, middle), ("second half", middle, last)):
+        sums = logarithms[begin // settings.segment : end // settings.segment].sum(axis=0)
+        for index, rate in enumerate(sums / (end - begin)):
+            keep("tangent", index, window, float(rate))
+    if not without:
+        keep("pair", 0, "all", _parting(settings, simulation, start, first, last, seed))
+    return rows
+
+
+def _growth(
+    settings: LyapunovSettings,
+    simulation: Simulation,
+    start: np.ndarray,
+    terms: Terms,
+    vectors: int,
+    steps: int,
+    seed: int,
+) -> np.ndarray:
+    """Logarithms (segments, vectors) of the growth of tangents from the start on."""
+    shape, time, segment = start.shape, settings.velocity_time, settings.segment
+
+    def push(state: Mapping[str, Any], frame: np.ndarray) -> tuple[Mapping[str, Any], np.ndarray]:
+        pushed = []
+        for x_dot, v_dot in frame.reshape(-1, 2, *shape):
+            along = {"initial_positions": x_dot, "initial_velocities": v_dot / time}
+            after = simulation.tangent(state, along, segment, terms=terms, record_every=segment)
+            assert after.position_tangents is not None and after.velocity_tangents is not None
+            ends = after.position_tangents.high[1], time * after.velocity_tangents.high[1]
+            pushed.append(np.concatenate([end.ravel() for end in ends]))
+        last = {"initial_positions": after.positions.high[1], "initial_velocities": after.velocities.high[1]}
+        return last, np.array(pushed)
+
+    state = {"initial_positions": start, "initial_velocities": simulation.velocities}
+    first = np.random.default_rng((seed, 1)).normal(size=(vectors, 2 * start.size))
+    return growth_by_segment(push, state, first, steps // segment)
+
+
+def _parting(
+    settings: LyapunovSettings, simulation: Simulation, start: np.ndarray, first: int, last: int, seed: int
+) -> float:
+    """The rate at which two runs part, as long as they are close; nan where that is too short."""
+    offset = settings.separation * np.random.default_rng((seed, 2)).normal(size=start.shape)
+    one, other = (simulation.run(last, {"initial_positions": at}) for at in (start, start + offset))
+    apart = norms(other.positions - one.positions)
+    steps = np.arange(first, last + 1)
+    steps = steps[np.maximum.accumulate(apart)[steps] <= settings.linear]
+    if len(steps) < 2 * settings.segment or apart[steps].min() <= 0.0:
+        return float("nan")
+    return growth_rate(steps, apart[steps])

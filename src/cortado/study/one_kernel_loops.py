@@ -1,0 +1,139 @@
+"""Kernels that are deliberately wrong: a neighbour sum and its non-linear use in one kernel.
+
+Every value is that of the kernels in `cortado.physics`, bit for bit. But Warp's backward pass does not run a dynamic
+loop again: after it the sum is 0 there, and what follows it (the clamp of the pressure, the yield beside a wall) has a
+silently wrong adjoint. So it is in the obvious way to write SPH in Warp, and in Warp's own example.
+"""
+
+# mypy: ignore-errors
+# Kernels are Warp's language, not Python's: their annotations are types made in a factory.
+
+from dataclasses import dataclass, replace
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
+from cortado.policies import Tape
+from cortado.rollout import Rollout, StepDerivative
+
+
+@dataclass(frozen=True)
+class OneKernelTape(Tape):
+    """Warp's tape again, over kernels of which some sum and go on in one."""
+
+    topics: tuple[str, ...]
+    """Of `one_kernel_loops`."""
+
+    def derivative(self, rollout: Rollout) -> StepDerivative:
+        step = super().derivative(rollout)
+        loops = one_kernel_loops(rollout.solver.discretisation)
+        wrong = {topic: SimpleNamespace(forward=loops[topic]) for topic in self.topics}
+        step.solver.kernels = replace(step.solver.kernels, **wrong)
+        return step
+
+
+@cache
+def one_kernel_loops(discretisation: Discretisation) -> dict[str, wp.Kernel]:
+    """Forward kernels by topic: "density" and "force" are linear after their sums, and so right; "walls" and "pressure"
+    are not."""
+    real, vector, pair_of = (
+        discretisation.precision.real,
+        discretisation.precision.vector,
+        discretisation.precision.pair,
+    )
+    surroundings = surroundings_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    separation, weight, gradient = pair.separation, pair.weight, pair.gradient
+    module = discretisation.module(True, "one_kernel_loops")
+
+    @wp.kernel(module=module)
+    def density(
+        s: surroundings,
+        x: wp.array(dtype=vector),
+        # out
+        n: wp.array(dtype=real),
+    ):
+        i = s.first + wp.tid()
+        total = real(0.0)
+        for k in range(s.fluid_count[i]):
+            total += weight(separation(x[i], x[s.neighbours[k, i]], s), s)
+        for k in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[k, i]
+            total += s.wall_weights[b] * weight(separation(x[i], s.wall_positions[b], s), s)
+        n[i] = s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
+
+    @wp.kernel(module=module)
+    def wall_yield(
+        s: surroundings,
+        x: wp.array(dtype=vector),
+        # out
+        y: wp.array(dtype=real),
+    ):
+        i = s.first + wp.tid()
+        total = vector()
+        for k in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[k, i]
+            total += (s.pliancy * s.wall_weights[b]) * gradient(separation(x[i], s.wall_positions[b], s), s)
+        y[i] = real(1.0) / (real(1.0) + wp.dot(total, total))
+
+    @wp.kernel(module=module)
+    def pressure(
+        s: surroundings,
+        stiffness: real,
+        time_step: wp.array(dtype=real),
+        n: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        rho_0: wp.array(dtype=real),
+        y: wp.array(dtype=real),
+        x_star: wp.array(dtype=vector),
+        p_in: wp.array(dtype=real),
+        # out
+        p_out: wp.array(dtype=real),
+        c: wp.array(dtype=real),
+        error: wp.array(dtype=pair_of),
+    ):
+        i = s.first + wp.tid()
+        total = real(0.0)
+        for k in range(s.fluid_count[i]):
+            total += weight(separation(x_star[i], x_star[s.neighbours[k, i]], s), s)
+        for k in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[k, i]
+            total += s.wall_weights[b] * weight(separation(x_star[i], s.wall_positions[b], s), s)
+        excess = m[i] * s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - rho_0[i]
+        delta = y[i] * stiffness / (time_step[0] * time_step[0])
+        p_i = wp.max(p_in[i] + delta * excess, real(0.0))
+        compression = wp.max(excess / rho_0[i], real(0.0))
+        p_out[i] = p_i
+        c[i] = p_i / (n[i] * n[i])
+        error[i] = pair_of(compression, compression)
+
+    @wp.kernel(module=module)
+    def pressure_force(
+        s: surroundings,
+        time_step: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
+        acceleration: wp.array(dtype=vector),
+        c: wp.array(dtype=real),
+        # out
+        x_star: wp.array(dtype=vector),
+        v_star: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid()
+        total = vector()
+        for k in range(s.fluid_count[i]):
+            j = s.neighbours[k, i]
+            total += (c[i] + c[j]) * gradient(separation(x[i], x[j], s), s)
+        for k in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[k, i]
+            total += (s.wall_push * s.wall_weights[b] * c[i]) * gradient(separation(x[i], s.wall_positions[b], s), s)
+        dt = time_step[0]
+        push = (-s.volume / m[i]) * total
+        velocity = v[i] + dt * (acceleration[i] + push)
+        v_star[i] = velocity
+        x_star[i] = x[i] + dt * velocity
+
+    return {"density": density, "walls": wall_yield, "pressure": pressure, "force": pressure_force}

@@ -1,0 +1,172 @@
+"""Finite differences over their step: where they equal the exact derivative, and where they saturate.
+
+A central difference of step h is at most (distance of two unrelated states) / (2 h): beyond that it says how large the
+attractor is, not how steep the map. Two predictions without a free number: it is right while h |dx/dg| is well below
+the scale of nonlinearity, and |difference| 2 h / distance tends to 1 as 2 h |dx/dg| / distance grows.
+"""
+
+from __future__ import annotations
+
+from functools import partial, reduce
+from math import gcd
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+
+from cortado.figures.canvas import DASHED, FAINT, INK
+from cortado.reference import Simulation
+from cortado.scene_kinds import Components, Count, Quantity
+from cortado.study.canvas import blank
+from cortado.study.estimates import Estimate, Line, norms
+from cortado.study.experiment import Kind, Progress, SceneSettings, Several
+from cortado.study.shades import shades
+from cortado.study.starts import perturbed, side_by_side
+from cortado.study.tables import Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+AGREES = 0.01
+"""Relative error up to which a difference counts as equal to the exact derivative."""
+SATURATED = 10.0
+"""2 h |dx/dg| / distance from which on a difference counts as saturated."""
+THIN: dict[str, Any] = {"markersize": 3.5, "linewidth": 1.4}
+
+
+class StepSizeSettings(SceneSettings):
+    """Differences of several steps, at several horizons."""
+
+    direction: Annotated[tuple[float, ...], Components(Quantity("m/s2"))]
+    """Of the change of gravity."""
+    differences: Annotated[tuple[float, ...], Several(Quantity("m/s2", above=0.0))]
+    horizons: Annotated[tuple[int, ...], Several(Count(1, 10_000))]
+    """Steps."""
+    seeds: Annotated[int, Count(2, 100)]
+    """First states; two unrelated ones give the distance."""
+    perturbation: Annotated[float, Quantity("spacings", above=0.0)]
+    """Of the first positions."""
+
+
+def measure(settings: StepSizeSettings, progress: Progress) -> Table:
+    """Columns: seed, horizon, difference [m/s2], size = |difference quotient| [s2], exact = |dx/dg| [s2], error
+    (relative), distance [m] of the state to that from the next first state."""
+    every, longest = reduce(gcd, settings.horizons), max(settings.horizons)
+
+    def tangent(seed: int, **way: Any) -> Any:
+        simulation = Simulation(settings.scene, threads=1)
+        start = {"initial_positions": perturbed(simulation, seed, settings.perturbation)}
+        along = {"gravity": np.asarray(settings.direction)}
+        return simulation.tangent(start, along, longest, record_every=every, **way)
+
+    seeds = range(settings.seeds)
+    ways: list[dict[str, Any]] = [{"method": "analytic"}]
+    ways += [{"method": "finite_difference", "difference": h} for h in settings.differences]
+    with progress(len(ways) * settings.seeds) as advance:
+        runs = iter(side_by_side((partial(tangent, seed, **way) for seed in seeds for way in ways), advance))
+    histories = [[next(runs) for _ in ways] for _ in seeds]
+    parts = []
+    for seed, (exact, *quotients) in enumerate(histories):
+        other = histories[(seed + 1) % settings.seeds][0]
+        sizes, distances = norms(exact.position_tangents), norms(exact.positions - other.positions)
+        for difference, quotient in zip(settings.differences, quotients, strict=True):
+            errors = norms(quotient.position_tangents - exact.position_tangents)
+            for horizon in settings.horizons:
+                frame = horizon // every
+                parts.append(
+                    {
+                        "seed": seed,
+                        "horizon": horizon,
+                        "difference": difference,
+                        "size": norms(quotient.position_tangents[frame : frame + 1])[0],
+                        "exact": sizes[frame],
+                        "error": errors[frame] / sizes[frame],
+                        "distance": distances[frame],
+                    }
+                )
+    return Table.joined(parts)
+
+
+def draw(table: Table, settings: StepSizeSettings) -> Figure:
+    """Sizes over the horizon, errors over the step, and all of it on one curve."""
+    figure = blank(15.0, 5.4)
+    sizes, errors, law = figure.subplots(1, 3)
+    figure.suptitle(settings.title)
+    horizons, differences = table.values("horizon"), table.values("difference")
+    for difference, shade in zip(differences, shades(len(differences)), strict=True):
+        found = [_mean(table.where(difference=difference, horizon=horizon)["size"]) for horizon in horizons]
+        sizes.semilogy(horizons, found, "o-", color=shade, label=f"step {difference:.0e}", **THIN)
+        rows = table.where(difference=difference)
+        law.loglog(_strength(rows), _saturation(rows), "o", markersize=3.5, color=shade, alpha=0.7)
+    exact = [_mean(table.where(horizon=horizon)["exact"]) for horizon in horizons]
+    sizes.semilogy(horizons, exact, color=INK, label="exact", **DASHED)
+    sizes.set(title="Size over the horizon", xlabel="steps", ylabel="|dx / dg| [s²]")
+    sizes.legend(fontsize=8)
+    for horizon, shade in zip(horizons, shades(len(horizons)), strict=True):
+        values = [_mean(table.where(difference=difference, horizon=horizon)["error"]) for difference in differences]
+        errors.loglog(differences, values, "o-", color=shade, label=f"{horizon} steps", **THIN)
+    errors.axhline(AGREES, **DASHED, color=FAINT)
+    errors.set(title="Error over the step", xlabel="step h [m/s²]", ylabel="relative error")
+    errors.legend(fontsize=8)
+    x = np.geomspace(_strength(table).min(), _strength(table).max(), 200)
+    law.loglog(x, np.minimum(x, 1.0), color=INK, label="the smaller of x and 1", **DASHED)
+    law.set(title="Saturation", xlabel="x = 2 h |dx / dg| / D", ylabel="2 h |difference quotient| / D")
+    law.legend(fontsize=9, loc="lower right", title="D: distance of unrelated states", title_fontsize=9)
+    return figure
+
+
+def verdict(table: Table, settings: StepSizeSettings) -> list[str]:
+    """Whether exact derivatives are the limit, up to which step, and whether large steps saturate as predicted."""
+    best = [rows["error"].min() for _, rows in table.groups("seed", "horizon")]
+    last = max(settings.horizons)
+    longest = [rows["error"].min() for _, rows in table.where(horizon=last).groups("seed")]
+    ends, sizes = [], []
+    for _, rows in table.groups("seed", "horizon"):
+        agreeing = rows["difference"][rows["error"] <= AGREES]
+        if len(agreeing) > 0 and agreeing.max() < max(settings.differences):
+            ends.append(agreeing.max())
+            sizes.append(rows["exact"][0])
+    sentences = [
+        f"The exact derivative is the limit of finite differences: with the best step they agree to "
+        f"{np.median(best):.1g} (median of {len(best)}), at {last} steps to {np.max(longest):.1g} at worst."
+    ]
+    if len(ends) >= 3:
+        reach = np.array(ends) * np.array(sizes)
+        slope = Line.through(np.log(sizes), np.log(ends)).slope
+        sentences.append(
+            f"The largest step that agrees within {AGREES:.0%} falls as |dx/dg| to the power {slope} (-1 expected): it "
+            f"moves the particles by {_mean(reach):.0e} m in all, within a factor {np.exp(np.log(reach).std()):.1g}."
+        )
+    saturated = table.chosen(_strength(table) > SATURATED)
+    if len(saturated) >= 3:
+        slope = Line.through(np.log(saturated["difference"]), np.log(saturated["size"])).slope
+        by_seed = [np.exp(np.log(_saturation(rows)).mean()) for _, rows in saturated.groups("seed")]
+        factor = Estimate.of(by_seed)
+        flat = table.where(difference=max(settings.differences), horizon=last)
+        ratio = _mean(flat["exact"] / flat["size"])
+        sentences.append(
+            f"Beyond, differences saturate: their size goes as the step to the power {slope} (-1 expected), and is "
+            f"{factor} times D / (2 h) (1 expected), D the distance of two unrelated states. At {last} steps the exact "
+            f"derivative is {ratio:.1g} times the difference of step {max(settings.differences):g}."
+        )
+        holds = abs(slope.value + 1.0) < 0.1 and 0.5 < factor.value < 2.0
+        sentences.append(
+            f"FD step size: {'true' if holds else 'not confirmed'}: flat finite differences come from their step, not "
+            f"from a bounded derivative."
+        )
+    return sentences
+
+
+def _strength(table: Table) -> np.ndarray:
+    return 2.0 * table["difference"] * table["exact"] / table["distance"]
+
+
+def _saturation(table: Table) -> np.ndarray:
+    return 2.0 * table["difference"] * table["size"] / table["distance"]
+
+
+def _mean(values: np.ndarray) -> float:
+    """The geometric one."""
+    return float(np.exp(np.log(np.maximum(values, 1e-300)).mean()))
+
+
+STEP_SIZE = Kind("step_size", StepSizeSettings, measure, draw, verdict)
