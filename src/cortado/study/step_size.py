@@ -134,7 +134,7 @@ def verdict(table: Table, settings: StepSizeSettings) -> list[str]:
         slope = Line.through(np.log(sizes), np.log(ends)).slope
         sentences.append(
             f"The largest step that agrees within {AGREES:.0%} falls as |dx/dg| to the power {slope} (-1 expected): it "
-            f"moves the particles by {_mean(reach):.0e} m in all, within a factor {np.exp(np.log(reach).std()):.1g}."
+            f"moves the particles by {_mean(reach):.0e} m in all, times or over {np.exp(np.log(reach).std()):.0f}."
         )
     saturated = table.chosen(_strength(table) > SATURATED)
     if len(saturated) >= 3:
