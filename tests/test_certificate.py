@@ -76,7 +76,7 @@ def test_beyond_the_horizon_another_policy_is_advised():
     assert 0.6 < horizon.predicted / horizon.measured < 1.6
     assert found.growth > 0.02
     exact, *others = found.agreement.policies
-    best = max(others, key=lambda judged: judged.cosine)
+    best = max(others, key=lambda judged: judged.merit)
     assert found.policy == best.policy and best.cosine > 0.9 and 0.1 < best.size < 10.0
     assert exact.size > 3.0
 
@@ -158,6 +158,7 @@ def comparison(adjoint=1.0, tangents=(0.5, 1.0), differences=((0.5, 1.0),) * 3, 
         comparison(tangents=(0.5, 7.0), adjoint=7.0, differences=((0.5, 2.0), (0.5, -1.0), (0.5, 0.3))),
         comparison(adjoint=1e-16, tangents=(0.0, -1e-16), differences=((0.0, 3e-13), (0.0, 2e-12), (0.0, 1e-11))),
         comparison(differences=((0.5, 1.1), (0.5, 1.001), (0.5, 1.0001))),
+        comparison(differences=((0.5, 1.0001), (0.5, 1.0001), (0.5, 1.0))),  # beside a kink
     ],
 )
 def test_what_is_right(right):
@@ -172,6 +173,7 @@ def test_what_is_right(right):
         comparison(adjoint=0.0),
         comparison(adjoint=1.0 + 1e-6),
         comparison(adjoint=1.00001, tangents=(0.5, 1.00001)),
+        comparison(differences=((0.5, 1.0001), (0.5, 1.0001), (0.5, 1.0002))),
         comparison(tangents=(0.6, 7.0), adjoint=7.0, differences=((0.5, 2.0), (0.5, -1.0), (0.5, 0.3))),
         comparison(tangents=(0.5, np.nan)),
     ],
@@ -210,8 +212,12 @@ def test_the_advice():
     far = horizon((1.0, 9.0, 9.0), (1.0, 1.0, 1.0))
     found = replace(long(), horizons=(far,))
     judged = [Judged("Exact()", 0.99, 9.0), Judged("AdjointSmoothing(strength=0.1)", 0.8, 1.0)]
-    for cosine, wanted in ((0.9, "VelocityOnly()"), (0.7, "AdjointSmoothing(strength=0.1)")):
-        both = (*judged, Judged("VelocityOnly()", cosine, 1.0))
+    for (cosine, size), wanted in {
+        (0.9, 1.0): "VelocityOnly()",
+        (0.9, 3.0): "AdjointSmoothing(strength=0.1)",
+        (0.7, 1.0): "AdjointSmoothing(strength=0.1)",
+    }.items():
+        both = (*judged, Judged("VelocityOnly()", cosine, size))
         assert replace(found, agreement=Agreement(0.1, both)).policy == wanted
     lost = (judged[0], Judged("AdjointSmoothing(strength=0.1)", 0.1, 1.0), Judged("VelocityOnly()", 0.2, 1.0))
     assert replace(found, agreement=Agreement(0.1, lost)).policy == "Smoothed()"

@@ -27,6 +27,11 @@ class Judged:
     size: float
     """Over that of the smoothed gradient."""
 
+    @property
+    def merit(self) -> float:
+        """The cosine over how many times too large or too small the gradient is; 1 is perfect."""
+        return self.cosine * min(self.size, 1.0 / self.size) if self.size > 0.0 else 0.0
+
 
 @dataclass(frozen=True)
 class Agreement:
@@ -39,9 +44,9 @@ class Agreement:
 
     @property
     def best(self) -> Judged | None:
-        """The policy, other than `Exact`, that points the way best; None where none does."""
-        best = max(self.policies[1:], key=lambda judged: judged.cosine)
-        return best if best.cosine > ALIKE else None
+        """The policy, other than `Exact`, of the greatest merit among those that point the way, if any does."""
+        good = [judged for judged in self.policies[1:] if judged.cosine > ALIKE]
+        return max(good, key=lambda judged: judged.merit, default=None)
 
 
 def agreement(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) -> Agreement | None:

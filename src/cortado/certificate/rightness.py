@@ -8,15 +8,16 @@ from cortado.certificate.course import Course
 from cortado.parameter_values import Arrays
 
 STEPS = tuple(10.0**-k for k in range(3, 9))
-"""Steps of the central differences, in units of the direction; they are tried until they stop getting better."""
+"""Steps of the central differences, in units of the direction; they are tried until they stop getting better, and
+agree with forward mode."""
 AGREEMENT = 1e-8
 """How near reverse and forward mode must be, relative, in float64; both are exact to round-off."""
 PLATEAU = 1e-3
 """Two neighbouring differences this near to each other, relative, are believed."""
 SLACK = 10.0
-"""What a believed difference may be off by, in units of its distance from its neighbour."""
+"""How far forward mode may be from a difference, in units of the least distance of two neighbouring ones."""
 RESOLUTION = 1e-6
-"""What a difference may be off by in any case, relative."""
+"""How far it may be in any case, relative."""
 FAINT = 1e-4
 """What a parameter may change the loss by, relative to the strongest, for all others to be reduced to."""
 ROUND_OFF = 1e-13
@@ -76,20 +77,16 @@ class Comparison:
 
     @property
     def miss(self) -> float | None:
-        """How near forward mode is there to the limit of differences, relative."""
-        if self.last_believed is None:
-            return None
-        last = int(np.flatnonzero(self.believed)[-1])
-        return float(self.misses[self.gaps[:, last].argmin() + 1, last])
+        """How near forward mode is there to a difference, relative."""
+        return float(self.misses[:, self.believed].min(axis=0)[-1]) if self.believed.any() else None
 
     @property
     def differences_agree(self) -> bool:
-        """Whether forward mode is the limit of differences wherever there is one to be seen."""
-        if not self.believed.any():
-            return True
-        best, moments = self.gaps.argmin(axis=0), np.arange(len(self.moments))
-        allowed = np.maximum(SLACK * self.gaps[best, moments], RESOLUTION)
-        return bool((self.misses[best + 1, moments] <= allowed)[self.believed].all())
+        """Whether forward mode is near a difference wherever there is a limit to be seen: nearer than neighbouring
+        differences are to each other. Beside a kink these may agree and be off, until a step falls short of it."""
+        allowed = np.maximum(SLACK * self.gaps.min(axis=0, initial=np.inf), RESOLUTION)
+        near = self.misses.min(axis=0, initial=np.inf) <= allowed
+        return bool(near[self.believed].all())
 
     @property
     def right(self) -> bool:
@@ -139,7 +136,8 @@ def compare(course: Course, values: Arrays, gradient: Arrays, along: Arrays) -> 
     for h in STEPS if comparison().disagreement < AGREEMENT else ():
         found.append(course.difference(values, along, h))
         gap = comparison().gaps[-1, -1] if len(found) > 1 else np.inf
-        if gap < RESOLUTION / SLACK or (best < PLATEAU and gap > best):
+        settled = gap < RESOLUTION / SLACK or (best < PLATEAU and gap > best)
+        if settled and comparison().differences_agree:
             break
         best = min(best, gap)
     return comparison()
