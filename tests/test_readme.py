@@ -9,14 +9,17 @@ import pytest
 
 import cortado.commands.bench
 import cortado.commands.check
+import cortado.commands.figure
 import cortado.commands.optimise
 import cortado.commands.run
 from cortado.cli import main
 from cortado.scene import load_scene
+from cortado.study.experiment_files import load_experiment
 from cortado.task import load_task
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+LOADERS = {"optimise": load_task, "figure": load_experiment}
 COMMANDS = re.findall(r"^    cortado (.*)$", README, re.MULTILINE)
 
 
@@ -43,14 +46,16 @@ def test_a_command_is_one(command, monkeypatch):
         (cortado.commands.run, "run_scene"),
         (cortado.commands.optimise, "optimise_task"),
         (cortado.commands.check, "check_scene"),
+        (cortado.commands.figure, "measure_figure"),
         (cortado.commands.bench, "bench_dam_break"),
     ):
         monkeypatch.setattr(module, function, lambda *arguments: "done")
     words = shlex.split(command)
     main(words)
+    load = next((LOADERS[word] for word in words if word in LOADERS), load_scene)
     for word in words:
         if word.endswith(".toml"):
-            assert (load_task(word) if "optimise" in words else load_scene(word)) is not None
+            assert load(word) is not None
 
 
 def test_there_are_commands():
