@@ -2,6 +2,8 @@
 
 import ast
 import json
+import os
+import site
 import subprocess
 import sys
 from functools import cache
@@ -170,8 +172,10 @@ def test_every_plant_is_found(copy, tmp_path):
     plants, request, answer = planted(copy), copy / "request.json", tmp_path / "answer.json"
     scenes = {name: {"scene": made.model_dump(mode="json"), "loss": loss} for name, (made, loss) in SCENES.items()}
     request.write_text(json.dumps({"plants": list(range(len(plants))), "scenes": scenes}))
-    program = [sys.executable, str(Path(__file__).with_name("planting.py")), str(request), str(answer)]
-    environment = {"PYTHONPATH": str(copy), "PATH": "", "HOME": str(Path.home())}
+    # Without -S an editable installation would be found before the copy.
+    program = [sys.executable, "-S", str(Path(__file__).with_name("planting.py")), str(request), str(answer)]
+    path = os.pathsep.join([str(copy), *site.getsitepackages()])
+    environment = {"PYTHONPATH": path, "PATH": "", "HOME": str(Path.home())}
     subprocess.run(program, env=environment, check=True, timeout=1200)
     found = json.loads(answer.read_text())
     hidden = [" | ".join(plants[int(number)]) for number, scene in found.items() if scene is None]
