@@ -1,11 +1,12 @@
 """What may be done to the adjoint a of a state between two backward steps: an average over neighbours, and a drag.
 
-    average:  a_i += strength sum_j w_ij (a_j - a_i),   w_ij = V W_ij / max(n_i, n_j)
+    average:  a_i += strength sum_j w_ij (a_j - a_i),   w_ij = W_ij / max(s_i, s_j, W(h / 2)),   s_i = sum_j W_ij
     drag:     a_i *= exp(-rate dt)
 
-The weights of the average are symmetric, so that sum_i a_i is kept; and as sum_j V W_ij < n_i, those of a particle add
-up to less than 1: for 0 <= strength <= 1 the square norm cannot grow. Long waves of a hardly feel it, those of the
-length of a few spacings decay: a viscosity of the adjoint.
+over fluid neighbours j of i. The weights of the average are symmetric, so that sum_i a_i is kept; and those of a
+particle add up to at most 1, so that for 0 <= strength <= 1 the square norm cannot grow. Long waves of a hardly feel
+it, those of the length of a few spacings decay: a viscosity of the adjoint. Divided by s, it acts at a surface and in a
+drop of a few particles as it does within the fluid; W(h / 2) is for those that hardly touch.
 """
 
 from functools import cache
@@ -18,7 +19,7 @@ from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions,
 
 @cache
 def adjoint_filter_kernels(discretisation: Discretisation) -> SimpleNamespace:
-    """Kernels ``average`` and ``drag`` of vectors (n,) in the scene's order, and ``squares`` of two of them."""
+    """Kernels ``crowd``, then ``average``, and ``drag`` of vectors (n,) in the scene's order, and ``squares``."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     surroundings = surroundings_type(discretisation.precision)
     pair = pair_functions(discretisation)
@@ -26,20 +27,37 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> SimpleNamespace:
     module = discretisation.module(False, "adjoint_filters")
 
     @wp.kernel(module=module, enable_backward=False)
+    def crowd(
+        s: surroundings,
+        x: wp.array(dtype=vector),
+        # out
+        most: wp.array(dtype=real),
+    ):
+        """max(s_i, W(h / 2))"""
+        i = s.first + wp.tid()
+        x_i = x[i]
+        total = -real(s.filling[i]) * s.self_weight
+        for k in range(0, s.fluid_count[i], UNROLL):
+            x_j = vectors(x, k, i, s)
+            for u in range(UNROLL):
+                total += weight(separation(x_i, x_j[u], s), s)
+        most[i] = wp.max(total, weight(vector(real(0.5) * s.support, real(0.0), real(0.0)), s))
+
+    @wp.kernel(module=module, enable_backward=False)
     def average(
         s: surroundings,
         order: wp.array(dtype=wp.int32),
         strength: wp.array(dtype=real),
         x: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
+        most: wp.array(dtype=real),
         a: wp.array(dtype=vector),
         # out
         a_new: wp.array(dtype=vector),
     ):
-        """``x`` and ``n`` are sorted, ``a`` is in the scene's order. A strength of 0 copies bit for bit."""
+        """``x`` and ``most`` are sorted, ``a`` is in the scene's order. A strength of 0 copies bit for bit."""
         i = s.first + wp.tid()
         x_i = x[i]
-        n_i = n[i]
+        most_i = most[i]
         a_i = a[order[i]]
         if strength[0] == real(0.0):
             a_new[order[i]] = a_i
@@ -47,9 +65,9 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> SimpleNamespace:
         total = vector()
         for k in range(0, s.fluid_count[i], UNROLL):
             x_j = vectors(x, k, i, s)
-            n_j = numbers(n, k, i, s)
+            most_j = numbers(most, k, i, s)
             for u in range(UNROLL):
-                w_ij = s.volume * weight(separation(x_i, x_j[u], s), s) / wp.max(n_i, n_j[u])
+                w_ij = weight(separation(x_i, x_j[u], s), s) / wp.max(most_i, most_j[u])
                 total += w_ij * (a[order[s.neighbours[k + u, i]]] - a_i)
         a_new[order[i]] = a_i + strength[0] * total
 
@@ -76,4 +94,4 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> SimpleNamespace:
         b_i = wp.vec3d(b[i])
         found[i] = wp.vec2d(wp.dot(a_i, a_i), wp.dot(b_i, b_i))
 
-    return SimpleNamespace(average=average, drag=drag, squares=squares)
+    return SimpleNamespace(crowd=crowd, average=average, drag=drag, squares=squares)

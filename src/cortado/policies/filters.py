@@ -22,9 +22,9 @@ class AdjointSmoothing(AdjointPolicy):
 
     Formula: for each field a of the adjoint, over the fluid neighbours of the state that it belongs to,
 
-        a_i <- a_i + strength sum_j w_ij (a_j - a_i),   w_ij = V W_ij / max(n_i, n_j),   0 <= strength <= 1.
+        a_i <- a_i + strength sum_j w_ij (a_j - a_i),   w_ij = W_ij / max(s_i, s_j),   s_i = sum_j W_ij.
 
-    The weights are symmetric and add up to less than 1: sum_i a_i is kept, the square norm does not grow. What grows
+    The weights are symmetric and add up to 1 at most: sum_i a_i is kept, the square norm does not grow. What grows
     exponentially in an adjoint lives at the scale of particles, the answer to a control at that of the fluid: a step
     damps a wave of length l by about strength (2 pi / l)^2 s_W^2 / 2, s_W^2 being the second moment of W.
 

@@ -19,9 +19,11 @@ class Average:
 
     def __init__(self, solver: Pcisph, fields: Iterable[str]):
         self._solver, self._fields = solver, tuple(fields)
-        self._kernel = adjoint_filter_kernels(solver.discretisation).average
+        self._kernels = adjoint_filter_kernels(solver.discretisation)
         self._before = solver.new_state()
-        self._strength = wp.zeros(1, dtype=solver.discretisation.precision.real, device=solver.search.device)
+        real, device = solver.discretisation.precision.real, solver.search.device
+        self._strength = wp.zeros(1, dtype=real, device=device)
+        self._most = wp.zeros(solver.search.particles, dtype=real, device=device)
 
     def set_strength(self, strength: float) -> None:
         """From now on; from 0, which leaves everything as it is, to 1."""
@@ -31,14 +33,12 @@ class Average:
         """Blend the adjoint of the state whose step the solver has recorded."""
         solver = self._solver
         moment = solver.moment(parameters)
+        launch, s, x = moment.launch, moment.surroundings, moment.fields.x
+        launch(self._kernels.crowd, [s, x], [self._most])
         for name in self._fields:
             before, after = getattr(self._before, name), getattr(bar, name)
             wp.copy(before, after)
-            moment.launch(
-                self._kernel,
-                [moment.surroundings, solver.search.order, self._strength] + [moment.fields.x, moment.fields.n, before],
-                [after],
-            )
+            launch(self._kernels.average, [s, solver.search.order, self._strength, x, self._most, before], [after])
 
 
 class Drag:
