@@ -1,0 +1,284 @@
+"""Policies against the gradient of a smoothed loss: ``python validation/policies.py --out runs/policies`` (an hour).
+
+A dam break of 144 particles in the plane, 12 x 12 with a spacing of 0.025 m, time step 1 ms, 4 pressure iterations a
+step, in float64. Parameters are gravity in 4 equal blocks of time, 8 numbers. A seed moves the first positions by 1 %
+of the spacing, and draws the gravity of a run whose last state is the target of four losses: centre of mass, Gaussian
+density on a grid, picture, and positions particle by particle.
+
+The reference is `policies.Smoothed` with a spread of 0.5 m/s2. For each policy the script writes the cosine of its
+gradient to the reference, and its size over the reference's, into `policies.csv`, and prints the medians over seeds.
+"""
+
+import argparse
+import csv
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado import Problem, Scene, Simulation, losses, policies
+from cortado.image_losses import Pyramid
+from cortado.progress import track
+from cortado.render.scene_renderer import scene_renderer
+
+SPACING, BLOCKS = 0.025, 4
+GRAVITY = np.tile([0.0, -9.81], (BLOCKS, 1))
+DISORDER = 0.01
+"""Of the first positions [spacings], of a seed and again of the reference's cloud."""
+SPREAD = 0.5
+"""Of the reference's gravities [m/s2]."""
+TILT, HIDDEN = 3.0, 1.0
+"""How far the target's gravities lean to a side, and their standard deviation [m/s2]."""
+POLICIES: dict[str, policies.Policy] = {
+    "exact": policies.Exact(),
+    "velocity only": policies.VelocityOnly(),
+    "damped 20/s": policies.Damped(20.0),
+    "smoothing 0.05": policies.AdjointSmoothing(0.05),
+    "smoothing 0.1": policies.AdjointSmoothing(0.1),
+    "smoothing 0.2": policies.AdjointSmoothing(0.2),
+    "smoothing auto": policies.AdjointSmoothing(),
+}
+
+
+def dam_break() -> Scene:
+    """A square column of water in a box twice as wide."""
+    return Scene(
+        name="dam break",
+        dimension=2,
+        discretisation={"spacing": SPACING, "support": 2.0, "kernel": "cubic_spline"},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.05, "colour": [0.1, 0.3, 0.8]}],
+        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.3, 0.3], "phase": "water"}],
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.9]},
+        forces={"gravity": [0.0, -9.81], "viscosity": "pairwise"},
+        solver={"time_step": 0.001, "minimum_iterations": 4, "maximum_iterations": 4},
+        render={"view": "plane", "resolution": [24, 36]},
+    )
+
+
+class DensityGrid:
+    """Squared distance of two Gaussian densities on a grid of two spacings, each particle spread over two spacings."""
+
+    width, nodes = 2.0 * SPACING, np.linspace(0.0, 0.9, 19)
+
+    def __init__(self, target: np.ndarray):
+        self.target = self.density(target)
+
+    def axes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(n, nodes) of both axes."""
+        a, b = (np.exp(-0.5 * ((x[:, k, None] - self.nodes) / self.width) ** 2) for k in range(2))
+        return a, b
+
+    def density(self, x: np.ndarray) -> np.ndarray:
+        """(nodes, nodes)"""
+        a, b = self.axes(x)
+        return a.T @ b / len(x)
+
+    def value(self, end: losses.TrajectoryEnd) -> float:
+        return float(((self.density(end.positions) - self.target) ** 2).sum())
+
+    def adjoint(self, end: losses.TrajectoryEnd) -> tuple[np.ndarray, np.ndarray]:
+        x = end.positions
+        (a, b), bar = self.axes(x), 2.0 * (self.density(x) - self.target) / len(x)
+        slopes = [-(x[:, k, None] - self.nodes) / self.width**2 * w for k, w in enumerate((a, b))]
+        x_bar = np.stack([((slopes[0] @ bar) * b).sum(1), ((a @ bar) * slopes[1]).sum(1)], axis=1)
+        return x_bar, np.zeros_like(x)
+
+
+class Case:
+    """One seed and horizon: the losses, and all of them after any run."""
+
+    def __init__(self, simulation: Simulation, seed: int, steps: int):
+        random = np.random.default_rng(seed)
+        self.simulation, self.steps = simulation, steps
+        self.start = simulation.positions + DISORDER * SPACING * random.standard_normal(simulation.positions.shape)
+        hidden = GRAVITY + [random.choice([-TILT, TILT]), 0.0] + HIDDEN * random.standard_normal(GRAVITY.shape)
+        self.problem = Problem(simulation, steps, losses.CentreOfMass([0.0, 0.0]))
+        target = self.problem.end(self.parameters({"gravity": hidden}))
+        renderer = scene_renderer(simulation)
+        picture = renderer.render(target.state.positions, target.state.mass_fractions, target.colours)
+        self.losses: dict[str, Any] = {
+            "centre of mass": losses.CentreOfMass(target.positions.mean(axis=0)),
+            "density grid": DensityGrid(target.positions),
+            "picture": losses.Image(renderer, picture),
+            "picture, pyramid": losses.Image(renderer, picture, Pyramid()),
+            "particles": losses.FinalPositions(target.positions),
+        }
+        self._seen: dict[bytes, dict[str, float]] = {}
+
+    def parameters(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Of the problem, for gravity in blocks."""
+        blocks = np.repeat(values["gravity"], self.steps // BLOCKS, axis=0)
+        return {"initial_positions": values.get("initial_positions", self.start), "gravity": blocks}
+
+    def values(self, values: dict[str, np.ndarray]) -> dict[str, float]:
+        """All losses of one run."""
+        parameters = self.parameters(values)
+        key = parameters["gravity"].tobytes() + parameters["initial_positions"].tobytes()
+        if key not in self._seen:
+            end = self.problem.end(parameters)
+            self._seen[key] = {name: loss.value(end) for name, loss in self.losses.items()}
+        return self._seen[key]
+
+    def reference(self, seed: int, samples: int) -> dict[str, policies.Estimate]:
+        """For each loss; the runs are the same for all."""
+        cloud = policies.Smoothed(SPREAD, samples, DISORDER, seed)
+        return {name: cloud.estimate(One(self, name), {"gravity": GRAVITY}) for name in self.losses}
+
+    def estimates(self, policy: policies.Policy) -> dict[str, tuple[np.ndarray, float | None]]:
+        """For each loss the gradient (blocks, 2), and the strength if there is one."""
+        found = {}
+        for name, loss in self.losses.items():
+            problem = Problem(self.simulation, self.steps, loss)
+            estimate = problem.estimate(self.parameters({"gravity": GRAVITY}), policy)
+            found[name] = estimate.gradient["gravity"].reshape(BLOCKS, -1, 2).sum(axis=1), estimate.strength
+        return found
+
+
+class One:
+    """One loss of a case, as `policies.Smoothed` sees a problem."""
+
+    def __init__(self, case: Case, name: str):
+        self._case, self._name = case, name
+        first = case.simulation
+        self.simulation = type("Moved", (), {"positions": case.start, "scene": first.scene})
+
+    def value(self, values: dict[str, np.ndarray]) -> float:
+        return self._case.values(values)[self._name]
+
+    def passage(self, values: dict[str, np.ndarray]) -> Any:
+        raise NotImplementedError
+
+
+Row = dict[str, Any]
+FIELDS = ("seed", "steps", "loss", "policy", "strength", "cosine", "size", *(f"g{k}" for k in range(2 * BLOCKS)))
+
+
+def references(seed: int, steps: int, samples: int) -> list[Row]:
+    """Two references of half the samples each, for every loss."""
+    case = Case(Simulation(dam_break(), precision="float64"), seed, steps)
+    rows = []
+    for half in range(2):
+        for loss, estimate in case.reference(1000 * seed + half, samples // 2).items():
+            rows.append(row(seed, steps, loss, f"reference {half + 1} of {samples}", estimate.gradient["gravity"]))
+    return rows
+
+
+def policy_rows(seed: int, steps: int) -> list[Row]:
+    """The gradients of every policy, for every loss."""
+    case = Case(Simulation(dam_break(), precision="float64"), seed, steps)
+    rows = []
+    for name, policy in POLICIES.items():
+        for loss, (gradient, strength) in case.estimates(policy).items():
+            rows.append(row(seed, steps, loss, name, gradient) | {"strength": "" if strength is None else strength})
+    return rows
+
+
+def row(seed: int, steps: int, loss: str, policy: str, gradient: np.ndarray) -> Row:
+    """One line of the file."""
+    numbers = {f"g{k}": float(value) for k, value in enumerate(gradient.ravel())}
+    return {"seed": seed, "steps": steps, "loss": loss, "policy": policy, "strength": "", **numbers}
+
+
+def gradient_of(line: Row) -> np.ndarray:
+    """(2 blocks,)"""
+    return np.array([float(line[f"g{k}"]) for k in range(2 * BLOCKS)])
+
+
+def cosine(a: np.ndarray, b: np.ndarray) -> float:
+    """Of two gradients."""
+    return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
+
+
+def compared(rows: list[Row], halves: list[Row]) -> list[Row]:
+    """The rows with cosine and size to their references; the references' are those of one half to the other."""
+    pairs: dict[tuple[int, int, str], list[np.ndarray]] = {}
+    for line in halves:
+        pairs.setdefault((int(line["seed"]), int(line["steps"]), line["loss"]), []).append(gradient_of(line))
+    found = []
+    for line in rows:
+        whole = np.mean(pairs[int(line["seed"]), int(line["steps"]), line["loss"]], axis=0)
+        g = gradient_of(line)
+        found.append(line | {"cosine": cosine(g, whole), "size": float(np.linalg.norm(g) / np.linalg.norm(whole))})
+    for (seed, steps, loss), (a, b) in pairs.items():
+        whole = row(seed, steps, loss, "one half of the reference to the other", (a + b) / 2)
+        found.append(whole | {"cosine": cosine(a, b), "size": float(np.linalg.norm(a) / np.linalg.norm(b))})
+    return found
+
+
+def read(path: Path) -> list[Row]:
+    """Rows of a file, none if it is not there."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write(path: Path, rows: Iterable[Row]) -> None:
+    """All rows, as CSV."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, FIELDS, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def report(rows: list[Row]) -> None:
+    """Print medians over seeds: cosine [least over seeds], size."""
+    cases = sorted({int(line["steps"]) for line in rows})
+    names = list(dict.fromkeys(line["loss"] for line in rows))
+    for steps in cases:
+        print(f"\n{steps} steps: median cosine to the reference [least], median size over the reference's")
+        print(f"{'':40}" + "".join(f"{name:>28}" for name in names))
+        for policy in dict.fromkeys(line["policy"] for line in rows):
+            cells = []
+            for name in names:
+                of = [x for x in rows if (int(x["steps"]), x["loss"], x["policy"]) == (steps, name, policy)]
+                cosines, sizes = ([float(x[key]) for x in of] for key in ("cosine", "size"))
+                cells.append(f"{np.median(cosines):8.3f} [{min(cosines):6.3f}] {np.median(sizes):9.2g}")
+            print(f"{policy:40}" + "".join(f"{cell:>28}" for cell in cells))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """See the head of the file."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("runs/policies"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
+    parser.add_argument("--steps", type=int, nargs="+", default=[400, 800], help="multiples of 4")
+    parser.add_argument("--samples", type=int, default=16, help="of the reference, 16 runs each; an even number")
+    parser.add_argument("--processes", type=int, default=2)
+    given = parser.parse_args(arguments)
+    given.out.mkdir(parents=True, exist_ok=True)
+    cases = [(seed, steps) for steps in given.steps for seed in given.seeds]
+    file = given.out / f"references_{given.samples}.csv"
+    kept = read(file)
+    known = {(int(line["seed"]), int(line["steps"])) for line in kept}
+    rows: list[Row] = []
+    with (
+        ProcessPoolExecutor(given.processes, get_context("spawn"), initializer=quiet) as pool,
+        track(sum(1 + (case not in known) for case in cases), "cases") as advance,
+    ):
+        wanted = {pool.submit(references, *case, given.samples): kept for case in cases if case not in known}
+        wanted |= {pool.submit(policy_rows, *case): rows for case in cases}
+        for done in as_completed(wanted):
+            wanted[done].extend(done.result())
+            write(file, kept)
+            advance()
+    halves = [line for line in kept if (int(line["seed"]), int(line["steps"])) in cases]
+    order = {name: k for k, name in enumerate(POLICIES)}
+    rows.sort(key=lambda line: (line["steps"], line["seed"], order[line["policy"]]))
+    found = compared(rows, halves)
+    write(given.out / "policies.csv", found)
+    report(found)
+    print(f"\nwritten: {given.out / 'policies.csv'}")
+
+
+def quiet() -> None:
+    """No lines of Warp's."""
+    wp.config.quiet = True
+
+
+if __name__ == "__main__":
+    main()
