@@ -1,12 +1,13 @@
 """Policies against the gradient of a smoothed loss: ``python validation/policies.py --out runs/policies`` (an hour).
 
 A dam break of 144 particles in the plane, 12 x 12 with a spacing of 0.025 m, time step 1 ms, 4 pressure iterations a
-step, in float64. Parameters are gravity in 4 equal blocks of time, 8 numbers. A seed moves the first positions by 1 %
+step, in float64. The parameter is gravity, constant or in equal blocks of time (``--blocks``). A seed moves the first positions by 1 %
 of the spacing, and draws the gravity of a run whose last state is the target of four losses: centre of mass, Gaussian
 density on a grid, picture, and positions particle by particle.
 
 The reference is `policies.Smoothed` with a spread of 0.5 m/s2. For each policy the script writes the cosine of its
-gradient to the reference, and its size over the reference's, into `policies.csv`, and prints the medians over seeds.
+gradient to the reference, and its size over the reference's, into `policies_1.csv` (for 1 block), and prints the
+medians over seeds.
 """
 
 import argparse
@@ -25,8 +26,8 @@ from cortado.image_losses import Pyramid
 from cortado.progress import track
 from cortado.render.scene_renderer import scene_renderer
 
-SPACING, BLOCKS = 0.025, 4
-GRAVITY = np.tile([0.0, -9.81], (BLOCKS, 1))
+SPACING, GRAVITY = 0.025, (0.0, -9.81)
+MOST_BLOCKS = 8
 DISORDER = 0.01
 """Of the first positions [spacings], of a seed and again of the reference's cloud."""
 SPREAD = 0.5
@@ -91,11 +92,13 @@ class DensityGrid:
 class Case:
     """One seed and horizon: the losses, and all of them after any run."""
 
-    def __init__(self, simulation: Simulation, seed: int, steps: int):
+    def __init__(self, simulation: Simulation, seed: int, steps: int, blocks: int):
         random = np.random.default_rng(seed)
-        self.simulation, self.steps = simulation, steps
+        self.simulation, self.steps, self.blocks = simulation, steps, blocks
+        self.gravity = np.tile(GRAVITY, (blocks, 1))
         self.start = simulation.positions + DISORDER * SPACING * random.standard_normal(simulation.positions.shape)
-        hidden = GRAVITY + [random.choice([-TILT, TILT]), 0.0] + HIDDEN * random.standard_normal(GRAVITY.shape)
+        hidden = self.gravity + [random.choice([-TILT, TILT]), 0.0]
+        hidden += HIDDEN * random.standard_normal(hidden.shape)
         self.problem = Problem(simulation, steps, losses.CentreOfMass([0.0, 0.0]))
         target = self.problem.end(self.parameters({"gravity": hidden}))
         renderer = scene_renderer(simulation)
@@ -111,7 +114,7 @@ class Case:
 
     def parameters(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Of the problem, for gravity in blocks."""
-        blocks = np.repeat(values["gravity"], self.steps // BLOCKS, axis=0)
+        blocks = np.repeat(values["gravity"], self.steps // self.blocks, axis=0)
         return {"initial_positions": values.get("initial_positions", self.start), "gravity": blocks}
 
     def values(self, values: dict[str, np.ndarray]) -> dict[str, float]:
@@ -126,15 +129,15 @@ class Case:
     def reference(self, seed: int, samples: int) -> dict[str, policies.Estimate]:
         """For each loss; the runs are the same for all."""
         cloud = policies.Smoothed(SPREAD, samples, DISORDER, seed)
-        return {name: cloud.estimate(One(self, name), {"gravity": GRAVITY}) for name in self.losses}
+        return {name: cloud.estimate(One(self, name), {"gravity": self.gravity}) for name in self.losses}
 
     def estimates(self, policy: policies.Policy) -> dict[str, tuple[np.ndarray, float | None]]:
         """For each loss the gradient (blocks, 2), and the strength if there is one."""
         found = {}
         for name, loss in self.losses.items():
             problem = Problem(self.simulation, self.steps, loss)
-            estimate = problem.estimate(self.parameters({"gravity": GRAVITY}), policy)
-            found[name] = estimate.gradient["gravity"].reshape(BLOCKS, -1, 2).sum(axis=1), estimate.strength
+            estimate = problem.estimate(self.parameters({"gravity": self.gravity}), policy)
+            found[name] = estimate.gradient["gravity"].reshape(self.blocks, -1, 2).sum(axis=1), estimate.strength
         return found
 
 
@@ -154,22 +157,22 @@ class One:
 
 
 Row = dict[str, Any]
-FIELDS = ("seed", "steps", "loss", "policy", "strength", "cosine", "size", *(f"g{k}" for k in range(2 * BLOCKS)))
+FIELDS = ("seed", "steps", "loss", "policy", "strength", "cosine", "size", *(f"g{k}" for k in range(2 * MOST_BLOCKS)))
 
 
-def references(seed: int, steps: int, samples: int) -> list[Row]:
+def references(seed: int, steps: int, blocks: int, samples: int) -> list[Row]:
     """Two references of half the samples each, for every loss."""
-    case = Case(Simulation(dam_break(), precision="float64"), seed, steps)
+    case = Case(Simulation(dam_break(), precision="float64"), seed, steps, blocks)
     rows = []
     for half in range(2):
-        for loss, estimate in case.reference(1000 * seed + half, samples // 2).items():
+        for loss, estimate in case.reference(1000 * seed + half + 1, samples // 2).items():
             rows.append(row(seed, steps, loss, f"reference {half + 1} of {samples}", estimate.gradient["gravity"]))
     return rows
 
 
-def policy_rows(seed: int, steps: int) -> list[Row]:
+def policy_rows(seed: int, steps: int, blocks: int) -> list[Row]:
     """The gradients of every policy, for every loss."""
-    case = Case(Simulation(dam_break(), precision="float64"), seed, steps)
+    case = Case(Simulation(dam_break(), precision="float64"), seed, steps, blocks)
     rows = []
     for name, policy in POLICIES.items():
         for loss, (gradient, strength) in case.estimates(policy).items():
@@ -185,7 +188,7 @@ def row(seed: int, steps: int, loss: str, policy: str, gradient: np.ndarray) -> 
 
 def gradient_of(line: Row) -> np.ndarray:
     """(2 blocks,)"""
-    return np.array([float(line[f"g{k}"]) for k in range(2 * BLOCKS)])
+    return np.array([float(line[f"g{k}"]) for k in range(2 * MOST_BLOCKS) if line.get(f"g{k}", "") != ""])
 
 
 def cosine(a: np.ndarray, b: np.ndarray) -> float:
@@ -246,13 +249,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("runs/policies"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
-    parser.add_argument("--steps", type=int, nargs="+", default=[400, 800], help="multiples of 4")
-    parser.add_argument("--samples", type=int, default=16, help="of the reference, 16 runs each; an even number")
+    parser.add_argument("--steps", type=int, nargs="+", default=[400, 800], help="multiples of the blocks")
+    parser.add_argument("--blocks", type=int, default=1, help="of time in which gravity is a parameter, at most 8")
+    parser.add_argument("--samples", type=int, default=32, help="of the reference, 4 runs a block; an even number")
     parser.add_argument("--processes", type=int, default=2)
     given = parser.parse_args(arguments)
     given.out.mkdir(parents=True, exist_ok=True)
     cases = [(seed, steps) for steps in given.steps for seed in given.seeds]
-    file = given.out / f"references_{given.samples}.csv"
+    file = given.out / f"references_{given.blocks}_{given.samples}.csv"
     kept = read(file)
     known = {(int(line["seed"]), int(line["steps"])) for line in kept}
     rows: list[Row] = []
@@ -260,8 +264,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ProcessPoolExecutor(given.processes, get_context("spawn"), initializer=quiet) as pool,
         track(sum(1 + (case not in known) for case in cases), "cases") as advance,
     ):
-        wanted = {pool.submit(references, *case, given.samples): kept for case in cases if case not in known}
-        wanted |= {pool.submit(policy_rows, *case): rows for case in cases}
+        wanted = {
+            pool.submit(references, *case, given.blocks, given.samples): kept for case in cases if case not in known
+        }
+        wanted |= {pool.submit(policy_rows, *case, given.blocks): rows for case in cases}
         for done in as_completed(wanted):
             wanted[done].extend(done.result())
             write(file, kept)
@@ -270,9 +276,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     order = {name: k for k, name in enumerate(POLICIES)}
     rows.sort(key=lambda line: (line["steps"], line["seed"], order[line["policy"]]))
     found = compared(rows, halves)
-    write(given.out / "policies.csv", found)
+    write(given.out / f"policies_{given.blocks}.csv", found)
     report(found)
-    print(f"\nwritten: {given.out / 'policies.csv'}")
+    print(f"\nwritten: {given.out / f'policies_{given.blocks}.csv'}")
 
 
 def quiet() -> None:

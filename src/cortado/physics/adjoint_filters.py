@@ -1,6 +1,7 @@
-"""What may be done to the adjoint a of a state between two backward steps: an average over neighbours, and a drag.
+"""What may be done to the adjoint a of a state between two backward steps: an average over neighbours, a limit, a drag.
 
     average:  a_i += strength sum_j w_ij (a_j - a_i),   w_ij = W_ij / max(s_i, s_j, W(h / 2)),   s_i = sum_j W_ij
+    limit:    a_i *= min(1, times r / |a_i|),   r^2 = sum_j |a_j|^2 / particles
     drag:     a_i *= exp(-rate dt)
 
 over fluid neighbours j of i. The weights of the average are symmetric, so that sum_i a_i is kept; and those of a
@@ -94,4 +95,21 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> SimpleNamespace:
         b_i = wp.vec3d(b[i])
         found[i] = wp.vec2d(wp.dot(a_i, a_i), wp.dot(b_i, b_i))
 
-    return SimpleNamespace(crowd=crowd, average=average, drag=drag, squares=squares)
+    @wp.kernel(module=module, enable_backward=False)
+    def limit(
+        times: wp.array(dtype=wp.float64),
+        particles: int,
+        squares: wp.array(dtype=wp.vec2d),
+        sums: wp.array(dtype=wp.vec2d),
+        field: int,
+        # in and out
+        a: wp.array(dtype=vector),
+    ):
+        """``squares`` of every particle and their ``sums``, of field 0 or 1, which is ``a``."""
+        i = wp.tid()
+        most = times[0] * times[0] * sums[0][field] / wp.float64(particles)
+        own = squares[i][field]
+        if own > most:
+            a[i] = real(wp.sqrt(most / own)) * a[i]
+
+    return SimpleNamespace(crowd=crowd, average=average, limit=limit, drag=drag, squares=squares)

@@ -9,9 +9,9 @@ from cortado.errors import InputError, shown
 from cortado.particles import State
 from cortado.policies.exact import Exact
 from cortado.policies.policy import AdjointPolicy, Differentiable, Estimate, Filtered, Values
-from cortado.policies.strength import smallest_sufficient
+from cortado.policies.strength import sufficient
 from cortado.rollout import Observer, Rollout, StepDerivative
-from cortado.solvers.adjoint_filters import FIELDS, AdjointNorms, Average, Drag
+from cortado.solvers.adjoint_filters import FIELDS, AdjointNorms, Average, Drag, Limit
 
 EXACT = Exact()
 
@@ -28,21 +28,29 @@ class AdjointSmoothing(AdjointPolicy):
     exponentially in an adjoint lives at the scale of particles, the answer to a control at that of the fluid: a step
     damps a wave of length l by about strength (2 pi / l)^2 s_W^2 / 2, s_W^2 being the second moment of W.
 
+    Then each vector of a is cut to ``limit`` root mean squares over all particles: now and then an adjoint grows at a
+    few particles faster than a smoothing can spread it, and would drown the rest.
+
     Bias: a little of the long waves is damped too, more with a greater strength. Losses of single particles, which have
     no long waves, get no good gradient. Cost: a sum over neighbours a field and step; with "auto" several ways back
     through one run (see `policies.strength`).
     """
 
     strength: float | Literal["auto"] = "auto"
-    """0 is the base policy bit for bit; "auto" the smallest at which the adjoint does not grow exponentially, reported
-    as ``strength`` of the `Estimate`."""
+    """0 is the base policy bit for bit; "auto" twice the smallest at which the adjoint does not grow exponentially,
+    reported as ``strength`` of the `Estimate`."""
     fields: tuple[str, ...] = FIELDS
     """Of "positions" and "velocities"."""
+    limit: float = 4.0
+    """Greatest vector of a particle, in root mean squares over all; infinite for none. Not applied with a strength of
+    0."""
     base: AdjointPolicy = EXACT
     """Whose backward steps these are."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fields", tuple(self.fields))
+        if not (isinstance(self.limit, (int, float, np.number)) and self.limit >= 1.0):
+            raise InputError(f"limit is {shown(self.limit)}, but must be a number of at least 1.")
         if not self.fields or not set(self.fields) <= set(FIELDS):
             raise InputError(f"fields is {shown(self.fields)}, but must be some of {', '.join(FIELDS)}.")
         number = isinstance(self.strength, (int, float, np.number)) and 0.0 <= self.strength <= 1.0
@@ -65,7 +73,8 @@ class AdjointSmoothing(AdjointPolicy):
                 passage.back(derivative, norms)
                 return norms.numpy()
 
-            derivative.set_strength(smallest_sufficient(history, float(rollout.parameters.time_step.numpy()[0])))
+            time_step = float(rollout.parameters.time_step.numpy()[0])
+            derivative.set_strength(sufficient(history, time_step))
         return Estimate(passage.loss, passage.back(derivative, observe), strength=derivative.strength)
 
 
@@ -74,17 +83,20 @@ class SmoothedStep(Filtered):
 
     def __init__(self, base: StepDerivative, rollout: Rollout, policy: AdjointSmoothing):
         super().__init__(base)
-        self._average = Average(base.solver, policy.fields)
+        self._average, self._limit = Average(base.solver, policy.fields), Limit(base.solver, policy.fields)
         self._parameters = rollout.parameters
+        self._times = policy.limit
         self.set_strength(0.0 if policy.strength == "auto" else float(policy.strength))
 
     def set_strength(self, strength: float) -> None:
         """From now on."""
         self.strength = strength
         self._average.set_strength(strength)
+        self._limit.set_times(self._times if strength > 0.0 else np.inf)
 
     def filter(self, bar: State) -> None:
         self._average(bar, self._parameters)
+        self._limit(bar)
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,30 @@ class Average:
             launch(self._kernels.average, [s, solver.search.order, self._strength, x, self._most, before], [after])
 
 
+class Limit:
+    """Cuts fields of an adjoint, particle by particle, to so many root mean squares over all particles."""
+
+    def __init__(self, solver: Pcisph, fields: Iterable[str]):
+        particles, device = solver.search.particles, solver.search.device
+        self._launch, self._particles, self._fields = solver.launch, particles, tuple(fields)
+        self._kernels = adjoint_filter_kernels(solver.discretisation)
+        self._squares = wp.zeros(particles, dtype=wp.vec2d, device=device)
+        self._sum = sum_of(wp.vec2d, particles, device)
+        self._times = wp.full(1, np.inf, dtype=wp.float64, device=device)
+
+    def set_times(self, times: float) -> None:
+        """From now on; infinitely many leave everything as it is."""
+        self._times.fill_(times)
+
+    def __call__(self, bar: State) -> None:
+        self._launch(self._kernels.squares, [bar.positions, bar.velocities], [self._squares])
+        sums = self._sum(self._squares)
+        for number, name in enumerate(FIELDS):
+            if name in self._fields:
+                arguments = [self._times, self._particles, self._squares, sums, number]
+                self._launch(self._kernels.limit, arguments, [getattr(bar, name)])
+
+
 class Drag:
     """Multiplies the adjoint of velocities by exp(-rate dt)."""
 
