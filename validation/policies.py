@@ -1,9 +1,9 @@
 """Policies against the gradient of a smoothed loss: ``python validation/policies.py --out runs/policies`` (an hour).
 
 A dam break of 144 particles in the plane, 12 x 12 with a spacing of 0.025 m, time step 1 ms, 4 pressure iterations a
-step, in float64. The parameter is gravity, constant or in equal blocks of time (``--blocks``). A seed moves the first positions by 1 %
-of the spacing, and draws the gravity of a run whose last state is the target of four losses: centre of mass, Gaussian
-density on a grid, picture, and positions particle by particle.
+step, in float64. The parameter is gravity, constant or in equal blocks of time (``--blocks``). A seed moves the first
+positions by 1 % of the spacing, and draws the gravity of a run whose last state is the target of the losses: centre of
+mass, Gaussian density on a grid, picture with two distances, and positions particle by particle.
 
 The reference is `policies.Smoothed` with a spread of 0.5 m/s2. For each policy the script writes the cosine of its
 gradient to the reference, and its size over the reference's, into `policies_1.csv` (for 1 block), and prints the
