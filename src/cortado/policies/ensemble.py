@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cortado.errors import InputError, shown
-from cortado.policies.policy import Arrays, Differentiable, Estimate, Values
+from cortado.parameter_values import Arrays, Values
+from cortado.policies.policy import Differentiable, Estimate
 from cortado.rollout import Observer
 
 MOST_NUMBERS = 64

@@ -6,9 +6,10 @@ from typing import Literal
 import numpy as np
 
 from cortado.errors import InputError, shown
+from cortado.parameter_values import Values
 from cortado.particles import State
 from cortado.policies.exact import Exact
-from cortado.policies.policy import AdjointPolicy, Differentiable, Estimate, Filtered, Values
+from cortado.policies.policy import AdjointPolicy, Differentiable, Estimate, Filtered
 from cortado.policies.strength import sufficient
 from cortado.rollout import Observer, Rollout, StepDerivative
 from cortado.solvers.adjoint_filters import FIELDS, AdjointNorms, Average, Drag, Limit

@@ -1,17 +1,12 @@
 """What a policy is: a way to come by a gradient, given to `Problem.value_and_gradient`."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
-
+from cortado.parameter_values import Arrays, Values
 from cortado.particles import Parameters, State
 from cortado.rollout import Observer, Rollout, StepDerivative
-
-Values = Mapping[str, Any]
-Arrays = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 from cortado import reference
 from cortado.controls import Controls
 from cortado.losses import Frames, as_loss
+from cortado.parameter_values import Arrays, Values
 from cortado.particles import State
 from cortado.policies import AdjointNorms, AdjointPolicy, Policy
 from cortado.problem import Problem
 from cortado.rollout import Rollout
 from cortado.scene import Scene
 from cortado.study.reference_losses import reference_loss
-
-Values = Mapping[str, Any]
-Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, eq=False)
