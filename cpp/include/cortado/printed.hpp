@@ -18,7 +18,7 @@ State<Real, D> printed_tangent(const Model<Real, D>& model, Step<Real, D>& step,
                                const State<Real, D>& dot, const Vector<Real, D>& gravity_dot, Real viscosity,
                                const Reading& reading) {
     const std::size_t count = state.x.size();
-    const Real m = model.rest_density, dt = model.time_step;
+    const Real m = model.rest_density;
     step.fluid.bend(model.smoothing, model.threads);
     step.walls.bend(model.smoothing, model.threads);
     const Values<Real> dn = density_tangent(model, step, state.x, dot.x);
@@ -26,8 +26,7 @@ State<Real, D> printed_tangent(const Model<Real, D>& model, Step<Real, D>& step,
     const Vectors<Real, D> da = acceleration_tangent(model, step, state, dot, dn, gravity_dot, gamma, Real(0));
     State<Real, D> new_dot{Vectors<Real, D>(count), Vectors<Real, D>(count)};
     const auto predict = [&](std::size_t i, const Vector<Real, D>& push_dot) {
-        new_dot.v[i] = dot.v[i] + dt * (da[i] + push_dot);
-        new_dot.x[i] = dot.x[i] + dt * new_dot.v[i];
+        predict_tangent(i, model.time_step, dot, da, push_dot, new_dot);
     };
     each_particle(count, model.threads, [&](std::size_t i) { predict(i, Vector<Real, D>::Constant(Real(0))); });
     Values<Real> dc(count);

@@ -80,6 +80,14 @@ Vector<Real, D> pressure_force_tangent(const Model<Real, D>& model, std::size_t 
     return -model.volume / model.rest_density * total;
 }
 
+// That of the prediction of particle i: dv* = dv + dt (da + dpush), dx* = dx + dt dv*.
+template <class Real, int D>
+void predict_tangent(std::size_t i, const Real& dt, const State<Real, D>& dot, const Vectors<Real, D>& da,
+                     const Vector<Real, D>& push_dot, State<Real, D>& star_dot) {
+    star_dot.v[i] = dot.v[i] + dt * (da[i] + push_dot);
+    star_dot.x[i] = dot.x[i] + dt * star_dot.v[i];
+}
+
 template <class Real, int D>
 Values<Real> pressure_coefficients(const Step<Real, D>& step, int k) {
     Values<Real> c(step.n.size());
@@ -93,7 +101,7 @@ State<Real, D> step_tangent(const Model<Real, D>& model, Step<Real, D>& step, co
                             const State<Real, D>& dot, const Vector<Real, D>& gravity_dot, Real viscosity,
                             Real viscosity_dot, const Terms& terms) {
     const std::size_t count = state.x.size();
-    const Real m = model.rest_density, dt = model.time_step;
+    const Real m = model.rest_density;
     step.fluid.bend(model.smoothing, model.threads);
     step.walls.bend(model.smoothing, model.threads);
     const Values<Real> dn = density_tangent(model, step, state.x, dot.x);
@@ -110,8 +118,7 @@ State<Real, D> step_tangent(const Model<Real, D>& model, Step<Real, D>& step, co
     });
     State<Real, D> new_dot{Vectors<Real, D>(count), Vectors<Real, D>(count)};
     const auto predict = [&](std::size_t i, const Vector<Real, D>& push_dot) {
-        new_dot.v[i] = dot.v[i] + dt * (da[i] + push_dot);
-        new_dot.x[i] = dot.x[i] + dt * new_dot.v[i];
+        predict_tangent(i, model.time_step, dot, da, push_dot, new_dot);
     };
     each_particle(count, model.threads, [&](std::size_t i) { predict(i, Vector<Real, D>::Constant(Real(0))); });
     Values<Real> dp(count, Real(0)), dc(count, Real(0));
