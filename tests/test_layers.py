@@ -33,7 +33,7 @@ LAYERS = """
     solvers.forces solvers.mixture solvers.emitter solvers.pcisph_parts solvers.pcisph solvers.pcisph_derivatives
     solvers.adjoint_filters
     rollout
-    policies.policy policies.exact policies.strength policies.filters policies.ensemble policies
+    policies.policy policies.exact policies.strength policies.filters policies.cloud policies.ensemble policies
     losses controls simulation problem
     render.scene_renderer reparametrisation
     evaluations optimisers optimisation

@@ -1,13 +1,15 @@
 """Policies: each does to the adjoint what its formula says, and nothing else."""
 
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 import pytest
 import warp as wp
 
 from cortado import InputError, Problem, Simulation, losses, policies
-from cortado.policies.strength import LADDER, MARGIN, growth, sufficient
+from cortado.policies.filters import extrapolated
+from cortado.policies.strength import LADDER, MOST_GROWTH, growth, sufficient
 from cortado.solvers.adjoint_filters import Average
 from reference import complex_step
 from scenes import plane, plane_of_three, scene, splash
@@ -127,20 +129,36 @@ class Twin:
 
     def adjoint(self, bar, policy):
         """The gradient with respect to the first state, for the adjoint of the last."""
-        frozen = isinstance(getattr(policy, "base", policy), policies.VelocityOnly)
+        if getattr(policy, "order", 1) == 1:
+            return self.back(bar, policy)
+        s, once = policy.strength, partial(replace, policy, order=1)
+        if policy.order == 2:
+            return 2 * self.back(bar, once(strength=s)) - self.back(bar, once(strength=2 * s))
+        three = [self.back(bar, once(strength=k * s)) for k in (1, 2, 3)]
+        return 3 * three[0] - 3 * three[1] + three[2]
+
+    def back(self, bar, policy):
+        """Without an extrapolation."""
+        chain = [policy]
+        while hasattr(chain[0], "base"):
+            chain.insert(0, chain[0].base)
+        frozen = isinstance(chain[0], policies.VelocityOnly)
         for state, jacobian in zip(reversed(self.states[:-1]), reversed(self.jacobians), strict=True):
             bar = (self.detached(jacobian) if frozen else jacobian).T @ bar
-            x_bar, v_bar = bar.reshape(2, *self.shape)
-            if isinstance(policy, policies.Damped):
-                v_bar = np.exp(-policy.rate * DT) * v_bar
-            if isinstance(policy, policies.AdjointSmoothing):
-                averaging = self.averaging(state, policy.strength)
-                x_bar = averaging @ x_bar if "positions" in policy.fields else x_bar
-                v_bar = averaging @ v_bar if "velocities" in policy.fields else v_bar
-                x_bar = limited(x_bar, policy.limit) if "positions" in policy.fields else x_bar
-                v_bar = limited(v_bar, policy.limit) if "velocities" in policy.fields else v_bar
-            bar = np.concatenate([x_bar.ravel(), v_bar.ravel()])
+            for each in chain[1:]:
+                bar = self.filtered(bar, state, each)
         return bar
+
+    def filtered(self, bar, state, policy):
+        """What a policy does to the adjoint of a state."""
+        x_bar, v_bar = bar.reshape(2, *self.shape)
+        if isinstance(policy, policies.Damped):
+            v_bar = np.exp(-policy.rate * DT) * v_bar
+        if isinstance(policy, policies.AdjointSmoothing):
+            averaging = self.averaging(state, policy.strength)
+            x_bar = limited(averaging @ x_bar, policy.limit) if "positions" in policy.fields else x_bar
+            v_bar = limited(averaging @ v_bar, policy.limit) if "velocities" in policy.fields else v_bar
+        return np.concatenate([x_bar.ravel(), v_bar.ravel()])
 
 
 def limited(vectors, times):
@@ -155,11 +173,13 @@ POLICIES = (
     policies.VelocityOnly(),
     policies.AdjointSmoothing(0.3),
     policies.AdjointSmoothing(0.3, limit=1.2),
-    policies.AdjointSmoothing(0.7, fields=["velocities"], limit=1.1),
-    policies.AdjointSmoothing(0.7, fields=["positions"]),
+    policies.AdjointSmoothing(0.7, fields=["velocities"], limit=1.1, order=1),
+    policies.AdjointSmoothing(0.7, fields=["positions"], order=1),
+    policies.AdjointSmoothing(0.3, order=3),
     policies.AdjointSmoothing(0.3, base=policies.VelocityOnly()),
     policies.AdjointSmoothing(0.3, base=policies.Tape()),
     policies.Damped(100.0),
+    policies.Damped(100.0, base=policies.AdjointSmoothing(0.3)),
 )
 
 
@@ -315,19 +335,43 @@ def chaotic():
     return Problem(simulation, 300, losses.CentreOfMassAlong([1.0, 0.0, 0.0]))
 
 
-def test_auto_takes_twice_the_smallest_sufficient_strength(chaotic):
+@pytest.mark.parametrize("order", [1, 2])
+def test_auto_takes_so_many_times_the_smallest_sufficient_strength(chaotic, order):
     point = {"gravity": np.array([0.5, -9.81, 0.0])}
-    auto = chaotic.estimate(point, policies.AdjointSmoothing())
-    assert auto.strength / MARGIN in LADDER
-    assert np.linalg.norm(chaotic.value_and_gradient(point)[1]["gravity"]) > 30 * np.linalg.norm(
-        auto.gradient["gravity"]
-    )
-    fixed = chaotic.estimate(point, policies.AdjointSmoothing(auto.strength))
+    auto = chaotic.estimate(point, policies.AdjointSmoothing(order=order))
+    least = auto.strength / (order + 1)
+    chosen = int(np.argmin(np.abs(np.array(LADDER) - least)))
+    assert LADDER[chosen] == pytest.approx(least, rel=1e-15)
+    _, exact = chaotic.value_and_gradient(point)
+    assert np.linalg.norm(exact["gravity"]) > 30 * np.linalg.norm(auto.gradient["gravity"])
+    fixed = chaotic.estimate(point, policies.AdjointSmoothing(auto.strength, order=order))
     assert auto.gradient["gravity"].tobytes() == fixed.gradient["gravity"].tobytes()
-    chosen = LADDER.index(auto.strength / MARGIN)
-    for strength in LADDER[: chosen + 1]:
-        history = norms_of(chaotic, point, policies.AdjointSmoothing(strength))
-        assert (sufficient(lambda _, h=history: h, DT) == 0.0) == (MARGIN * strength == auto.strength)
+    for k, strength in enumerate(LADDER[: chosen + 1]):
+        history = norms_of(chaotic, point, policies.AdjointSmoothing(strength, order=1))
+        assert (growth(history, DT) <= MOST_GROWTH) == (k == chosen)
+
+
+def test_the_ladder_is_climbed_no_further_than_needed():
+    steps, dt, asked = 100, 0.01, []
+
+    def history(strength):
+        asked.append(strength)
+        size = np.exp((3.0 - 60.0 * strength) * np.linspace(1.0, 0.0, steps + 1))
+        return np.stack([size, 0 * size], axis=1)
+
+    assert sufficient(history, dt) == 0.0375  # where 3 e-folds have become less than 1
+    assert asked == [0.0, 0.0125, 0.025, 0.0375]
+    assert sufficient(lambda strength: np.full((steps + 1, 2), np.inf), dt) == LADDER[-1]
+    assert sufficient(lambda strength: np.ones((steps + 1, 2)), dt) == 0.0
+
+
+def test_an_extrapolation_takes_powers_of_the_strength_off():
+    """g(s) = 1 + s + s^2 at strengths 1, 2, 3 of some unit: to first order 1 - 2 s^2, to second 1."""
+    s = 0.1
+    g = [{"viscosity": np.array(1.0 + k * s + (k * s) ** 2)} for k in (1, 2, 3)]
+    assert extrapolated(g[:1])["viscosity"] == g[0]["viscosity"]
+    assert extrapolated(g[:2])["viscosity"] == pytest.approx(1.0 - 2.0 * s**2, rel=1e-14)
+    assert extrapolated(g)["viscosity"] == pytest.approx(1.0, rel=1e-14)
 
 
 def test_growth_is_in_e_folds():
@@ -353,7 +397,7 @@ def test_every_adjoint_of_a_state_can_be_observed():
         seen[step] = bar.numpy(2)
         norms(step, bar)
 
-    found = problem.estimate(point, policies.AdjointSmoothing(0.1), observe)
+    found = problem.estimate(point, policies.AdjointSmoothing(0.1, order=1), observe)
     assert list(seen) == [7, 6, 5, 4, 3, 2, 1, 0]
     for k, name in enumerate(("initial_positions", "initial_velocities")):
         np.testing.assert_array_equal(seen[7][k], problem.loss.weights[k])
@@ -427,6 +471,48 @@ def test_before_chaos_smoothed_and_exact_agree():
     assert np.linalg.norm(found.gradient["gravity"] - exact["gravity"]) < 0.02 * np.linalg.norm(exact["gravity"])
 
 
+class Linear:
+    """In place of a policy: the gradient of a quadratic function."""
+
+    def __init__(self):
+        self.asked = []
+
+    def estimate(self, problem, parameters, observe=None):
+        self.asked.append(parameters)
+        g, mu = parameters["gravity"], parameters["viscosity"]
+        gravity = np.array([[6.0 * g[0, 0], -g[1, 0]], [-g[0, 1], 2.0 * mu]])
+        return policies.Estimate(7.0, {"gravity": gravity, "viscosity": 2.0 * g[1, 1] + 2.0 * mu}, strength=0.5)
+
+
+def test_an_average_is_of_the_policys_gradients():
+    stub, inner = Stub(quadratic, simulation_of("2-D")), Linear()
+    found = policies.Averaged(0.3, samples=2000, policy=inner).estimate(stub, POINT)
+    assert found.loss == quadratic(POINT) and found.strength == 0.5
+    for name, wanted in {"gravity": [[6.0, -0.5], [2.0, 1.4]], "viscosity": 7.4}.items():
+        assert found.gradient[name].shape == POINT[name].shape
+        away = (found.gradient[name] - wanted) / found.standard_error[name]
+        assert np.abs(away).max() < 4.0
+    np.testing.assert_allclose(found.standard_error["viscosity"], 0.3 * np.sqrt(8.0 / 2000), rtol=0.1)
+    moved = np.array([p["gravity"] - POINT["gravity"] for p in inner.asked])
+    np.testing.assert_allclose(moved.std(axis=0), 0.3, rtol=0.1)
+    drawn = np.array([p["initial_positions"] - stub.simulation.positions for p in inner.asked])
+    spacing = stub.simulation.scene.discretisation.spacing
+    assert drawn.std() == pytest.approx(0.01 * spacing, rel=0.02)
+    again = policies.Averaged(0.3, samples=2000, policy=Linear()).estimate(stub, POINT)
+    assert found.gradient["gravity"].tobytes() == again.gradient["gravity"].tobytes()
+
+
+def test_before_chaos_an_average_and_the_exact_gradient_agree():
+    simulation = Simulation(splash(), precision="float64")
+    problem = Problem(simulation, 60, losses.CentreOfMass([0.1, 0.1, 0.1]))
+    point = {"gravity": np.array([0.5, -9.81, 0.0]), "initial_positions": simulation.positions}
+    _, exact = problem.value_and_gradient(point)
+    policy = policies.Averaged({"gravity": 0.1, "initial_positions": 1e-6}, disorder=0.001, policy=policies.Exact())
+    found = problem.estimate(point, policy)
+    assert found.strength is None and found.gradient["initial_positions"].shape == simulation.positions.shape
+    assert np.linalg.norm(found.gradient["gravity"] - exact["gravity"]) < 0.02 * np.linalg.norm(exact["gravity"])
+
+
 # ---- centre of mass -------------------------------------------------------------------------------------------------
 
 
@@ -452,6 +538,10 @@ def test_centres_of_mass_and_their_gradients(make, masses):
 
 MISTAKES = {
     "strength above 1": lambda p: policies.AdjointSmoothing(1.5),
+    "strength twice 0.6": lambda p: policies.AdjointSmoothing(0.6),
+    "order 0": lambda p: policies.AdjointSmoothing(order=0),
+    "order in words": lambda p: policies.AdjointSmoothing(order="two"),
+    "auto as a base": lambda p: p.estimate({"viscosity": 1.0}, policies.Damped(1.0, base=policies.AdjointSmoothing())),
     "strength NaN": lambda p: policies.AdjointSmoothing(float("nan")),
     "strength in words": lambda p: policies.AdjointSmoothing("strong"),
     "limit below 1": lambda p: policies.AdjointSmoothing(limit=0.5),
@@ -459,6 +549,9 @@ MISTAKES = {
     "a field that is none": lambda p: policies.AdjointSmoothing(fields=("densities",)),
     "rate below 0": lambda p: policies.Damped(-1.0),
     "one sample": lambda p: policies.Smoothed(samples=1),
+    "an average of one": lambda p: policies.Averaged(samples=1),
+    "an average over no spread": lambda p: p.estimate({"viscosity": 1.0}, policies.Averaged(0.0)),
+    "an average of no policy": lambda p: policies.Averaged(policy=policies.Exact),
     "disorder below 0": lambda p: policies.Smoothed(disorder=-0.1),
     "spread 0": lambda p: p.estimate({"viscosity": 1.0}, policies.Smoothed(0.0)),
     "spread without a name": lambda p: p.estimate({"viscosity": 1.0}, policies.Smoothed({"gravity": 1.0})),

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -34,14 +35,15 @@ SPREAD = 0.5
 """Of the reference's gravities [m/s2]."""
 TILT, HIDDEN = 3.0, 1.0
 """How far the target's gravities lean to a side, and their standard deviation [m/s2]."""
+LOSSES = ("centre of mass", "density grid", "picture, pyramid", "picture", "particles")
 POLICIES: dict[str, policies.Policy] = {
     "exact": policies.Exact(),
     "velocity only": policies.VelocityOnly(),
     "damped 20/s": policies.Damped(20.0),
-    "smoothing 0.05": policies.AdjointSmoothing(0.05),
-    "smoothing 0.1": policies.AdjointSmoothing(0.1),
-    "smoothing 0.2": policies.AdjointSmoothing(0.2),
-    "smoothing auto": policies.AdjointSmoothing(),
+    "smoothing 0.1, not extrapolated": policies.AdjointSmoothing(0.1, order=1),
+    "smoothing, not extrapolated": policies.AdjointSmoothing(order=1),
+    "smoothing": policies.AdjointSmoothing(),
+    "smoothing, averaged over 4": policies.Averaged(SPREAD, 4, DISORDER),
 }
 
 
@@ -103,13 +105,14 @@ class Case:
         target = self.problem.end(self.parameters({"gravity": hidden}))
         renderer = scene_renderer(simulation)
         picture = renderer.render(target.state.positions, target.state.mass_fractions, target.colours)
-        self.losses: dict[str, Any] = {
-            "centre of mass": losses.CentreOfMass(target.positions.mean(axis=0)),
-            "density grid": DensityGrid(target.positions),
-            "picture": losses.Image(renderer, picture),
-            "picture, pyramid": losses.Image(renderer, picture, Pyramid()),
-            "particles": losses.FinalPositions(target.positions),
-        }
+        made: list[Any] = [
+            losses.CentreOfMass(target.positions.mean(axis=0)),
+            DensityGrid(target.positions),
+            losses.Image(renderer, picture, Pyramid()),
+            losses.Image(renderer, picture),
+            losses.FinalPositions(target.positions),
+        ]
+        self.losses = dict(zip(LOSSES, made, strict=True))
         self._seen: dict[bytes, dict[str, float]] = {}
 
     def parameters(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -126,34 +129,36 @@ class Case:
             self._seen[key] = {name: loss.value(end) for name, loss in self.losses.items()}
         return self._seen[key]
 
-    def reference(self, seed: int, samples: int) -> dict[str, policies.Estimate]:
-        """For each loss; the runs are the same for all."""
-        cloud = policies.Smoothed(SPREAD, samples, DISORDER, seed)
-        return {name: cloud.estimate(One(self, name), {"gravity": self.gravity}) for name in self.losses}
-
-    def estimates(self, policy: policies.Policy) -> dict[str, tuple[np.ndarray, float | None]]:
-        """For each loss the gradient (blocks, 2), and the strength if there is one."""
-        found = {}
-        for name, loss in self.losses.items():
-            problem = Problem(self.simulation, self.steps, loss)
-            estimate = problem.estimate(self.parameters({"gravity": self.gravity}), policy)
-            found[name] = estimate.gradient["gravity"].reshape(self.blocks, -1, 2).sum(axis=1), estimate.strength
-        return found
+    def estimate(self, loss: str, policy: policies.Policy) -> policies.Estimate:
+        """The gradient of a loss with respect to gravity in blocks."""
+        return policy.estimate(One(self, loss), {"gravity": self.gravity})
 
 
 class One:
-    """One loss of a case, as `policies.Smoothed` sees a problem."""
+    """One loss of a case with gravity in blocks, as policies see a problem."""
 
     def __init__(self, case: Case, name: str):
         self._case, self._name = case, name
-        first = case.simulation
-        self.simulation = type("Moved", (), {"positions": case.start, "scene": first.scene})
+        self._problem = Problem(case.simulation, case.steps, case.losses[name])
+        self.simulation = SimpleNamespace(positions=case.start, scene=case.simulation.scene)
 
     def value(self, values: dict[str, np.ndarray]) -> float:
         return self._case.values(values)[self._name]
 
-    def passage(self, values: dict[str, np.ndarray]) -> Any:
-        raise NotImplementedError
+    def passage(self, values: dict[str, np.ndarray]) -> "InBlocks":
+        return InBlocks(self._problem.passage(self._case.parameters(values)), self._case.blocks)
+
+
+class InBlocks:
+    """The ways back through a run, with the gradient in blocks."""
+
+    def __init__(self, passage: Any, blocks: int):
+        self._passage, self._blocks = passage, blocks
+        self.loss, self.rollout, self.derivative = passage.loss, passage.rollout, passage.derivative
+
+    def back(self, derivative: Any, observe: Any = None) -> dict[str, np.ndarray]:
+        gradient = self._passage.back(derivative, observe)["gravity"]
+        return {"gravity": gradient.reshape(self._blocks, -1, 2).sum(axis=1)}
 
 
 Row = dict[str, Any]
@@ -161,29 +166,27 @@ FIELDS = ("seed", "steps", "loss", "policy", "strength", "cosine", "size", *(f"g
 
 
 def references(seed: int, steps: int, blocks: int, samples: int) -> list[Row]:
-    """Two references of half the samples each, for every loss."""
+    """Two references of half the samples each, for every loss, from the same runs."""
     case = Case(Simulation(dam_break(), precision="float64"), seed, steps, blocks)
     rows = []
-    for half in range(2):
-        for loss, estimate in case.reference(1000 * seed + half + 1, samples // 2).items():
-            rows.append(row(seed, steps, loss, f"reference {half + 1} of {samples}", estimate.gradient["gravity"]))
+    for half in (1, 2):
+        cloud = policies.Smoothed(SPREAD, samples // 2, DISORDER, 1000 * seed + half)
+        name = f"reference {half} of {samples}"
+        rows += [row(seed, steps, loss, name, case.estimate(loss, cloud)) for loss in LOSSES]
     return rows
 
 
-def policy_rows(seed: int, steps: int, blocks: int) -> list[Row]:
-    """The gradients of every policy, for every loss."""
+def policy_rows(seed: int, steps: int, blocks: int, loss: str) -> list[Row]:
+    """The gradients of every policy, for a loss."""
     case = Case(Simulation(dam_break(), precision="float64"), seed, steps, blocks)
-    rows = []
-    for name, policy in POLICIES.items():
-        for loss, (gradient, strength) in case.estimates(policy).items():
-            rows.append(row(seed, steps, loss, name, gradient) | {"strength": "" if strength is None else strength})
-    return rows
+    return [row(seed, steps, loss, name, case.estimate(loss, policy)) for name, policy in POLICIES.items()]
 
 
-def row(seed: int, steps: int, loss: str, policy: str, gradient: np.ndarray) -> Row:
+def row(seed: int, steps: int, loss: str, policy: str, found: policies.Estimate) -> Row:
     """One line of the file."""
-    numbers = {f"g{k}": float(value) for k, value in enumerate(gradient.ravel())}
-    return {"seed": seed, "steps": steps, "loss": loss, "policy": policy, "strength": "", **numbers}
+    numbers = {f"g{k}": float(value) for k, value in enumerate(found.gradient["gravity"].ravel())}
+    strength = "" if found.strength is None else found.strength
+    return {"seed": seed, "steps": steps, "loss": loss, "policy": policy, "strength": strength, **numbers}
 
 
 def gradient_of(line: Row) -> np.ndarray:
@@ -207,7 +210,8 @@ def compared(rows: list[Row], halves: list[Row]) -> list[Row]:
         g = gradient_of(line)
         found.append(line | {"cosine": cosine(g, whole), "size": float(np.linalg.norm(g) / np.linalg.norm(whole))})
     for (seed, steps, loss), (a, b) in pairs.items():
-        whole = row(seed, steps, loss, "one half of the reference to the other", (a + b) / 2)
+        mean = policies.Estimate(0.0, {"gravity": (a + b) / 2})
+        whole = row(seed, steps, loss, "one half of the reference to the other", mean)
         found.append(whole | {"cosine": cosine(a, b), "size": float(np.linalg.norm(a) / np.linalg.norm(b))})
     return found
 
@@ -262,19 +266,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows: list[Row] = []
     with (
         ProcessPoolExecutor(given.processes, get_context("spawn"), initializer=quiet) as pool,
-        track(sum(1 + (case not in known) for case in cases), "cases") as advance,
+        track(sum(len(LOSSES) + (case not in known) for case in cases), "cases") as advance,
     ):
         wanted = {
             pool.submit(references, *case, given.blocks, given.samples): kept for case in cases if case not in known
         }
-        wanted |= {pool.submit(policy_rows, *case, given.blocks): rows for case in cases}
+        wanted |= {pool.submit(policy_rows, *case, given.blocks, loss): rows for case in cases for loss in LOSSES}
         for done in as_completed(wanted):
             wanted[done].extend(done.result())
             write(file, kept)
             advance()
     halves = [line for line in kept if (int(line["seed"]), int(line["steps"])) in cases]
     order = {name: k for k, name in enumerate(POLICIES)}
-    rows.sort(key=lambda line: (line["steps"], line["seed"], order[line["policy"]]))
+    rows.sort(key=lambda line: (line["steps"], line["seed"], order[line["policy"]], LOSSES.index(line["loss"])))
     found = compared(rows, halves)
     write(given.out / f"policies_{given.blocks}.csv", found)
     report(found)

@@ -1,20 +1,21 @@
 """How a gradient is come by: objects to be given to `Problem.value_and_gradient`, each with its formula, bias and cost.
 
 `Exact` is the derivative of the discrete map, `Tape` the same by other means. Where neighbouring trajectories separate
-it says less and less, and others take its place: `AdjointSmoothing`, `VelocityOnly`, `Damped`. `Smoothed`, from forward
-runs alone, is what they are measured by.
+it says less and less, and others take its place: `AdjointSmoothing`, `VelocityOnly`, `Damped`, or the mean of theirs
+over a cloud, `Averaged`. `Smoothed`, from forward runs alone, is what they are measured by.
 """
 
-from cortado.policies.ensemble import Smoothed
+from cortado.policies.ensemble import Averaged, Smoothed
 from cortado.policies.exact import Exact, Tape, VelocityOnly
 from cortado.policies.filters import AdjointSmoothing, Damped
-from cortado.policies.policy import AdjointPolicy, Estimate, Policy
+from cortado.policies.policy import AdjointPolicy, Estimate, Policy, checked_policy
 from cortado.solvers.adjoint_filters import AdjointNorms
 
 __all__ = [
     "AdjointNorms",
     "AdjointPolicy",
     "AdjointSmoothing",
+    "Averaged",
     "Damped",
     "Estimate",
     "Exact",
@@ -22,4 +23,5 @@ __all__ = [
     "Smoothed",
     "Tape",
     "VelocityOnly",
+    "checked_policy",
 ]

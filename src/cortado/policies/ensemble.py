@@ -1,21 +1,23 @@
-"""The gradient of a smoothed loss, from forward runs alone."""
+"""The gradient of a loss averaged over a cloud, from forward runs alone or from gradients that stay small."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from cortado.errors import InputError, shown
-from cortado.parameter_values import Arrays, Values
-from cortado.policies.policy import Differentiable, Estimate
+from cortado.errors import InputError
+from cortado.parameter_values import Values
+from cortado.policies.cloud import Cloud
+from cortado.policies.filters import AdjointSmoothing
+from cortado.policies.policy import Differentiable, Estimate, Policy, checked_policy
 from cortado.rollout import Observer
 
+SMOOTHING = AdjointSmoothing()
 MOST_NUMBERS = 64
 """Numbers that differences may be taken along: each costs two runs a sample."""
 
 
 @dataclass(frozen=True)
-class Smoothed:
+class Smoothed(Cloud):
     """Central differences, averaged over a cloud of parameters and first states: the reference beyond chaos.
 
     Formula: for parameters u of N numbers, each in units of its spread h,
@@ -30,64 +32,60 @@ class Smoothed:
     ``standard_error`` tells. Cost: 2 N samples forward runs, so that it is for a few dozen numbers at most.
     """
 
-    spread: float | Mapping[str, float] = 0.5
-    """h of the parameters, in their units, or by name."""
-    samples: int = 8
-    disorder: float = 0.01
-    """Standard deviation of every coordinate of the first positions [spacings]."""
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.samples < 2:
-            raise InputError(f"samples is {shown(self.samples)}, but must be at least 2, to know how they scatter.")
-        if not self.disorder >= 0.0:
-            raise InputError(f"disorder is {shown(self.disorder)}, but must be at least 0, in spacings.")
-
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        values = {name: np.asarray(value, dtype=np.float64) for name, value in parameters.items()}
-        loss, random = problem.value(values), np.random.default_rng(self.seed)
-        spreads = np.concatenate([np.full(value.size, self._spread(name)) for name, value in values.items()])
-        numbers = len(spreads)
+        cloud = self.around(problem, parameters)
+        loss, numbers = problem.value(cloud.values), len(cloud.spreads)
         if numbers > MOST_NUMBERS:
             raise InputError(
                 f"the parameters are {numbers} numbers, but must be {MOST_NUMBERS} at most, as Smoothed runs the "
                 "simulation twice for each: take fewer, such as one gravity for all steps, or another policy."
             )
-
-        def along(u: np.ndarray, disorder: np.ndarray) -> float:
-            moved = _moved(values, spreads * u)
-            start = moved.get("initial_positions", problem.simulation.positions)
-            return problem.value({**moved, "initial_positions": start + disorder} if self.disorder else moved)
-
-        found = np.zeros((self.samples, numbers))
+        found, r = np.zeros((self.samples, numbers)), np.sqrt(numbers)
         for sample in found:
-            for q in _rotation(numbers, random):
-                disorder = self._displacement(problem, random)
-                r = np.sqrt(numbers)
-                sample += (along(r * q, disorder) - along(-r * q, disorder)) / (2.0 * r) * q
-        error = found.std(axis=0, ddof=1) / np.sqrt(self.samples)
-        zeros = {name: np.zeros_like(value) for name, value in values.items()}
-        gradient, errors = (_moved(zeros, numbers_ / spreads) for numbers_ in (found.mean(axis=0), error))
-        return Estimate(loss, gradient, standard_error=errors)
-
-    def _spread(self, name: str) -> float:
-        if isinstance(self.spread, Mapping) and name not in self.spread:
-            raise InputError(f"spread has nothing for {name}, but must have a number for every parameter.")
-        spread = self.spread[name] if isinstance(self.spread, Mapping) else self.spread
-        if not spread > 0.0:
-            raise InputError(f"spread of {name} is {shown(spread)}, but must be greater than 0.")
-        return float(spread)
-
-    def _displacement(self, problem: Differentiable, random: np.random.Generator) -> np.ndarray:
-        spacing = problem.simulation.scene.discretisation.spacing
-        return self.disorder * spacing * random.standard_normal(problem.simulation.positions.shape)
+            for q in _rotation(numbers, cloud.random):
+                displacement = cloud.displacement()
+                ahead, behind = (problem.value(cloud.at(side * q, displacement)) for side in (r, -r))
+                sample += (ahead - behind) / (2.0 * r) * q
+        gradient, error = (cloud.named(one / cloud.spreads) for one in _mean_and_error(found))
+        return Estimate(loss, gradient, standard_error=error)
 
 
-def _moved(values: Arrays, change: np.ndarray) -> Arrays:
-    """Values plus a change of all their numbers, one after another."""
-    ends = np.cumsum([value.size for value in values.values()])
-    parts = np.split(change, ends[:-1])
-    return {name: value + part.reshape(value.shape) for (name, value), part in zip(values.items(), parts, strict=True)}
+@dataclass(frozen=True)
+class Averaged(Cloud):
+    """Gradients of another policy, averaged over a cloud of parameters and first states.
+
+    Formula: g = mean over samples of the policy's gradient at u + h z, z normal, with first positions moved at random:
+    the gradient of the loss that `Smoothed` differentiates, as far as the policy's are right, for any number of
+    parameters. Of `Exact` gradients beyond chaos the mean is useless, as few of them drown the rest.
+
+    Bias: that of the policy; noise, which `Estimate`'s ``standard_error`` tells. Cost: ``samples`` times that of the
+    policy, and a forward run.
+    """
+
+    samples: int = 4
+    policy: Policy = SMOOTHING
+    """Whose gradients are averaged."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checked_policy(self.policy)
+
+    def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
+        cloud = self.around(problem, parameters)
+        loss, found, strengths = problem.value(cloud.values), [], []
+        for _ in range(self.samples):
+            moved = cloud.at(cloud.random.standard_normal(len(cloud.spreads)), cloud.displacement())
+            one = self.policy.estimate(problem, moved, observe)
+            found.append(np.concatenate([one.gradient[name].ravel() for name in cloud.values]))
+            strengths.append(one.strength)
+        gradient, error = (cloud.named(one) for one in _mean_and_error(np.array(found)))
+        known = [strength for strength in strengths if strength is not None]
+        return Estimate(loss, gradient, float(np.mean(known)) if known else None, error)
+
+
+def _mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of rows, and its standard error."""
+    return samples.mean(axis=0), samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
 
 
 def _rotation(size: int, random: np.random.Generator) -> np.ndarray:

@@ -1,12 +1,14 @@
 """Policies that change the adjoint between two backward steps of another policy."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import comb
 from typing import Literal
 
 import numpy as np
 
 from cortado.errors import InputError, shown
-from cortado.parameter_values import Values
+from cortado.parameter_values import Arrays, Values
 from cortado.particles import State
 from cortado.policies.exact import Exact
 from cortado.policies.policy import AdjointPolicy, Differentiable, Estimate, Filtered
@@ -15,6 +17,8 @@ from cortado.rollout import Observer, Rollout, StepDerivative
 from cortado.solvers.adjoint_filters import FIELDS, AdjointNorms, Average, Drag, Limit
 
 EXACT = Exact()
+MOST_ORDER = 4
+"""Of an extrapolation: noise grows as 2^order."""
 
 
 @dataclass(frozen=True)
@@ -32,19 +36,26 @@ class AdjointSmoothing(AdjointPolicy):
     Then each vector of a is cut to ``limit`` root mean squares over all particles: now and then an adjoint grows at a
     few particles faster than a smoothing can spread it, and would drown the rest.
 
-    Bias: a little of the long waves is damped too, more with a greater strength. Losses of single particles, which have
-    no long waves, get no good gradient. Cost: a sum over neighbours a field and step; with "auto" several ways back
-    through one run (see `policies.strength`).
+    Long waves are damped too, a little, and those of early controls most. So the gradients g(s) of several strengths
+    are extrapolated to none (Richardson), with a strength s at which each of them is tame:
+
+        g = sum_{k = 1 ... order} (-1)^(k + 1) binomial(order, k) g(k s).
+
+    Bias: what short waves would have told, and of long ones a part that falls as s^order. Losses of single particles,
+    which have no long waves, get no good gradient. Cost: ``order`` ways back, with a sum over neighbours more a field
+    and step; with "auto" some more ways back through the same run (see `policies.strength`).
     """
 
     strength: float | Literal["auto"] = "auto"
-    """0 is the base policy bit for bit; "auto" twice the smallest at which the adjoint does not grow exponentially,
-    reported as ``strength`` of the `Estimate`."""
+    """s; 0 is the base policy bit for bit; "auto" ``order`` + 1 times the smallest at which the adjoint does not grow
+    exponentially, reported as ``strength`` of the `Estimate`."""
     fields: tuple[str, ...] = FIELDS
     """Of "positions" and "velocities"."""
     limit: float = 4.0
     """Greatest vector of a particle, in root mean squares over all; infinite for none. Not applied with a strength of
     0."""
+    order: int = 2
+    """Of the extrapolation; 1 for none. As the base of another policy this one is not extrapolated."""
     base: AdjointPolicy = EXACT
     """Whose backward steps these are."""
 
@@ -54,29 +65,51 @@ class AdjointSmoothing(AdjointPolicy):
             raise InputError(f"limit is {shown(self.limit)}, but must be a number of at least 1.")
         if not self.fields or not set(self.fields) <= set(FIELDS):
             raise InputError(f"fields is {shown(self.fields)}, but must be some of {', '.join(FIELDS)}.")
-        number = isinstance(self.strength, (int, float, np.number)) and 0.0 <= self.strength <= 1.0
+        if self.order not in range(1, MOST_ORDER + 1):
+            raise InputError(f"order is {shown(self.order)}, but must be a whole number from 1 to {MOST_ORDER}.")
+        number = isinstance(self.strength, (int, float, np.number)) and 0.0 <= self.strength * self.order <= 1.0
         if not (number or self.strength == "auto"):
-            raise InputError(f'strength is {shown(self.strength)}, but must be a number from 0 to 1, or "auto".')
+            most = shown(1.0 / self.order)
+            wanted = f'a number from 0 to {most} with an order of {self.order}, or "auto"'
+            raise InputError(f"strength is {shown(self.strength)}, but must be {wanted}.")
 
     def derivative(self, rollout: Rollout) -> "SmoothedStep":
+        if self.strength == "auto":
+            raise InputError('strength is "auto", but must be a number where smoothing is the base of another policy.')
         return SmoothedStep(self.base.derivative(rollout), rollout, self)
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
+        """``observe`` is given the adjoints of the weakest strength."""
         passage = problem.passage(parameters)
-        derivative = passage.derivative(self)
+        derivative = passage.derivative(replace(self, strength=0.0, order=1))
         assert isinstance(derivative, SmoothedStep)
-        if self.strength == "auto":
-            rollout = passage.rollout
-            norms = AdjointNorms(rollout.solver, rollout.steps)
 
-            def history(strength: float) -> np.ndarray:
-                derivative.set_strength(strength)
-                passage.back(derivative, norms)
-                return norms.numpy()
+        def back(strength: float, observe: Observer | None) -> Arrays:
+            derivative.set_strength(strength)
+            return passage.back(derivative, observe)
 
-            time_step = float(rollout.parameters.time_step.numpy()[0])
-            derivative.set_strength(sufficient(history, time_step))
-        return Estimate(passage.loss, passage.back(derivative, observe), strength=derivative.strength)
+        strength = self._sufficient(passage.rollout, back) if self.strength == "auto" else float(self.strength)
+        gradient = back(strength, observe)
+        if strength == 0.0:
+            return Estimate(passage.loss, gradient, strength=0.0)
+        gradients = [gradient, *(back(k * strength, None) for k in range(2, self.order + 1))]
+        return Estimate(passage.loss, extrapolated(gradients), strength=strength)
+
+    def _sufficient(self, rollout: Rollout, back: Callable[[float, Observer], Arrays]) -> float:
+        norms = AdjointNorms(rollout.solver, rollout.steps)
+
+        def history(strength: float) -> np.ndarray:
+            back(strength, norms)
+            return norms.numpy()
+
+        time_step = float(rollout.parameters.time_step.numpy()[0])
+        return min((self.order + 1) * sufficient(history, time_step), 1.0 / self.order)
+
+
+def extrapolated(gradients: Sequence[Arrays]) -> Arrays:
+    """The gradient at 0, by the polynomial through those at 1, 2, ... times a strength."""
+    weights = [(-1) ** k * comb(len(gradients), k + 1) for k in range(len(gradients))]
+    return {name: np.tensordot(weights, [g[name] for g in gradients], axes=1) for name in gradients[0]}
 
 
 class SmoothedStep(Filtered):
@@ -87,11 +120,10 @@ class SmoothedStep(Filtered):
         self._average, self._limit = Average(base.solver, policy.fields), Limit(base.solver, policy.fields)
         self._parameters = rollout.parameters
         self._times = policy.limit
-        self.set_strength(0.0 if policy.strength == "auto" else float(policy.strength))
+        self.set_strength(float(policy.strength))
 
     def set_strength(self, strength: float) -> None:
         """From now on."""
-        self.strength = strength
         self._average.set_strength(strength)
         self._limit.set_times(self._times if strength > 0.0 else np.inf)
 

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from cortado.errors import InputError
 from cortado.parameter_values import Arrays, Values
 from cortado.particles import Parameters, State
 from cortado.rollout import Observer, Rollout, StepDerivative
@@ -17,9 +18,9 @@ class Estimate:
     gradient: Arrays
     """For each parameter given, an array of its shape (float64)."""
     strength: float | None = None
-    """Of the smoothing that `AdjointSmoothing` applied."""
+    """Of the smoothing that `AdjointSmoothing` applied, the weakest of those that were extrapolated."""
     standard_error: Arrays | None = None
-    """Of every number of the gradient, where it is an average (`Smoothed`)."""
+    """Of every number of the gradient, where it is an average (`Smoothed`, `Averaged`)."""
 
 
 class Passage(Protocol):
@@ -57,6 +58,13 @@ class Policy(Protocol):
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         """The loss and its gradient; ``observe`` is given the adjoint of every state, by policies that have any."""
+
+
+def checked_policy(policy: Policy) -> Policy:
+    """The policy, if it is one: its class is not."""
+    if isinstance(policy, type) or not hasattr(policy, "estimate"):
+        raise InputError(f"policy is {policy!r}, but must be an object such as cortado.policies.Exact().")
+    return policy
 
 
 class AdjointPolicy(ABC):

@@ -1,7 +1,7 @@
-"""How strong a smoothing of the adjoint has to be: twice the least with which it does not grow exponentially.
+"""How strong a smoothing of the adjoint has to be for it not to grow exponentially.
 
-Ladder, margin and limit (`AdjointSmoothing.limit`) were chosen on dam breaks of 144 particles in the plane, of 400 and
-800 steps, with two first states and four losses; `validation/policies.py` judges them on others.
+Ladder, `AdjointSmoothing.limit` and the factor on the least strength were chosen on dam breaks of 144 particles in the
+plane, of 400 and 800 steps, with ten first states and four losses; `validation/policies.py` judges them on others.
 """
 
 from collections.abc import Callable
@@ -10,22 +10,20 @@ import numpy as np
 
 LADDER = (0.0125, 0.025, 0.0375, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5)
 """Strengths that are tried, weakest first, after 0."""
-MARGIN = 2.0
-"""So many times the least sufficient strength is taken: with that one, what grows no more does not die away either."""
 MOST_GROWTH = 1.0
 """e-folds over all steps that are not taken for exponential growth."""
 
 
 def sufficient(history: Callable[[float], np.ndarray], time_step: float) -> float:
-    """`MARGIN` times the weakest rung of the ladder with which the adjoint's norm stops growing, or the strongest where
-    none does it; 0 where it does not grow anyway.
+    """The weakest rung of the ladder with which the adjoint's norm stops growing, the strongest where none does it, and
+    0 where it does not grow anyway.
 
     ``history`` (steps + 1, 2): norms of the adjoints of positions and velocities with a strength.
     """
     for strength in (0.0, *LADDER):
         if growth(history(strength), time_step) <= MOST_GROWTH:
-            return MARGIN * strength
-    return MARGIN * LADDER[-1]
+            return strength
+    return LADDER[-1]
 
 
 def growth(norms: np.ndarray, time_step: float) -> float:

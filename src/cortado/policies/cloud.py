@@ -1,0 +1,80 @@
+"""Parameters and first states around given ones, over which a loss or its gradient is averaged."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cortado.errors import InputError, shown
+from cortado.parameter_values import Arrays, Values
+from cortado.policies.policy import Differentiable
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """How wide it is, and how many samples of it are taken."""
+
+    spread: float | Mapping[str, float] = 0.5
+    """Of the parameters, in their units, or by name: standard deviation of every number."""
+    samples: int = 8
+    disorder: float = 0.01
+    """Standard deviation of every coordinate of the first positions [spacings]."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.samples < 2:
+            raise InputError(f"samples is {shown(self.samples)}, but must be at least 2, to know how they scatter.")
+        if not self.disorder >= 0.0:
+            raise InputError(f"disorder is {shown(self.disorder)}, but must be at least 0, in spacings.")
+
+    def around(self, problem: Differentiable, parameters: Values) -> "Sampler":
+        """Of these parameters of a problem."""
+        values = {name: np.asarray(value, dtype=np.float64) for name, value in parameters.items()}
+        spreads = np.concatenate([np.full(value.size, self._spread(name)) for name, value in values.items()])
+        start = problem.simulation.positions
+        disorder = self.disorder * problem.simulation.scene.discretisation.spacing
+        return Sampler(values, spreads, start, disorder, np.random.default_rng(self.seed))
+
+    def _spread(self, name: str) -> float:
+        if isinstance(self.spread, Mapping) and name not in self.spread:
+            raise InputError(f"spread has nothing for {name}, but must have a number for every parameter.")
+        spread = self.spread[name] if isinstance(self.spread, Mapping) else self.spread
+        if not spread > 0.0:
+            raise InputError(f"spread of {name} is {shown(spread)}, but must be greater than 0.")
+        return float(spread)
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """A cloud around the parameters of a problem, and the random numbers that samples are drawn by."""
+
+    values: Arrays
+    spreads: np.ndarray
+    """(numbers,) of all numbers of the values, one after another."""
+    start: np.ndarray
+    """(n, d) first positions of the simulation [m]"""
+    disorder: float
+    """[m]"""
+    random: np.random.Generator
+
+    def displacement(self) -> np.ndarray:
+        """(n, d) a random one of the first positions [m]"""
+        return self.disorder * self.random.standard_normal(self.start.shape)
+
+    def at(self, u: np.ndarray, displacement: np.ndarray) -> Arrays:
+        """The parameters moved by ``u`` (numbers,), in spreads, and first positions displaced."""
+        values = _moved(self.values, self.spreads * u)
+        if not self.disorder:
+            return values
+        return {**values, "initial_positions": values.get("initial_positions", self.start) + displacement}
+
+    def named(self, numbers: np.ndarray) -> Arrays:
+        """Numbers one after another, as arrays by the parameters' names."""
+        return _moved({name: np.zeros_like(value) for name, value in self.values.items()}, numbers)
+
+
+def _moved(values: Arrays, change: np.ndarray) -> Arrays:
+    """Values plus a change of all their numbers, one after another."""
+    ends = np.cumsum([value.size for value in values.values()])
+    parts = np.split(change, ends[:-1])
+    return {name: value + part.reshape(value.shape) for (name, value), part in zip(values.items(), parts, strict=True)}
