@@ -172,9 +172,9 @@ POLICIES = (
     policies.Exact(),
     policies.VelocityOnly(),
     policies.AdjointSmoothing(0.3),
-    policies.AdjointSmoothing(0.3, limit=1.2),
-    policies.AdjointSmoothing(0.7, fields=["velocities"], limit=1.1, order=1),
-    policies.AdjointSmoothing(0.7, fields=["positions"], order=1),
+    policies.AdjointSmoothing(0.3, limit=1.2, order=2),
+    policies.AdjointSmoothing(0.7, fields=["velocities"], limit=1.1),
+    policies.AdjointSmoothing(0.7, fields=["positions"]),
     policies.AdjointSmoothing(0.3, order=3),
     policies.AdjointSmoothing(0.3, base=policies.VelocityOnly()),
     policies.AdjointSmoothing(0.3, base=policies.Tape()),
@@ -344,10 +344,10 @@ def test_auto_takes_so_many_times_the_smallest_sufficient_strength(chaotic, orde
     assert LADDER[chosen] == pytest.approx(least, rel=1e-15)
     _, exact = chaotic.value_and_gradient(point)
     assert np.linalg.norm(exact["gravity"]) > 30 * np.linalg.norm(auto.gradient["gravity"])
-    fixed = chaotic.estimate(point, policies.AdjointSmoothing(auto.strength, order=order))
+    fixed = chaotic.estimate(point, policies.AdjointSmoothing(order=order).tuned(chaotic, point))
     assert auto.gradient["gravity"].tobytes() == fixed.gradient["gravity"].tobytes()
     for k, strength in enumerate(LADDER[: chosen + 1]):
-        history = norms_of(chaotic, point, policies.AdjointSmoothing(strength, order=1))
+        history = norms_of(chaotic, point, policies.AdjointSmoothing(strength))
         assert (growth(history, DT) <= MOST_GROWTH) == (k == chosen)
 
 
@@ -397,7 +397,7 @@ def test_every_adjoint_of_a_state_can_be_observed():
         seen[step] = bar.numpy(2)
         norms(step, bar)
 
-    found = problem.estimate(point, policies.AdjointSmoothing(0.1, order=1), observe)
+    found = problem.estimate(point, policies.AdjointSmoothing(0.1), observe)
     assert list(seen) == [7, 6, 5, 4, 3, 2, 1, 0]
     for k, name in enumerate(("initial_positions", "initial_velocities")):
         np.testing.assert_array_equal(seen[7][k], problem.loss.weights[k])
@@ -502,6 +502,15 @@ def test_an_average_is_of_the_policys_gradients():
     assert found.gradient["gravity"].tobytes() == again.gradient["gravity"].tobytes()
 
 
+def test_an_average_finds_its_strength_once(chaotic):
+    point, cloud = {"gravity": np.array([0.5, -9.81, 0.0])}, {"spread": 0.1, "samples": 2}
+    found = chaotic.estimate(point, policies.Averaged(**cloud))
+    smoothing = policies.AdjointSmoothing(order=2).tuned(chaotic, point)
+    assert found.strength == smoothing.strength > 0.0
+    again = chaotic.estimate(point, policies.Averaged(**cloud, policy=smoothing))
+    assert found.gradient["gravity"].tobytes() == again.gradient["gravity"].tobytes()
+
+
 def test_before_chaos_an_average_and_the_exact_gradient_agree():
     simulation = Simulation(splash(), precision="float64")
     problem = Problem(simulation, 60, losses.CentreOfMass([0.1, 0.1, 0.1]))
@@ -538,7 +547,7 @@ def test_centres_of_mass_and_their_gradients(make, masses):
 
 MISTAKES = {
     "strength above 1": lambda p: policies.AdjointSmoothing(1.5),
-    "strength twice 0.6": lambda p: policies.AdjointSmoothing(0.6),
+    "strength twice 0.6": lambda p: policies.AdjointSmoothing(0.6, order=2),
     "order 0": lambda p: policies.AdjointSmoothing(order=0),
     "order in words": lambda p: policies.AdjointSmoothing(order="two"),
     "auto as a base": lambda p: p.estimate({"viscosity": 1.0}, policies.Damped(1.0, base=policies.AdjointSmoothing())),

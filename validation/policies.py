@@ -40,10 +40,11 @@ POLICIES: dict[str, policies.Policy] = {
     "exact": policies.Exact(),
     "velocity only": policies.VelocityOnly(),
     "damped 20/s": policies.Damped(20.0),
-    "smoothing 0.1, not extrapolated": policies.AdjointSmoothing(0.1, order=1),
-    "smoothing, not extrapolated": policies.AdjointSmoothing(order=1),
+    "smoothing 0.1": policies.AdjointSmoothing(0.1),
     "smoothing": policies.AdjointSmoothing(),
-    "smoothing, averaged over 4": policies.Averaged(SPREAD, 4, DISORDER),
+    "smoothing, extrapolated": policies.AdjointSmoothing(order=2),
+    "the latter averaged over 4": policies.Averaged(SPREAD, 4, DISORDER),
+    "averaged over 8": policies.Averaged(SPREAD, 8, DISORDER),
 }
 
 

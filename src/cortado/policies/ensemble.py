@@ -11,7 +11,7 @@ from cortado.policies.filters import AdjointSmoothing
 from cortado.policies.policy import Differentiable, Estimate, Policy, checked_policy
 from cortado.rollout import Observer
 
-SMOOTHING = AdjointSmoothing()
+SMOOTHING = AdjointSmoothing(order=2)
 MOST_NUMBERS = 64
 """Numbers that differences may be taken along: each costs two runs a sample."""
 
@@ -64,7 +64,7 @@ class Averaged(Cloud):
 
     samples: int = 4
     policy: Policy = SMOOTHING
-    """Whose gradients are averaged."""
+    """Whose gradients are averaged. The strength of an `AdjointSmoothing` is found once, at the parameters."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -72,15 +72,17 @@ class Averaged(Cloud):
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         cloud = self.around(problem, parameters)
-        loss, found, strengths = problem.value(cloud.values), [], []
+        loss, policy = problem.value(cloud.values), self.policy
+        if isinstance(policy, AdjointSmoothing):
+            policy = policy.tuned(problem, cloud.values)
+        found, strength = [], None
         for _ in range(self.samples):
             moved = cloud.at(cloud.random.standard_normal(len(cloud.spreads)), cloud.displacement())
-            one = self.policy.estimate(problem, moved, observe)
+            one = policy.estimate(problem, moved, observe)
             found.append(np.concatenate([one.gradient[name].ravel() for name in cloud.values]))
-            strengths.append(one.strength)
+            strength = one.strength
         gradient, error = (cloud.named(one) for one in _mean_and_error(np.array(found)))
-        known = [strength for strength in strengths if strength is not None]
-        return Estimate(loss, gradient, float(np.mean(known)) if known else None, error)
+        return Estimate(loss, gradient, strength, error)
 
 
 def _mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

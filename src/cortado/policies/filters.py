@@ -1,6 +1,6 @@
 """Policies that change the adjoint between two backward steps of another policy."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import comb
 from typing import Literal
@@ -11,7 +11,7 @@ from cortado.errors import InputError, shown
 from cortado.parameter_values import Arrays, Values
 from cortado.particles import State
 from cortado.policies.exact import Exact
-from cortado.policies.policy import AdjointPolicy, Differentiable, Estimate, Filtered
+from cortado.policies.policy import AdjointPolicy, Differentiable, Estimate, Filtered, Passage
 from cortado.policies.strength import sufficient
 from cortado.rollout import Observer, Rollout, StepDerivative
 from cortado.solvers.adjoint_filters import FIELDS, AdjointNorms, Average, Drag, Limit
@@ -36,14 +36,15 @@ class AdjointSmoothing(AdjointPolicy):
     Then each vector of a is cut to ``limit`` root mean squares over all particles: now and then an adjoint grows at a
     few particles faster than a smoothing can spread it, and would drown the rest.
 
-    Long waves are damped too, a little, and those of early controls most. So the gradients g(s) of several strengths
-    are extrapolated to none (Richardson), with a strength s at which each of them is tame:
+    Long waves are damped too, a little, and those of early controls most. With an ``order`` above 1 the gradients g(s)
+    of several strengths are extrapolated to none (Richardson), all of them strong enough to be tame:
 
         g = sum_{k = 1 ... order} (-1)^(k + 1) binomial(order, k) g(k s).
 
-    Bias: what short waves would have told, and of long ones a part that falls as s^order. Losses of single particles,
-    which have no long waves, get no good gradient. Cost: ``order`` ways back, with a sum over neighbours more a field
-    and step; with "auto" some more ways back through the same run (see `policies.strength`).
+    Bias: what short waves would have told, and of long ones a part that falls as s^order; noise, which grows with the
+    order: 2 is for means over several runs (`Averaged`). Losses of single particles, which have no long waves, get no
+    good gradient. Cost: ``order`` ways back, with a sum over neighbours more a field and step; with "auto" some more
+    through the same run (see `policies.strength`), which `tuned` saves a search.
     """
 
     strength: float | Literal["auto"] = "auto"
@@ -54,8 +55,8 @@ class AdjointSmoothing(AdjointPolicy):
     limit: float = 4.0
     """Greatest vector of a particle, in root mean squares over all; infinite for none. Not applied with a strength of
     0."""
-    order: int = 2
-    """Of the extrapolation; 1 for none. As the base of another policy this one is not extrapolated."""
+    order: int = 1
+    """Of the extrapolation. As the base of another policy this one is not extrapolated."""
     base: AdjointPolicy = EXACT
     """Whose backward steps these are."""
 
@@ -81,25 +82,32 @@ class AdjointSmoothing(AdjointPolicy):
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         """``observe`` is given the adjoints of the weakest strength."""
         passage = problem.passage(parameters)
-        derivative = passage.derivative(replace(self, strength=0.0, order=1))
-        assert isinstance(derivative, SmoothedStep)
-
-        def back(strength: float, observe: Observer | None) -> Arrays:
-            derivative.set_strength(strength)
-            return passage.back(derivative, observe)
-
-        strength = self._sufficient(passage.rollout, back) if self.strength == "auto" else float(self.strength)
-        gradient = back(strength, observe)
+        strength = self._sufficient(passage) if self.strength == "auto" else float(self.strength)
+        gradient = self._back(passage, strength, observe)
         if strength == 0.0:
             return Estimate(passage.loss, gradient, strength=0.0)
-        gradients = [gradient, *(back(k * strength, None) for k in range(2, self.order + 1))]
+        gradients = [gradient, *(self._back(passage, k * strength) for k in range(2, self.order + 1))]
         return Estimate(passage.loss, extrapolated(gradients), strength=strength)
 
-    def _sufficient(self, rollout: Rollout, back: Callable[[float, Observer], Arrays]) -> float:
+    def tuned(self, problem: Differentiable, parameters: Values) -> "AdjointSmoothing":
+        """The same with the strength that "auto" finds here, for use at parameters nearby."""
+        if self.strength != "auto":
+            return self
+        return replace(self, strength=self._sufficient(problem.passage(parameters)))
+
+    def _back(self, passage: Passage, strength: float, observe: Observer | None = None) -> Arrays:
+        """The gradient with one strength."""
+        derivative = passage.derivative(replace(self, strength=0.0, order=1))
+        assert isinstance(derivative, SmoothedStep)
+        derivative.set_strength(strength)
+        return passage.back(derivative, observe)
+
+    def _sufficient(self, passage: Passage) -> float:
+        rollout = passage.rollout
         norms = AdjointNorms(rollout.solver, rollout.steps)
 
         def history(strength: float) -> np.ndarray:
-            back(strength, norms)
+            self._back(passage, strength, norms)
             return norms.numpy()
 
         time_step = float(rollout.parameters.time_step.numpy()[0])
