@@ -6,8 +6,8 @@ positions by 1 % of the spacing, and draws the gravity of a run whose last state
 mass, Gaussian density on a grid, picture with two distances, and positions particle by particle.
 
 The reference is `policies.Smoothed` with a spread of 0.5 m/s2. For each policy the script writes the cosine of its
-gradient to the reference, and its size over the reference's, into `policies_1.csv` (for 1 block), and prints the
-medians over seeds.
+gradient to the reference, and its size over the reference's, into `policies_1.csv` (for 1 block) with a picture, and
+prints the medians over seeds.
 """
 
 import argparse
@@ -23,6 +23,7 @@ import numpy as np
 import warp as wp
 
 from cortado import Problem, Scene, Simulation, losses, policies
+from cortado.figures.canvas import INK, PALETTE, drawing
 from cortado.image_losses import Pyramid
 from cortado.progress import track
 from cortado.render.scene_renderer import scene_renderer
@@ -43,9 +44,10 @@ POLICIES: dict[str, policies.Policy] = {
     "smoothing 0.1": policies.AdjointSmoothing(0.1),
     "smoothing": policies.AdjointSmoothing(),
     "smoothing, extrapolated": policies.AdjointSmoothing(order=2),
-    "the latter averaged over 4": policies.Averaged(SPREAD, 4, DISORDER),
+    "averaged over 4": policies.Averaged(SPREAD, 4, DISORDER),
     "averaged over 8": policies.Averaged(SPREAD, 8, DISORDER),
 }
+DRAWN = ("exact", "velocity only", "smoothing", "averaged over 4", "averaged over 8")
 
 
 def dam_break() -> Scene:
@@ -249,6 +251,32 @@ def report(rows: list[Row]) -> None:
             print(f"{policy:40}" + "".join(f"{cell:>28}" for cell in cells))
 
 
+def draw(rows: list[Row], path: Path) -> None:
+    """Cosine and size of each policy, a dot a seed and a line at the median."""
+    horizons = sorted({int(line["steps"]) for line in rows})
+    with drawing(path, 6.5 * len(horizons), 7.0) as figure:
+        panels = figure.subplots(2, len(horizons), sharex=True, sharey="row", squeeze=False)
+        for k, steps in enumerate(horizons):
+            for key, panel in zip(("cosine", "size"), panels[:, k], strict=True):
+                for number, policy in enumerate(DRAWN):
+                    for at, loss in enumerate(LOSSES):
+                        chosen = (steps, loss, policy)
+                        of = [x for x in rows if (int(x["steps"]), x["loss"], x["policy"]) == chosen]
+                        values = np.array([float(x[key]) for x in of])
+                        x = at + 0.15 * (number - (len(DRAWN) - 1) / 2)
+                        label = policy if at == 0 else None
+                        panel.plot(np.full(len(values), x), values, ".", color=PALETTE[number], ms=5, alpha=0.7)
+                        line = {"color": PALETTE[number], "lw": 2.5, "label": label}
+                        panel.plot([x - 0.06, x + 0.06], [np.median(values)] * 2, **line)
+            panels[0, k].set_title(f"after {steps} steps")
+            panels[1, k].set_yscale("log")
+            panels[1, k].axhline(1.0, color=INK, lw=0.8)
+            panels[1, k].set_xticks(range(len(LOSSES)), LOSSES, rotation=20, ha="right")
+        panels[0, 0].set_ylabel("cosine to the smoothed gradient")
+        panels[1, 0].set_ylabel("size over the smoothed gradient's")
+        figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=len(DRAWN))
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """See the head of the file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -283,6 +311,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     found = compared(rows, halves)
     write(given.out / f"policies_{given.blocks}.csv", found)
     report(found)
+    draw(found, given.out / f"policies_{given.blocks}.png")
     print(f"\nwritten: {given.out / f'policies_{given.blocks}.csv'}")
 
 
