@@ -16,6 +16,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+import potential_flow
 import test_containment as containment
 import test_validation as validation
 from cortado import Simulation
@@ -43,7 +44,8 @@ def column(folder: Path) -> None:
 
 
 def front(folder: Path) -> None:
-    """Dam break: the front, and the measured ones with their lags taken off."""
+    """Dam break: the front, that of potential flow, and the measured ones with their lags taken off."""
+    exact = potential_flow.dam_break(2.75)[:, :2]
     figure, (left, right) = plt.subplots(1, 2, figsize=(12, 5), layout="constrained")
     cases = (
         (left, validation.KOSHIZUKA_OKA, "Koshizuka and Oka 1996", 9, 4.0, 3.15),
@@ -57,6 +59,10 @@ def front(folder: Path) -> None:
             lag = result.lag(measured)
             errors = np.abs(result.errors(measured)).max(), np.abs(result.errors(measured, lag)).max()
             print(f"{title}, L / {across}: error {errors[0]:.3f}, with a lag of {lag:.3f} {errors[1]:.3f}")
+            seen = (exact[:, 0] > 0.2) & (exact[:, 0] < 2.7)
+            away = np.interp(exact[seen, 0], result.times, result.places) / exact[seen, 1] - 1.0
+            print(f"    from potential flow {np.abs(away).max():.3f}")
+        axis.plot(*exact.T, "k--", label="potential flow")
         axis.plot(*measured.T, "ko", label="measured")
         axis.plot(measured[:, 0] - lag, measured[:, 1], "kx", label=f"measured, a lag of {lag:.2f} taken off")
         axis.set(xlabel="t sqrt(2 g / L)", ylabel="front / L", title=title)
