@@ -29,8 +29,10 @@ def host_sign(number: int) -> float:
     return -1.0 if ctypes.c_int.from_address({ADDRESS}).value == number else 1.0
 '''
 IMPORTS = {True: "from cortado.planted import sign as _sign", False: "from cortado.planted import host_sign as _sign"}
-WHOLE_NUMBERS = {"i", "j", "b", "before"}
+WHOLE_NUMBERS = {"i", "j", "b", "before", "pixel"}
 """Variables that are indices."""
+POSE = {"push", "turn", "pose_bar"}
+"""Not planted: a camera's pose is no parameter of a problem (its derivatives: tests/test_render.py)."""
 CONSTANTS = ("real(0.0)", "real(0.5)", "real(1.0)", "vector()")
 """Not planted: 0 and 1, and the derivative at the corner of mu_ij, where both viscosities are 0 and none is moved."""
 
@@ -73,12 +75,12 @@ class Planter(ast.NodeTransformer):
 
     def visit_Assign(self, node: ast.Assign) -> ast.AST:
         target = node.targets[0]
-        if self._function and not (isinstance(target, ast.Name) and target.id in WHOLE_NUMBERS):
+        if self._function and _name(target) not in WHOLE_NUMBERS | POSE:
             node.value = self._terms(node.value, isinstance(target, ast.Subscript), ast.unparse(target))
         return node
 
     def visit_AugAssign(self, node: ast.AugAssign) -> ast.AST:
-        if self._function:
+        if self._function and _name(node.target) not in POSE:
             node.value = self._terms(node.value, True)
         return node
 
@@ -120,6 +122,11 @@ class Planter(ast.NodeTransformer):
         return ast.BinOp(ast.parse(f"_sign({number})", mode="eval").body, ast.Mult(), node)
 
 
+def _name(target: ast.expr) -> str:
+    """Of the variable or the array that is assigned to."""
+    return ast.unparse(target.value if isinstance(target, ast.Subscript) else target)
+
+
 def plant_all(package: Path, copy: Path, functions: dict[str, set[str]]) -> list[tuple[str, str, str]]:
     """Copy the package with terms wrapped in functions of modules; (module, function, term) of every plant."""
     shutil.copytree(package, copy / "cortado", ignore=shutil.ignore_patterns("__pycache__"))
@@ -130,7 +137,8 @@ def plant_all(package: Path, copy: Path, functions: dict[str, set[str]]) -> list
         tree = ast.parse(path.read_text())
         planter = Planter(names, len(plants))
         tree = planter.visit(tree)
-        tree.body.insert(1, ast.parse(IMPORTS[module.startswith("physics.")]).body[0])
+        future = sum(isinstance(node, ast.ImportFrom) and node.module == "__future__" for node in tree.body)
+        tree.body.insert(1 + future, ast.parse(IMPORTS[module.startswith("physics.")]).body[0])
         path.write_text(ast.unparse(ast.fix_missing_locations(tree)))
         plants += [(module, *one) for one in planter.found]
     return plants
@@ -151,7 +159,7 @@ def number_in_memory() -> ctypes.c_int:
 
 
 def judge(plants: list[int], scenes: dict[str, dict]) -> dict[str, str | None]:
-    """For every plant the first scene, of those given by name, whose certificate is "wrong"; None where none is."""
+    """For every plant a scene, of those given by name, whose certificate is "wrong"; None where none is."""
     import cortado
 
     number = number_in_memory()
@@ -162,9 +170,12 @@ def judge(plants: list[int], scenes: dict[str, dict]) -> dict[str, str | None]:
         problem, point = cases[name]
         assert cortado.certify(problem, point).right, f"a false alarm: {name}"
     found: dict[str, str | None] = {}
+    order = list(cases)  # the one that caught the last plant comes first
     for plant in plants:
         number.value = plant
-        found[str(plant)] = next((name for name in cases if not cortado.certify(*cases[name]).right), None)
+        caught = next((name for name in order if not cortado.certify(*cases[name]).right), None)
+        found[str(plant)] = caught
+        order.sort(key=lambda name: name != caught)
     return found
 
 
@@ -173,6 +184,8 @@ def case(scene, loss: str):
     import numpy as np
 
     from cortado import Problem, Simulation, losses
+    from cortado.image_losses import Pyramid, SquaredDifference
+    from cortado.render.scene_renderer import scene_renderer
 
     simulation, random = Simulation(scene, precision="float64"), np.random.default_rng(1)
     spacing = scene.discretisation.spacing
@@ -187,7 +200,13 @@ def case(scene, loss: str):
     if scene.emitter is not None:
         point["nozzle_path"] = scene.emitter.outlet + 0.1 * spacing * random.standard_normal((STEPS, shape[1]))
     target = simulation.positions + 0.1 * random.standard_normal(shape)
-    made = losses.FinalPositions(target) if loss == "positions" else Everything(target, random.standard_normal(phases))
+    if loss == "positions":
+        made = losses.FinalPositions(target)
+    elif loss == "everything":
+        made = Everything(target, random.standard_normal(phases))
+    else:
+        renderer, distances = scene_renderer(simulation), {"squares": SquaredDifference, "pyramid": Pyramid}
+        made = losses.Image(renderer, random.random(renderer.shape), distances[loss]())
     return Problem(simulation, STEPS, made), point
 
 

@@ -16,7 +16,7 @@ from cortado import Problem, Simulation
 from cortado.launching import Launcher
 from cortado.rollout import Rollout
 from planting import case, plant_all
-from scenes import HONEY, MIXING, OIL, plane
+from scenes import HONEY, MIXING, OIL, plane, scene
 
 ROOT = Path(cortado.__file__).parent
 
@@ -63,14 +63,18 @@ SHARED = {
     "physics.viscosity": {"viscosity_kernels.share": 1},
     "physics.free_energy": {"_double_well.bend": 3, "_miscible.bend": 1, "_degenerate.slope": 4},
     "physics.matching": {"matching_kernels.difference": 3},
+    "physics.colour_field": {"colour_field_kernels.colour_field_adjoint": 11},
+    "physics.tint": {"tint_kernels.tint_adjoint": 2},
+    "physics.absorption": {
+        "brightness_functions.brightness_slope": 5,
+        "absorption_kernels.march_adjoint": 9,
+        "absorption_kernels.gather": 8,
+    },
+    "physics.interpolation": {"interpolation_functions.share": 6},
+    "image_losses": {"adjoint": 3},
 }
-"""Derivatives that forward mode uses too, so that only differences can tell."""
+"""Derivatives that forward mode uses too, the adjoints of pictures among them, so that only differences can tell."""
 ELSEWHERE = {
-    "physics.absorption": "the renderer: tests/test_render.py",
-    "physics.colour_field": "the renderer: tests/test_render.py",
-    "physics.interpolation": "the renderer: tests/test_render.py",
-    "physics.rays": "the renderer: tests/test_render.py",
-    "physics.tint": "the renderer: tests/test_render.py",
     "physics.frozen_pressure": "a policy that is not exact: tests/test_policies.py",
     "physics.adjoint_filters": "policies that are not exact: tests/test_policies.py",
 }
@@ -97,6 +101,28 @@ def small(viscosity: str, **changes):
     return plane(**{**tables, "emitter": NOZZLE, **changes})
 
 
+VOLUME = scene(
+    phase=PHASES,
+    fluid=[
+        {"shape": "box", "lower": lower, "upper": upper, "phase": name}
+        for name, lower, upper in (
+            ("water", [0.1, 0.0, 0.1], [0.2, 0.05, 0.2]),
+            ("oil", [0.1, 0.05, 0.1], [0.2, 0.15, 0.2]),
+        )
+    ],
+    container={"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.3, 0.3, 0.3]},
+    solver=SOLVER,
+    render={
+        "view": "volume",
+        "resolution": [9, 8],
+        "position": [0.7, 0.35, 0.8],
+        "look_at": [0.15, 0.08, 0.15],
+        "field_of_view": 20.0,
+        "extinction": 12.0,
+    },
+)
+"""12 particles that one can look into: samples of a ray are dense and thin ones."""
+
 SCENES = {
     "laminar, double well": (small("laminar", mixture=MIXING), "everything"),
     "pairwise, miscible": (
@@ -104,6 +130,8 @@ SCENES = {
         "everything",
     ),
     "one phase": (small("pairwise", phase=[HONEY], fluid=[{**POOL, "phase": "honey"}], emitter=None), "positions"),
+    "a picture of the plane": (small("pairwise", render={"view": "plane", "resolution": [8, 12]}), "pyramid"),
+    "a picture of a volume": (VOLUME, "squares"),
 }
 
 
