@@ -51,6 +51,8 @@ PARTICLES = 64
 _TABLES = GOOD_TASK[GOOD_TASK.index("[problem]") :]
 _OPTIMISE = GOOD_TASK[GOOD_TASK.index("[optimise]") :]
 _TARGET, _START = "target.gravity = [1.5, -9.81]", "start.gravity = [0.0, -7.0]"
+_CHECK, _SMOOTHING = "[optimise.check]", '[optimise.policy]\nname = "adjoint_smoothing"\n'
+_SEVERAL = "samples = 4\nspread.gravity = 0.1"
 _RATE, _STEPS = "learning_rate = 0.5", "steps = 5"
 _ROWS = "start.gravity = [[0.0, -7.0], [0.0, -8.0]]"
 _FOR_EACH_STEP = [[[-9.0, -9.0]] * 5, [[9.0, 9.0]] * 5]
@@ -137,6 +139,21 @@ BAD_TASKS = [
     ("viscosity in a list", _TABLES, _both("viscosity", [0.1]), "problem.target.viscosity"),
     ("path without an emitter", _TABLES, _both("nozzle_path", [0.1, 0.2]), "problem.target.nozzle_path"),
     ("flow rate without an emitter", _TABLES, _both("flow_rate", 0.1), "problem.target.flow_rate"),
+    ("unknown policy", _CHECK, f'[optimise.policy]\nname = "adjoint"\n{_CHECK}', "optimise.policy.name"),
+    ("policy without a table", _RATE, f'{_RATE}\npolicy = "exact"', "optimise.policy"),
+    ("strength of nothing", _CHECK, f"[optimise.policy]\nstrength = 0.1\n{_CHECK}", "optimise.policy.strength"),
+    ("strength beyond 1", _CHECK, f"{_SMOOTHING}strength = 1.5\n{_CHECK}", "optimise.policy.strength"),
+    ("strength of a mean beyond a half", _CHECK, f"{_SMOOTHING}strength = 0.6\n{_SEVERAL}\n{_CHECK}",
+     "optimise.policy.strength"),
+    ("no samples", _CHECK, f"{_SMOOTHING}samples = 0\n{_CHECK}", "optimise.policy.samples"),
+    ("samples without a spread", _CHECK, f"{_SMOOTHING}samples = 4\n{_CHECK}", "optimise.policy.spread"),
+    ("spread of one sample", _CHECK, f"{_SMOOTHING}spread.gravity = 0.1\n{_CHECK}", "optimise.policy.spread"),
+    ("spread of a vector", _CHECK, f"{_SMOOTHING}samples = 4\nspread.gravity = [0.1, 0.1]\n{_CHECK}",
+     "optimise.policy.spread.gravity"),
+    ("no spread", _CHECK, f"{_SMOOTHING}samples = 4\nspread.gravity = 0.0\n{_CHECK}",
+     "optimise.policy.spread.gravity"),
+    ("spread of something else", _CHECK, f"{_SMOOTHING}{_SEVERAL}\nspread.viscosity = 0.1\n{_CHECK}",
+     "optimise.policy.spread.viscosity"),
     ("one knot", _RATE, f"{_RATE}\nknots = 1", "optimise.knots"),
     ("knots of a constant", _RATE, f"{_RATE}\nknots = 3", "optimise.knots"),
     ("more knots than steps", _START, f"{_ROWS}\nknots = 6", "optimise.knots"),

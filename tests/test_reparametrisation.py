@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cortado import InputError, Problem, Simulation, losses
+from cortado import InputError, Problem, Simulation, losses, policies
 from cortado.reparametrisation import SMALLEST, Knots, Logarithm, Reparametrised, Softmax
 from scenes import plane, plane_of_three
 
@@ -156,6 +156,31 @@ def test_without_coordinates_it_is_the_problem_itself(problem):
     assert search.parameters(point) == point and search.coordinate(point) == point
     (loss, gradient), (wanted, exact) = search.value_and_gradient(point), problem.value_and_gradient(point)
     assert loss == wanted and all(gradient[name].tobytes() == exact[name].tobytes() for name in point)
+
+
+@pytest.mark.parametrize("policy", [policies.VelocityOnly(), policies.AdjointSmoothing(0.2, order=2)], ids=repr)
+def test_policies_go_back_to_coordinates(problem, policy):
+    search = Reparametrised(problem, COORDINATES)
+    u = search.coordinate(start_of(problem))
+    found, plain = search.estimate(u, policy), problem.estimate(search.parameters(u), policy)
+    assert found.loss == plain.loss and found.strength == plain.strength
+    for name, gradient in plain.gradient.items():
+        wanted = COORDINATES[name].adjoint(u[name], gradient) if name in COORDINATES else gradient
+        np.testing.assert_allclose(found.gradient[name], wanted, rtol=1e-12, atol=1e-15 * np.abs(wanted).max())
+
+
+def test_a_cloud_is_one_of_coordinates(problem):
+    """Its gravity has one row a knot, and there are few numbers enough for differences."""
+    search = Reparametrised(problem, COORDINATES)
+    u = {"gravity": search.coordinate(start_of(problem))["gravity"]}
+    _, exact = search.value_and_gradient(u)
+    for policy in (
+        policies.Smoothed(0.01, disorder=0.0),
+        policies.Averaged(0.01, disorder=0.0, policy=policies.Exact()),
+    ):
+        found = search.estimate(u, policy).gradient["gravity"]
+        assert found.shape == (3, 2)
+        assert np.linalg.norm(found - exact["gravity"]) < 0.01 * np.linalg.norm(exact["gravity"])
 
 
 def test_coordinates_of_parameters_that_are_not_given_do_no_harm(problem):

@@ -8,6 +8,7 @@ import pytest
 
 from bad_scenes import assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK
+from cortado import policies
 from cortado.commands.optimise import judge
 from cortado.errors import SceneError
 from cortado.optimisation import Record, Result
@@ -111,6 +112,23 @@ def test_options_of_the_search(task_file):
     )
     assert (task.optimise.knots, task.optimise.logarithmic) == (2, ("viscosity",))
     np.testing.assert_array_equal(task.optimise.bounds["gravity"], [[-5, -20], [5, 0]])
+
+
+SMOOTHING = ['optimise.policy.name="adjoint_smoothing"']
+SEVERAL = ["optimise.policy.samples=4", "optimise.policy.spread.gravity=0.5"]
+POLICIES = {
+    "exact": ([], policies.Exact()),
+    "velocity only": (['optimise.policy.name="velocity_only"'], policies.VelocityOnly()),
+    "smoothing": (SMOOTHING, policies.AdjointSmoothing()),
+    "with a strength": ([*SMOOTHING, "optimise.policy.strength=0.3"], policies.AdjointSmoothing(0.3)),
+    "averaged": ([*SMOOTHING, *SEVERAL], policies.Averaged({"gravity": 0.5}, 4)),
+    "averaged without smoothing": (SEVERAL, policies.Averaged({"gravity": 0.5}, 4, policy=policies.Exact())),
+}
+
+
+@pytest.mark.parametrize(("overrides", "wanted"), POLICIES.values(), ids=POLICIES)
+def test_a_policy_is_chosen_by_name(task_file, overrides, wanted):
+    assert load_task(task_file, overrides).optimise.policy.policy() == wanted
 
 
 def test_random_values_are_drawn_later(task_file):

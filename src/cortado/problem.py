@@ -12,7 +12,7 @@ from cortado.errors import InputError
 from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd, as_loss, fingerprint
 from cortado.parameter_values import NAMES, UNITS, Arrays, Values
 from cortado.particles import State
-from cortado.policies import AdjointPolicy, Estimate, Exact, Policy, checked_policy
+from cortado.policies import AdjointPolicy, Estimate, Policy, estimate
 from cortado.rollout import MEMORY_BUDGET, Observer, Rollout, StepDerivative
 from cortado.simulation import Simulation, check_steps
 from cortado.trajectory import Trajectory
@@ -93,7 +93,7 @@ class Problem:
         ``observe`` is given the number and the adjoint of every state, from the last to the first, by policies that go
         back through a run; `policies.AdjointNorms` is such an observer.
         """
-        return checked_policy(Exact() if policy is None else policy).estimate(self, parameters, observe)
+        return estimate(self, parameters, policy, observe)
 
     def passage(self, parameters: Values) -> "Passage":
         """A forward run that can be gone back through, until the next evaluation: what policies work with."""

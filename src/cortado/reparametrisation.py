@@ -12,8 +12,9 @@ import numpy as np
 
 from cortado.errors import InputError
 from cortado.parameter_values import Arrays
-from cortado.policies import Policy
+from cortado.policies import Estimate, Passage, Policy, estimate
 from cortado.problem import Problem
+from cortado.rollout import Observer, StepDerivative
 
 SMALLEST = 1e-4
 """Fractions below it are taken as it where coordinates are looked for: that of 0 is infinitely far away."""
@@ -93,6 +94,7 @@ class Reparametrised:
 
     def __init__(self, problem: Problem, coordinates: Mapping[str, Coordinates]):
         self.problem, self.coordinates = problem, dict(coordinates)
+        self.simulation = problem.simulation
 
     @property
     def fingerprint(self) -> str:
@@ -119,8 +121,29 @@ class Reparametrised:
 
     def value_and_gradient(self, u: Mapping[str, Any], policy: Policy | None = None) -> tuple[float, Arrays]:
         """The loss and its derivatives with respect to the coordinates."""
-        loss, gradient = self.problem.value_and_gradient(self.parameters(u), policy)
-        for name, coordinates in self.coordinates.items():
+        found = self.estimate(u, policy)
+        return found.loss, found.gradient
+
+    def estimate(self, u: Mapping[str, Any], policy: Policy | None = None, observe: Observer | None = None) -> Estimate:
+        """The same, with what the policy reports; a spread, of a policy that has one, is that of coordinates."""
+        return estimate(self, u, policy, observe)
+
+    def passage(self, u: Mapping[str, Any]) -> "CoordinatePassage":
+        """A forward run that can be gone back through: what policies work with."""
+        return CoordinatePassage(self.problem.passage(self.parameters(u)), self.coordinates, u)
+
+
+class CoordinatePassage:
+    """A forward run of a problem, and ways back to coordinates."""
+
+    def __init__(self, passage: Passage, coordinates: Mapping[str, Coordinates], u: Mapping[str, Any]):
+        self._passage, self._coordinates, self._u = passage, coordinates, u
+        self.loss, self.rollout, self.derivative = passage.loss, passage.rollout, passage.derivative
+
+    def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:
+        """The gradient with respect to the coordinates."""
+        gradient = self._passage.back(derivative, observe)
+        for name, coordinates in self._coordinates.items():
             if name in gradient:
-                gradient[name] = coordinates.adjoint(np.asarray(u[name]), gradient[name])
-        return loss, gradient
+                gradient[name] = coordinates.adjoint(np.asarray(self._u[name]), gradient[name])
+        return gradient

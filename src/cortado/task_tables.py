@@ -12,6 +12,7 @@ from cortado.errors import Phrase
 from cortado.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisers import LBFGS, Adam, GradientDescent, Optimiser
 from cortado.parameter_values import NAMES
+from cortado.policies import AdjointPolicy, AdjointSmoothing, Averaged, Exact, Policy, VelocityOnly
 from cortado.scene_kinds import MISSING, Choice, Count, Kind, Quantity, Text, as_number, as_sequence, wrong
 from cortado.scene_tables import Table
 
@@ -22,6 +23,11 @@ OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
 }
 """By the names in a file; each is made from the learning rate (for L-BFGS the size of its first step)."""
 DISTANCES: dict[str, ImageLoss] = {"squared_difference": SquaredDifference(), "pyramid": Pyramid()}
+POLICIES: dict[str, AdjointPolicy] = {
+    "exact": Exact(),
+    "velocity_only": VelocityOnly(),
+    "adjoint_smoothing": AdjointSmoothing(),
+}
 RANDOM = "random"
 CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
 
@@ -137,6 +143,47 @@ class CheckTable(Table):
     """Peak signal-to-noise ratio of the found image to the target."""
 
 
+class PolicyTable(Table):
+    """[optimise.policy]: which gradient the search follows, see docs/policies.md."""
+
+    name: Annotated[str, Choice(tuple(POLICIES))] = "exact"
+    """What is done on the way back through a run."""
+    strength: Annotated[float | None, Quantity(above=0.0, most=1.0)] = None
+    """Of adjoint smoothing; None: found at the start of a search."""
+    samples: Annotated[int, Count(1, 10_000)] = 1
+    """Runs of a cloud that the gradient is the mean of."""
+    spread: Annotated[dict[str, Any] | None, Values()] = None
+    """Of the cloud: by name a number, the standard deviation of what is searched."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.strength is not None and self.name != "adjoint_smoothing":
+            raise wrong(("strength",), self.strength, "left out, as nothing is smoothed")
+        if self.strength is not None and self.strength * self._order > 1.0:
+            raise wrong(("strength",), self.strength, f"at most {1.0 / self._order:g}, as means are extrapolated")
+        if self.samples > 1 and self.spread is None:
+            raise wrong(("spread",), MISSING, "a table of numbers greater than 0, as there are several samples")
+        if self.samples == 1 and self.spread is not None:
+            raise wrong(("spread",), Phrase("given"), "left out, as there is one sample")
+        for name, number in (self.spread or {}).items():
+            if number.ndim or not number > 0.0:
+                raise wrong(("spread", name), number.tolist(), "a number greater than 0")
+        return self
+
+    @property
+    def _order(self) -> int:
+        return 2 if self.samples > 1 else 1
+
+    def policy(self) -> Policy:
+        """As an object."""
+        one = POLICIES[self.name]
+        if isinstance(one, AdjointSmoothing):
+            one = AdjointSmoothing("auto" if self.strength is None else self.strength, order=self._order)
+        if self.spread is None:
+            return one
+        return Averaged({name: float(number) for name, number in self.spread.items()}, self.samples, policy=one)
+
+
 class OptimiseTable(Table):
     """[optimise]: from where, how and how long."""
 
@@ -157,6 +204,8 @@ class OptimiseTable(Table):
     """In units of the parameters; for L-BFGS the size of its first step."""
     iterations: Annotated[int, Count(1, 10_000_000)]
     """Updates at most, of each search."""
+    policy: PolicyTable = PolicyTable()
+    """Which gradient it follows."""
     check: CheckTable = CheckTable()
     """What the run has to reach."""
 

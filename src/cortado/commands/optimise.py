@@ -11,6 +11,7 @@ from cortado.assignment import Assignment, assignment
 from cortado.errors import ComputationError, DivergedError
 from cortado.image_losses import psnr
 from cortado.optimisation import Record, Result, optimise
+from cortado.policies import tuned
 from cortado.progress import track
 from cortado.report import write_report
 from cortado.run_folder import RunFolder
@@ -128,6 +129,7 @@ def _search(made: Assignment, folder: RunFolder, resume: bool) -> Result:
                 settings.algorithm(),
                 settings.iterations,
                 bounds=made.bounds,
+                policy=tuned(settings.policy.policy(), search, start),
                 checkpoint=folder.checkpoint / str(k) if k else folder.checkpoint,
                 resume=resume,
                 on_iteration=note,
@@ -154,6 +156,7 @@ def _rows(made: Assignment, found: dict[str, np.ndarray], result: Result, verdic
     rows: Rows = [
         ("particles", made.problem.simulation.particles),
         ("steps", made.problem.steps),
+        ("gradients", made.task.optimise.policy.name.replace("_", " ")),
         ("iterations", _iterations(made, result)),
         ("first loss", f"{verdict.first:.4g}"),
         ("best loss", f"{result.loss:.4g}"),

@@ -5,10 +5,12 @@ it says less and less, and others take its place: `AdjointSmoothing`, `VelocityO
 over a cloud, `Averaged`. `Smoothed`, from forward runs alone, is what they are measured by.
 """
 
+from cortado.parameter_values import Values
 from cortado.policies.ensemble import Averaged, Smoothed
 from cortado.policies.exact import Exact, Tape, VelocityOnly
 from cortado.policies.filters import AdjointSmoothing, Damped
-from cortado.policies.policy import AdjointPolicy, Estimate, Policy, checked_policy
+from cortado.policies.policy import AdjointPolicy, Differentiable, Estimate, Passage, Policy, checked_policy, tuned
+from cortado.rollout import Observer
 from cortado.solvers.adjoint_filters import AdjointNorms
 
 __all__ = [
@@ -17,11 +19,21 @@ __all__ = [
     "AdjointSmoothing",
     "Averaged",
     "Damped",
+    "Differentiable",
     "Estimate",
     "Exact",
+    "Passage",
     "Policy",
     "Smoothed",
     "Tape",
     "VelocityOnly",
-    "checked_policy",
+    "estimate",
+    "tuned",
 ]
+
+
+def estimate(
+    problem: Differentiable, parameters: Values, policy: Policy | None = None, observe: Observer | None = None
+) -> Estimate:
+    """What a policy, `Exact` if none is given, has to say of a problem, or an `InputError` where it is none."""
+    return checked_policy(Exact() if policy is None else policy).estimate(problem, parameters, observe)

@@ -1,6 +1,6 @@
 """The gradient of a loss averaged over a cloud, from forward runs alone or from gradients that stay small."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from cortado.errors import InputError
 from cortado.parameter_values import Values
 from cortado.policies.cloud import Cloud
 from cortado.policies.filters import AdjointSmoothing
-from cortado.policies.policy import Differentiable, Estimate, Policy, checked_policy
+from cortado.policies.policy import Differentiable, Estimate, Policy, checked_policy, tuned
 from cortado.rollout import Observer
 
 SMOOTHING = AdjointSmoothing(order=2)
@@ -72,9 +72,7 @@ class Averaged(Cloud):
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         cloud = self.around(problem, parameters)
-        loss, policy = problem.value(cloud.values), self.policy
-        if isinstance(policy, AdjointSmoothing):
-            policy = policy.tuned(problem, cloud.values)
+        loss, policy = problem.value(cloud.values), tuned(self.policy, problem, cloud.values)
         found, strength = [], None
         for _ in range(self.samples):
             moved = cloud.at(cloud.random.standard_normal(len(cloud.spreads)), cloud.displacement())
@@ -83,6 +81,10 @@ class Averaged(Cloud):
             strength = one.strength
         gradient, error = (cloud.named(one) for one in _mean_and_error(np.array(found)))
         return Estimate(loss, gradient, strength, error)
+
+    def tuned(self, problem: Differentiable, parameters: Values) -> "Averaged":
+        """The same with a policy that is tuned here."""
+        return replace(self, policy=tuned(self.policy, problem, parameters))
 
 
 def _mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from cortado.errors import InputError
 from cortado.parameter_values import Arrays, Values
@@ -65,6 +65,19 @@ def checked_policy(policy: Policy) -> Policy:
     if isinstance(policy, type) or not hasattr(policy, "estimate"):
         raise InputError(f"policy is {policy!r}, but must be an object such as cortado.policies.Exact().")
     return policy
+
+
+@runtime_checkable
+class Tunable(Protocol):
+    """A policy that finds something out before it makes a gradient."""
+
+    def tuned(self, problem: Differentiable, parameters: Values) -> Policy:
+        """The same with what it finds out here, for use at parameters nearby."""
+
+
+def tuned(policy: Policy, problem: Differentiable, parameters: Values) -> Policy:
+    """The policy with what there is to find out found out, so that a search does so once."""
+    return policy.tuned(problem, parameters) if isinstance(policy, Tunable) else policy
 
 
 class AdjointPolicy(ABC):
