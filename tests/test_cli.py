@@ -317,13 +317,19 @@ def test_a_killed_optimisation_resumes_bit_for_bit(cortado_command):
     assert len(json.loads(Path("killed/environment.json").read_text())["resumed"]) == 1
 
 
-def test_an_interrupted_optimisation_resumes_bit_for_bit(cortado_command, monkeypatch):
+SMOOTHED = ["name=adjoint_smoothing", "strength=0.2", "samples=2", "spread.gravity=0.1"]
+
+
+@pytest.mark.parametrize("policy", [[], ["name=adjoint_smoothing"], SMOOTHED], ids=["exact", "smoothing", "averaged"])
+def test_an_interrupted_optimisation_resumes_bit_for_bit(cortado_command, monkeypatch, policy):
+    options = ["check.loss_reduction=1", "check.parameter_error=100", *(f"policy.{one}" for one in policy)]
+    task = ["optimise", "task.toml", *(word for one in options for word in ("--set", f"optimise.{one}"))]
     with monkeypatch.context() as patch:
         patch.setattr(cortado.commands.optimise, "track", interrupting(after=3))
-        assert cortado_command("optimise", "task.toml", "--out", "stopped")[0] == 130
+        assert cortado_command(*task, "--out", "stopped")[0] == 130
     assert len(metrics("stopped")) == 4
-    assert cortado_command("optimise", "task.toml", "--out", "stopped", "--resume")[0] == 0
-    cortado_command("optimise", "task.toml", "--out", "whole")
+    assert cortado_command(*task, "--out", "stopped", "--resume")[0] == 0
+    cortado_command(*task, "--out", "whole")
     assert_same_optimisation("stopped", "whole")
 
 
