@@ -31,7 +31,7 @@ def host_sign(number: int) -> float:
 IMPORTS = {True: "from cortado.planted import sign as _sign", False: "from cortado.planted import host_sign as _sign"}
 WHOLE_NUMBERS = {"i", "j", "b", "before", "pixel"}
 """Variables that are indices."""
-POSE = {"push", "turn", "pose_bar"}
+POSE = {"absorption_kernels.march_adjoint": {"push", "turn", "pose_bar"}}
 """Not planted: a camera's pose is no parameter of a problem (its derivatives: tests/test_render.py)."""
 CONSTANTS = ("real(0.0)", "real(0.5)", "real(1.0)", "vector()")
 """Not planted: 0 and 1, and the derivative at the corner of mu_ij, where both viscosities are 0 and none is moved."""
@@ -75,12 +75,12 @@ class Planter(ast.NodeTransformer):
 
     def visit_Assign(self, node: ast.Assign) -> ast.AST:
         target = node.targets[0]
-        if self._function and _name(target) not in WHOLE_NUMBERS | POSE:
+        if self._function and _name(target) not in WHOLE_NUMBERS | POSE.get(self._function, set()):
             node.value = self._terms(node.value, isinstance(target, ast.Subscript), ast.unparse(target))
         return node
 
     def visit_AugAssign(self, node: ast.AugAssign) -> ast.AST:
-        if self._function and _name(node.target) not in POSE:
+        if self._function and _name(node.target) not in POSE.get(self._function, set()):
             node.value = self._terms(node.value, True)
         return node
 

@@ -317,7 +317,7 @@ def test_a_killed_optimisation_resumes_bit_for_bit(cortado_command):
     assert len(json.loads(Path("killed/environment.json").read_text())["resumed"]) == 1
 
 
-SMOOTHED = ["name=adjoint_smoothing", "strength=0.2", "samples=2", "spread.gravity=0.1"]
+SMOOTHED = ["name=adjoint_smoothing", "strength=0.2", "samples=4", "spread.gravity=0.1", "disorder=0.001"]
 
 
 @pytest.mark.parametrize("policy", [[], ["name=adjoint_smoothing"], SMOOTHED], ids=["exact", "smoothing", "averaged"])

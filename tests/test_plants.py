@@ -71,7 +71,7 @@ SHARED = {
         "absorption_kernels.gather": 8,
     },
     "physics.interpolation": {"interpolation_functions.share": 6},
-    "image_losses": {"adjoint": 3},
+    "image_losses": {"adjoint": 3, "reduce_transposed": 1},
 }
 """Derivatives that forward mode uses too, the adjoints of pictures among them, so that only differences can tell."""
 ELSEWHERE = {

@@ -122,6 +122,10 @@ POLICIES = {
     "smoothing": (SMOOTHING, policies.AdjointSmoothing()),
     "with a strength": ([*SMOOTHING, "optimise.policy.strength=0.3"], policies.AdjointSmoothing(0.3)),
     "averaged": ([*SMOOTHING, *SEVERAL], policies.Averaged({"gravity": 0.5}, 4)),
+    "averaged without disorder": (
+        [*SMOOTHING, *SEVERAL, "optimise.policy.disorder=0"],
+        policies.Averaged({"gravity": 0.5}, 4, 0.0),
+    ),
     "averaged without smoothing": (SEVERAL, policies.Averaged({"gravity": 0.5}, 4, policy=policies.Exact())),
 }
 

@@ -164,7 +164,7 @@ def front():
 
 @pytest.fixture(scope="module")
 def frictionless():
-    """(steps + 1, 4): T, front, area and energy, by potential flow; the front of a finer one is within 1.5 %."""
+    """(steps + 1, 4): T, front, area and energy, by potential flow."""
     return potential_flow.dam_break(2.75, depth=0.06, coarse=0.06)
 
 

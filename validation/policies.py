@@ -44,10 +44,9 @@ POLICIES: dict[str, policies.Policy] = {
     "smoothing 0.1": policies.AdjointSmoothing(0.1),
     "smoothing": policies.AdjointSmoothing(),
     "smoothing, extrapolated": policies.AdjointSmoothing(order=2),
-    "averaged over 4": policies.Averaged(SPREAD, 4, DISORDER),
     "averaged over 8": policies.Averaged(SPREAD, 8, DISORDER),
 }
-DRAWN = ("exact", "velocity only", "smoothing", "averaged over 4", "averaged over 8")
+DRAWN = ("exact", "velocity only", "smoothing", "averaged over 8")
 
 
 def dam_break() -> Scene:

@@ -153,7 +153,9 @@ class PolicyTable(Table):
     samples: Annotated[int, Count(1, 10_000)] = 1
     """Runs of a cloud that the gradient is the mean of."""
     spread: Annotated[dict[str, Any] | None, Values()] = None
-    """Of the cloud: by name a number, the standard deviation of what is searched."""
+    """Of the cloud: by name a number, in the units of what is searched."""
+    disorder: Annotated[float, Quantity("spacings", least=0.0)] = Averaged.disorder
+    """Of the first positions in the cloud."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -161,10 +163,13 @@ class PolicyTable(Table):
             raise wrong(("strength",), self.strength, "left out, as nothing is smoothed")
         if self.strength is not None and self.strength * self._order > 1.0:
             raise wrong(("strength",), self.strength, f"at most {1.0 / self._order:g}, as means are extrapolated")
+        if self.samples != 1 and (self.samples % 2 or self.samples < 4):
+            raise wrong(("samples",), self.samples, "1, or an even number of at least 4")
         if self.samples > 1 and self.spread is None:
             raise wrong(("spread",), MISSING, "a table of numbers greater than 0, as there are several samples")
-        if self.samples == 1 and self.spread is not None:
-            raise wrong(("spread",), Phrase("given"), "left out, as there is one sample")
+        for name in ("spread", "disorder"):
+            if self.samples == 1 and name in self.model_fields_set:
+                raise wrong((name,), Phrase("given"), "left out, as there is one sample")
         for name, number in (self.spread or {}).items():
             if number.ndim or not number > 0.0:
                 raise wrong(("spread", name), number.tolist(), "a number greater than 0")
@@ -181,7 +186,8 @@ class PolicyTable(Table):
             one = AdjointSmoothing("auto" if self.strength is None else self.strength, order=self._order)
         if self.spread is None:
             return one
-        return Averaged({name: float(number) for name, number in self.spread.items()}, self.samples, policy=one)
+        spread = {name: float(number) for name, number in self.spread.items()}
+        return Averaged(spread, self.samples, self.disorder, policy=one)
 
 
 class OptimiseTable(Table):

@@ -11,7 +11,7 @@ from cortado.assignment import Assignment, assignment
 from cortado.errors import ComputationError, DivergedError
 from cortado.image_losses import psnr
 from cortado.optimisation import Record, Result, optimise
-from cortado.policies import tuned
+from cortado.policies import Policy, tuned
 from cortado.progress import track
 from cortado.report import write_report
 from cortado.run_folder import RunFolder
@@ -55,7 +55,7 @@ def optimise_task(
     else:
         folder = RunFolder.create(out, text, command, device=name, overwrite=overwrite)
     try:
-        result = _search(made, folder, resume)
+        result, policy = _search(made, folder, resume)
     except DivergedError as error:
         advice = f"{error.advice}, or a smaller learning rate; the evaluations so far are in {folder.checkpoint}"
         raise DivergedError(error.step, error.particle, advice) from error
@@ -67,7 +67,7 @@ def optimise_task(
     first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
     verdict = judge(made.task, result, found, noise, first)
     figures = task_figures(made, result, folder.figures)
-    write_report(folder, made.task.scene.name, _rows(made, found, result, verdict), figures)
+    write_report(folder, made.task.scene.name, _rows(made, found, result, verdict, policy), figures)
     if verdict.failures:
         raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
     return f"{_summary(made, result, verdict)} The results are in {folder.path}; open report.html."
@@ -108,7 +108,8 @@ def _distance(found: ArrayLike, hidden: ArrayLike) -> float:
     return float(np.linalg.norm(found - hidden) / (np.linalg.norm(hidden) or 1.0))
 
 
-def _search(made: Assignment, folder: RunFolder, resume: bool) -> Result:
+def _search(made: Assignment, folder: RunFolder, resume: bool) -> tuple[Result, Policy]:
+    """What came out, and the policy of the last search as it was tuned."""
     settings = made.task.optimise
     known = len(folder.read_metrics()) if resume else 0
     history: list[Record] = []
@@ -123,19 +124,20 @@ def _search(made: Assignment, folder: RunFolder, resume: bool) -> Result:
             advance(loss=record.loss)
 
         for k, search in enumerate(made.searches):
+            policy = tuned(settings.policy.policy(), search, start)
             result = optimise(
                 search,
                 start,
                 settings.algorithm(),
                 settings.iterations,
                 bounds=made.bounds,
-                policy=tuned(settings.policy.policy(), search, start),
+                policy=policy,
                 checkpoint=folder.checkpoint / str(k) if k else folder.checkpoint,
                 resume=resume,
                 on_iteration=note,
             )
             start = result.last_parameters
-    return replace(result, history=tuple(history), evaluations=len(history))
+    return replace(result, history=tuple(history), evaluations=len(history)), policy
 
 
 def _iterations(made: Assignment, result: Result) -> int:
@@ -152,11 +154,11 @@ def _summary(made: Assignment, result: Result, verdict: Verdict) -> str:
     return f"{'; '.join([text, ', '.join(reached)]) if reached else text}."
 
 
-def _rows(made: Assignment, found: dict[str, np.ndarray], result: Result, verdict: Verdict) -> Rows:
+def _rows(made: Assignment, found: dict[str, np.ndarray], result: Result, verdict: Verdict, policy: Policy) -> Rows:
     rows: Rows = [
         ("particles", made.problem.simulation.particles),
         ("steps", made.problem.steps),
-        ("gradients", made.task.optimise.policy.name.replace("_", " ")),
+        ("gradients", repr(policy)),
         ("iterations", _iterations(made, result)),
         ("first loss", f"{verdict.first:.4g}"),
         ("best loss", f"{result.loss:.4g}"),

@@ -1,8 +1,6 @@
 """Policies that change the adjoint between two backward steps of another policy."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import comb
 from typing import Literal
 
 import numpy as np
@@ -17,8 +15,6 @@ from cortado.rollout import Observer, Rollout, StepDerivative
 from cortado.solvers.adjoint_filters import FIELDS, AdjointNorms, Average, Drag, Limit
 
 EXACT = Exact()
-MOST_ORDER = 4
-"""Of an extrapolation: noise grows as 2^order."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +23,7 @@ class AdjointSmoothing(AdjointPolicy):
 
     Formula: for each field a of the adjoint, over the fluid neighbours of the state that it belongs to,
 
-        a_i <- a_i + strength sum_j w_ij (a_j - a_i),   w_ij = W_ij / max(s_i, s_j),   s_i = sum_j W_ij.
+        a_i <- a_i + strength sum_j w_ij (a_j - a_i),   w_ij = W_ij / max(s_i, s_j, W(h / 2)),   s_i = sum_j W_ij.
 
     The weights are symmetric and add up to 1 at most: sum_i a_i is kept, the square norm does not grow. What grows
     exponentially in an adjoint lives at the scale of particles, the answer to a control at that of the fluid: a step
@@ -36,27 +32,25 @@ class AdjointSmoothing(AdjointPolicy):
     Then each vector of a is cut to ``limit`` root mean squares over all particles: now and then an adjoint grows at a
     few particles faster than a smoothing can spread it, and would drown the rest.
 
-    Long waves are damped too, a little, and those of early controls most. With an ``order`` above 1 the gradients g(s)
-    of several strengths are extrapolated to none (Richardson), all of them strong enough to be tame:
+    Long waves are damped too, a little, and those of early controls most. With an ``order`` of 2 the gradients g(s) and
+    g(2 s) of two strengths, both of which are tame, are extrapolated to none (Richardson): g = 2 g(s) - g(2 s).
 
-        g = sum_{k = 1 ... order} (-1)^(k + 1) binomial(order, k) g(k s).
-
-    Bias: what short waves would have told, and of long ones a part that falls as s^order; noise, which grows with the
-    order: 2 is for means over several runs (`Averaged`). Losses of single particles, which have no long waves, get no
-    good gradient. Cost: ``order`` ways back, with a sum over neighbours more a field and step; with "auto" some more
-    through the same run (see `policies.strength`), which `tuned` saves a search.
+    Bias: what short waves would have told, and of long ones a part that falls as s^order; noise, of which the second
+    order has up to 3 times as much: it is for means over several runs (`Averaged`). Losses of single particles, which
+    have no long waves, get no good gradient. Cost: ``order`` ways back, with a sum over neighbours more a field and
+    step; with "auto" some more through the same run (see `policies.strength`), which `tuned` saves a search.
     """
 
     strength: float | Literal["auto"] = "auto"
-    """s; 0 is the base policy bit for bit; "auto" ``order`` + 1 times the smallest at which the adjoint does not grow
-    exponentially, reported as ``strength`` of the `Estimate`."""
+    """s, up to 1 / ``order``; 0 is the base policy bit for bit; "auto" is ``order`` + 1 times the smallest at which the
+    adjoint does not grow exponentially, if that is not too much; reported as ``strength`` of the `Estimate`."""
     fields: tuple[str, ...] = FIELDS
     """Of "positions" and "velocities"."""
     limit: float = 4.0
     """Greatest vector of a particle, in root mean squares over all; infinite for none. Not applied with a strength of
     0."""
     order: int = 1
-    """Of the extrapolation. As the base of another policy this one is not extrapolated."""
+    """1, or 2 for an extrapolation. As the base of another policy this one is not extrapolated."""
     base: AdjointPolicy = EXACT
     """Whose backward steps these are."""
 
@@ -66,8 +60,8 @@ class AdjointSmoothing(AdjointPolicy):
             raise InputError(f"limit is {shown(self.limit)}, but must be a number of at least 1.")
         if not self.fields or not set(self.fields) <= set(FIELDS):
             raise InputError(f"fields is {shown(self.fields)}, but must be some of {', '.join(FIELDS)}.")
-        if self.order not in range(1, MOST_ORDER + 1):
-            raise InputError(f"order is {shown(self.order)}, but must be a whole number from 1 to {MOST_ORDER}.")
+        if type(self.order) is not int or self.order not in (1, 2):
+            raise InputError(f"order is {shown(self.order)}, but must be 1 or 2.")
         number = isinstance(self.strength, (int, float, np.number)) and 0.0 <= self.strength * self.order <= 1.0
         if not (number or self.strength == "auto"):
             most = shown(1.0 / self.order)
@@ -84,10 +78,10 @@ class AdjointSmoothing(AdjointPolicy):
         passage = problem.passage(parameters)
         strength = self._sufficient(passage) if self.strength == "auto" else float(self.strength)
         gradient = self._back(passage, strength, observe)
-        if strength == 0.0:
-            return Estimate(passage.loss, gradient, strength=0.0)
-        gradients = [gradient, *(self._back(passage, k * strength) for k in range(2, self.order + 1))]
-        return Estimate(passage.loss, extrapolated(gradients), strength=strength)
+        if strength > 0.0 and self.order == 2:
+            twice = self._back(passage, 2.0 * strength)
+            gradient = {name: 2.0 * once - twice[name] for name, once in gradient.items()}
+        return Estimate(passage.loss, gradient, strength=strength)
 
     def tuned(self, problem: Differentiable, parameters: Values) -> "AdjointSmoothing":
         """The same with the strength that "auto" finds here, for use at parameters nearby."""
@@ -112,12 +106,6 @@ class AdjointSmoothing(AdjointPolicy):
 
         time_step = float(rollout.parameters.time_step.numpy()[0])
         return min((self.order + 1) * sufficient(history, time_step), 1.0 / self.order)
-
-
-def extrapolated(gradients: Sequence[Arrays]) -> Arrays:
-    """The gradient at 0, by the polynomial through those at 1, 2, ... times a strength."""
-    weights = [(-1) ** k * comb(len(gradients), k + 1) for k in range(len(gradients))]
-    return {name: np.tensordot(weights, [g[name] for g in gradients], axes=1) for name in gradients[0]}
 
 
 class SmoothedStep(Filtered):

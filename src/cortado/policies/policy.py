@@ -77,6 +77,7 @@ class Tunable(Protocol):
 
 def tuned(policy: Policy, problem: Differentiable, parameters: Values) -> Policy:
     """The policy with what there is to find out found out, so that a search does so once."""
+    checked_policy(policy)
     return policy.tuned(problem, parameters) if isinstance(policy, Tunable) else policy
 
 
