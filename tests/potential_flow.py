@@ -9,6 +9,7 @@ Units: L = 1, T = t sqrt(2 g / L).
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -68,7 +69,7 @@ class Surface:
     nodes: np.ndarray
     potential: np.ndarray
 
-    @property
+    @cached_property
     def arc(self) -> np.ndarray:
         """(n,) length from the wall."""
         return np.concatenate([[0.0], np.hypot(*np.diff(self.nodes, axis=0).T).cumsum()])

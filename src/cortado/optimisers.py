@@ -5,16 +5,15 @@ on nothing else. Resuming (`cortado.optimisation`) rests on this; an optimiser w
 them from a seed of its own.
 """
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from numbers import Real
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from cortado.errors import InputError
 from cortado.evaluations import Packing, Vector
+from cortado.scene_kinds import as_number
 
 PerParameter = float | Mapping[str, float]
 
@@ -170,8 +169,7 @@ class LBFGS:
     def __post_init__(self) -> None:
         if not isinstance(self.memory, int) or self.memory < 1:
             raise InputError(f"The memory of L-BFGS must be an integer of at least 1, not {self.memory!r}.")
-        if not _is_number(self.tolerance) or not 0.0 <= self.tolerance < 1.0:
-            raise InputError(f"The tolerance of L-BFGS must be a number in [0, 1), not {self.tolerance!r}.")
+        _require_fraction("The tolerance of L-BFGS", self.tolerance)
         _require_positive("scale", self.scale)
 
     def check(self, packing: Packing) -> None:
@@ -246,21 +244,18 @@ def _values(values: PerParameter) -> Iterator[object]:
     return iter(values.values() if isinstance(values, Mapping) else [values])
 
 
-def _is_number(value: object) -> bool:
-    """Whether a value is a finite real number."""
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-
-
 def _require_positive(name: str, values: PerParameter) -> None:
     """Raise InputError unless every number is positive and finite."""
     for value in _values(values):
-        if not _is_number(value) or not value > 0.0:  # type: ignore[operator]
+        number = as_number(value)
+        if number is None or number <= 0.0:
             raise InputError(f"{name} must be a positive, finite number, not {value!r}.")
 
 
 def _require_fraction(name: str, value: float) -> None:
     """Raise InputError unless a number is in [0, 1)."""
-    if not _is_number(value) or not 0.0 <= value < 1.0:
+    number = as_number(value)
+    if number is None or not 0.0 <= number < 1.0:
         raise InputError(f"{name} must be a number in [0, 1), not {value!r}.")
 
 

@@ -116,7 +116,7 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
         if not isinstance(start[name], str) and (start[name] <= 0.0).any():
             raise SceneError(None, f"optimise.start.{name}", float(start[name].min()), "greater than 0")
     spread = optimise.policy.spread
-    for name in set(start) ^ set(spread or start):
+    for name in sorted(set(start) ^ set(spread or start)):
         wanted, found = ("given, as it is searched", MISSING) if name in start else ("left out", Phrase("given"))
         raise SceneError(None, f"optimise.policy.spread.{name}", found, wanted)
     given = optimise.check.model_fields_set

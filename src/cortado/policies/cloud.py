@@ -9,6 +9,7 @@ import numpy as np
 from cortado.errors import InputError, shown
 from cortado.parameter_values import Arrays, Values
 from cortado.policies.policy import Differentiable
+from cortado.scene_kinds import as_number
 
 Made = TypeVar("Made")
 
@@ -31,7 +32,8 @@ class Cloud:
     def __post_init__(self) -> None:
         if not _is_whole(self.samples) or self.samples < 2:
             raise InputError(f"samples is {shown(self.samples)}, but must be at least 2, to know how they scatter.")
-        if not _is_number(self.disorder) or not 0.0 <= self.disorder < np.inf:
+        disorder = as_number(self.disorder)
+        if disorder is None or disorder < 0.0:
             raise InputError(f"disorder is {shown(self.disorder)}, but must be a number of at least 0, in spacings.")
         if not _is_whole(self.seed) or self.seed < 0:
             raise InputError(f"seed is {shown(self.seed)}, but must be a whole number of at least 0.")
@@ -48,9 +50,10 @@ class Cloud:
         if isinstance(self.spread, Mapping) and name not in self.spread:
             raise InputError(f"spread has nothing for {name}, but must have a number for every parameter.")
         spread = self.spread[name] if isinstance(self.spread, Mapping) else self.spread
-        if not _is_number(spread) or not 0.0 < spread < np.inf:
+        number = as_number(spread)
+        if number is None or number <= 0.0:
             raise InputError(f"spread of {name} is {shown(spread)}, but must be a number greater than 0.")
-        return float(spread)
+        return number
 
 
 @dataclass(frozen=True)
@@ -102,10 +105,6 @@ def _moved(values: Arrays, change: np.ndarray) -> Arrays:
     ends = np.cumsum([value.size for value in values.values()])
     parts = np.split(change, ends[:-1])
     return {name: value + part.reshape(value.shape) for (name, value), part in zip(values.items(), parts, strict=True)}
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
 
 
 def _is_whole(value: object) -> bool:
