@@ -12,7 +12,7 @@ import cortado
 ROOT = Path(cortado.__file__).parent
 
 LAYERS = """
-    errors
+    errors arrays
     image_losses srgb masses
     smoothing calibration parameter_values
     precision cells
@@ -34,7 +34,7 @@ LAYERS = """
     solvers.adjoint_filters
     rollout
     policies.policy policies.exact policies.strength policies.filters policies.cloud policies.ensemble policies
-    losses controls simulation problem
+    losses checked_loss controls simulation problem
     render.scene_renderer reparametrisation
     evaluations optimisers optimisation
     run_folder progress pictures video

@@ -433,9 +433,13 @@ def test_wrong_settings_are_refused(make):
     [
         ({"start": {}}, "names no parameter"),
         ({"start": {"x": np.array([1.0, np.nan])}}, "'x' has components that are not finite"),
-        ({"start": {"x": "one"}}, "'x' must be a number or an array of numbers"),
-        ({"start": {"x": np.zeros((0, 3))}}, "'x' must be a number or an array of numbers"),
-        ({"start": {"x": [[1.0], [1.0, 2.0]]}}, "'x' is not a number or a regular array"),
+        ({"start": {"x": "one"}}, "'x' is 'one', but must be a number or an array"),
+        ({"start": {"x": np.ones(2, complex)}}, "'x' is made of complex numbers"),
+        ({"start": {"x": np.ma.array([1.0, 2.0], mask=[0, 1])}}, "'x' is partly masked"),
+        ({"bounds": {"x": (np.zeros(2, complex), None)}}, "lower bound of 'x' is made of complex numbers"),
+        ({"bounds": {"x": (None, "2")}}, "upper bound of 'x' is '2'"),
+        ({"start": {"x": np.zeros((0, 3))}}, r"'x' has shape \(0, 3\), but must have at least one"),
+        ({"start": {"x": [[1.0], [1.0, 2.0]]}}, r"'x' is \[\[1.0\], \[1.0, 2.0\]\], but must be a number or an array"),
         ({"optimiser": "adam"}, "optimiser must be an object"),
         (
             {"optimiser": Adam({"y": 0.1})},

@@ -460,15 +460,45 @@ def top(**changed: Any) -> TopView:
         (lambda: renderer(top(), lower=[1, 1, 1]), "upper is .* must not be below lower"),
         (lambda: renderer(top(), cell=1e-5), "cell is 1e-05, which makes .* nodes"),
         (lambda: renderer(top()).adjoint(np.zeros((256, 256, 3))), "call render before"),
-        (lambda: picture(renderer(top()), scene(n=4)), r"positions is vec3d of shape \(4,\), but"),
+        (lambda: picture(renderer(top()), scene(n=4)), r"positions is vec3d of shape \(4,\) on cpu, but"),
         (lambda: picture(renderer(top()), scene(phases=2)), "fractions is"),
         (lambda: picture(renderer(top()), scene(), FLOAT32), "positions is vec3f"),
+        (lambda: renderer(top()).render(**scene(n=4)), r"positions has shape \(4, 3\), but must have \(200, 3\)"),
+        (lambda: renderer(top()).render(**scene(phases=2)), r"fractions has shape \(200, 2\), but must have"),
+        (
+            lambda: renderer(top()).render(**scene() | {"positions": np.ones((N, 3), complex)}),
+            "positions is made of com",
+        ),
+        (
+            lambda: renderer(top()).render(**scene() | {"fractions": np.full((N, PHASES), np.nan)}),
+            "fractions has a value",
+        ),
+        (lambda: renderer(top()).render(**scene() | {"colours": "red"}), "colours is 'red'"),
+        (lambda: camera(resolution=8), "resolution is 8, but must be two"),
+        (lambda: camera(field_of_view="wide"), "field_of_view is 'wide', but must be a number"),
+        (lambda: camera(near=1j), "near is 1j"),
+        (lambda: renderer(top(), support="2"), "support is '2', but must be a number"),
+        (lambda: renderer(top(), particles="2"), "particles is '2', but must be at least 1"),
         (lambda: picture(renderer(top()), scene() | {"colours": np.zeros((3, 4))}), "colours has shape"),
     ],
 )
 def test_wrong_input_is_a_sentence(make, sentence):
     with pytest.raises(InputError, match=sentence):
         make()
+
+
+@pytest.mark.parametrize("precision", [FLOAT32, FLOAT64], ids=lambda precision: precision.name)
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_numpy_arrays_make_the_same_picture(dimension, precision):
+    view = TopView(
+        tuple(LOWER[:dimension]), tuple(UPPER[:dimension]), SPACING, RESOLUTION, up_axis={2: 2, 3: 1}[dimension]
+    )
+    made = renderer(view, lower=LOWER[:dimension], upper=UPPER[:dimension], dimension=dimension, precision=precision)
+    values = scene(dimension)
+    wanted = picture(made, values, precision)
+    given = values | {"positions": values["positions"][:, :dimension]}
+    np.testing.assert_array_equal(made.render(**given), wanted)
+    np.testing.assert_array_equal(made.render(*(value.tolist() for value in given.values())), wanted)
 
 
 def test_the_derivative_has_the_shape_of_the_picture():

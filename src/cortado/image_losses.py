@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cortado.arrays import as_numbers
 from cortado.errors import InputError
 
 Image = NDArray[np.float64]
@@ -155,7 +156,7 @@ def _along_columns(image: Image, matrix: Any) -> Image:
 
 def _difference(image: ArrayLike, target: ArrayLike) -> Image:
     """image - target, (rows, columns, 3) float64"""
-    image, target = np.asarray(image, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    image, target = as_numbers("The image", image), as_numbers("The target", target)
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"The image has shape {image.shape}, but must be (rows, columns, 3).")
     if image.shape != target.shape:

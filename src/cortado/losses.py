@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
+from cortado.arrays import as_numbers
 from cortado.errors import InputError, shown
 from cortado.image_losses import ImageLoss, SquaredDifference
 from cortado.launching import sum_of
@@ -74,8 +75,8 @@ class Frames:
 
     def __init__(self, losses: Mapping[int, Loss]):
         """``losses`` {number of steps: loss}; 0 is the first state."""
-        if not losses:
-            raise InputError("losses is empty, but must have a loss for at least one frame.")
+        if not isinstance(losses, Mapping) or not losses:
+            raise InputError(f"losses is {shown(losses)}, but must be a table with a loss for at least one frame.")
         self.losses = dict(losses)
 
     @property
@@ -94,7 +95,7 @@ class FinalPositions:
 
     def __init__(self, target: np.ndarray):
         """``target`` (n, d) [m], in the scene's order."""
-        self.target = np.array(target, dtype=np.float64)
+        self.target = as_numbers("target", target).copy()
         if self.target.ndim != 2 or not np.isfinite(self.target).all():
             raise InputError(f"target has shape {self.target.shape}, but must be (particles, dimension) and finite.")
         self.target.setflags(write=False)
@@ -170,7 +171,7 @@ class CentreOfMassAlong:
 
 def _finite(what: str, value: Any, dimensions: int) -> np.ndarray:
     """A read-only copy in float64, or an `InputError`."""
-    array = np.array(value, dtype=np.float64)
+    array = as_numbers(what, value).copy()
     if array.ndim != dimensions or not np.isfinite(array).all():
         raise InputError(f"{what} has shape {array.shape}, but must have {dimensions} dimension and be finite.")
     array.setflags(write=False)
@@ -246,10 +247,7 @@ class Image:
 
 def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:
     """A copy (rows, columns, 3) in float64, or an `InputError`; ``shape``: of the renderer's pictures, if known."""
-    try:
-        image = np.array(target, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"target is {shown(target)}, but must be a picture (rows, columns, 3).") from None
+    image = as_numbers("target", target).copy()
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"target has shape {image.shape}, but must be a picture (rows, columns, 3).")
     if shape is not None and image.shape != shape:
@@ -288,8 +286,3 @@ class Recorded:
         loss = wp.zeros(1, dtype=end.precision.real, device=copies[0].device, requires_grad=True)
         self.function(copies[0], copies[1], loss)
         return loss, copies[0], copies[1]
-
-
-def as_loss(loss: Any) -> Loss:
-    """A loss, or a function of Warp arrays made into one."""
-    return loss if hasattr(loss, "adjoint") else Recorded(loss)

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from cortado.arrays import as_numbers, as_one_number
 from cortado.errors import ComputationError, InputError
 from cortado.evaluations import Evaluation, EvaluationLog, Log, MemoryLog, Packing, Vector
 from cortado.optimisers import Optimiser, Search
@@ -176,7 +177,7 @@ class _Evaluator:
     def _compute(self, vector: Vector) -> Evaluation:
         """Evaluate the problem, and keep the evaluation if it is finite."""
         loss, gradients = self.problem.value_and_gradient(self.packing.unpack(vector), policy=self.policy)
-        evaluation = Evaluation(vector.copy(), float(loss), self._packed(gradients))
+        evaluation = Evaluation(vector.copy(), as_one_number("The problem's loss", loss), self._packed(gradients))
         self._require_finite(evaluation)
         self.log.append(evaluation)
         return evaluation
@@ -190,7 +191,7 @@ class _Evaluator:
                 f"The problem gave gradients of shapes {found} for parameters of shapes {wanted}; a gradient "
                 "has the names and the shapes of the parameters."
             )
-        return self.packing.pack(gradients)
+        return self.packing.pack({name: as_numbers(f"The gradient of '{name}'", gradients[name]) for name in wanted})
 
     def _require_finite(self, evaluation: Evaluation) -> None:
         """Raise ComputationError, with advice, if an evaluation cannot be used."""
@@ -240,15 +241,12 @@ def _checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
 
 def _checked_value(what: str, value: Any) -> Vector:
     """A value as a float64 array, or InputError if it is not made of finite numbers."""
-    try:
-        array = np.asarray(value)
-    except ValueError:
-        raise InputError(f"{what} is not a number or a regular array of numbers.") from None
-    if array.dtype.kind not in "iuf" or array.size == 0:
-        raise InputError(f"{what} must be a number or an array of numbers, not {value!r}.")
+    array = as_numbers(what, value).copy()
+    if array.size == 0:
+        raise InputError(f"{what} has shape {array.shape}, but must have at least one number.")
     if not np.isfinite(array).all():
         raise InputError(f"{what} has components that are not finite; start from finite numbers.")
-    return array.astype(np.float64)
+    return array
 
 
 def _checked_bounds(bounds: Mapping[str, tuple[Any, Any]], packing: Packing) -> tuple[Vector, Vector]:
@@ -270,8 +268,9 @@ def _checked_pair(name: str, pair: tuple[Any, Any], shape: tuple[int, ...]) -> t
     """The lower and upper bound of one parameter, each of its shape, infinite where there is none."""
     try:
         lower, upper = pair
-        low = np.broadcast_to(np.asarray(-np.inf if lower is None else lower, dtype=np.float64), shape)
-        high = np.broadcast_to(np.asarray(np.inf if upper is None else upper, dtype=np.float64), shape)
+        low = as_numbers(f"The lower bound of '{name}'", -np.inf if lower is None else lower)
+        high = as_numbers(f"The upper bound of '{name}'", np.inf if upper is None else upper)
+        low, high = np.broadcast_to(low, shape), np.broadcast_to(high, shape)
     except (TypeError, ValueError):
         raise InputError(
             f"The bounds of '{name}' must be (lower, upper), each None, a number or an array of shape "

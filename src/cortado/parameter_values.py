@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from cortado.arrays import as_numbers
 from cortado.errors import InputError, shown
 
 Values = Mapping[str, Any]
@@ -68,14 +69,6 @@ def checked_parameter(name: str, value: Any, shapes: list[tuple[int, ...]], what
     if what != "direction":
         _check_range(name, array, what)
     return array
-
-
-def as_numbers(what: str, value: Any) -> np.ndarray:
-    """A number or array in float64, or an `InputError` in a sentence."""
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{what} is {shown(value)}, but must be a number or an array of numbers.") from None
 
 
 def _check_range(name: str, array: np.ndarray, what: str) -> None:

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from cortado.checked_loss import as_loss
 from cortado.controls import Controls
 from cortado.errors import InputError
-from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd, as_loss, fingerprint
+from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd, fingerprint
 from cortado.parameter_values import NAMES, UNITS, Arrays, Values
 from cortado.particles import State
 from cortado.policies import AdjointPolicy, Estimate, Policy, estimate
@@ -51,10 +52,6 @@ class Problem:
         """
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is a {type(simulation).__name__}, but must be a cortado.Simulation.")
-        if not (isinstance(loss, Frames) or hasattr(loss, "adjoint") or callable(loss)):
-            raise InputError(
-                f"loss is a {type(loss).__name__}, but must have a value and an adjoint, or be a function."
-            )
         self.simulation, self.steps, self.loss = simulation, check_steps(steps, least=0), loss
         by_step = loss.losses if isinstance(loss, Frames) else {self.steps: loss}
         for step in by_step:
@@ -162,14 +159,9 @@ class Problem:
         no_colours = np.zeros_like(end.colours)
         if isinstance(bar, State):
             return EndAdjoint(bar, no_colours)
-        arrays = [np.zeros_like(array) for array in (end.positions, end.velocities, end.mass_fractions)]
-        for k, (what, array) in enumerate(zip(("positions", "velocities", "mass_fractions"), bar, strict=False)):
-            if np.shape(array) != arrays[k].shape:
-                wanted = arrays[k].shape
-                raise InputError(f"the loss's adjoint of {what} has shape {np.shape(array)}, but must be {wanted}.")
-            arrays[k] = array
+        positions, velocities, *rest = bar
         state = self.simulation.solver.new_state()
-        state.set(*arrays)
+        state.set(positions, velocities, *rest or [np.zeros_like(end.mass_fractions)])
         return EndAdjoint(state, no_colours)
 
 

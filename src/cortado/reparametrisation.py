@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from cortado.arrays import as_numbers
 from cortado.errors import InputError
 from cortado.parameter_values import Arrays
 from cortado.policies import Estimate, Passage, Policy, estimate
@@ -103,17 +104,14 @@ class Reparametrised:
 
     def parameters(self, u: Mapping[str, Any]) -> Arrays:
         """p(u) by name."""
-        return {
-            name: self.coordinates[name].parameter(np.asarray(value)) if name in self.coordinates else value
-            for name, value in u.items()
-        }
+        known = {name: as_numbers(f"coordinate of {name}", u[name]) for name in self.coordinates.keys() & u.keys()}
+        return {**u, **{name: self.coordinates[name].parameter(value) for name, value in known.items()}}
 
     def coordinate(self, parameters: Mapping[str, Any]) -> Arrays:
         """u by name."""
-        return {
-            name: self.coordinates[name].coordinate(value) if name in self.coordinates else value
-            for name, value in parameters.items()
-        }
+        names = self.coordinates.keys() & parameters.keys()
+        known = {name: as_numbers(f"parameter {name}", parameters[name]) for name in names}
+        return {**parameters, **{name: self.coordinates[name].coordinate(value) for name, value in known.items()}}
 
     def value(self, u: Mapping[str, Any]) -> float:
         """The loss, forward only."""

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cortado.arrays import as_numbers
 from cortado.errors import InputError
 
 
@@ -12,7 +13,7 @@ def to_srgb(image: ArrayLike) -> NDArray[np.uint8]:
     Raises:
         InputError: another shape, or values that are not finite.
     """
-    linear = np.asarray(image, dtype=np.float64)
+    linear = as_numbers("The image", image)
     if linear.ndim != 3 or linear.shape[2] != 3 or not linear.size:
         raise InputError(f"The image has shape {linear.shape}, but must be (rows, columns, 3).")
     if not np.isfinite(linear).all():

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from cortado.checked_loss import as_loss
 from cortado.controls import Controls
 from cortado.errors import DivergedError
-from cortado.losses import EndAdjoint, Frames, TrajectoryEnd, as_loss
+from cortado.losses import EndAdjoint, Frames, TrajectoryEnd
 from cortado.parameter_values import Arrays, Values
 from cortado.particles import State
 from cortado.problem import Problem

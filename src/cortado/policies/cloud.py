@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from cortado.arrays import as_numbers
 from cortado.errors import InputError, shown
 from cortado.parameter_values import Arrays, Values
 from cortado.policies.policy import Differentiable
@@ -40,7 +41,7 @@ class Cloud:
 
     def around(self, problem: Differentiable, parameters: Values) -> "Sampler":
         """Of these parameters of a problem."""
-        values = {name: np.asarray(value, dtype=np.float64) for name, value in parameters.items()}
+        values = {name: as_numbers(f"parameter {name}", value) for name, value in parameters.items()}
         spreads = np.concatenate([np.full(value.size, self._spread(name)) for name, value in values.items()])
         start = problem.simulation.positions
         disorder = self.disorder * problem.simulation.scene.discretisation.spacing

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from cortado.arrays import as_numbers
+
 
 @dataclass(frozen=True, eq=False)
 class Digits:
@@ -21,7 +23,7 @@ class Digits:
         """Numbers as they are, if they have digits already, else with nothing left over."""
         if isinstance(values, Digits):
             return values
-        high = np.asarray(values, dtype=np.float64)
+        high = as_numbers("An array of numbers", values)
         return cls(high, np.zeros_like(high))
 
     @property

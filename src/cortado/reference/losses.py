@@ -5,6 +5,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.arrays import as_numbers
 from cortado.errors import InputError
 from cortado.reference.digits import Digits
 
@@ -24,7 +25,7 @@ class FinalPositions:
 
     def __init__(self, target: NDArray):
         """``target`` (n, d) [m], in the scene's order."""
-        self.target = np.array(target, dtype=np.float64)
+        self.target = as_numbers("target", target).copy()
 
     def value(self, positions: Digits, velocities: Digits) -> float:
         return float((self._distances(positions) ** 2).sum() / len(self.target))

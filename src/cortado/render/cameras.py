@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cortado.arrays import as_numbers, as_one_number
 from cortado.errors import InputError, shown
 
 Vector = tuple[float, ...]
@@ -13,10 +14,7 @@ Vector = tuple[float, ...]
 
 def vector(name: str, values: Sequence[float] | np.ndarray, length: int = 3) -> Vector:
     """Finite numbers as a tuple of that length, or an `InputError` that calls them ``name``."""
-    try:
-        found = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        found = np.array(np.nan)
+    found = as_numbers(name, values)
     if found.shape != (length,) or not np.isfinite(found).all():
         raise InputError(f"{name} is {shown(values)}, but must be {length} finite numbers.")
     return tuple(found.tolist())
@@ -24,7 +22,7 @@ def vector(name: str, values: Sequence[float] | np.ndarray, length: int = 3) -> 
 
 def positive(name: str, value: float) -> None:
     """An `InputError` where a number is not."""
-    if not 0 < value < np.inf:
+    if not 0 < as_one_number(name, value) < np.inf:
         raise InputError(f"{name} is {shown(value)}, but must be a positive number.")
 
 
@@ -56,7 +54,8 @@ class Camera:
         check_resolution(self.resolution)
         if self.far is None:
             object.__setattr__(self, "far", 2.0 * float(np.linalg.norm(sight)))
-        if not 0 <= self.near < self.reach < np.inf:
+        near, far = as_one_number("near", self.near), as_one_number("far", self.far)
+        if not 0 <= near < far < np.inf:
             raise InputError(f"near is {shown(self.near)} and far {shown(self.far)}, but must be 0 <= near < far.")
 
     @property
@@ -115,7 +114,7 @@ class Perspective(Camera):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 < self.field_of_view < 180:
+        if not 0 < as_one_number("field_of_view", self.field_of_view) < 180:
             raise InputError(f"field_of_view is {shown(self.field_of_view)}, but must be between 0 and 180 degrees.")
 
     @property
@@ -125,8 +124,8 @@ class Perspective(Camera):
 
 def check_resolution(resolution: tuple[int, int]) -> None:
     """An `InputError` unless these are numbers of columns and rows."""
-    good = len(resolution) == 2 and all(isinstance(n, (int, np.integer)) and n > 0 for n in resolution)
-    if not good:
+    whole = isinstance(resolution, Sequence) and all(isinstance(n, (int, np.integer)) and n > 0 for n in resolution)
+    if not whole or len(resolution) != 2:
         raise InputError(
             f"resolution is {shown(resolution)}, but must be two positive whole numbers, columns and rows."
         )

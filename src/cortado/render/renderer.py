@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.arrays import as_numbers
 from cortado.errors import InputError, shown
+from cortado.particles import padded
 from cortado.precision import Precision
 from cortado.render.cameras import positive, vector
 from cortado.render.fields import ColourField
@@ -66,11 +68,11 @@ class Renderer:
         ``volume`` is the rest volume of a particle [m^d], ``cell`` the distance of nodes [m], by default half the
         support radius.
         """
-        cell = 0.5 * support if cell is None else cell
-        for name, size in (("support", support), ("volume", volume), ("cell", cell)):
+        for name, size in (("support", support), ("volume", volume), ("cell", 1.0 if cell is None else cell)):
             positive(name, size)
+        cell = 0.5 * support if cell is None else cell
         for name, number in (("particles", particles), ("phases", phases)):
-            if number < 1:
+            if not isinstance(number, (int, np.integer)) or number < 1:
                 raise InputError(f"{name} is {shown(number)}, but must be at least 1.")
         low, high = np.array(vector("lower", lower, dimension)), np.array(vector("upper", upper, dimension))
         if not (high >= low).all():
@@ -83,11 +85,11 @@ class Renderer:
             )
         self.view = view
         self._particles, self._phases, self._precision = particles, phases, precision
-        device = wp.get_device(device)
+        self._dimension, self._device = dimension, wp.get_device(device)
         self._field = ColourField(
-            low, high, turns, cell, smoothing, support, volume, particles, phases, precision, device
+            low, high, turns, cell, smoothing, support, volume, particles, phases, precision, self._device
         )
-        self._rays = RayMarcher(view, self._field.nodes, precision, device)
+        self._rays = RayMarcher(view, self._field.nodes, precision, self._device)
         self._rendered = False
 
     @property
@@ -102,18 +104,18 @@ class Renderer:
         columns, rows = self.view.camera.resolution
         return rows, columns, 3
 
-    def render(self, positions: wp.array, fractions: wp.array, colours: np.ndarray) -> np.ndarray:
+    def render(self, positions: Any, fractions: Any, colours: Any) -> np.ndarray:
         """The picture (rows, columns, 3), in float64, row 0 at the top.
 
-        Of positions (n,) [m], mass fractions (n,) [-], as vectors of the renderer's precision, and the colours
-        (phases, 3) of the phases.
+        Args:
+            positions: (n, d) [m], or a Warp array (n,) of vectors in the renderer's precision, on its device.
+            fractions: (n, phases) mass fractions [-], or such a Warp array.
+            colours: (phases, 3) of the phases.
         """
-        self._check("positions", positions, self._precision.vector)
-        self._check("fractions", fractions, self._precision.fractions(self._phases))
-        colours = np.asarray(colours, dtype=np.float64)
-        if colours.shape != (self._phases, 3):
-            raise InputError(f"colours has shape {colours.shape}, but must have {(self._phases, 3)}.")
-        self._field.gather(positions, fractions, colours)
+        x = self._on_device("positions", positions, self._dimension, self._precision.vector)
+        c = self._on_device("fractions", fractions, self._phases, self._precision.fractions(self._phases))
+        colours = _of_shape("colours", colours, (self._phases, 3))
+        self._field.gather(x, c, colours)
         self._rays.march(self._field.values)
         self._rendered = True
         return self._rays.image.numpy().astype(np.float64).reshape(self.shape)
@@ -123,9 +125,7 @@ class Renderer:
         columns, 3)."""
         if not self._rendered:
             raise InputError("There is no picture to go back from; call render before adjoint.")
-        image_bar = np.asarray(image_bar, dtype=np.float64)
-        if image_bar.shape != self.shape:
-            raise InputError(f"image_bar has shape {image_bar.shape}, but must have that of the picture, {self.shape}.")
+        image_bar = _of_shape("image_bar", image_bar, self.shape)
         field_bar, pose = self._rays.adjoint(image_bar.reshape(-1, 3), self._field.values)
         return RenderAdjoint(*self._field.adjoint(field_bar), pose[:3], pose[3:])
 
@@ -140,7 +140,22 @@ class Renderer:
         indices = np.moveaxis(np.indices(tuple(nodes.shape)), 0, -1)
         return np.array(nodes.origin, dtype=np.float64) + nodes.cell * indices
 
-    def _check(self, name: str, values: wp.array, dtype: Any) -> None:
-        if values.shape != (self._particles,) or not wp.types.types_equal(values.dtype, dtype):
-            found = f"{values.dtype.__name__} of shape {values.shape}"
-            raise InputError(f"{name} is {found}, but must be {dtype.__name__} of shape {(self._particles,)}.")
+    def _on_device(self, name: str, values: Any, components: int, dtype: Any) -> wp.array:
+        """A Warp array (n,) of vectors as it is, or one of an array (n, components)."""
+        if not isinstance(values, wp.array):
+            array = _of_shape(name, values, (self._particles, components))
+            if not np.isfinite(array).all():
+                raise InputError(f"{name} has a value that is not finite, but must be made of finite numbers.")
+            return wp.array(padded(array) if name == "positions" else array, dtype=dtype, device=self._device)
+        shape, device = (self._particles,), self._device
+        if values.shape != shape or not wp.types.types_equal(values.dtype, dtype) or values.device != device:
+            found = f"{values.dtype.__name__} of shape {values.shape} on {values.device}"
+            raise InputError(f"{name} is {found}, but must be {dtype.__name__} of shape {shape} on {device}.")
+        return values
+
+
+def _of_shape(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    array = as_numbers(name, values)
+    if array.shape != shape:
+        raise InputError(f"{name} has shape {array.shape}, but must have {shape}.")
+    return array

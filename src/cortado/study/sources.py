@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado import reference
+from cortado.checked_loss import as_loss
 from cortado.controls import Controls
-from cortado.losses import Frames, as_loss
+from cortado.losses import Frames
 from cortado.parameter_values import Arrays, Values
 from cortado.particles import State
 from cortado.policies import AdjointNorms, AdjointPolicy, Policy

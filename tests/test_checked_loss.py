@@ -1,0 +1,126 @@
+"""Losses that users write: what their mistakes are called, and that good ones come through unchanged."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+from cortado.checked_loss import as_loss
+from cortado.errors import InputError
+from cortado.losses import EndAdjoint, FinalPositions, Frames, TrajectoryEnd
+from cortado.particles import State
+from cortado.precision import FLOAT32, FLOAT64
+
+N, PHASES = 5, 2
+
+
+def state(particles: int = N, phases: int = PHASES, precision=FLOAT64) -> State:
+    return State.zeros(particles, phases, precision, "cpu")
+
+
+END = TrajectoryEnd(state(), 2, np.zeros((PHASES, 3)))
+
+
+class Given:
+    """A loss that returns what it is given."""
+
+    def __init__(self, value=1.0, adjoint=None):
+        self._value, self._adjoint = value, adjoint
+
+    def value(self, end):
+        return self._value
+
+    def adjoint(self, end):
+        return self._adjoint
+
+
+class Narrow(Given):
+    def adjoint(self):
+        return None
+
+
+@pytest.mark.parametrize("value", [2, 2.0, np.float32(2.0), np.array(2.0)])
+def test_a_value_is_a_number(value):
+    found = as_loss(Given(value)).value(END)
+    assert type(found) is float and found == 2.0
+
+
+def test_adjoints_of_every_form_come_through():
+    arrays = (np.ones((N, 2)), np.zeros((N, 2)), np.ones((N, PHASES)))
+    for given in (arrays, arrays[:2], [array.tolist() for array in arrays]):
+        found = as_loss(Given(adjoint=given)).adjoint(END)
+        assert len(found) == len(given)
+        for one, wanted in zip(found, arrays, strict=False):
+            assert one.dtype == np.float64
+            np.testing.assert_array_equal(one, wanted)
+    bar = state()
+    assert as_loss(Given(adjoint=bar)).adjoint(END) is bar
+    found = as_loss(Given(adjoint=EndAdjoint(bar, np.ones((PHASES, 3)))))
+    assert found.adjoint(END).state is bar
+
+
+def a_pair(positions, velocities=None):
+    return positions, np.zeros((N, 2)) if velocities is None else velocities
+
+
+MISTAKES = {
+    "no value": (lambda: as_loss(Given(None)).value(END), "the loss's value is None"),
+    "an array as value": (lambda: as_loss(Given(np.ones(3))).value(END), r"shape \(3,\), but must be one number"),
+    "a complex value": (lambda: as_loss(Given(1j)).value(END), "the loss's value is 1j"),
+    "no adjoint": (lambda: as_loss(Given()).adjoint(END), "is a NoneType"),
+    "one array": (lambda: as_loss(Given(adjoint=np.ones((N, 2)))).adjoint(END), "is a ndarray"),
+    "one array in a tuple": (lambda: as_loss(Given(adjoint=(np.ones((N, 2)),))).adjoint(END), "is a tuple of 1"),
+    "a wrong shape": (
+        lambda: as_loss(Given(adjoint=a_pair(np.ones((N, 3))))).adjoint(END),
+        r"of positions has shape \(5, 3\), but must be \(5, 2\)",
+    ),
+    "complex numbers": (
+        lambda: as_loss(Given(adjoint=a_pair(np.ones((N, 2)), np.ones((N, 2), complex)))).adjoint(END),
+        "of velocities is made of complex numbers",
+    ),
+    "a mask": (
+        lambda: as_loss(Given(adjoint=a_pair(np.ma.masked_equal(np.zeros((N, 2)), 0.0)))).adjoint(END),
+        "of positions is partly masked",
+    ),
+    "another number of particles": (
+        lambda: as_loss(Given(adjoint=state(N + 1))).adjoint(END),
+        r"of positions is a Warp array of vec3d of shape \(6,\) on cpu, but must be .* \(5,\)",
+    ),
+    "another precision": (lambda: as_loss(Given(adjoint=state(precision=FLOAT32))).adjoint(END), "of vec3f"),
+    "NumPy arrays in a state": (
+        lambda: as_loss(Given(adjoint=replace(state(), velocities=np.zeros((N, 3))))).adjoint(END),
+        "of velocities is a ndarray",
+    ),
+    "colours": (lambda: as_loss(Given(adjoint=EndAdjoint(state(), np.ones(3)))).adjoint(END), "of colours has shape"),
+    "no state": (lambda: as_loss(Given(adjoint=EndAdjoint(None, np.ones((2, 3))))).adjoint(END), "a NoneType as its"),
+    "a class": (lambda: as_loss(FinalPositions), "loss is the class FinalPositions"),
+    "an array": (lambda: as_loss(np.zeros((N, 2))), "loss is a ndarray"),
+    "too few arguments": (lambda: as_loss(lambda x, v: None), r"takes the arguments '\(x, v\)', but must take 3"),
+    "too many arguments": (lambda: as_loss(lambda x, v, c, loss: None), "must take 3: positions, velocities"),
+    "an adjoint without an argument": (lambda: as_loss(Narrow()), "the loss's adjoint takes the arguments"),
+    "frames that are a list": (lambda: Frames([Given()]), "losses is .* but must be a table"),
+}
+
+
+@pytest.mark.parametrize("mistake, words", MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_is_a_sentence(mistake, words):
+    with pytest.raises(InputError, match=words) as caught:
+        mistake()
+    sentence = str(caught.value)
+    assert "\n" not in sentence and sentence.endswith(".") and len(sentence) < 300
+
+
+def test_a_function_whose_arguments_cannot_be_told_is_taken():
+    class Opaque:
+        __signature__ = "none"
+
+        def __call__(self, *arrays):
+            arrays[2].fill_(3.0)
+
+    assert as_loss(Opaque()).value(END) == 3.0
+
+
+def test_a_function_of_warp_arrays_is_taken():
+    assert as_loss(lambda x, v, loss: loss.fill_(float(len(x)))).value(END) == N
+    assert isinstance(END.state.positions, wp.array)
