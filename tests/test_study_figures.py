@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,12 @@ import pytest
 from PIL import Image
 
 from bad_scenes import assert_one_sentence
+from bad_tasks import TINY_LATTE
+from cortado.assignment import assignment
 from cortado.cli import main
+from cortado.optimisation import optimise
+from cortado.optimisers import Adam
+from cortado.policies import Exact, VelocityOnly
 from cortado.reference import Simulation, Terms
 from cortado.study.experiment_files import load_experiment
 from cortado.study.forces import ABLATIONS, FULL
@@ -18,7 +24,9 @@ from cortado.study.image_horizon import ADJOINT, TAPE
 from cortado.study.pressure_terms import ONE_STEP, PROPAGATED
 from cortado.study.scenes import varied
 from cortado.study.tables import Table
+from cortado.study.task import TASK, TaskSettings
 from cortado.study.term_sizes import term_sizes
+from cortado.task import load_task
 from scenes import scene
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -78,6 +86,25 @@ def test_pictures_come_nearer_to_the_target(measured):
     assert losses[-1] < 0.5 * losses[len(losses) // 3 * 2]
     assert table.values("picture")[:3] == ["", "target", "iteration 0"]
     assert len(table.where(picture="target")) == 32 * 32
+
+
+def test_a_task_is_searched_with_its_own_policy(tmp_path):
+    """Its losses are those of a search with the policy, and others without."""
+    file = tmp_path / "task.toml"
+    file.write_text(TINY_LATTE)
+    losses = {}
+    for name, policy in (("velocity_only", VelocityOnly()), ("exact", Exact())):
+        overrides = [f"optimise.policy.name={name}"]
+        settings = TaskSettings(title="a cup", task=str(file), overrides=overrides)
+        made = assignment(load_task(file, overrides), "cpu", "float32")
+        wanted = optimise(made.search, made.start, Adam(0.5), 3, policy=policy)
+        losses[name] = TASK.measure(settings, no_progress).where(picture="")["loss"]
+        np.testing.assert_array_equal(losses[name], [record.loss for record in wanted.history])
+    assert (losses["velocity_only"][1:] != losses["exact"][1:]).all()
+
+
+def no_progress(total):
+    return nullcontext(lambda n=1, **fields: None)
 
 
 def test_autograd_and_the_adjoint_agree_with_differences_while_little_has_grown(measured):

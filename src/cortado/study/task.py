@@ -11,6 +11,7 @@ from cortado.errors import InputError
 from cortado.figures.canvas import PALETTE, whole_numbers
 from cortado.image_losses import psnr
 from cortado.optimisation import Record, optimise
+from cortado.policies import tuned
 from cortado.scene_kinds import Choice, Text
 from cortado.srgb import to_srgb
 from cortado.study.canvas import blank
@@ -72,7 +73,13 @@ def _search(made: Assignment, progress: Progress) -> list[Record]:
 
         for search in made.searches:
             found = optimise(
-                search, start, settings.algorithm(), settings.iterations, bounds=made.bounds, on_iteration=note
+                search,
+                start,
+                settings.algorithm(),
+                settings.iterations,
+                bounds=made.bounds,
+                policy=tuned(settings.policy.policy(), search, start),
+                on_iteration=note,
             )
             start = found.last_parameters
     return history
