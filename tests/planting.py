@@ -158,7 +158,7 @@ def number_in_memory() -> ctypes.c_int:
     return ctypes.c_int.from_address(ADDRESS)
 
 
-def judge(plants: list[int], scenes: dict[str, dict]) -> dict[str, str | None]:
+def judge(plants: list[int], scenes: dict[str, dict], precision: str) -> dict[str, str | None]:
     """For every plant a scene, of those given by name, whose certificate is "wrong"; None where none is."""
     import cortado
 
@@ -166,7 +166,7 @@ def judge(plants: list[int], scenes: dict[str, dict]) -> dict[str, str | None]:
     number.value = -1
     cases = {}
     for name, tables in scenes.items():
-        cases[name] = case(cortado.Scene(**tables["scene"]), tables["loss"])
+        cases[name] = case(cortado.Scene(**tables["scene"]), tables["loss"], precision)
         problem, point = cases[name]
         assert cortado.certify(problem, point).right, f"a false alarm: {name}"
     found: dict[str, str | None] = {}
@@ -179,7 +179,7 @@ def judge(plants: list[int], scenes: dict[str, dict]) -> dict[str, str | None]:
     return found
 
 
-def case(scene, loss: str):
+def case(scene, loss: str, precision: str = "float64"):
     """A problem of a few steps, and a point at which nothing is symmetric, at rest or pure."""
     import numpy as np
 
@@ -187,7 +187,7 @@ def case(scene, loss: str):
     from cortado.image_losses import Pyramid, SquaredDifference
     from cortado.render.scene_renderer import scene_renderer
 
-    simulation, random = Simulation(scene, precision="float64"), np.random.default_rng(1)
+    simulation, random = Simulation(scene, precision=precision), np.random.default_rng(1)
     spacing = scene.discretisation.spacing
     shape, phases = simulation.positions.shape, len(scene.phase)
     point = {
@@ -233,4 +233,4 @@ if __name__ == "__main__":
     import cortado
 
     assert Path(cortado.__file__).is_relative_to(Path(sys.argv[1]).parent), "this is not the copy"
-    Path(sys.argv[2]).write_text(json.dumps(judge(request["plants"], request["scenes"])))
+    Path(sys.argv[2]).write_text(json.dumps(judge(**request)))

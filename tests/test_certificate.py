@@ -6,12 +6,17 @@ from functools import cache
 
 import numpy as np
 import pytest
+import warp as wp
 
 import cortado
 from cortado import InputError, Problem, Simulation, losses
 from cortado.certificate import Comparison, certify
 from cortado.certificate.agreement import Agreement, Judged
 from cortado.certificate.horizon import Horizon
+from cortado.certificate.twin import in_float64
+from cortado.physics.free_energy import FREE_ENERGIES
+from cortado.problem import Passage
+from cortado.render.scene_renderer import scene_renderer
 from scenes import plane, plane_of_three, scene, splash, two_layers
 from test_emitter import jet, pour
 
@@ -87,6 +92,107 @@ def test_within_the_horizon_the_exact_gradient_is_advised():
     exact, *_ = found.agreement.policies
     assert exact.policy == "Exact()" and exact.cosine > 0.99 and exact.size == pytest.approx(1.0, abs=0.1)
     assert found.horizons[0].predicted is None
+
+
+# ---- in float32 --------------------------------------------------------------------------------------------------
+
+
+class Spread:
+    """Mean of the fourth power of the distance to a place and of the square of the speed, in float32."""
+
+    def __init__(self, sign=1.0):
+        self.sign = sign
+
+    def value(self, end):
+        x, v = end.state.positions.numpy(), end.state.velocities.numpy()
+        assert x.dtype == v.dtype == np.float32
+        return float((((x - np.float32(0.1)) ** 2).sum(axis=1) ** 2).mean() + np.float32(0.01) * (v**2).mean())
+
+    def adjoint(self, end):
+        x, v = end.positions - 0.1, end.velocities
+        z = 0.1**2 if end.dimension == 2 else 0.0
+        x_bar = 4.0 * ((x**2).sum(axis=1, keepdims=True) + z) * x / len(x)
+        return self.sign * x_bar, 0.02 / (3 * len(v)) * v
+
+
+def recorded(positions, velocities, loss):
+    """A function of arrays in float32."""
+    wp.launch(squares_of_single, len(positions), inputs=[positions, loss], device=positions.device)
+
+
+@wp.kernel
+def squares_of_single(x: wp.array(dtype=wp.vec3f), loss: wp.array(dtype=wp.float32)):
+    wp.atomic_add(loss, 0, wp.dot(x[wp.tid()], x[wp.tid()]))
+
+
+def picture(simulation):
+    renderer = scene_renderer(simulation)
+    return losses.Image(renderer, np.random.default_rng(1).random(renderer.shape))
+
+
+def two_frames(simulation):
+    return losses.Frames({3: losses.FinalPositions(0.9 * simulation.positions), 8: Spread()})
+
+
+SMALL_PICTURE = {"view": "top", "resolution": [12, 10]}
+IN_SINGLE = {
+    "3-D": (splash, lambda simulation: losses.FinalPositions(simulation.positions)),
+    "2-D, centre of mass": (plane, lambda simulation: losses.CentreOfMass([0.3, 0.1])),
+    "3-D, two fluids, a picture": (lambda: two_layers(render=SMALL_PICTURE), picture),
+    "2-D, three fluids, a loss of one's own": (plane_of_three, lambda simulation: Spread()),
+    "2-D, nozzle, two frames": (jet, two_frames),
+    "3-D, a function of Warp arrays": (scene, lambda simulation: recorded),
+}
+
+
+def certified_in_single(name):
+    made, loss = IN_SINGLE[name]
+    simulation = Simulation(made())
+    assert simulation.precision.name == "float32"
+    return certify(Problem(simulation, 8, loss(simulation)))
+
+
+@pytest.mark.parametrize("name", IN_SINGLE)
+def test_right_gradients_are_found_right_in_float32(name):
+    found = certified_in_single(name)
+    c = found.comparison
+    assert found.right, (found.wrong, c.disagreement, c.miss)
+    assert c.disagreement < 1e-10 and c.last_believed == 8 and c.miss < 1e-4
+    assert found.horizon == 8
+
+
+@pytest.mark.parametrize("name", ["3-D, two fluids, a picture", "2-D, three fluids, a loss of one's own"])
+def test_a_sign_flipped_is_found_in_float32(name, monkeypatch):
+    """In the gradient with respect to one parameter, as a wrong adjoint would."""
+    back = Passage.back
+
+    def wrong(*arguments):
+        gradient = back(*arguments)
+        return {**gradient, "viscosity": -gradient["viscosity"]}
+
+    monkeypatch.setattr(Passage, "back", wrong)
+    assert certified_in_single(name).wrong == ("viscosity",)
+
+
+def test_a_wrong_adjoint_of_a_loss_is_found_in_float32():
+    assert not certify(Problem(Simulation(plane()), 8, Spread(sign=-1.0))).right
+    assert not certify(Problem(Simulation(plane()), 8, Spread(sign=1.2))).right
+
+
+def test_what_is_certified_in_float32_is_what_is_in_float64():
+    simulation = Simulation(two_layers(), free_energy=FREE_ENERGIES["miscible"])
+    twin = in_float64(Problem(simulation, 3, picture(simulation), memory_budget=1000))
+    assert twin.simulation.precision.name == "float64" and twin.simulation.free_energy == simulation.free_energy
+    assert (twin.steps, twin.memory_budget, twin.simulation.scene) == (3, 2000, simulation.scene)
+    assert in_float64(twin) is twin
+    point = {"gravity": [1.0, -9.0, 0.5]}
+    single = Problem(simulation, 3, picture(simulation)).value_and_gradient(point)
+    double = twin.value_and_gradient(point)
+    assert double[0] == pytest.approx(single[0], rel=1e-5)
+    np.testing.assert_allclose(double[1]["gravity"], single[1]["gravity"], rtol=1e-3, atol=1e-6)
+
+
+# ---- what is asked, and answered ---------------------------------------------------------------------------------
 
 
 def test_parameters_may_be_values_and_many_numbers():

@@ -40,8 +40,8 @@ LAYERS = """
     run_folder progress pictures video
     figures.canvas figures.curves figures.particle_sets figures.side_by_side figures report
     task_tables task assignment task_figures
-    certificate.course certificate.changes certificate.rightness certificate.horizon certificate.agreement
-    certificate.certificate certificate figures.gradient_check
+    certificate.twin certificate.course certificate.changes certificate.rightness certificate.horizon
+    certificate.agreement certificate.certificate certificate figures.gradient_check
     study.tables study.scenes study.experiment study.canvas study.comparison study.reference_losses study.sources
     study.gravity_tangents study.term_sizes
     study.estimates study.shades study.starts study.spatial_scales study.lyapunov_spectrum study.lyapunov_exponents

@@ -53,6 +53,7 @@ class Problem:
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is a {type(simulation).__name__}, but must be a cortado.Simulation.")
         self.simulation, self.steps, self.loss = simulation, check_steps(steps, least=0), loss
+        self.memory_budget = memory_budget
         by_step = loss.losses if isinstance(loss, Frames) else {self.steps: loss}
         for step in by_step:
             if step not in range(self.steps + 1):

@@ -1,21 +1,29 @@
 """Runs of a problem, judged at several steps on the way."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from cortado.certificate.twin import Rounded
 from cortado.checked_loss import as_loss
 from cortado.controls import Controls
 from cortado.errors import DivergedError
-from cortado.losses import EndAdjoint, Frames, TrajectoryEnd
-from cortado.parameter_values import Arrays, Values
+from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd
+from cortado.parameter_values import Arrays
 from cortado.particles import State
 from cortado.problem import Problem
 from cortado.rollout import Rollout
 
 MOMENTS = 25
 """Steps at most at which a run is judged, where its loss is one of the last state."""
+ROUGH = (1e-1, 1e-2, 1e-3)
+"""Steps of differences of a loss in float32, in units of the direction."""
+ROUND_OFF = 1e-6
+"""Of such a loss, relative."""
+HEARD = 30.0
+"""How many times greater a difference has to be to mean something."""
 
 
 @dataclass(frozen=True)
@@ -42,24 +50,49 @@ class Course:
         self.problem = problem
         self.moments = np.array(sorted(frames) if frames else list(moments)[min(1, steps) :])
         """Steps at which the loss is asked, the last is that of the problem's own loss."""
-        self._losses = {int(m): as_loss(frames[m] if frames else loss) for m in self.moments}
+        by_moment = {int(m): frames[m] if frames else loss for m in self.moments}
+        self._losses = {m: one if isinstance(one, Rounded) else as_loss(one) for m, one in by_moment.items()}
         self._total = np.cumsum if frames else np.asarray
 
-    def losses(self, parameters: Values) -> np.ndarray:
-        """(moments,) of the loss; NaN where the run diverges."""
-        try:
-            ends = self.problem.states(parameters, self._losses)
-        except DivergedError:
-            return np.full(len(self.moments), np.nan)
-        return self._judged(ends)
-
     def difference(self, parameters: Arrays, along: Arrays, h: float) -> np.ndarray:
-        """(moments,) of the central difference of step h along a direction of all or some of the parameters."""
-        ahead, behind = (
-            self.losses({**parameters, **{name: parameters[name] + sign * h * d for name, d in along.items()}})
-            for sign in (1.0, -1.0)
-        )
-        return (ahead - behind) / (2.0 * h)
+        """(moments,) of the central difference of step h along a direction of all or some of the parameters; NaN where
+        a run diverges."""
+        changes = [
+            _change(loss, before, after) if isinstance(loss, Rounded) and h < 1.0 else _values(loss, before, after)
+            for loss, before, after in self._beside(parameters, along, h)
+        ]
+        return self._total(changes or np.full(len(self.moments), np.nan)) / (2.0 * h)
+
+    def rough_miss(self, parameters: Arrays, along: Arrays) -> float:
+        """How far the adjoints of losses that are `Rounded` are from differences of their own values, relative, at the
+        step where they are nearest and in the median of moments; 0 where there is none, or round-off hides it."""
+        if not any(isinstance(loss, Rounded) for loss in self._losses.values()):
+            return 0.0
+        found = np.full((len(ROUGH), len(self.moments)), np.inf)
+        for row, h in zip(found, ROUGH, strict=True):
+            for k, (loss, before, after) in enumerate(self._beside(parameters, along, h)):
+                if isinstance(loss, Rounded):
+                    by_adjoint, by_value = _change(loss, before, after), _values(loss, before, after)
+                    size, noise = max(abs(by_adjoint), abs(by_value)), ROUND_OFF * abs(loss.value(after))
+                    row[k] = abs(by_adjoint - by_value) / size if size > HEARD * noise else np.inf
+        seen = found.min(axis=0)
+        return float(np.median(seen[np.isfinite(seen)])) if np.isfinite(seen).any() else 0.0
+
+    def _beside(
+        self, parameters: Arrays, along: Arrays, h: float
+    ) -> Iterator[tuple[Loss, TrajectoryEnd, TrajectoryEnd]]:
+        """At every moment its loss, and the states a step of -h and of h away; none where a run diverges."""
+        try:
+            behind, ahead = (
+                self.problem.states(
+                    {**parameters, **{name: parameters[name] + step * d for name, d in along.items()}}, self._losses
+                )
+                for step in (-h, h)
+            )
+        except DivergedError:
+            return
+        for step, loss in self._losses.items():
+            yield loss, behind[step], ahead[step]
 
     def tangent(self, parameters: Arrays, along: Arrays) -> Tangent:
         """Derivatives along a direction, which names all or some of the parameters."""
@@ -87,6 +120,21 @@ class Course:
 
     def _judged(self, ends: dict[int, TrajectoryEnd]) -> np.ndarray:
         return self._total([loss.value(ends[step]) for step, loss in self._losses.items()])
+
+
+def _values(loss: Loss, before: TrajectoryEnd, after: TrajectoryEnd) -> float:
+    """By how much the loss of the latter state is greater."""
+    return loss.value(after) - loss.value(before)
+
+
+def _change(loss: Loss, before: TrajectoryEnd, after: TrajectoryEnd) -> float:
+    """The same by the loss's adjoints: the mean of both times the distance of the states, which is exact to second
+    order and has no round-off of the loss in it."""
+    ends = (before, after)
+    old, new = (end.state.numpy(end.dimension) for end in ends)
+    distance, colours = tuple(b - a for a, b in zip(old, new, strict=True)), {"colours": after.colours - before.colours}
+    bars = [loss.adjoint(end) for end in ends]
+    return 0.5 * sum(_product(bar, distance) + _of_colours(bar, colours) for bar in bars)
 
 
 def _product(bar: State | EndAdjoint | tuple[np.ndarray, ...], dot: tuple[np.ndarray, ...]) -> float:

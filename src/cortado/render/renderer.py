@@ -84,6 +84,19 @@ class Renderer:
                 f"{2.0 * support:g} m."
             )
         self.view = view
+        self._settings: dict[str, Any] = {
+            "lower": lower,
+            "upper": upper,
+            "smoothing": smoothing,
+            "support": support,
+            "volume": volume,
+            "particles": particles,
+            "phases": phases,
+            "device": device,
+            "dimension": dimension,
+            "cell": cell,
+            "periods": periods,
+        }
         self._particles, self._phases, self._precision = particles, phases, precision
         self._dimension, self._device = dimension, wp.get_device(device)
         self._field = ColourField(
@@ -97,6 +110,10 @@ class Renderer:
         """Tells one view from another, for checkpoints, and one grid of nodes."""
         nodes = self._field.nodes
         return f"{self.view!r} {tuple(nodes.origin)} {nodes.cell} {tuple(nodes.shape)} {tuple(nodes.period)}"
+
+    def in_precision(self, precision: Precision) -> "Renderer":
+        """Another one, of the same pictures in that precision."""
+        return Renderer(self.view, **self._settings, precision=precision)
 
     @property
     def shape(self) -> tuple[int, int, int]:

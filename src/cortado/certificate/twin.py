@@ -1,0 +1,69 @@
+"""A problem once more in float64: in float32 round-off is far greater than what a certificate looks for."""
+
+from typing import Any
+
+import numpy as np
+
+from cortado.checked_loss import as_loss
+from cortado.losses import CentreOfMass, CentreOfMassAlong, EndAdjoint, FinalPositions, Frames, Image, TrajectoryEnd
+from cortado.particles import State
+from cortado.precision import FLOAT64
+from cortado.problem import Problem
+from cortado.render.renderer import Renderer
+from cortado.simulation import Simulation
+
+ANY_PRECISION = (FinalPositions, CentreOfMass, CentreOfMassAlong)
+"""Losses that take states of either precision."""
+
+
+def in_float64(problem: Problem) -> Problem:
+    """The problem itself where it is one in float64, else the same scene, device, steps and loss in float64.
+
+    A loss of our own looks at states in float64 then. Of any other nobody knows whether it can, so it goes on being
+    asked in float32: see `Rounded`.
+    """
+    single = problem.simulation
+    if single.precision == FLOAT64:
+        return problem
+    energy = single.free_energy if len(single.scene.phase) > 1 else None
+    double = Simulation(single.scene, str(single.device), "float64", energy)
+    loss: Any = problem.loss
+    if isinstance(loss, Frames):
+        loss = Frames({step: _loss_in_float64(one, single) for step, one in loss.losses.items()})
+    else:
+        loss = _loss_in_float64(loss, single)
+    return Problem(double, problem.steps, loss, 2 * problem.memory_budget)
+
+
+def _loss_in_float64(loss: Any, single: Simulation) -> Any:
+    if type(loss) in ANY_PRECISION:
+        return loss
+    if type(loss) is Image and isinstance(loss.renderer, Renderer):
+        return Image(loss.renderer.in_precision(FLOAT64), loss.target, loss.distance)
+    return Rounded(loss, single)
+
+
+class Rounded:
+    """A loss that may know float32 alone, asked about states in float64: its values are as rough as float32 is."""
+
+    def __init__(self, loss: Any, single: Simulation):
+        """``single``: the simulation in float32 that the loss was made for."""
+        self._loss, self._single = as_loss(loss), single
+
+    def value(self, end: TrajectoryEnd) -> float:
+        return self._loss.value(self._rounded(end))
+
+    def adjoint(self, end: TrajectoryEnd) -> EndAdjoint | tuple[np.ndarray, ...]:
+        bar = self._loss.adjoint(self._rounded(end))
+        if isinstance(bar, State):
+            return bar.numpy(end.dimension)
+        if isinstance(bar, EndAdjoint):
+            state = end.state.like()
+            state.set(*bar.state.numpy(end.dimension))
+            return EndAdjoint(state, bar.colours)
+        return bar
+
+    def _rounded(self, end: TrajectoryEnd) -> TrajectoryEnd:
+        state = self._single.solver.new_state()
+        state.set(end.positions, end.velocities, end.mass_fractions)
+        return TrajectoryEnd(state, end.dimension, end.colours)
