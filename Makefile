@@ -1,10 +1,10 @@
 # make demo: set up and run the main job on the CPU; make test: set up and run lint, types and tests;
-# make sanitize: check the C++ engine with sanitizers.
+# make sanitize: check the C++ engine with sanitizers; make fuzz: an hour of hostile input, MINUTES=10 for a part of it.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test lint types unit sanitize clean
+.PHONY: setup demo test lint types unit sanitize fuzz clean
 
 setup: $(VENV)/.ready
 
@@ -34,6 +34,9 @@ sanitize: setup
 	cmake -S cpp -B build/sanitize -DCORTADO_SANITIZE=ON -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python
 	cmake --build build/sanitize --parallel
 	build/sanitize/check_engine
+
+fuzz: setup
+	$(BIN)/python -m fuzz $(if $(MINUTES),--minutes $(MINUTES)) $(ARGS)
 
 clean:
 	rm -rf $(VENV) runs build dist

@@ -23,7 +23,7 @@ SPACINGS = {
     "pour": 0.007,
     "recover_gravity": 0.25,
     "recover_gravity_small": 0.25,
-    "splash_8000": 0.05,
+    "splash_8000": 0.25,
 }
 """Spacing [m] in place of a file's own, for some hundred particles."""
 STEPS, ITERATIONS = 4, 2

@@ -65,10 +65,16 @@ class Case:
 
         return self.judged(call(program, (function.__name__, path.name), self.folder), codes=codes)
 
-    def judged(self, outcome: Outcome, limits: Limits = LIMITS, codes: Collection[int] = judge.CODES) -> Outcome:
+    def judged(
+        self,
+        outcome: Outcome,
+        limits: Limits = LIMITS,
+        codes: Collection[int] = judge.CODES,
+        heard: bool = True,
+    ) -> Outcome:
         """Note an outcome, with the complaints that there are about it."""
         self.outcomes.append(outcome)
-        self.complaints += judge.complaints(outcome, limits, codes)
+        self.complaints += judge.complaints(outcome, limits, codes, heard)
         return outcome
 
 

@@ -38,7 +38,7 @@ class Options:
 
 
 def main() -> None:
-    """Run the cases that are left; the exit code is 1 if one of the seed failed."""
+    """Run the cases that are left; the exit code is 1 if one of the seed has failed, or one of those named."""
     options = tyro.cli(Options, config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff))
     _check(options)
     campaign = Campaign(FAMILIES, options.seed, options.folder)
@@ -54,7 +54,8 @@ def main() -> None:
     except KeyboardInterrupt:
         print("Interrupted; the same command goes on.")
     print(_table(list(campaign.ledger.entries.values())))
-    sys.exit(1 if campaign.ledger.failed() else 0)
+    failed = [entry.case for entry in campaign.ledger.failed()]
+    sys.exit(1 if set(options.again or failed) & set(failed) else 0)
 
 
 def _check(options: Options) -> None:

@@ -1,6 +1,7 @@
 """All families of cases, by name."""
 
 from fuzz.cases import Family
+from fuzz.environments import ENVIRONMENTS, run_in_environment
 from fuzz.files import prepare, read_hostile
 from fuzz.kills import kill_run, kill_search, prepare_runs, prepare_searches
 from fuzz.scenes import run_scene, search_task
@@ -11,4 +12,5 @@ FAMILIES = {
     "files": Family(300, read_hostile, prepare),
     "kills-run": Family(200, kill_run, prepare_runs),
     "kills-optimise": Family(200, kill_search, prepare_searches),
+    "environments": Family(2 * len(ENVIRONMENTS), run_in_environment),
 }

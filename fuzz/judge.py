@@ -14,8 +14,10 @@ _PROGRESS = re.compile(r"\w+ \d+/\d+, [\d:]+ left.*")
 _CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "terminate called")
 
 
-def complaints(outcome: Outcome, limits: Limits = LIMITS, codes: Collection[int] = CODES) -> list[str]:
-    """Sentences about an outcome, by what every command has to keep to."""
+def complaints(
+    outcome: Outcome, limits: Limits = LIMITS, codes: Collection[int] = CODES, heard: bool = True
+) -> list[str]:
+    """Sentences about an outcome, by what every command has to keep to; ``heard`` tells whether stderr was open."""
     if outcome.hung:
         return [f"hung for more than {limits.seconds:g} s{_place(outcome.stack)}"]
     found = []
@@ -29,7 +31,7 @@ def complaints(outcome: Outcome, limits: Limits = LIMITS, codes: Collection[int]
     if outcome.code not in codes:
         how = f"died of {signal.Signals(-outcome.code).name}" if outcome.code < 0 else f"exit code {outcome.code}"
         found.append(f"{how}: {_last_line(outcome.err)}")
-    if crash is None:
+    if crash is None and heard:
         found += _about_words(outcome)
     return found
 

@@ -138,6 +138,8 @@ def _be_program(function: Callable[[], None], folder: Path, out: Path, err: Path
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
         for path, descriptor in ((os.devnull, 0), (out, 1), (err, 2)):
             os.dup2(os.open(path, os.O_RDWR), descriptor)
+        sys.stdout, sys.stderr = (os.fdopen(k, "w", closefd=False, errors="backslashreplace") for k in (1, 2))
+        faulthandler.disable()
         faulthandler.register(signal.SIGUSR1, open(stack, "w"), all_threads=True)  # noqa: SIM115 until the end
         os.chdir(folder)
         code = _exit_code(function)
@@ -198,10 +200,13 @@ def _is_hung(child: int, seconds: float, limit: float) -> bool:
 
 
 def _processor_seconds(child: int) -> float:
-    with suppress(OSError):
-        fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    return 0.0
+    """[s] of computing, of a process and of all that it has started in its session."""
+    ticks = 0
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            fields = path.read_text().rpartition(")")[2].split()
+            ticks += (int(fields[11]) + int(fields[12])) * (int(fields[3]) == child)
+    return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def _resident(child: int) -> int:
