@@ -1,6 +1,8 @@
 """The command line: files, exit codes, sentences; kills and resumes."""
 
+import errno
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -18,6 +20,10 @@ from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
 from cortado import Problem, Scene, Trajectory
 from cortado.cli import main
+from cortado.folder_lock import locked
+from cortado.pictures import heart, rosetta, write_picture
+from cortado.run_folder import FIGURES, RunFolder
+from test_files import largest_file
 
 RUN_FILES = {"scene.json", "environment.json", "metrics.jsonl", "trajectory.vtkhdf", "figures", "report.html"}
 OPTIMISE_FILES = {"scene.json", "environment.json", "metrics.jsonl", "checkpoint", "figures", "report.html"}
@@ -140,10 +146,12 @@ def test_a_run_that_diverges_says_where_and_keeps_its_frames(cortado_command):
 
 
 def interrupting(after):
-    """A progress bar under which Ctrl-C is pressed after so many steps."""
+    """A progress bar under which Ctrl-C is pressed after so many steps, at once if there are fewer than 0."""
 
     @contextmanager
-    def track(total, description):
+    def track(*arguments, **options):
+        if after < 0:
+            raise KeyboardInterrupt
         calls = iter(range(after))
 
         def advance(n=1, **fields):
@@ -160,7 +168,16 @@ def test_an_interrupted_run_keeps_its_frames(cortado_command, monkeypatch):
     code, out, err = cortado_command("run", "scene.toml", "--steps", 20, "--out", "dam")
     assert (code, out) == (130, "")
     assert_one_sentence(err.removesuffix("\n"))
+    assert err == f"Interrupted; the frames so far are in {Path('dam/trajectory.vtkhdf').absolute()}.\n"
     assert len(Trajectory.load("dam/trajectory.vtkhdf").times) == 5
+
+
+@pytest.mark.parametrize("command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"])
+def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command, monkeypatch, command):
+    for module in (cortado.commands.run, cortado.commands.optimise):
+        monkeypatch.setattr(module, "track", interrupting(after=-1))
+    monkeypatch.setattr(cortado.commands.run, "TrajectoryWriter", interrupting(after=-1))
+    assert cortado_command(*command, "--out", "dam") == (130, "", "Interrupted.\n")
 
 
 # ---- wrong input -------------------------------------------------------------------------------------------------
@@ -259,7 +276,7 @@ def test_other_parameters_are_optimised_and_drawn(cortado_command, overrides):
     options = [word for override in [*overrides, *easy] for word in ("--set", override)]
     code, _, err = cortado_command("optimise", "task.toml", "--out", "found", *options)
     assert (code, err) == (0, "")
-    assert Path("found/figures/gravity.png").exists()
+    assert "gravity.png" in figures("found")
 
 
 @pytest.mark.parametrize("old, new, field", [bad[1:] for bad in BAD_TASKS], ids=[bad[0] for bad in BAD_TASKS])
@@ -336,10 +353,12 @@ def test_an_interrupted_optimisation_resumes_bit_for_bit(cortado_command, monkey
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("solver.time_step=0.002", "another scene"),
-        ("optimise.learning_rate=0.4", "learning_rate=0.5"),
-        ("optimise.optimiser=lbfgs", "optimiser"),
-        ("optimise.start.gravity=[0,-6]", "another 'gravity'"),
+        ("solver.time_step=0.002", "is now given solver.time_step = 0.002"),
+        ("optimise.learning_rate=0.4", "begun with optimise.learning_rate = 0.5 and is now given"),
+        ("optimise.optimiser=lbfgs", "optimise.optimiser = 'lbfgs'"),
+        ("optimise.start.gravity=[0,-6]", "is now given optimise.start.gravity = [0.0, -6.0]"),
+        ("problem.target.gravity=[1,-9]", "is now given problem.target.gravity = [1.0, -9.0]"),
+        ("problem.steps=6", "is now given problem.steps = 6"),
     ],
 )
 def test_a_changed_task_is_not_resumed(cortado_command, override, words):
@@ -350,11 +369,88 @@ def test_a_changed_task_is_not_resumed(cortado_command, override, words):
     assert metrics("found") == before
 
 
-@pytest.mark.parametrize("override", ["problem.target.gravity=[1,-9]", "problem.steps=6"])
-def test_another_problem_is_not_resumed(cortado_command, override):
+def test_another_precision_or_picture_is_not_resumed(cortado_command):
     cortado_command("optimise", "task.toml", "--out", "found", "--set", "optimise.iterations=1")
-    code, out, err = cortado_command("optimise", "task.toml", "--out", "found", "--resume", "--set", override)
-    assert (code, out, len(err.splitlines())) == (2, "", 1) and "cannot be resumed" in err
+    again = ["optimise", "task.toml", "--out", "found", "--resume", "--precision", "float64"]
+    assert_refused(cortado_command(*again), "precision = 'float32' and is now given precision = 'float64'")
+    picture = ["optimise", "plane.toml", "--out", "drawn", "--set", "problem.picture=a.png"]
+    Path("plane.toml").write_text(PLANE_PICTURE)
+    for draw, options, code in ((heart, ["--set", "optimise.check={}"], 0), (rosetta, ["--resume"], 2)):
+        write_picture("a.png", draw(16))
+        result = cortado_command(*picture, "--set", "optimise.iterations=1", *options)
+        assert result[0] == code, result
+    assert_refused(result, "problem = target and loss ")
+    assert "steps" not in result[2]
+
+
+def test_run_and_optimise_do_not_go_on_with_each_other(cortado_command):
+    cortado_command("run", "scene.toml", "--out", "dam", "--steps", 1)
+    refused = cortado_command("optimise", "task.toml", "--out", "dam", "--resume")
+    assert_refused(refused, "`cortado run` wrote", "`cortado optimise` cannot go on")
+    _, _, err = cortado_command("run", "scene.toml", "--out", "dam", "--steps", 1)
+    assert "--overwrite" in err and "--resume" not in err
+
+
+@pytest.mark.parametrize("command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"])
+def test_a_folder_that_is_being_written_is_refused(cortado_command, command):
+    with locked(Path("busy")):
+        result = cortado_command(*command, "--out", "busy")
+        assert_refused(result, "busy is being written by process", "--out")
+        assert os.listdir("busy") == [".lock"]
+    assert_refused(cortado_command(*command, "--out", "scene.toml"), "cannot be written")
+
+
+@pytest.mark.parametrize("size", [400, 2000, 20_000])
+def test_a_run_on_a_full_disk_says_so(cortado_command, size):
+    again = ["run", "scene.toml", "--out", "dam", "--steps", 20, "--overwrite"]
+    with largest_file(size):
+        code, out, err = cortado_command(*again)
+    assert (code, out) == (1, "")
+    assert_one_sentence(err.removesuffix("\n"))
+    assert "cannot be written: File too large" in err
+    assert cortado_command(*again)[0] == 0
+
+
+@pytest.mark.parametrize("full", ["trajectory.vtkhdf", "metrics.jsonl", "particles.png", "run.mp4", "report.html"])
+def test_frames_stay_when_a_disk_fills_up(cortado_command, monkeypatch, full):
+    Path("scene.toml").write_text(TINY_LATTE.partition("[problem]")[0])
+    replace, write = os.replace, cortado.vtkhdf.write_fully
+    left = iter(range(20))
+
+    def until_full(*arguments):
+        return refuse() if next(left, None) is None else write(*arguments)
+
+    if full == "trajectory.vtkhdf":
+        monkeypatch.setattr(cortado.vtkhdf, "write_fully", until_full)
+    elif full == "metrics.jsonl":
+        monkeypatch.setattr(RunFolder, "metrics", Path("/dev/full"))
+    else:
+        monkeypatch.setattr(os, "replace", lambda old, new: refuse() if Path(new).name == full else replace(old, new))
+    code, out, err = cortado_command("run", "scene.toml", "--out", "dam", "--steps", 8)
+    assert (code, out) == (1, ""), err
+    assert_one_sentence(err.removesuffix("\n"))
+    assert "No space left on device" in err
+    assert len(Trajectory.load("dam/trajectory.vtkhdf").times) == (2 if full == "trajectory.vtkhdf" else 9)
+    assert not list(Path("dam").rglob(".*"))
+
+
+def refuse():
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("size", [400, 2500, 3500])
+def test_a_search_on_a_full_disk_says_so_and_goes_on(cortado_command, size):
+    with largest_file(size):
+        code, out, err = cortado_command(*LONG, "full")
+    assert (code, out) == (1, ""), err
+    assert_one_sentence(err.removesuffix("\n"))
+    assert "cannot be written" in err and "File too large" in err
+    if not Path("full/environment.json").exists():
+        assert os.listdir("full") == []
+        return
+    assert cortado_command(*LONG, "full", "--resume")[0] == 0
+    cortado_command(*LONG, "whole")
+    assert_same_optimisation("full", "whole")
 
 
 def test_a_finished_optimisation_goes_on(cortado_command):
@@ -368,7 +464,10 @@ def test_a_finished_optimisation_goes_on(cortado_command):
 
 
 def figures(run):
-    return {path.name for path in (Path(run) / "figures").iterdir()}
+    """Names of the pictures, each of them one that is removed when the run is overwritten."""
+    names = {path.name for path in (Path(run) / "figures").iterdir()}
+    assert names <= set(FIGURES)
+    return names
 
 
 def test_a_run_is_rendered_as_its_scene_asks(cortado_command, folder):
@@ -464,7 +563,7 @@ def test_another_image_is_not_resumed(cortado_command, text, override):
     Path("task.toml").write_text(text)
     cortado_command("optimise", "task.toml", "--out", "found", "--set", "optimise.iterations=1")
     code, out, err = cortado_command("optimise", "task.toml", "--out", "found", "--resume", "--set", override)
-    assert (code, out, len(err.splitlines())) == (2, "", 1) and "resume" in err
+    assert (code, out, len(err.splitlines())) == (2, "", 1) and f"is now given {override.partition('=')[0]} = " in err
     assert len(metrics("found")) == 2
 
 

@@ -12,7 +12,7 @@ import cortado
 ROOT = Path(cortado.__file__).parent
 
 LAYERS = """
-    errors arrays
+    errors files arrays
     image_losses srgb masses
     smoothing calibration parameter_values
     precision cells
@@ -29,7 +29,7 @@ LAYERS = """
     scene_fluids scene_emitter scene_mixture scene_render scene_containers scene_stability scene_checks scene sampling
     discrete_scene
     reference.digits reference.engine reference.losses reference.histories reference.simulation reference
-    vtkhdf trajectory
+    vtkhdf_layout vtkhdf trajectory
     solvers.forces solvers.mixture solvers.emitter solvers.pcisph_parts solvers.pcisph solvers.pcisph_derivatives
     solvers.adjoint_filters
     rollout
@@ -37,7 +37,7 @@ LAYERS = """
     losses checked_loss controls simulation problem
     render.scene_renderer reparametrisation
     evaluations optimisers optimisation
-    run_folder progress pictures video
+    folder_lock run_environment run_folder progress pictures video
     figures.canvas figures.curves figures.particle_sets figures.side_by_side figures report
     task_tables task assignment task_figures
     certificate.twin certificate.course certificate.changes certificate.rightness certificate.horizon

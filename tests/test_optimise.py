@@ -349,7 +349,7 @@ def test_resume_without_a_checkpoint_is_refused():
 
 def test_a_checkpoint_that_cannot_be_made_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be made"):
+    with pytest.raises(InputError, match="cannot be written"):
         rosenbrock(Adam(0.05), 3, checkpoint=tmp_path / "file" / "run")
 
 

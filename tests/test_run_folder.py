@@ -4,15 +4,17 @@ import io
 import json
 import os
 import re
-import stat
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import cortado.run_folder
 from cortado.errors import InputError
+from cortado.files import unfinished
 from cortado.progress import track
 from cortado.report import write_report
-from cortado.run_folder import RunFolder, write_atomically
+from cortado.run_folder import RunFolder
 
 SCENE = '{"name": "drop", "dimension": 2}'
 COMMAND = ["cortado", "run", "drop.toml"]
@@ -56,13 +58,29 @@ def test_a_folder_with_a_run_is_refused_unless_overwritten(tmp_path):
     folder = new_run(tmp_path / "a")
     folder.append_metrics(step=1)
     (folder.path / "notes.txt").write_text("mine")
-    (folder.figures / "old.png").write_text("")
-    with pytest.raises(InputError, match=r"--out.*--resume.*--overwrite"):
+    (folder.figures / "holiday.png").write_text("mine")
+    (folder.figures / "loss.png").write_text("")
+    (folder.checkpoint / "1").mkdir(parents=True)
+    (folder.checkpoint / "evaluations.log").write_text("")
+    (folder.checkpoint / "1" / "evaluations.log").write_text("")
+    with pytest.raises(InputError, match=r"--out, or replace it with --overwrite\.$"):
         new_run(folder.path)
+    with pytest.raises(InputError, match=r"--overwrite\.$"):
+        new_run(folder.path, kind="optimise")
     assert folder.read_metrics() == [{"step": 1}]
     new_run(folder.path, overwrite=True)
-    assert folder.read_metrics() == [] and os.listdir(folder.figures) == []
+    assert folder.read_metrics() == [] and not folder.checkpoint.exists()
+    assert os.listdir(folder.figures) == ["holiday.png"]
+    assert (folder.figures / "holiday.png").read_text() == "mine"
     assert (folder.path / "notes.txt").read_text() == "mine"
+
+
+def test_resume_is_advised_where_it_can_be_done(tmp_path):
+    new_run(tmp_path / "a", kind="optimise")
+    with pytest.raises(InputError, match="--resume"):
+        new_run(tmp_path / "a", kind="optimise")
+    with pytest.raises(InputError, match=r"--overwrite\.$"):
+        new_run(tmp_path / "a")
 
 
 def test_files_of_somebody_else_are_never_overwritten(tmp_path):
@@ -75,8 +93,8 @@ def test_files_of_somebody_else_are_never_overwritten(tmp_path):
 
 def test_resume_needs_the_same_scene_and_is_noted(tmp_path):
     folder = new_run(tmp_path / "a")
-    with pytest.raises(InputError, match="another scene"):
-        RunFolder.resume(folder.path, '{"name": "other"}', COMMAND)
+    with pytest.raises(InputError, match="begun with dimension = 2 and is now given dimension = 3; "):
+        RunFolder.resume(folder.path, '{"name": "drop", "dimension": 3}', COMMAND)
     RunFolder.resume(folder.path, '{"dimension": 2, "name": "drop"}', [*COMMAND, "--resume"])
     environment = json.loads(folder.environment.read_text())
     assert environment["command"] == COMMAND
@@ -85,26 +103,77 @@ def test_resume_needs_the_same_scene_and_is_noted(tmp_path):
         RunFolder.resume(tmp_path / "b", SCENE, COMMAND)
 
 
+def test_a_refused_resume_names_the_setting(tmp_path):
+    settings = {"problem": {"steps": 20, "target": {"gravity": np.array([0.0, -9.5])}}, "extinctions": (0.5, 1.0)}
+    folder = new_run(tmp_path / "a", kind="optimise", settings=settings)
+    RunFolder.resume(folder.path, SCENE, COMMAND, kind="optimise", settings=settings)
+    settings["problem"]["target"] = {"gravity": np.array([0.0, -9.8])}
+    words = r"problem\.target\.gravity = \[0\.0, -9\.5\] and is now given problem\.target\.gravity = \[0\.0, -9\.8\]"
+    with pytest.raises(InputError, match=words):
+        RunFolder.resume(folder.path, SCENE, COMMAND, kind="optimise", settings=settings)
+    with pytest.raises(InputError, match=r"`cortado optimise` wrote, with which `cortado run` cannot go on"):
+        RunFolder.resume(folder.path, SCENE, COMMAND, kind="run")
+
+
+class Killed(BaseException):
+    """In place of a SIGKILL."""
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_kill_while_a_folder_is_made_leaves_one_to_overwrite_or_resume(tmp_path, monkeypatch, overwrite):
+    """Killed at every file that is written, made or removed."""
+    events = [(Path, "unlink"), (Path, "mkdir"), (Path, "rmdir"), (cortado.run_folder, "write_atomically")]
+    finished = False
+    for moment in range(100):
+        path = tmp_path / str(moment)
+        if overwrite:
+            old = new_run(path)
+            old.append_metrics(step=1)
+            (old.figures / "loss.png").write_text("")
+        left = iter(range(moment))
+        with monkeypatch.context() as patch:
+            for owner, name in events:
+                patch.setattr(owner, name, killing(getattr(owner, name), left))
+            try:
+                new_run(path, overwrite=overwrite)
+                finished = True
+            except Killed:
+                pass
+        if (path / "environment.json").exists():
+            assert RunFolder.resume(path, SCENE, COMMAND).figures.is_dir() and (path / "scene.json").exists()
+        else:
+            assert not path.exists() or os.listdir(path) == []
+        assert new_run(path, overwrite=True).read_metrics() == []
+        if finished:
+            return
+    raise AssertionError("A hundred kills were not enough.")
+
+
+def killing(function, left):
+    def until_killed(*arguments, **options):
+        if next(left, None) is None:
+            raise Killed
+        return function(*arguments, **options)
+
+    return until_killed
+
+
+def test_what_killed_processes_left_unfinished_is_removed(tmp_path):
+    folder = new_run(tmp_path / "a")
+    for options in ({}, {"overwrite": True}):
+        for place in (folder.path, folder.figures):
+            unfinished(place / "file").write_text("")
+        (RunFolder.create if options else RunFolder.resume)(folder.path, SCENE, COMMAND, **options)
+        assert sorted(os.listdir(folder.path)) == ["environment.json", "figures", "scene.json"]
+        assert os.listdir(folder.figures) == []
+
+
 def test_unwritable_places_are_sentences(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
         new_run(tmp_path / "file")
     with pytest.raises(InputError, match="cannot be written"):
         new_run(tmp_path / "file" / "below")
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "a.json"
-    write_atomically(path, "old")
-
-    def full_disk(*arguments):
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(OSError, match="No space"):
-        write_atomically(path, "new")
-    assert path.read_text() == "old" and os.listdir(tmp_path) == ["a.json"]
-    assert path.stat().st_mode & stat.S_IRUSR
 
 
 def test_report_is_one_self_contained_escaped_page(tmp_path):

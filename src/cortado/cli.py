@@ -208,8 +208,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(_say(error, 1))
     except CortadoError as error:
         sys.exit(_say(error, 2))
-    except KeyboardInterrupt:
-        print("Interrupted; the frames and the evaluations so far are in the run folder.", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"Interrupted{'; ' if str(stop) else ''}{stop}.", file=sys.stderr)
         sys.exit(130)
 
 

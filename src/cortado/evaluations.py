@@ -16,7 +16,8 @@ from typing import Any, BinaryIO, Protocol, Self
 import numpy as np
 import numpy.typing as npt
 
-from cortado.errors import InputError
+from cortado.errors import ComputationError, InputError
+from cortado.files import sentences, write_atomically, write_fully
 
 Vector = npt.NDArray[np.float64]
 
@@ -151,7 +152,8 @@ class EvaluationLog:
             _require_unused(self._path)
         if not resume or not self._path.exists():
             _begin(self._path, header)
-        self._file: BinaryIO = open(self._path, "r+b")  # noqa: SIM115 closed by close()
+        with sentences(self._path):
+            self._file: BinaryIO = open(self._path, "r+b", buffering=0)  # noqa: SIM115 closed by close()
         try:
             self._first_record = _check_header(self._file, header, self._path)
             self._count = self._count_whole()
@@ -175,13 +177,18 @@ class EvaluationLog:
         return Evaluation(values[1 : 1 + size], float(values[0]), values[1 + size :])
 
     def append(self, evaluation: Evaluation) -> None:
-        """Write one more evaluation; it is on the disk on return."""
+        """Write one more evaluation; it is on the disk on return. Raises ComputationError if the disk refuses."""
         values = np.concatenate([[evaluation.loss], evaluation.parameters, evaluation.gradient])
         content = struct.pack("<Q", self._count) + values.astype("<f8").tobytes()
-        self._file.seek(self._first_record + self._count * self._record_size)
-        self._file.write(content + struct.pack("<I", zlib.crc32(content)))
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        try:
+            self._file.seek(self._first_record + self._count * self._record_size)
+            write_fully(self._file, content + struct.pack("<I", zlib.crc32(content)))
+            os.fsync(self._file.fileno())
+        except OSError as problem:
+            raise ComputationError(
+                f"An evaluation cannot be written to '{self._path}': {problem.strerror or problem}; free some space "
+                f"and resume. The {self._count} evaluations before it are kept."
+            ) from problem
         self._count += 1
 
     def close(self) -> None:
@@ -225,18 +232,9 @@ def _require_unused(path: Path) -> None:
 
 def _begin(path: Path, header: Mapping[str, Any]) -> None:
     """Write the first line of a new log so that the file is there with the whole line, or not at all."""
-    try:
+    with sentences(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"The checkpoint folder '{path.parent}' cannot be made ({error.strerror}); give another one."
-        ) from None
-    unfinished = path.with_suffix(".new")
-    with open(unfinished, "wb") as file:
-        file.write(json.dumps(header).encode() + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(unfinished, path)
+    write_atomically(path, json.dumps(header) + "\n")
 
 
 def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> int:
@@ -244,9 +242,10 @@ def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> int:
     found = _read_header(file, path)
     for key, wanted in header.items():
         if found.get(key) != wanted:
+            former, given = _differing(_shown(found.get(key)), _shown(wanted))
             raise InputError(
-                f"'{path}' cannot be resumed, because it was begun with {key} = {_shown(found.get(key))} and "
-                f"is now given {key} = {_shown(wanted)}; give the former, or another checkpoint folder."
+                f"'{path}' cannot be resumed, because it was begun with {key} = {former} and "
+                f"is now given {key} = {given}; give the former, or another checkpoint folder."
             )
     return file.tell()
 
@@ -265,6 +264,15 @@ def _read_header(file: BinaryIO, path: Path) -> dict[str, Any]:
 def _shown(value: str | Sequence[Any] | None) -> str:
     """A setting as a message shows it."""
     return value if isinstance(value, str) else json.dumps(value)
+
+
+def _differing(former: str, given: str) -> tuple[str, str]:
+    """Of two texts made of as many parts, separated by semicolons, those that differ."""
+    formers, givens = former.split("; "), given.split("; ")
+    if len(formers) != len(givens):
+        return former, given
+    parts = [pair for pair in zip(formers, givens, strict=True) if pair[0] != pair[1]]
+    return "; ".join(one for one, _ in parts), "; ".join(other for _, other in parts)
 
 
 def _is_whole(record: bytes, index: int, size: int) -> bool:

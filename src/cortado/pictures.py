@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cortado.errors import InputError
-from cortado.run_folder import write_atomically
+from cortado.files import write_atomically
 from cortado.srgb import from_srgb, to_srgb
 
 Picture = NDArray[np.float64]
@@ -102,10 +102,7 @@ def write_picture(path: str | Path, image: ArrayLike) -> Path:
 
     content = BytesIO()
     Image.fromarray(to_srgb(image)).save(content, format="PNG")
-    try:
-        write_atomically(Path(path), content.getvalue())
-    except OSError as problem:
-        raise InputError(f"The picture {path} cannot be written: {problem}.") from problem
+    write_atomically(Path(path), content.getvalue())
     return Path(path)
 
 

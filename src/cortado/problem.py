@@ -119,13 +119,18 @@ class Problem:
 
     @property
     def fingerprint(self) -> str:
-        """Which problem this is, in a checksum: scene, first positions (which may be in a file), free energy (by its
-        name and curvature), precision, steps, ``fingerprint`` of the loss; for a loss without one only its type is
-        known."""
+        """Which problem this is, part by part, in words and checksums: steps, precision, scene, first positions (which
+        may be in a file), free energy (by its name and curvature), ``fingerprint`` of the loss; for a loss without one
+        only its type is known."""
         simulation, energy = self.simulation, self.simulation.free_energy
-        text = f"{simulation.scene.to_json()} {simulation.precision.name} {self.steps} {fingerprint(self.loss)}"
-        text += f" {energy.name} {energy.curvature}"
-        return sha256(text.encode() + simulation.positions.tobytes()).hexdigest()
+        parts = {
+            "scene": simulation.scene.to_json().encode(),
+            "first positions": simulation.positions.tobytes(),
+            "target and loss": fingerprint(self.loss).encode(),
+        }
+        checksums = [f"{name} {sha256(content).hexdigest()[:16]}" for name, content in parts.items()]
+        energies = f"free energy {energy.name} {energy.curvature}"
+        return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies])
 
     def iterations(self) -> np.ndarray:
         """(steps,) pressure iterations of the last evaluation."""

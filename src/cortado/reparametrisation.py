@@ -100,7 +100,7 @@ class Reparametrised:
     @property
     def fingerprint(self) -> str:
         """Which problem in which coordinates this is."""
-        return f"{self.problem.fingerprint} {sorted(self.coordinates.items(), key=str)}"
+        return f"{self.problem.fingerprint}; coordinates {sorted(self.coordinates.items(), key=str)}"
 
     def parameters(self, u: Mapping[str, Any]) -> Arrays:
         """p(u) by name."""

@@ -10,7 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from cortado.errors import InputError
-from cortado.run_folder import RunFolder, write_atomically
+from cortado.files import write_atomically
+from cortado.run_folder import RunFolder
 
 Figures = list[tuple[str, str | Path]]
 """(caption, path) of each picture or video"""
@@ -78,10 +79,7 @@ def write_report(
 </body>
 </html>
 """
-    try:
-        write_atomically(folder.report, page)
-    except OSError as problem:
-        raise InputError(f"The report {folder.report} cannot be written: {problem}.") from problem
+    write_atomically(folder.report, page)
     return folder.report
 
 

@@ -3,28 +3,34 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
-import shutil
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Self
 
 from cortado.errors import InputError
+from cortado.evaluations import FILE_NAME
+from cortado.files import UNFINISHED, sentences, write_atomically
+from cortado.parameter_values import NAMES
+from cortado.run_environment import as_json, plain, require_same, session
 
-_PACKAGES = ("warp-lang", "numpy", "scipy", "pydantic", "h5py", "matplotlib")
-_FILES = ("scene.json", "environment.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html")
+_RESUMABLE = "optimise"
+"""The command that has --resume."""
+_FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html")
 _FOLDERS = ("checkpoint", "figures")
+_PICTURES = ("particles", "rendered", "density_errors", "loss", "images", "progress", *NAMES)
+FIGURES = (*(f"{name}.png" for name in _PICTURES), "run.mp4", "found.mp4")
+"""Every file that a run may have in its figures; whatever else is there is the user's."""
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """Paths and files of one run: `create` makes one, `open` finds one, `resume` goes on with one."""
+    """Paths and files of one run: `create` makes one, `open` finds one, `resume` goes on with one.
+
+    Its mark, environment.json, comes first and is removed last, so that a process that is killed in between leaves
+    a folder which can be overwritten or resumed.
+    """
 
     path: Path
 
@@ -35,6 +41,8 @@ class RunFolder:
         scene_json: str,
         command: Sequence[str],
         *,
+        kind: str = "run",
+        settings: Mapping[str, Any] | None = None,
         device: str = "",
         overwrite: bool = False,
     ) -> Self:
@@ -44,19 +52,21 @@ class RunFolder:
             path: the folder, made with its parents when missing.
             scene_json: the resolved scene.
             command: the command line, word by word.
+            kind: the command that writes it; only this one resumes it.
+            settings: tables of what else must be the same when it is resumed.
             device: where the run computes, in words.
             overwrite: removes an earlier run in this folder (its files only).
 
         Raises:
             InputError: the folder holds a run already, or files that a run would replace, or is not writable.
+            ComputationError: the disk is full.
         """
         folder = cls(Path(path).absolute())
-        with _sentences(folder.path):
-            folder._make_room(overwrite)
-            folder.figures.mkdir(parents=True, exist_ok=True)
-            environment = {**_environment(), **_session(command, device), "resumed": []}
-            write_atomically(folder.environment, json.dumps(environment, indent=2) + "\n")
-            write_atomically(folder.scene, scene_json)
+        noted = {**session(command, device), "kind": kind, "settings": as_json(settings or {}), "resumed": []}
+        with sentences(folder.path):
+            folder._make_room(kind, overwrite)
+            folder.path.mkdir(parents=True, exist_ok=True)
+            folder._complete(noted, scene_json)
         return folder
 
     @classmethod
@@ -68,26 +78,42 @@ class RunFolder:
         """
         folder = cls(Path(path).absolute())
         if not folder._holds_run():
-            raise InputError(f"There is no run in {folder.path}.")
+            raise InputError(f"There is no run in {folder.path}; choose another --out, or begin one without --resume.")
         return folder
 
     @classmethod
-    def resume(cls, path: str | Path, scene_json: str, command: Sequence[str], *, device: str = "") -> Self:
+    def resume(
+        cls,
+        path: str | Path,
+        scene_json: str,
+        command: Sequence[str],
+        *,
+        kind: str = "run",
+        settings: Mapping[str, Any] | None = None,
+        device: str = "",
+    ) -> Self:
         """The folder of an existing run that goes on, noted in environment.json with versions and command.
 
         Raises:
-            InputError: there is no run in it, or one of another scene.
+            InputError: there is no run in it, or one of another kind, scene or settings; the sentence says which.
+            ComputationError: the disk is full.
         """
         folder = cls.open(path)
-        environment = _read_json(folder.environment)
-        if _read_json(folder.scene) != json.loads(scene_json):
+        noted = _read_json(folder.environment)
+        former = noted.get("kind", kind)
+        if former != kind:
             raise InputError(
-                f"The run in {folder.path} is of another scene than the one given; choose another --out, or "
-                f"give the scene that it began with."
+                f"{folder.path} holds what `cortado {former}` wrote, with which `cortado {kind}` cannot go on; choose "
+                f"another --out, or replace it with --overwrite."
             )
-        with _sentences(folder.path):
-            environment["resumed"].append({**_environment(), **_session(command, device)})
-            write_atomically(folder.environment, json.dumps(environment, indent=2) + "\n")
+        if folder.scene.exists():
+            require_same(_read_json(folder.scene), json.loads(scene_json), folder.path)
+        if "settings" in noted:
+            require_same(noted["settings"], as_json(settings or {}), folder.path)
+        noted.setdefault("resumed", []).append(session(command, device))
+        with sentences(folder.path):
+            folder._remove_unfinished()
+            folder._complete(noted, scene_json)
             _cut_torn_line(folder.metrics)
         return folder
 
@@ -128,8 +154,8 @@ class RunFolder:
 
     def append_metrics(self, **values: Any) -> None:
         """Adds one line to metrics.jsonl, kept even if the process is killed next; takes NumPy values too."""
-        line = json.dumps(values, default=_plain) + "\n"
-        with _sentences(self.path), open(self.metrics, "a", encoding="utf-8") as file:
+        line = json.dumps(values, default=plain) + "\n"
+        with sentences(self.metrics), open(self.metrics, "a", encoding="utf-8") as file:
             file.write(line)
 
     def read_metrics(self) -> list[dict[str, Any]]:
@@ -148,69 +174,49 @@ class RunFolder:
 
     def _holds_run(self) -> bool:
         try:
-            return "cortado" in json.loads(self.environment.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            return "cortado" in dict(json.loads(self.environment.read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError):
             return False
 
-    def _make_room(self, overwrite: bool) -> None:
-        present = [name for name in _FILES + _FOLDERS if (self.path / name).exists()]
-        if not present:
-            return
-        if not self._holds_run():
+    def _complete(self, noted: Mapping[str, Any], scene_json: str) -> None:
+        """What is there from the first moment on, the mark before anything else."""
+        write_atomically(self.environment, json.dumps(noted, indent=2) + "\n")
+        write_atomically(self.scene, scene_json)
+        self.figures.mkdir(exist_ok=True)
+
+    def _make_room(self, kind: str, overwrite: bool) -> None:
+        present = [name for name in (self.environment.name, *_FILES, *_FOLDERS) if (self.path / name).exists()]
+        if present and not self._holds_run():
             raise InputError(f"{self.path} holds {', '.join(present)}, but no run of Cortado; choose another --out.")
-        if not overwrite:
+        if present and not overwrite:
+            resumable = kind == _RESUMABLE == _read_json(self.environment).get("kind")
+            advice = ", or go on with it by --resume" if resumable else ""
             raise InputError(
-                f"{self.path} already holds a run; choose another --out, or continue it with --resume, or "
-                f"replace it with --overwrite."
+                f"{self.path} already holds a run; choose another --out, or replace it with --overwrite{advice}."
             )
-        for name in _FOLDERS:
-            shutil.rmtree(self.path / name, ignore_errors=True)
-        for name in sorted(_FILES, key="environment.json".__eq__):  # the mark of a run goes last
-            (self.path / name).unlink(missing_ok=True)
+        self._remove_unfinished()
+        if present:
+            self._remove_run()
 
+    def _remove_run(self) -> None:
+        """Removes what a run wrote, its mark last, and leaves what others put beside it."""
+        written = (*map(self.figures.joinpath, FIGURES), *map(self.path.joinpath, _FILES))
+        for path in (*(folder / FILE_NAME for folder in self._checkpoints()), *written):
+            path.unlink(missing_ok=True)
+        for folder in (*self._checkpoints(), self.figures):
+            with suppress(OSError):  # it is not there, or something of the user's is in it
+                folder.rmdir()
+        self.environment.unlink()
 
-def write_atomically(path: Path, content: str | bytes) -> None:
-    """Writes a whole file under a temporary name and then renames it, so that no reader meets half of it."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    def _remove_unfinished(self) -> None:
+        """Removes what killed processes left of files that they were writing."""
+        for folder in (self.path, self.figures, *self._checkpoints()):
+            for path in folder.glob(UNFINISHED):
+                path.unlink(missing_ok=True)
 
-
-@contextmanager
-def _sentences(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as problem:
-        raise InputError(f"The run folder {path} cannot be written: {problem}.") from problem
-
-
-def _environment() -> dict[str, Any]:
-    """Where the run happens: operating system, Python, and the versions that matter."""
-    return {
-        "cortado": _version("cortado"),
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "executable": sys.executable,
-        "packages": {name: _version(name) for name in _PACKAGES},
-    }
-
-
-def _session(command: Sequence[str], device: str) -> dict[str, Any]:
-    now = datetime.now(UTC).isoformat(timespec="seconds")
-    return {"device": device, "command": list(command), "started": now}
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
+    def _checkpoints(self) -> list[Path]:
+        """The folders with the logs of one search after the other, that of the first one last, as it holds the rest."""
+        return [*self.checkpoint.glob("[0-9]*/"), self.checkpoint]
 
 
 def _read_json(path: Path) -> Any:
@@ -225,10 +231,3 @@ def _cut_torn_line(path: Path) -> None:
     if path.exists():
         with open(path, "r+b") as file:
             file.truncate(file.read().rfind(b"\n") + 1)
-
-
-def _plain(value: Any) -> Any:
-    """NumPy numbers and arrays as Python numbers and lists."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} has no JSON form")

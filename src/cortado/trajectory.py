@@ -74,11 +74,12 @@ class Trajectory:
 
         Raises:
             InputError: no frames, or a path that cannot be written.
+            ComputationError: the disk is full.
         """
         single = self.positions.dtype == np.float32
         with vtkhdf.TrajectoryWriter(
             path,
-            frames=len(self.times),
+            times=self.times,
             particles=self.particles,
             dimension=self.dimension,
             precision="float32" if single else "float64",
@@ -86,9 +87,9 @@ class Trajectory:
             scalars=fraction_names(0 if self.mass_fractions is None else self.mass_fractions.shape[2]),
         ) as writer:
             writer.append_steps(self.iterations, self.density_errors, self.converged)
-            for k, (time, step) in enumerate(zip(self.times, self.steps, strict=True)):
+            for k, step in enumerate(self.steps):
                 fractions = {} if self.mass_fractions is None else fraction_fields(self.mass_fractions[k])
-                writer.append(time, self.positions[k], self.velocities[k], step=int(step), **fractions)
+                writer.append(self.positions[k], self.velocities[k], step=int(step), **fractions)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

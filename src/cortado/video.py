@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cortado.errors import InputError
-from cortado.run_folder import write_atomically
+from cortado.files import write_atomically
 from cortado.srgb import to_srgb
 
 MOST_FRAMES = 120
@@ -54,10 +54,7 @@ def write_video(path: str | Path, frames: Iterable[ArrayLike], frames_per_second
         for image in images:
             container.mux(stream.encode(_frame(av, image)))
         container.mux(stream.encode())
-    try:
-        write_atomically(path, content.getvalue())
-    except OSError as problem:
-        raise InputError(f"The video {path} cannot be written: {problem}.") from problem
+    write_atomically(path, content.getvalue())
     return path
 
 

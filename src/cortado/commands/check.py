@@ -68,7 +68,7 @@ def _make(folder: Path) -> None:
 
 def _written(certificate: Certificate, found: str, out: Path, as_json: bool) -> str:
     from cortado.figures.gradient_check import gradient_check
-    from cortado.run_folder import write_atomically
+    from cortado.files import write_atomically
 
     gradient_check(certificate, out / "certificate.png")
     write_atomically(out / "certificate.json", found.encode())

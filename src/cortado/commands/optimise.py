@@ -3,12 +3,14 @@
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from cortado.assignment import Assignment, assignment
 from cortado.errors import ComputationError, DivergedError
+from cortado.folder_lock import locked
 from cortado.image_losses import psnr
 from cortado.optimisation import Record, Result, optimise
 from cortado.policies import Policy, tuned
@@ -49,15 +51,42 @@ def optimise_task(
 ) -> str:
     """Optimise, write the run folder, and return a sentence that says where the results are."""
     made = assignment(load_task(task_file, overrides), device, precision)
-    text, name = made.task.scene.to_json(), str(made.problem.simulation.device)
     if resume:
-        folder = RunFolder.resume(out, text, command, device=name)
-    else:
-        folder = RunFolder.create(out, text, command, device=name, overwrite=overwrite)
+        RunFolder.open(out)
+    with locked(out):
+        folder = _run_folder(made, out, resume, overwrite, command)
+        try:
+            return _solved(made, folder, resume)
+        except KeyboardInterrupt:
+            kept = _kept(folder)
+            raise KeyboardInterrupt(f"{kept}; --resume goes on with them" if kept else "") from None
+
+
+def _run_folder(made: Assignment, out: Path, resume: bool, overwrite: bool, command: list[str]) -> RunFolder:
+    """A new one, or the one that is there; a search goes on with other iterations and another check if so wished."""
+    task, simulation = made.task, made.problem.simulation
+    settings = {
+        "precision": simulation.precision.name,
+        "problem": task.problem.model_dump(),
+        "optimise": task.optimise.model_dump(exclude={"iterations", "check"}),
+    }
+    noted: dict[str, Any] = {"kind": "optimise", "settings": settings, "device": str(simulation.device)}
+    if resume:
+        return RunFolder.resume(out, task.scene.to_json(), command, **noted)
+    return RunFolder.create(out, task.scene.to_json(), command, overwrite=overwrite, **noted)
+
+
+def _kept(folder: RunFolder) -> str:
+    """Where the evaluations are; empty where there are none."""
+    return f"the evaluations so far are in {folder.checkpoint}" if folder.read_metrics() else ""
+
+
+def _solved(made: Assignment, folder: RunFolder, resume: bool) -> str:
+    """Search, judge, and write what came out; returns the sentence about it."""
     try:
         result, policy = _search(made, folder, resume)
     except DivergedError as error:
-        advice = f"{error.advice}, or a smaller learning rate; the evaluations so far are in {folder.checkpoint}"
+        advice = "; ".join(filter(None, [f"{error.advice}, or a smaller learning rate", _kept(folder)]))
         raise DivergedError(error.step, error.particle, advice) from error
     found = made.search.parameters(result.parameters)
     noise = None

@@ -7,6 +7,7 @@ import numpy as np
 
 from cortado.errors import DivergedError
 from cortado.figures import density_errors, images, particles
+from cortado.folder_lock import locked
 from cortado.particles import State
 from cortado.progress import track
 from cortado.render.scene_renderer import scene_renderer
@@ -35,26 +36,36 @@ def run_scene(
     scene = load_scene(scene_file, overrides)
     simulation = Simulation(scene, device, precision)
     rollout = simulation.rollout(check_steps(steps))
-    folder = RunFolder.create(out, scene.to_json(), command, device=str(simulation.device), overwrite=overwrite)
-    try:
-        _write_trajectory(simulation, rollout, folder, record_every)
-    except DivergedError as error:
-        _write_pictures(scene, simulation, folder)
-        advice = f"{error.advice}; the frames so far are in {folder.path}"
-        raise DivergedError(error.step, error.particle, advice) from error
-    _write_pictures(scene, simulation, folder)
+    with locked(out):
+        folder = RunFolder.create(out, scene.to_json(), command, device=str(simulation.device), overwrite=overwrite)
+        try:
+            _compute(simulation, rollout, folder, record_every)
+        except KeyboardInterrupt:
+            kept = f"the frames so far are in {folder.trajectory}" if folder.trajectory.exists() else ""
+            raise KeyboardInterrupt(kept) from None
     converged = simulation.converged(rollout)
     warning = "" if converged.all() else f"Mind that {not_converged_sentence(converged)} "
     return f"{warning}The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
 
 
+def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:
+    """Run, and fill the folder, also where the run diverges."""
+    try:
+        _write_trajectory(simulation, rollout, folder, record_every)
+    except DivergedError as error:
+        _write_pictures(simulation.scene, simulation, folder)
+        advice = f"{error.advice}; the frames so far are in {folder.path}"
+        raise DivergedError(error.step, error.particle, advice) from error
+    _write_pictures(simulation.scene, simulation, folder)
+
+
 def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:
     steps, time_step = rollout.steps, simulation.scene.solver.time_step
-    frames = 1 + steps // record_every + (steps % record_every > 0)
+    recorded = np.append(np.arange(0, steps, record_every), steps)
     with (
         TrajectoryWriter(
             folder.trajectory,
-            frames=frames,
+            times=recorded * time_step,
             particles=simulation.particles,
             dimension=simulation.dimension,
             precision=simulation.precision.name,  # type: ignore[arg-type]
@@ -66,7 +77,7 @@ def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolde
 
         def write(step: int, state: State) -> None:
             positions, velocities, fractions = state.numpy(simulation.dimension)
-            writer.append(step * time_step, positions, velocities, step=step, **fraction_fields(fractions))
+            writer.append(positions, velocities, step=step, **fraction_fields(fractions))
 
         def observe(step: int, state: State) -> None:
             if step % record_every == 0 or step == steps:

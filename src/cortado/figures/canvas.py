@@ -8,8 +8,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from cortado.errors import InputError
-from cortado.run_folder import write_atomically
+from cortado.files import write_atomically
 
 PALETTE = ("#3d6b8e", "#c0763b", "#5b8a5a", "#8c5f7d", "#a89a4b", "#6b7a80", "#a8504f", "#4f8f8b")
 """Muted colours that stay apart in print and for most eyes."""
@@ -50,10 +49,7 @@ def drawing(path: str | Path, width: float = 9.0, height: float = 5.2) -> Iterat
         FigureCanvasAgg(figure)
         yield figure
         figure.savefig(content, format="png")
-    try:
-        write_atomically(Path(path), content.getvalue())
-    except OSError as problem:
-        raise InputError(f"The picture {path} cannot be written: {problem}.") from problem
+    write_atomically(Path(path), content.getvalue())
 
 
 def whole_numbers(axis: Any) -> None:

@@ -7,9 +7,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cortado.errors import InputError
 from cortado.figures.canvas import STYLE
-from cortado.run_folder import write_atomically
+from cortado.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,7 +32,4 @@ def save(draw: Callable[[], Figure], path: Path) -> None:
     content = BytesIO()
     with matplotlib.rc_context(STYLE):
         draw().savefig(content, format="png")
-    try:
-        write_atomically(path, content.getvalue())
-    except OSError as problem:
-        raise InputError(f"The picture {path} cannot be written: {problem}.") from problem
+    write_atomically(path, content.getvalue())

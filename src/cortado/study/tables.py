@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import InputError
-from cortado.run_folder import write_atomically
+from cortado.files import write_atomically
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -79,10 +79,7 @@ class Table:
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(self.columns)
         writer.writerows(zip(*(column.tolist() for column in self.columns.values()), strict=True))
-        try:
-            write_atomically(Path(path), text.getvalue())
-        except OSError as problem:
-            raise InputError(f"The table {path} cannot be written: {problem}.") from problem
+        write_atomically(Path(path), text.getvalue())
 
     @classmethod
     def read_csv(cls, path: str | os.PathLike[str]) -> Table:
