@@ -91,7 +91,8 @@ class Campaign:
             memory = max((outcome.memory for outcome in case.outcomes), default=0)
             codes = [outcome.code for outcome in case.outcomes]
             seconds = round(time.monotonic() - started, 3)
-            entry = Entry(name, list(dict.fromkeys(case.complaints)), case.notes, codes, seconds, memory)
+            computed = round(sum(outcome.computed for outcome in case.outcomes), 3)
+            entry = Entry(name, list(dict.fromkeys(case.complaints)), case.notes, codes, seconds, computed, memory)
             self._result(name).write_text(json.dumps(asdict(entry)), encoding="utf-8")
         finally:
             os._exit(0)
@@ -109,7 +110,7 @@ class Campaign:
         try:
             entry = Entry(**json.loads(result.read_text(encoding="utf-8")))
         except (OSError, ValueError):
-            entry = Entry(name, ["the fuzzer itself died"], [], [], seconds, 0)
+            entry = Entry(name, ["the fuzzer itself died"], [], [], seconds, 0.0, 0)
         result.unlink(missing_ok=True)
         self.ledger.add(entry)
         if not entry.complaints:

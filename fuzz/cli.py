@@ -68,13 +68,16 @@ def _check(options: Options) -> None:
 
 def _table(entries: list[Entry]) -> str:
     """How far every family is, and what its commands did."""
-    lines = [f"{'family':15} {'done':>5} {'of':>5} {'failed':>6} {'longest':>8} {'memory':>7}  exit codes"]
+    lines = [
+        f"{'family':15} {'done':>5} {'of':>5} {'failed':>6} {'longest':>8} {'computed':>9} {'memory':>7}  exit codes"
+    ]
     for name, family in FAMILIES.items():
         own = [entry for entry in entries if entry.case.partition(":")[0] == name]
         codes = Counter(code for entry in own for code in entry.codes)
         lines.append(
             f"{name:15} {len(own):5} {family.cases:5} {sum(bool(entry.complaints) for entry in own):6} "
             f"{max((entry.seconds for entry in own), default=0.0):6.1f} s "
+            f"{sum(entry.computed for entry in own):7.0f} s "
             f"{max((entry.memory for entry in own), default=0) / 1e9:4.1f} GB  "
             f"{', '.join(f'{code}: {count}' for code, count in sorted(codes.items()))}"
         )

@@ -18,6 +18,9 @@ class Entry:
     codes: list[int]
     """Exit codes of its commands."""
     seconds: float
+    """From its start to its end."""
+    computed: float
+    """[s] of computing."""
     memory: int
     """The most bytes that a command of it held."""
 

@@ -57,6 +57,8 @@ class Outcome:
     out: str
     err: str
     seconds: float
+    computed: float
+    """[s] of computing, with that of processes which it started."""
     memory: int
     """The most bytes that it held."""
     hung: bool = False
@@ -188,7 +190,8 @@ def _watched(
         _signal_group(child, signal.SIGKILL)  # and whatever it has left behind
     out, err, stack = (_read(path) for path in files)
     code = os.waitstatus_to_exitcode(status)
-    return Outcome(arguments, code, out, err, seconds, 1024 * usage.ru_maxrss, hung, swollen, stack if hung else "")
+    computed, memory = usage.ru_utime + usage.ru_stime, 1024 * usage.ru_maxrss
+    return Outcome(arguments, code, out, err, seconds, computed, memory, hung, swollen, stack if hung else "")
 
 
 def _is_hung(child: int, seconds: float, limit: float) -> bool:

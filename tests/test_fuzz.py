@@ -201,12 +201,12 @@ def test_scripts_are_right(environment):
 def test_a_ledger_remembers(tmp_path):
     path = tmp_path / "ledger.jsonl"
     ledger = Ledger(path)
-    ledger.add(Entry("a:1", [], [], [0], 0.1, 5))
-    ledger.add(Entry("a:2", ["bad"], [], [1], 0.1, 5))
+    ledger.add(Entry("a:1", [], [], [0], 0.1, 0.1, 5))
+    ledger.add(Entry("a:2", ["bad"], [], [1], 0.1, 0.1, 5))
     path.write_bytes(path.read_bytes() + b'{"case": "a:3", "compl')  # torn by a kill
     again = Ledger(path)
     assert list(again.entries) == ["a:1", "a:2"] and [entry.case for entry in again.failed()] == ["a:2"]
-    again.add(Entry("a:2", [], [], [0], 0.1, 5))
+    again.add(Entry("a:2", [], [], [0], 0.1, 0.1, 5))
     assert list(Ledger(path).entries) == ["a:1", "a:2"] and not Ledger(path).failed()
 
 
