@@ -12,7 +12,7 @@ import cortado
 ROOT = Path(cortado.__file__).parent
 
 LAYERS = """
-    errors files arrays
+    errors files arrays interruption terminal kernel_cache
     image_losses srgb masses
     smoothing calibration parameter_values
     precision cells
@@ -47,7 +47,7 @@ LAYERS = """
     study.estimates study.shades study.starts study.spatial_scales study.lyapunov_spectrum study.lyapunov_exponents
     study.one_kernel_loops
     study.* study.kinds study.experiment_files study.results
-    commands.* cli
+    commands.* usage cli __main__
 """
 """From the foundations to the command line; ``package.*`` stands for modules that do not import one another.
 

@@ -4,9 +4,11 @@ Names are imported when they are first used, so that ``import cortado`` is quick
 """
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # that of typing, which takes as long to import as all else here
 if TYPE_CHECKING:
+    from typing import Any
+
     from cortado import image_losses as image_losses
     from cortado import losses as losses
     from cortado import optimisers as optimisers
@@ -46,7 +48,7 @@ _HOMES = {
 __all__ = [*_MODULES, *_HOMES]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     if name in _MODULES:
         return importlib.import_module(f"cortado.{name}")
     if name in _HOMES:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.errors import InputError
+from cortado.errors import DivergedError, InputError
 from cortado.losses import FinalPositions, Frames, Image, Loss, TrajectoryEnd
 from cortado.parameter_values import NOT_NEGATIVE, TABLES, Arrays
 from cortado.pictures import heart, read_picture, rosetta
@@ -87,7 +87,11 @@ def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> d
         assert renderer is not None
         return {steps[-1]: _picture(task, renderer)}
     nothing = FinalPositions(simulation.positions)
-    ends = Problem(simulation, task.problem.steps, nothing).states(task.hidden, steps)
+    try:
+        ends = Problem(simulation, task.problem.steps, nothing).states(task.hidden, steps)
+    except DivergedError as error:
+        advice = f"this is the run with the parameters of problem.target, so change those, or {error.advice}"
+        raise DivergedError(error.step, error.particle, advice) from None
     if renderer is None:
         return {step: end.positions for step, end in ends.items()}
     return {

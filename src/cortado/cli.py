@@ -1,14 +1,17 @@
 """The command line: ``cortado run | optimise | gradients | bench``.
 
-Exit codes: 0 done, 1 the computation failed (or a check did), 2 the input is wrong. A mistake of the user's is one
-sentence on stderr, never a traceback.
+Exit codes: 0 done, 1 the computation failed (or a check did), 2 the input is wrong, 130 interrupted. A mistake of the
+user's, or of the machine, is one sentence on stderr, never a traceback.
 """
 
-import os
+import io
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr
+from functools import partial
 from pathlib import Path
+from signal import SIGINT
 from typing import Annotated, Literal
 
 import tyro
@@ -16,11 +19,19 @@ from tyro.conf import Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
+from cortado.interruption import Interrupted
+from cortado.kernel_cache import complaint, start_warp
+from cortado.terminal import say, tell, to_stdout
+from cortado.usage import usage_sentence
 
 app = SubcommandApp()
 gradients = SubcommandApp()
 app.command(gradients, name="gradients", help="Check the gradients of a scene; the gradient study.")
 
+BROKEN_PIPE = 141
+"""Exit code where nobody reads the result: that of a process which the signal SIGPIPE ended."""
+Work = Callable[[], str]
+"""What a command does once its arguments are understood; returns what it prints."""
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Overrides = Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")]
 
@@ -35,7 +46,7 @@ def run(
     precision: str = "float32",
     record_every: int = 1,
     overwrite: bool = False,
-) -> None:
+) -> Work:
     """Run a scene forward and write its trajectory.
 
     Args:
@@ -49,11 +60,10 @@ def run(
         overwrite: Replace an earlier run in the same folder.
     """
     _require_at_least(1, record_every, "--record-every")
-    _start_warp()
     from cortado.commands.run import run_scene
 
-    command = ["cortado", *sys.argv[1:]]
-    print(run_scene(scene, steps, out, list(overrides), device, precision, record_every, overwrite, command))
+    words = _words(overrides)
+    return partial(run_scene, scene, steps, out, words, device, precision, record_every, overwrite, _command())
 
 
 @app.command
@@ -65,7 +75,7 @@ def optimise(
     precision: str = "float32",
     resume: bool = False,
     overwrite: bool = False,
-) -> None:
+) -> Work:
     """Optimise what a task file names, and check the result as the file asks.
 
     Args:
@@ -79,11 +89,9 @@ def optimise(
     """
     if resume and overwrite:
         raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
-    _start_warp()
     from cortado.commands.optimise import optimise_task
 
-    command = ["cortado", *sys.argv[1:]]
-    print(optimise_task(task, out, list(overrides), device, precision, resume, overwrite, command))
+    return partial(optimise_task, task, out, _words(overrides), device, precision, resume, overwrite, _command())
 
 
 @gradients.command
@@ -98,7 +106,7 @@ def check(
     device: str = "cpu",
     json: bool = False,
     seed: int = 0,
-) -> None:
+) -> Work:
     """Check the gradients of a scene, in float64: are they right, how long do they mean something, what to use beyond.
 
     Args:
@@ -114,10 +122,9 @@ def check(
         seed: Of the random directions.
     """
     _require_at_least(0, seed, "--seed")
-    _start_warp()
     from cortado.commands.check import check_scene
 
-    print(check_scene(scene, steps, parameters, loss, change, out, list(overrides), device, json, seed))
+    return partial(check_scene, scene, steps, parameters, loss, change, out, _words(overrides), device, json, seed)
 
 
 @gradients.command
@@ -127,7 +134,7 @@ def figure(
     overrides: Overrides = (),
     reduced: bool = False,
     redraw: bool = False,
-) -> None:
+) -> Work:
     """Measure and draw one experiment of the gradient study.
 
     Args:
@@ -137,10 +144,9 @@ def figure(
         reduced: The quick form, with the settings that the file has in [reduced].
         redraw: Draw and judge the numbers that are there again.
     """
-    _start_warp()
     from cortado.commands.figure import measure_figure
 
-    print(measure_figure(experiment, out, list(overrides), reduced, redraw))
+    return partial(measure_figure, experiment, out, _words(overrides), reduced, redraw)
 
 
 @gradients.command
@@ -149,7 +155,7 @@ def study(
     out: Path = Path("runs/study"),
     only: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (),
     reduced: bool = False,
-) -> None:
+) -> Work:
     """Measure and draw all experiments; those that are there already, with the same settings, are not repeated.
 
     Args:
@@ -158,10 +164,9 @@ def study(
         only: The name of an experiment, such as figure_4; may be given again.
         reduced: The quick form of each.
     """
-    _start_warp()
     from cortado.commands.study import run_study
 
-    print(run_study(folder, out, reduced, list(only)))
+    return partial(run_study, folder, out, reduced, _words(only))
 
 
 @app.command
@@ -172,7 +177,7 @@ def bench(
     precision: str = "float32",
     engine: Literal["warp", "reference"] = "warp",
     json: bool = False,
-) -> None:
+) -> Work:
     """Time a dam break, forward and with its derivatives.
 
     Args:
@@ -184,33 +189,55 @@ def bench(
         json: Print JSON for machines instead of a table.
     """
     _require_at_least(1, particles, "--particles")
-    _start_warp()
     from cortado.commands.bench import bench_dam_break, bench_reference
 
     if engine == "reference":
-        print(bench_reference(particles, steps, precision, json))
+        return partial(bench_reference, particles, steps, precision, json)
     else:
-        print(bench_dam_break(particles, steps, device, precision, json))
+        return partial(bench_dam_break, particles, steps, device, precision, json)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command; exits with its code unless that is 0."""
+    arguments = sys.argv[1:] if arguments is None else arguments
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # type: ignore[assignment]
-            app.cli(
-                prog="cortado",
-                description="A differentiable SPH fluid simulator.",
-                args=arguments,
-                config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
-            )
+            work = _understood(arguments)
+            start_warp()
+            tell(work())
     except ComputationError as error:
         sys.exit(_say(error, 1))
     except CortadoError as error:
         sys.exit(_say(error, 2))
     except KeyboardInterrupt as stop:
-        print(f"Interrupted{'; ' if str(stop) else ''}{stop}.", file=sys.stderr)
-        sys.exit(130)
+        stop = stop if isinstance(stop, Interrupted) else Interrupted(SIGINT)
+        sys.exit(_say(stop, stop.code))
+    except BrokenPipeError:
+        sys.exit(BROKEN_PIPE)
+    except Exception as error:
+        sentence = complaint(error)
+        if sentence is None:
+            raise
+        say(sentence)
+        sys.exit(1)
+
+
+def _understood(arguments: Sequence[str]) -> Work:
+    """The command that the arguments name; prints help and exits where they ask for it."""
+    box = io.StringIO()
+    try:
+        with redirect_stderr(box), to_stdout():
+            return app.cli(
+                prog="cortado",
+                description="A differentiable SPH fluid simulator.",
+                args=arguments,
+                config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+            )
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise InputError(usage_sentence(box.getvalue(), arguments)) from None
 
 
 def _require_at_least(least: int, value: int, option: str) -> None:
@@ -218,27 +245,25 @@ def _require_at_least(least: int, value: int, option: str) -> None:
         raise InputError(f"{option} is {value}, but must be at least {least}.")
 
 
-def _start_warp() -> None:
-    """Start Warp without its greeting, and without the line that its C code prints where there is no CUDA driver."""
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_ERROR
-    sys.stderr.flush()
-    stderr, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nothing, 2)
-        wp.init()
-    finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
-        os.close(nothing)
+def _words(options: Sequence[str]) -> list[str]:
+    """What was given to --set or --only; raises `InputError` for bytes that are no text."""
+    for option in options:
+        try:
+            option.encode()
+        except UnicodeEncodeError:
+            raise InputError(f"{option!r} is among the options, but must be text in UTF-8.") from None
+    return list(options)
 
 
-def _say(error: CortadoError, code: int) -> int:
-    print(str(error), file=sys.stderr)
+def _command() -> list[str]:
+    return ["cortado", *sys.argv[1:]]
+
+
+def _say(error: BaseException, code: int) -> int:
+    say(str(error))
     return code
 
 
 def _show_warning(message: Warning, category: type[Warning], *rest: object) -> None:
     if issubclass(category, CortadoWarning):
-        print(f"Warning: {message}", file=sys.stderr)
+        say(f"Warning: {message}")

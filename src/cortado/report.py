@@ -79,7 +79,7 @@ def write_report(
 </body>
 </html>
 """
-    write_atomically(folder.report, page)
+    write_atomically(folder.report, page.encode(errors="backslashreplace"))  # names of files may not be UTF-8
     return folder.report
 
 

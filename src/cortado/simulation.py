@@ -270,8 +270,11 @@ def not_converged_sentence(converged: np.ndarray) -> str:
 
 
 def _device(name: str) -> Any:
+    found = ", ".join(str(device) for device in wp.get_devices())
+    none = "" if wp.get_cuda_device_count() else "; no GPU with a CUDA driver is found"
     try:
+        if name == "cuda" and none:
+            raise ValueError  # Warp itself would write on stderr
         return wp.get_device(name)
     except (RuntimeError, ValueError) as error:
-        found = ", ".join(str(device) for device in wp.get_devices())
-        raise InputError(f"device is {name!r}, but must be one of: {found}.") from error
+        raise InputError(f"device is {name!r}, but must be one of: {found}{none}.") from error

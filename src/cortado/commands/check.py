@@ -13,6 +13,7 @@ from cortado.losses import CentreOfMass, FinalPositions, Image, Loss
 from cortado.problem import Problem
 from cortado.scene import load_scene
 from cortado.simulation import Simulation, check_steps
+from cortado.terminal import tell
 
 LOSSES = ("positions", "centre-of-mass", "image")
 
@@ -42,7 +43,7 @@ def check_scene(
     if out is not None:
         text += _written(certificate, found, out, as_json)
     if not certificate.right:
-        print(text)
+        tell(text)
         raise ComputationError(f"The adjoint is wrong for: {', '.join(certificate.wrong)}.")
     return text
 

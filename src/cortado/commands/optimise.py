@@ -12,6 +12,7 @@ from cortado.assignment import Assignment, assignment
 from cortado.errors import ComputationError, DivergedError
 from cortado.folder_lock import locked
 from cortado.image_losses import psnr
+from cortado.interruption import keeping
 from cortado.optimisation import Record, Result, optimise
 from cortado.policies import Policy, tuned
 from cortado.progress import track
@@ -55,11 +56,8 @@ def optimise_task(
         RunFolder.open(out)
     with locked(out):
         folder = _run_folder(made, out, resume, overwrite, command)
-        try:
+        with keeping(lambda: f"{_kept(folder)}; --resume goes on with them" if _kept(folder) else ""):
             return _solved(made, folder, resume)
-        except KeyboardInterrupt:
-            kept = _kept(folder)
-            raise KeyboardInterrupt(f"{kept}; --resume goes on with them" if kept else "") from None
 
 
 def _run_folder(made: Assignment, out: Path, resume: bool, overwrite: bool, command: list[str]) -> RunFolder:

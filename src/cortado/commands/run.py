@@ -8,6 +8,7 @@ import numpy as np
 from cortado.errors import DivergedError
 from cortado.figures import density_errors, images, particles
 from cortado.folder_lock import locked
+from cortado.interruption import keeping
 from cortado.particles import State
 from cortado.progress import track
 from cortado.render.scene_renderer import scene_renderer
@@ -38,11 +39,8 @@ def run_scene(
     rollout = simulation.rollout(check_steps(steps))
     with locked(out):
         folder = RunFolder.create(out, scene.to_json(), command, device=str(simulation.device), overwrite=overwrite)
-        try:
+        with keeping(lambda: f"the frames so far are in {folder.trajectory}" if folder.trajectory.exists() else ""):
             _compute(simulation, rollout, folder, record_every)
-        except KeyboardInterrupt:
-            kept = f"the frames so far are in {folder.trajectory}" if folder.trajectory.exists() else ""
-            raise KeyboardInterrupt(kept) from None
     converged = simulation.converged(rollout)
     warning = "" if converged.all() else f"Mind that {not_converged_sentence(converged)} "
     return f"{warning}The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
@@ -122,7 +120,7 @@ def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder) -> 
     speeds = [np.linalg.norm(trajectory.velocities[frame], axis=1) for frame in shown]
     figures: Figures = [
         (
-            "The fluid at the start, half-way and at the end, seen along the third axis.",
+            f"The fluid at the start, half-way and at the end{', seen along the third axis' * (scene.dimension == 3)}.",
             particles(
                 [trajectory.positions[frame] for frame in shown],
                 [f"t = {trajectory.times[frame]:.3f} s" for frame in shown],

@@ -1,12 +1,12 @@
 """``cortado gradients study``: all experiments of a folder, one after the other."""
 
-import sys
 from pathlib import Path
 
 from cortado.errors import ComputationError, CortadoError, InputError
 from cortado.study.experiment import DeviceSettings, Experiment
 from cortado.study.experiment_files import load_experiment
 from cortado.study.results import Results
+from cortado.terminal import say, tell
 
 
 def run_study(folder: Path, out: Path, reduced: bool, only: list[str]) -> str:
@@ -23,7 +23,7 @@ def run_study(folder: Path, out: Path, reduced: bool, only: list[str]) -> str:
             failures.append(experiment.name)
         sections.append("\n".join([f"{experiment.name}: {experiment.settings.title}", *(f"  {s}" for s in verdict)]))
     if failures:
-        print("\n\n".join(sections))
+        tell("\n\n".join(sections))
         raise ComputationError(f"These experiments failed: {', '.join(failures)}. The others are in {out.absolute()}.")
     return "\n\n".join([*sections, f"The results are in {out.absolute()}, a folder for each experiment."])
 
@@ -43,7 +43,7 @@ def _verdict(experiment: Experiment, results: Results) -> list[str]:
         return results.verdict()
     if _needs_gpu(experiment) and not _has_gpu():
         return ["Left out: it needs a GPU, and there is none."]
-    print(f"{experiment.name} ...", file=sys.stderr, flush=True)
+    say(f"{experiment.name} ...")
     return results.measure(experiment)
 
 

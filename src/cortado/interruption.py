@@ -1,0 +1,78 @@
+"""What Ctrl-C and SIGTERM do to a command: a sentence and the exit code that shells expect, at any moment.
+
+As long as there is nothing to keep, the process ends on the spot: an exception would come out of the import of some
+library, or get lost in it. Within `keeping` it is a `KeyboardInterrupt`, so that files are closed on the way out.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+AGAIN = 0.01
+"""[s] after which an interruption is tried again that came where Python drops exceptions, such as in a finaliser."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal; takes its number and what is kept, the rest of the sentence."""
+
+    def __init__(self, number: int, kept: str = ""):
+        super().__init__(number, kept)
+        self.code = 128 + number
+        """The exit code."""
+        self.kept = kept
+
+    def __str__(self) -> str:
+        return f"Interrupted; {self.kept}." if self.kept else "Interrupted."
+
+
+def leave_at_once() -> None:
+    """From now on, end the process on the spot; a signal that is ignored stays so (nohup, background jobs)."""
+    for number in SIGNALS:
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, _leave)
+    sys.unraisablehook = _try_again
+
+
+def finish() -> None:
+    """There is nothing left to interrupt."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+@contextmanager
+def keeping(kept: Callable[[], str]) -> Iterator[None]:
+    """Within it an interruption is an exception; ``kept`` then gives the end of its sentence: what is there, and where,
+    or nothing."""
+    ours = [number for number in SIGNALS if signal.getsignal(number) is _leave]
+    for number in ours:
+        signal.signal(number, _raise)
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        raise Interrupted(stop.args[0] if isinstance(stop, Interrupted) else signal.SIGINT, kept()) from None
+    finally:
+        for number in ours:
+            signal.signal(number, _leave)
+
+
+def _leave(number: int, _: FrameType | None) -> None:
+    with suppress(OSError):
+        os.write(2, b"Interrupted.\n")
+    os._exit(128 + number)
+
+
+def _raise(number: int, _: FrameType | None) -> None:
+    raise Interrupted(number)
+
+
+def _try_again(dropped: "sys.UnraisableHookArgs") -> None:
+    if not isinstance(dropped.exc_value, Interrupted):
+        sys.__unraisablehook__(dropped)
+    else:
+        number = dropped.exc_value.args[0]
+        signal.signal(signal.SIGALRM, lambda *_: _raise(number, None))
+        signal.setitimer(signal.ITIMER_REAL, AGAIN)

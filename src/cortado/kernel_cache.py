@@ -1,0 +1,102 @@
+"""The folder in which Warp keeps compiled kernels: another one where it cannot be written, a sentence where it fails.
+
+Containers and clusters often have a home that is read-only or full.
+"""
+
+import atexit
+import logging
+import os
+import shutil
+import tempfile
+import traceback
+from contextlib import suppress
+from pathlib import Path
+
+from cortado.errors import ComputationError
+from cortado.terminal import say
+
+VARIABLE = "WARP_CACHE_PATH"
+ROOM = 16 * 2**20
+"""[bytes] that must be free for kernels; those of one run take a few MiB."""
+
+
+def start_warp() -> None:
+    """Start Warp without its greeting. Where its cache cannot be written, a warning says so, and kernels that are not
+    in it are compiled in a temporary folder; raises `ComputationError` where there is none either."""
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it has a folder of its own, and goes on without it
+    reason = _start()
+    folder = wp.config.kernel_cache_dir
+    reason = reason or _trouble(folder)
+    if reason is None:
+        return
+    try:
+        wp.config.kernel_cache_dir = _replacement(folder)
+    except OSError:
+        wp.config.kernel_cache_dir = None
+    if wp.config.kernel_cache_dir is None or _trouble(wp.config.kernel_cache_dir):
+        raise ComputationError(
+            f"Compiled kernels can be kept neither in {folder} ({reason}) nor in a temporary folder; "
+            f"set the environment variable {VARIABLE} to a folder that can be written."
+        )
+    _start()
+    say(
+        f"Warning: Compiled kernels cannot be kept in {folder} ({reason}), so they are compiled again in every run; "
+        f"set the environment variable {VARIABLE} to a folder that can be written."
+    )
+
+
+def complaint(error: Exception) -> str | None:
+    """What to say of an error that came out of loading or compiling a kernel; None for any other error."""
+    import warp as wp
+
+    frames = traceback.extract_tb(error.__traceback__)
+    loading = any(frame.name == "load" and Path(frame.filename).parts[-3:-1] == ("warp", "_src") for frame in frames)
+    missing = isinstance(error, RuntimeError) and str(error).startswith("Failed to find ")
+    if not (loading or missing) or type(error).__module__.startswith("warp"):  # which are mistakes in a kernel
+        return None
+    reason = getattr(error, "strerror", None) or str(error).partition(" (")[0]
+    return (
+        f"A compiled kernel in {wp.config.kernel_cache_dir} cannot be used ({reason}): the disk may be full or the "
+        f"file damaged; delete that folder, or set the environment variable {VARIABLE} to another one."
+    )
+
+
+def _start() -> str | None:
+    """Start Warp, unless it has started, without the line that its C code prints where there is no CUDA driver; why
+    its cache cannot be made, None if it can."""
+    import warp as wp
+
+    stderr, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nothing, 2)
+        wp.init()
+    except OSError as problem:
+        return problem.strerror or str(problem)
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(nothing)
+    return None
+
+
+def _trouble(folder: str) -> str | None:
+    """Why a folder has no room for kernels; None if it has."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            free = shutil.disk_usage(folder).free
+    except OSError as problem:
+        return problem.strerror or str(problem)
+    return None if free >= ROOM else f"only {free / 2**20:.1f} MiB are free there"
+
+
+def _replacement(folder: str) -> str:
+    """A temporary folder for kernels, with those that are in the cache, until the process ends."""
+    temporary = tempfile.mkdtemp(prefix="cortado-kernels-")
+    atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+    with suppress(OSError):
+        for kernel in Path(folder).glob("wp_*"):
+            (Path(temporary) / kernel.name).symlink_to(kernel)
+    return temporary

@@ -1,0 +1,36 @@
+"""A command line that cannot be understood, in one sentence instead of the box that tyro draws around several."""
+
+import re
+from collections.abc import Sequence
+
+from cortado.errors import LONGEST
+
+_COMMAND = re.compile(r"(run|optimise|bench|gradients( (check|figure|study))?)(?= |$)")
+_EDGES = "│|╭╮╰╯─-+ "
+_SENTENCES = (
+    (r"Expected one of \{(.*)\}", r"a command is missing, one of \1"),
+    (r"Unrecognized or misplaced options: (\S+?),?(?: .*)?", r"\1 is no option here"),
+    (r"Unrecognized .*?options: (\S+?),?(?: .*)? Perhaps you meant: (\S+).*", r"\1 is unknown; \2 may be meant"),
+    (r"Unrecognized .*?options: (\S+?),?(?: .*)? Available subcommands: (.*)", r"\1 is unknown, but must be one of \2"),
+    (r"Unrecognized .*?options: (\S+?),?(?: .*)?", r"\1 is unknown, or one too many"),
+    (r"Missing from .*?: (\S+) .*", r"\1 is missing"),
+    (r"Missing value for argument '(-\S+)'.*", r"\1 is given without a value"),
+    (r"Missing value for argument '(\S+)'.*", r"the \1 is missing"),
+    (r"invalid choice '(.*)' for argument '(.*)'\. Expected one of \((.*?),?\)", r"\2 is '\1', but must be one of \3"),
+    (r"Error parsing (\S+): invalid literal for int.*?: (.*)", r"\1 is \2, but must be a whole number"),
+    (r"Error parsing (\S+): could not convert string to float: (.*)", r"\1 is \2, but must be a number"),
+    (r"Error parsing (\S+): (.*)", r"\1 cannot be used: \2"),
+)
+"""What tyro says, and what we say."""
+
+
+def usage_sentence(box: str, arguments: Sequence[str]) -> str:
+    """What tyro says in its box, as a sentence of ours."""
+    lines = ["" if set(line) <= set(_EDGES) else line.strip("│| ") for line in box.splitlines()[1:]]
+    text = " ".join(line for line in lines if line)
+    text = re.split(r" (?:Argument helptext:|For full helptext,)", text)[0].rstrip(". ")
+    found = ((re.fullmatch(theirs, text), ours) for theirs, ours in _SENTENCES)
+    said = next((match.expand(ours) for match, ours in found if match), text)
+    said = said if len(said) <= 2 * LONGEST else f"{said[: 2 * LONGEST]}..."
+    command = _COMMAND.match(" ".join(arguments))
+    return f"{said}; see cortado {f'{command[0]} ' if command else ''}--help."

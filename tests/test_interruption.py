@@ -1,0 +1,62 @@
+"""Ctrl-C and SIGTERM at any moment: a sentence, and the exit code that shells expect."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+STOPPED = "print('here', flush=True); time.sleep(60)"
+SLOW_IMPORT = f"import time; {STOPPED}"
+START = "import time; from cortado import interruption; interruption.leave_at_once(); "
+KEEPING = f"""{START}
+class Late:
+    def __del__(self):
+        print('here', flush=True)
+        time.sleep(0.5)
+
+try:
+    with interruption.keeping(lambda: "two frames are in runs"):
+        WORK
+except KeyboardInterrupt as stop:
+    print(stop)
+    raise SystemExit(stop.code)
+"""
+
+
+def stopped(number: int, *arguments: str, **environment: str) -> tuple[int, str]:
+    """Exit code and what a Python process says that gets a signal when it says 'here'."""
+    process = subprocess.Popen(
+        [sys.executable, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env={**os.environ, **environment},
+        text=True,
+    )
+    assert process.stdout is not None and process.stdout.readline() == "here\n"
+    process.send_signal(number)
+    out, _ = process.communicate(timeout=30)
+    return process.returncode, out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_import_is_interrupted_in_one_sentence(tmp_path, number):
+    (tmp_path / "tyro.py").write_text(SLOW_IMPORT)  # what the command line imports first
+    found = stopped(number, "-m", "cortado", "run", "scene.toml", PYTHONPATH=str(tmp_path))
+    assert found == (128 + number, "Interrupted.\n")
+
+
+@pytest.mark.parametrize(
+    "work", [STOPPED, "Late()\n        time.sleep(60)"], ids=["at work", "in a finaliser, which drops exceptions"]
+)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_is_kept_is_said(number, work):
+    found = stopped(number, "-c", KEEPING.replace("WORK", work))
+    assert found == (128 + number, "Interrupted; two frames are in runs.\n")
+
+
+def test_a_signal_that_is_ignored_stays_so():
+    ignoring = f"import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); {START}"
+    found = stopped(signal.SIGINT, "-c", f"{ignoring} print('here', flush=True); time.sleep(0.2); print('done')")
+    assert found == (0, "done\n")

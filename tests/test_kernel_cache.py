@@ -1,0 +1,68 @@
+"""A cache of kernels that cannot be written, and one with a damaged file; never that of whoever runs the tests."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+KERNEL = """
+import sys
+import warp as wp
+from cortado.kernel_cache import complaint, start_warp
+
+@wp.kernel(module="unique")
+def twice(x: wp.array(dtype=float)):
+    i = wp.tid()
+    x[i] = 2.0 * x[i]
+
+start_warp()
+x = wp.ones(3, dtype=float, device="cpu")
+try:
+    wp.launch(twice, 3, inputs=[x], device="cpu")
+except Exception as error:
+    print(complaint(error))
+else:
+    print(x.numpy().sum(), wp.config.kernel_cache_dir)
+"""
+
+
+@pytest.fixture
+def twice(tmp_path):
+    """Runs the kernel with a cache: what it prints, and what it warns of."""
+    program = tmp_path / "twice.py"
+    program.write_text(KERNEL)
+
+    def run(cache):
+        environment = {**os.environ, "WARP_CACHE_PATH": str(cache), "TMPDIR": str(tmp_path)}
+        done = subprocess.run([sys.executable, program], capture_output=True, env=environment, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        return done.stdout, done.stderr
+
+    return run
+
+
+@pytest.mark.parametrize("ending", [".o", ".meta"])
+def test_a_damaged_kernel_is_said_in_a_sentence(twice, tmp_path, ending):
+    out, err = twice(tmp_path / "cache")
+    assert out.startswith("6.0") and err == ""
+    (file,) = (tmp_path / "cache").rglob(f"*{ending}")
+    file.write_bytes(file.read_bytes()[:100])
+    out, _ = twice(tmp_path / "cache")
+    assert out.startswith(f"A compiled kernel in {file.parent.parent} cannot be used (") and len(out.splitlines()) == 1
+    assert "delete that folder, or set the environment variable WARP_CACHE_PATH to another one." in out
+
+
+def test_a_cache_that_cannot_be_written_is_replaced(twice, tmp_path):
+    (tmp_path / "file").touch()
+    out, err = twice(tmp_path / "file" / "cache")
+    total, folder = out.split()
+    assert total == "6.0" and folder.startswith(str(tmp_path / "cortado-kernels-")) and not os.path.exists(folder)
+    assert err.startswith(f"Warning: Compiled kernels cannot be kept in {tmp_path / 'file' / 'cache'}")
+    assert len(err.splitlines()) == 1 and "(Not a directory)" in err and "WARP_CACHE_PATH" in err
+
+
+def test_other_errors_are_no_complaint_of_the_cache():
+    from cortado.kernel_cache import complaint
+
+    assert complaint(ValueError("steps")) is None and complaint(OSError(28, "No space left on device")) is None
