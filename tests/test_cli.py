@@ -287,7 +287,9 @@ def test_an_optimisation_that_diverges_says_so(cortado_command):
 
 
 def test_a_target_that_diverges_is_named(cortado_command, folder):
-    code, out, err = cortado_command("optimise", "task.toml", "--out", "found", "--set", "problem.target.gravity=[0,-1e30]")
+    code, out, err = cortado_command(
+        "optimise", "task.toml", "--out", "found", "--set", "problem.target.gravity=[0,-1e30]"
+    )
     assert (code, out) == (1, "") and "problem.target" in err and "learning rate" not in err
     assert_one_sentence(err.splitlines()[-1])
     assert_nothing_made(folder)
