@@ -1,12 +1,21 @@
-"""Walls hold the fluid, and the fluid keeps its density, at every step of a violent flow."""
+"""Walls hold the fluid, and the fluid keeps its density, at every step of a violent flow; where they fail, the run ends
+in a sentence."""
 
 from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 
-from cortado import Scene, Simulation, Trajectory
+from cortado import CortadoWarning, DivergedError, InputError, Problem, Scene, Simulation, Trajectory, losses
 from cortado.commands.bench import dam_break
+from cortado.launching import Launcher
+from cortado.particles import State, to_device
+from cortado.precision import precision_named
+from cortado.region import Region
+from cortado.scene_containers import CylinderContainer
+from cortado.solvers.containment import Containment, Walled
+from scenes import plane, scene
 
 SUPPORTS = {"cubic_spline": 2.0, "wendland_c2": 2.6, "wendland_c4": 3.0}
 
@@ -65,3 +74,131 @@ def _check(scene: Scene, steps: int) -> None:
     assert travelled.max() > 3.0 * scene.discretisation.spacing  # it did move
     assert escaped(scene, trajectory) == 0
     assert worst_density_error(trajectory) <= 0.01
+
+
+FAST = {"time_step": 0.05, "minimum_iterations": 3, "maximum_iterations": 3}
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("make", [plane, scene])
+def test_fluid_that_leaves_the_container_ends_the_run(make, precision):
+    made = make(solver=FAST)
+    frames = []
+    rollout = Simulation(made, precision=precision).rollout(40)
+    wanted = r"left the container and was at \(.*\) m; try a smaller time step"
+    with pytest.raises(DivergedError, match=wanted) as caught:
+        rollout.forward(lambda step, state: frames.append(state.numpy(made.dimension)[0]), keep=False)
+    assert len(frames) == caught.value.step - 1  # those before are good
+    tolerance = 0.5 * made.discretisation.spacing
+    assert made.container.contains(np.concatenate(frames).astype(np.float64), tolerance).all()
+    assert len(rollout.iterations) == caught.value.step
+
+
+def test_without_pressure_walls_hold_nothing():
+    Simulation(plane(forces={"gravity": [0.0, -9.81], "pressure": False})).run(200)
+
+
+CUP = {"base": (0.1, 0.2, 0.3), "radius": 0.5, "height": 1.0}
+PLANE = Region.between(np.array([0.0, -1.0]), np.array([1.0, 2.0]))
+REGIONS = {
+    "plane": PLANE,
+    "periodic": PLANE.opened(np.array([1.0, 0.0])),
+    "space": Region.everywhere(3),
+    "cup": CylinderContainer(**CUP, axis="y").region(3),
+    "open cup": CylinderContainer(**CUP, axis="z", lid=False).region(3),
+}
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("name", REGIONS)
+def test_the_device_finds_the_particles_that_numpy_finds(name, precision):
+    """Each of 4,000 random ways, a step of its own kind: within, through a wall, over a rim, or outside throughout."""
+    region, real, random = REGIONS[name], precision_named(precision), np.random.default_rng(3)
+    n, d = 4000, len(region.lower)
+    before, after = random.uniform(-1.5, 2.5, (2, n, d))
+    spacing = 0.1
+    wanted = region.escaped(before, after, 0.5 * spacing)
+    after[7, 0], after[9, -1] = np.nan, np.inf
+    wanted[[7, 9]] = True
+    assert wanted.sum() == 2 if name == "space" else 10 < wanted.sum() < n - 10
+    device = wp.get_device("cpu")
+    near = Region.between(np.full(d, -2.0), np.full(d, 3.0))
+    containment = Containment(Walled(region, near, spacing), real, Launcher(n, device, record_tape=False))
+    order = np.concatenate([random.permutation(n), np.zeros(n)])
+    state, step = State.zeros(n, 1, real, device), np.zeros(n)
+    state.set(after, np.zeros((n, d)), np.ones((n, 1)))
+    containment.look(
+        wp.array(order, dtype=wp.int32, device=device),
+        to_device(before[order[:n].astype(int)], real, device),
+        wp.array(step + 1.0, dtype=real.real, device=device),
+        state,
+    )
+    assert int(containment.bad_particle.numpy()[0]) == np.flatnonzero(wanted)[0]
+    assert int(containment._count.numpy()[0]) == wanted.sum()
+
+
+def test_over_the_rim_of_an_open_cup_fluid_may_go():
+    tables = cup().model_dump(mode="json")
+    tables["container"] |= {"lid": False, "height": 0.6, "radius": 0.62}
+    trajectory = Simulation(Scene(**{**tables, "forces": {"gravity": [9.0, -6.0, 0.0]}}), precision="float64").run(300)
+    assert np.linalg.norm(trajectory.positions[-1][:, [0, 2]], axis=1).max() > 0.8  # some is spilled
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_parameters_that_cannot_be_are_refused():
+    simulation = Simulation(plane(), precision="float64")
+    problem = Problem(simulation, 20, losses.CentreOfMass([0.0, 0.0]))
+    with pytest.raises(InputError, match=r"initial_positions has particle 0 at \(5.025, 0.025\) m, outside"):
+        problem.value({"initial_positions": simulation.positions + [5.0, 0.0]})
+    with pytest.raises(InputError, match="rest_density has a value of size 1e"):
+        problem.value_and_gradient({"rest_density": 1e300})
+    for values in ({"gravity": [0.0, -1e4]}, {"time_step": 1.0}):
+        with pytest.raises(DivergedError):
+            problem.value_and_gradient(values)
+
+
+def test_a_time_step_beyond_the_limit_of_stability_is_warned_of_once():
+    simulation = Simulation(plane(), precision="float64")
+    problem = Problem(simulation, 2, losses.CentreOfMass([0.0, 0.0]))
+    problem.value({"gravity": [0.0, -9.81], "time_step": 0.0021})
+    with pytest.warns(CortadoWarning, match="time_step is 0.012 s, but the limit of stability with these"):
+        problem.value({"time_step": 0.012})
+    problem.value({"time_step": 0.012})
+    with pytest.warns(CortadoWarning, match="limit of stability"):
+        simulation.run(2, controls={"gravity": [[0.0, -9.81], [0.0, -400.0]]})
+
+
+def test_scenes_that_a_precision_does_not_resolve_are_refused():
+    def moved(spacings):
+        x = spacings * 0.05
+        block = {"shape": "box", "lower": [x, 0.0], "upper": [x + 0.4, 0.4], "phase": "water"}
+        return plane(fluid=[block], container={"shape": "none"}, forces={"gravity": [0.0, 0.0]})
+
+    Simulation(moved(9e3))
+    Simulation(moved(9e8), precision="float64")
+    with pytest.raises(InputError, match=r"reaches 1.1e\+04 spacings of 0.05 m from the origin"):
+        Simulation(moved(1.1e4))
+
+
+def test_particles_that_go_further_than_a_precision_resolves_are_lost():
+    block = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "velocity": [490.0, 0.0], "phase": "water"}
+    solver = {"time_step": 0.1, "minimum_iterations": 3, "maximum_iterations": 3}
+    with pytest.warns(CortadoWarning, match="limit of stability"):
+        fast = plane(fluid=[block], container={"shape": "none"}, forces={"gravity": [0.0, 0.0]}, solver=solver)
+    assert Simulation(fast, precision="float64").run(12).positions[-1].max() > 500.0
+    with pytest.raises(DivergedError, match=r"in step 11: .* further than positions are precise in float32"):
+        Simulation(fast).run(12)
+
+
+def test_points_that_are_packed_are_refused(tmp_path):
+    lattice = np.stack(np.meshgrid(*[0.025 * (np.arange(12) + 0.5)] * 2), axis=-1).reshape(-1, 2)
+    body = {"shape": "points", "file": str(tmp_path / "points.npy"), "phase": "water"}
+    for squeezed in (1.0, 0.8):
+        np.save(tmp_path / "points.npy", 2.0 * squeezed * lattice)
+        fits = plane(fluid=[body])
+        if squeezed == 1.0:
+            Simulation(fits)
+        else:
+            with pytest.raises(InputError, match=r"have 1.56 times the rest density .* discretisation.spacing is 0.05"):
+                Simulation(fits)

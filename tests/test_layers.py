@@ -21,20 +21,20 @@ LAYERS = """
     physics.nozzle physics.pressure physics.viscosity physics.free_energy physics.spreading physics.diffusion
     physics.mixture
     physics.frozen_pressure physics.adjoint_filters
-    physics.convergence physics.reduction physics.matching
+    physics.containment physics.convergence physics.reduction physics.matching
     physics.tint physics.colour_field physics.interpolation physics.rays physics.absorption
-    launching neighbours particles
+    shapes region launching neighbours particles
     render.cameras render.views render.fields render.marching render.renderer
-    shapes scene_kinds scene_tables scene_toml scene_points
+    scene_kinds scene_tables scene_toml scene_points
     scene_fluids scene_emitter scene_mixture scene_render scene_containers scene_stability scene_checks scene sampling
     discrete_scene
     reference.digits reference.engine reference.losses reference.histories reference.simulation reference
     vtkhdf_layout vtkhdf trajectory
-    solvers.forces solvers.mixture solvers.emitter solvers.pcisph_parts solvers.pcisph solvers.pcisph_derivatives
-    solvers.adjoint_filters
+    solvers.forces solvers.mixture solvers.containment solvers.emitter
+    solvers.pcisph_parts solvers.pcisph solvers.pcisph_derivatives solvers.adjoint_filters
     rollout
     policies.policy policies.exact policies.strength policies.filters policies.cloud policies.ensemble policies
-    losses checked_loss controls simulation problem
+    losses checked_loss parameter_checks controls simulation problem
     render.scene_renderer reparametrisation
     evaluations optimisers optimisation
     folder_lock run_environment run_folder progress pictures video

@@ -402,6 +402,26 @@ def test_not_finite_stops_with_advice_and_keeps_the_rest(optimiser, problem, wha
     assert [record.replayed for record in records] == [True, True]
 
 
+@dataclass
+class Walled:
+    """x^2, which refuses what is not above a floor."""
+
+    floor: float
+
+    def value_and_gradient(self, parameters, policy=None):
+        if parameters["x"] < self.floor:
+            raise InputError(f"parameter x is {parameters['x']:g}, but must be at least {self.floor:g}.")
+        return float(parameters["x"] ** 2), {"x": 2.0 * parameters["x"]}
+
+
+def test_parameters_that_a_search_comes_to_are_no_mistake_of_the_user(tmp_path):
+    with pytest.raises(ComputationError, match=r"At iteration 3 the search came to .* x is 0.7") as caught:
+        optimise(Walled(0.75), {"x": 1.0}, Adam(learning_rate=0.1), 10, checkpoint=tmp_path)
+    assert str(tmp_path) in str(caught.value)
+    with pytest.raises(InputError, match="x is 1, but"):
+        optimise(Walled(2.0), {"x": 1.0}, Adam(learning_rate=0.1), 10)
+
+
 # Wrong input
 
 

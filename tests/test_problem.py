@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cortado import InputError, Problem, Simulation, losses, policies
+from cortado import CortadoWarning, InputError, Problem, Simulation, losses, policies
 from cortado.particles import State
 from cortado.physics.free_energy import MISCIBLE
 from cortado.rollout import checkpoint_interval
@@ -200,3 +200,30 @@ def test_a_free_energy_that_does_not_fit_is_a_sentence(simulation):
         Simulation(plane_of_three(), free_energy="miscible")
     with pytest.raises(InputError, match=r"must be left out, as the scene has only one phase\.$"):
         Simulation(simulation.scene, free_energy=MISCIBLE)
+
+
+def test_a_passage_ends_with_the_next_evaluation(problem, simulation):
+    point = {**GRAVITY, "viscosity": 0.1}
+    _, wanted = problem.value_and_gradient(point)
+    passage = problem.passage(point)
+    for _ in range(2):
+        found = passage.back(passage.derivative(policies.Exact()))
+        assert found["gravity"].tobytes() == wanted["gravity"].tobytes()
+    problem.value({"gravity": [1.0, -5.0, 0.0]})
+    with pytest.raises(InputError, match="evaluated again"):
+        passage.back(passage.derivative(policies.Exact()))
+
+
+class Overflowing:
+    """A loss whose adjoint is beyond all numbers."""
+
+    def value(self, end):
+        return 1.0
+
+    def adjoint(self, end):
+        return np.full_like(end.positions, np.inf), np.zeros_like(end.velocities)
+
+
+def test_a_gradient_that_is_not_finite_is_warned_of(simulation):
+    with pytest.warns(CortadoWarning, match="gradient with respect to gravity is not finite"):
+        Problem(simulation, 3, Overflowing()).value_and_gradient(GRAVITY)

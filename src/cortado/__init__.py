@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from cortado.certificate import certify as certify
     from cortado.errors import ComputationError as ComputationError
     from cortado.errors import CortadoError as CortadoError
+    from cortado.errors import CortadoWarning as CortadoWarning
     from cortado.errors import DivergedError as DivergedError
     from cortado.errors import InputError as InputError
     from cortado.errors import SceneError as SceneError
@@ -34,6 +35,7 @@ _MODULES = ("image_losses", "losses", "optimisers", "pictures", "policies", "ren
 _HOMES = {
     "ComputationError": "errors",
     "CortadoError": "errors",
+    "CortadoWarning": "errors",
     "DivergedError": "errors",
     "InputError": "errors",
     "Problem": "problem",

@@ -3,13 +3,15 @@
 n counts fluid particles in the order in which the scene lists them, d is the scene's dimension.
 """
 
+import warnings
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cortado.errors import InputError
+from cortado.errors import CortadoWarning, InputError
 from cortado.masses import masses, masses_adjoint, masses_tangent
+from cortado.parameter_checks import check_places, check_sizes, unstable_sentence
 from cortado.parameter_values import (
     MATERIALS,
     NAMES,
@@ -37,6 +39,7 @@ class Controls:
         self._phases = len(simulation.scene.phase)
         no_emitter = {"nozzle_path": np.zeros(simulation.dimension), "flow_rate": np.zeros(())}
         self._scene: Arrays = no_emitter | simulation.parameters()
+        self._warned = False
 
     def shapes(self, name: str) -> list[tuple[int, ...]]:
         """The shapes that a parameter may have; () is a number."""
@@ -44,7 +47,10 @@ class Controls:
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
         """Values as float64 arrays; raises `InputError` in a sentence. A ``what`` of "direction" may be negative."""
-        return {name: self._checked(name, value, what) for name, value in values.items()}
+        found = {name: self._checked(name, value, what) for name, value in values.items()}
+        if what != "direction":
+            self._check(found)
+        return found
 
     def colours(self, values: Arrays) -> np.ndarray:
         """(phases, 3) the colours of the phases."""
@@ -57,6 +63,7 @@ class Controls:
         diffusion even where it is 0.
         """
         simulation, parameters = self._simulation, rollout.parameters
+        rollout.evaluation += 1
         if values.keys().isdisjoint(STATES):
             rollout.initial.assign(simulation.state)
         else:
@@ -100,6 +107,19 @@ class Controls:
                 if name in found:
                     found[name] = found[name] + bar
         return {name: found[name].reshape(values[name].shape) for name in values if name in found}
+
+    def _check(self, values: Arrays) -> None:
+        """Whether they make sense for the scene; a time step beyond the limit of stability is warned of once."""
+        simulation = self._simulation
+        check_sizes(values, simulation.precision)
+        if self._steps == 0:
+            return
+        emitter = simulation.solver.emitter
+        check_places(values, simulation.scene, emitter.nozzle.first if emitter else simulation.particles)
+        sentence = unstable_sentence(values, simulation.scene) if values and not self._warned else None
+        if sentence is not None:
+            self._warned = True
+            warnings.warn(sentence, CortadoWarning, stacklevel=4)
 
     def _masses(self, values: Arrays) -> np.ndarray:
         """(n,) of the particles; fractions a little below 0, as diffusion leaves them, may still make one negative."""

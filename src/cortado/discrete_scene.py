@@ -15,10 +15,20 @@ from cortado.calibration import (
     wall_layer,
     wall_rigidity,
 )
+from cortado.errors import InputError
+from cortado.region import Region
 from cortado.sampling import FluidSample, boundary_particles, boundary_volumes, fluid_particles, period
 from cortado.scene import Scene
+from cortado.scene_fluids import PointsFluid
 from cortado.shapes import Points
 from cortado.smoothing import SmoothingKernel, smoothing_kernel
+
+MOST_AVERAGE_COMPRESSION = 0.1
+"""Of the first particles, the mean of (n - 1)+ where n is the number density: a lattice that is squeezed by more
+bursts."""
+MOST_DENSITY = 1.5
+"""Greatest number density of a first particle; on a disturbed lattice with all particles half a spacing apart it is
+1.4."""
 
 
 @dataclass(frozen=True)
@@ -84,9 +94,16 @@ class DiscreteScene:
     periods: Points
     """(d,) lengths of the period [m], 0 along an axis that is not periodic."""
 
+    @property
+    def near(self) -> Region:
+        """A box around all first particles and walls."""
+        everything = np.concatenate([self.fluid.positions, self.walls.positions])
+        return Region.between(everything.min(axis=0), everything.max(axis=0))
+
 
 def discretise(scene: Scene) -> DiscreteScene:
-    """Cut a scene into particles. Raises `InputError` if a file with points is gone since the scene was read."""
+    """Cut a scene into particles. Raises `InputError` if a file with points is gone since the scene was read, or if
+    points are packed too densely."""
     kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     layer = wall_layer(kernel, spacing, support, dimension)
@@ -96,6 +113,25 @@ def discretise(scene: Scene) -> DiscreteScene:
     volumes = layer.factor * boundary_volumes(
         walls, lambda r: kernel.weight(r, dimension, support), support, lower, lengths
     )
-    return DiscreteScene(
-        kernel, lattice, fluid_particles(scene), layer, Walls(walls, volumes / lattice.volume), lengths
+    fluid = fluid_particles(scene)
+    if any(isinstance(body, PointsFluid) for body in scene.fluid):
+        _check_packing(scene, fluid.positions, kernel, lattice)
+    return DiscreteScene(kernel, lattice, fluid, layer, Walls(walls, volumes / lattice.volume), lengths)
+
+
+def _check_packing(scene: Scene, positions: Points, kernel: SmoothingKernel, lattice: Lattice) -> None:
+    """Fluid that starts compressed flies apart; points of a file may be any, those of a lattice are not compressed."""
+    volumes = boundary_volumes(
+        positions, lambda r: kernel.weight(r, scene.dimension, lattice.support), lattice.support, *period(scene)
     )
+    densities = lattice.volume / volumes
+    average, greatest = np.maximum(densities - 1.0, 0.0).mean(), densities.max()
+    if average > MOST_AVERAGE_COMPRESSION or greatest > MOST_DENSITY:
+        spacing = scene.discretisation.spacing
+        place = ", ".join(f"{x:g}" for x in positions[densities.argmax()])
+        raise InputError(
+            f"The points of the fluid have {greatest:.3g} times the rest density at ({place}) m and are compressed by "
+            f"{average:.0%} on average, but must have at most {MOST_DENSITY:g} times and be compressed by at most "
+            f"{MOST_AVERAGE_COMPRESSION:.0%}: discretisation.spacing is {spacing:g} m, and with "
+            f"{spacing * (1.0 + average) ** (-1.0 / scene.dimension):.3g} m they would fit."
+        )

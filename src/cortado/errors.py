@@ -54,19 +54,30 @@ class ComputationError(CortadoError):
 
 
 class DivergedError(ComputationError):
-    """A particle was lost: its position is no longer finite, or far away from everything."""
+    """A particle was lost: it left its container, or its position is not finite or too far away."""
 
-    def __init__(self, step: int, particle: int, advice: str):
-        super().__init__(step, particle, advice)
+    def __init__(self, step: int, particle: int, advice: str, where: str = "was lost", others: int = 0):
+        super().__init__(step, particle, advice, where, others)
         self.step = step
         """The first bad step, counted from 1."""
         self.particle = particle
         """The first bad particle, in the scene's order."""
         self.advice = advice
         """What to try, in words."""
+        self.where = where
+        """What became of the particle, and where it was at the end of that step, in words."""
+        self.others = others
+        """How many particles more were lost in the same step."""
+
+    def with_advice(self, advice: str) -> "DivergedError":
+        """The same error with another advice."""
+        return DivergedError(self.step, self.particle, advice, self.where, self.others)
 
     def __str__(self) -> str:
-        return f"The simulation diverged in step {self.step}, where particle {self.particle} was lost; {self.advice}."
+        more = f" (and {self.others} more)" if self.others else ""
+        return (
+            f"The simulation diverged in step {self.step}: particle {self.particle}{more} {self.where}; {self.advice}."
+        )
 
 
 def shown(value: Any) -> str:

@@ -147,8 +147,6 @@ class NeighbourSearch:
         self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
         self.wall_positions = wp.array(walls, dtype=precision.vector, device=device)
         self.wall_weights = wp.array(wall_weights, dtype=precision.real, device=device)
-        self.origin = self._sort.grid.origin
-        """Lower corner of the grid of cells [m], as a Warp vector."""
         self._wall_sort = CellSort(grid, len(walls), precision, device)
         self._wall_sort(self.wall_positions)
         sorted_to_given = self._wall_sort.order.numpy()[: len(walls)]

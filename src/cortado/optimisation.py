@@ -175,8 +175,20 @@ class _Evaluator:
         return evaluation
 
     def _compute(self, vector: Vector) -> Evaluation:
-        """Evaluate the problem, and keep the evaluation if it is finite."""
-        loss, gradients = self.problem.value_and_gradient(self.packing.unpack(vector), policy=self.policy)
+        """Evaluate the problem, and keep the evaluation if it is finite.
+
+        A first evaluation that is refused has a wrong start; later ones, parameters to which the search has come.
+        """
+        try:
+            loss, gradients = self.problem.value_and_gradient(self.packing.unpack(vector), policy=self.policy)
+        except InputError as error:
+            if not self.history:
+                raise
+            raise ComputationError(
+                f"At iteration {len(self.history)} the search came to parameters that cannot be: {error} Try a smaller "
+                f"learning rate, or bounds on the parameters. The {len(self.history)} evaluations before "
+                f"{self.log.fate}."
+            ) from error
         evaluation = Evaluation(vector.copy(), as_one_number("The problem's loss", loss), self._packed(gradients))
         self._require_finite(evaluation)
         self.log.append(evaluation)

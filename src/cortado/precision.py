@@ -25,6 +25,10 @@ class Precision:
     """NumPy scalar type."""
     tiny: float
     """A number that is far below round-off of 1, and whose reciprocal is finite."""
+    furthest: float
+    """In spacings from the origin: where positions are rounded to about a thousandth of a spacing (float32) or less."""
+    greatest: float
+    """No parameter is larger, as products of several of them must stay finite."""
 
     def fractions(self, phases: int) -> Any:
         """Warp vector type of one number for each phase."""
@@ -36,8 +40,8 @@ def _vector_type(real: Any, length: int) -> Any:
     return wp.types.vector(length=length, dtype=real)
 
 
-FLOAT32 = Precision("float32", wp.float32, wp.vec3f, wp.vec2f, np.float32, 1e-30)
-FLOAT64 = Precision("float64", wp.float64, wp.vec3d, wp.vec2d, np.float64, 1e-200)
+FLOAT32 = Precision("float32", wp.float32, wp.vec3f, wp.vec2f, np.float32, 1e-30, 1e4, 1e12)
+FLOAT64 = Precision("float64", wp.float64, wp.vec3d, wp.vec2d, np.float64, 1e-200, 1e9, 1e50)
 
 
 def precision_named(name: str) -> Precision:

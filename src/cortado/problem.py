@@ -1,5 +1,6 @@
 """Parameters in, loss out; loss and gradient; and the derivative along a direction."""
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
@@ -9,7 +10,7 @@ import numpy as np
 
 from cortado.checked_loss import as_loss
 from cortado.controls import Controls
-from cortado.errors import InputError
+from cortado.errors import CortadoWarning, InputError
 from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd, fingerprint
 from cortado.parameter_values import NAMES, UNITS, Arrays, Values
 from cortado.particles import State
@@ -91,14 +92,24 @@ class Problem:
         ``observe`` is given the number and the adjoint of every state, from the last to the first, by policies that go
         back through a run; `policies.AdjointNorms` is such an observer.
         """
-        return estimate(self, parameters, policy, observe)
+        found = estimate(self, parameters, policy, observe)
+        broken = [name for name, value in found.gradient.items() if not np.isfinite(value).all()]
+        if broken:
+            warnings.warn(
+                f"the gradient with respect to {', '.join(broken)} is not finite, as it grew beyond what "
+                f"{self.simulation.precision.name} holds: try fewer steps, float64, or a policy for long runs.",
+                CortadoWarning,
+                stacklevel=3,
+            )
+        return found
 
     def passage(self, parameters: Values) -> "Passage":
         """A forward run that can be gone back through, until the next evaluation: what policies work with."""
         values = self._controls.checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         bars = {step: self._adjoint(step, end) for step, end in ends.items()}
-        return Passage(self._total(ends), self._rollout, values, bars, self._controls, self._derivatives)
+        rollout = self._rollout
+        return Passage(self._total(ends), rollout, values, bars, self._controls, self._derivatives, rollout.evaluation)
 
     def tangent(self, parameters: Values, directions: Values) -> float:
         """The derivative of the loss along ``directions`` (any of the parameters), by forward mode."""
@@ -181,6 +192,7 @@ class Passage:
     _bars: Mapping[int, EndAdjoint]
     _controls: Controls
     _derivatives: dict[AdjointPolicy, StepDerivative]
+    _evaluation: int
 
     def derivative(self, policy: AdjointPolicy) -> StepDerivative:
         """The policy's backward step, made once for each problem."""
@@ -189,7 +201,15 @@ class Passage:
         return self._derivatives[policy]
 
     def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:
-        """The gradient; ``observe`` is given the number and the adjoint of every state, from the last to the first."""
+        """The gradient; ``observe`` is given the number and the adjoint of every state, from the last to the first.
+
+        Raises `InputError` after another evaluation of the problem, which overwrites the states of this one.
+        """
+        if self._evaluation != self.rollout.evaluation:
+            raise InputError(
+                "The problem was evaluated again after this passage was made, but a passage can be gone back through "
+                "only until then: make another one with passage()."
+            )
         bars, values = self._bars, self._values
         first = self.rollout.backward(derivative, {step: bar.state for step, bar in bars.items()}, observe)
         gradient = self._controls.gradient(values, first, derivative.parameters())

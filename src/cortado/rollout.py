@@ -16,6 +16,7 @@ import warp as wp
 from cortado.errors import DivergedError
 from cortado.launching import Replayed, add
 from cortado.particles import Parameters, State
+from cortado.solvers.containment import Lost
 from cortado.solvers.pcisph import Pcisph
 from cortado.solvers.pcisph_derivatives import PcisphTangent
 
@@ -74,6 +75,8 @@ class Rollout:
         self._buffer, self._bar = self.initial.like(), self.initial.like()
         self._growth = -1
         self._forget_stale_graphs()
+        self.evaluation = 0
+        """How often the first state and the parameters were replaced: a way back belongs to one evaluation."""
         self.iterations = np.zeros(0, dtype=int)
         """(steps,) pressure iterations of the last forward run."""
         self.errors = np.zeros((0, 2))
@@ -95,16 +98,16 @@ class Rollout:
                 chunk = self._advance(state, step, last)
                 if self._grow_lists():
                     continue
-                bad_step = int(self.solver.bad_step.numpy()[0])
-                good = chunk if bad_step < 0 else chunk[: bad_step - step]
+                lost = self.solver.containment.lost()
+                good = chunk if lost is None else chunk[: lost.step - step]
                 for number, new_state in enumerate(good, step + 1):
                     if observe is not None:
                         observe(number, new_state)
                     if keep and number % self._interval == 0:
                         self._states[number] = new_state
-                if bad_step >= 0:
-                    step = bad_step + 1
-                    raise self._diverged(bad_step)
+                if lost is not None:
+                    bad, step = chunk[lost.step - step], lost.step + 1
+                    raise self._diverged(lost, bad)
                 state, step = chunk[-1], last
         finally:
             self._read_records(step)
@@ -140,13 +143,15 @@ class Rollout:
         self._step = Replayed(step, self.solver.launch)
         self._steps_back: dict[tuple[StepDerivative, int], Replayed] = {}
 
-    def _diverged(self, step: int) -> DivergedError:
-        particle = int(self.solver.bad_particle.numpy()[0])
-        dt = float(self.parameters.time_step.numpy()[0])
+    def _diverged(self, lost: Lost, state: State) -> DivergedError:
+        containment, dt = self.solver.containment, float(self.parameters.time_step.numpy()[0])
+        position = state.positions.numpy()[lost.particle][: containment.walled.dimension]
         return DivergedError(
-            step=step + 1,
-            particle=particle,
+            step=lost.step + 1,
+            particle=lost.particle,
             advice=f"try a smaller time step than {dt:g} s, or more pressure iterations",
+            where=containment.where(position),
+            others=lost.others,
         )
 
     def _read_records(self, steps: int) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from cortado.errors import Phrase
+from cortado.region import Region
 from cortado.scene_fluids import INDEX_OF_AXIS, LENGTH, check_order, refuse_plane
 from cortado.scene_kinds import Choice, Components, FieldPath, Flag, Quantity, Shaped, wrong
 from cortado.scene_tables import Table
@@ -21,8 +22,12 @@ class Container(Table):
         """The box around it: lower and upper, each (d,) [m]; None if there is none."""
 
     @abstractmethod
+    def region(self, dimension: int) -> Region:
+        """Where fluid may be, within one period."""
+
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
         """(n,) whether points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
+        return self.region(points.shape[1]).contains(points, tolerance)
 
     @abstractmethod
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
@@ -49,8 +54,8 @@ class NoContainer(Container):
     def extent(self) -> None:
         return None
 
-    def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        return np.ones(len(points), dtype=bool)
+    def region(self, dimension: int) -> Region:
+        return Region.everywhere(dimension)
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         return np.zeros((0, dimension))
@@ -77,9 +82,8 @@ class BoxContainer(Container):
     def extent(self) -> tuple[Points, Points]:
         return np.array(self.lower), np.array(self.upper)
 
-    def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        lower, upper = self.extent()
-        return np.asarray(((points >= lower - tolerance) & (points <= upper + tolerance)).all(axis=1))
+    def region(self, dimension: int) -> Region:
+        return Region.between(*self.extent())
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         return box_walls(*self.extent(), self.periodic, spacing, depth)
@@ -116,13 +120,13 @@ class CylinderContainer(Container):
         lower[axis], upper[axis] = self.base[axis], self.base[axis] + self.height
         return lower, upper
 
-    def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        from_base = points - self.base
-        along = from_base[:, INDEX_OF_AXIS[self.axis]]
-        from_axis = np.linalg.norm(np.delete(from_base, INDEX_OF_AXIS[self.axis], axis=1), axis=1)
-        top = self.height + tolerance if self.lid else np.inf
-        within = (from_axis <= self.radius + tolerance, along >= -tolerance, along <= top)
-        return np.logical_and.reduce(within)
+    def region(self, dimension: int) -> Region:
+        axis, (lower, upper) = INDEX_OF_AXIS[self.axis], self.extent()
+        across, rim = np.ones(3), float(upper[axis])
+        across[axis] = 0.0
+        if not self.lid:
+            upper[axis] = np.inf
+        return Region(lower, upper, np.array(self.base), across, self.radius, np.inf if self.lid else rim)
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         upright = cup_walls(self.radius, self.height, self.lid, spacing, depth)

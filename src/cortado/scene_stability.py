@@ -5,13 +5,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cortado.parameter_values import Arrays
 from cortado.shapes import Points
 
 if TYPE_CHECKING:
     from cortado.scene import Scene
 
 
-def stability_limit(scene: "Scene") -> float:
+def stability_limit(scene: "Scene", values: Arrays | None = None) -> float:
     """The smallest of three limits [s], infinite if nothing moves; h is the support radius.
 
     Courant: 0.4 h / v, where v is the largest initial speed and that of a free fall through the container, or through
@@ -19,28 +20,39 @@ def stability_limit(scene: "Scene") -> float:
     Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity: 0.06 h^2 rho / mu of the most viscous and the lightest phase
     in use, as they may meet: the least that a lattice bears of explicit steps with any kernel here (Wendland C4 in 3-D;
     the form is that of Morris et al. 1997, whose 0.125 is for an h of half the support).
+
+    ``values``: parameters by name that replace the scene's; of a gravity for each step the strongest counts.
     """
-    support, emitter = scene.discretisation.support_radius, scene.emitter
-    gravity = np.array(scene.forces.gravity)
-    strength = float(np.linalg.norm(gravity))
-    speed = max(float(np.linalg.norm(fluid.velocity)) for fluid in scene.fluid)
-    if emitter is not None:
-        speed = max(speed, emitter.speed(scene.discretisation.spacing))
-    if strength > 0.0:
-        lower, upper = _extent(scene)
-        drop = float(np.abs(gravity) @ (upper - lower)) / strength
-        speed += sqrt(2.0 * strength * drop)
+    values = values or {}
+    support, gravity = scene.discretisation.support_radius, np.atleast_2d(values.get("gravity", scene.forces.gravity))
+    strength = float(np.linalg.norm(gravity, axis=1).max())
+    lower, upper = _extent(scene)
+    speed = _first_speed(scene, values) + sqrt(2.0 * float((np.abs(gravity) @ (upper - lower)).max()))
     courant = 0.4 * support / speed if speed > 0.0 else inf
     force = 0.25 * sqrt(support / strength) if strength > 0.0 else inf
-    return min(courant, force, _viscous_limit(scene))
+    return min(courant, force, _viscous_limit(scene, values))
 
 
-def _viscous_limit(scene: "Scene") -> float:
+def _first_speed(scene: "Scene", values: Arrays) -> float:
+    """The largest speed with which fluid starts or comes out of a nozzle [m/s]."""
+    if "initial_velocities" in values:
+        speed = float(np.linalg.norm(values["initial_velocities"], axis=1).max())
+    else:
+        speed = max(float(np.linalg.norm(fluid.velocity)) for fluid in scene.fluid)
+    if scene.emitter is None:
+        return speed
+    faster = float(values.get("flow_rate", scene.emitter.flow_rate)) / scene.emitter.flow_rate
+    return max(speed, faster * scene.emitter.speed(scene.discretisation.spacing))
+
+
+def _viscous_limit(scene: "Scene", values: Arrays) -> float:
     if scene.forces.viscosity == "none":
         return inf
     names = {fluid.phase for fluid in scene.fluid} | ({scene.emitter.phase} if scene.emitter else set())
-    used = [phase for phase in scene.phase if phase.name in names]
-    density, viscosity = min(phase.rest_density for phase in used), max(phase.viscosity for phase in used)
+    used = [k for k, phase in enumerate(scene.phase) if phase.name in names]
+    densities = np.atleast_1d(values.get("rest_density", [phase.rest_density for phase in scene.phase]))
+    viscosities = np.atleast_1d(values.get("viscosity", [phase.viscosity for phase in scene.phase]))
+    density, viscosity = float(densities[used].min()), float(viscosities[used].max())
     return 0.06 * scene.discretisation.support_radius**2 * density / viscosity if viscosity > 0.0 else inf
 
 

@@ -12,15 +12,18 @@ from cortado.controls import Controls
 from cortado.discrete_scene import DiscreteScene, discretise
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.neighbours import Grid, NeighbourSearch
+from cortado.parameter_checks import check_sizes
 from cortado.parameter_values import MATERIALS
 from cortado.particles import State, padded
 from cortado.physics.diffusion import Diffusion
 from cortado.physics.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
 from cortado.physics.surroundings import Discretisation
-from cortado.precision import precision_named
+from cortado.precision import Precision, precision_named
 from cortado.rollout import Rollout
 from cortado.sampling import FluidSample
 from cortado.scene import Scene
+from cortado.scene_containers import NoContainer
+from cortado.solvers.containment import Walled
 from cortado.solvers.emitter import Nozzle
 from cortado.solvers.forces import ForceTerm, Gravity, laminar_viscosity, pairwise_viscosity
 from cortado.solvers.mixture import Phases
@@ -56,6 +59,7 @@ class Simulation:
         self.device = _device(device)
         self.precision = precision_named(precision)
         discrete = discretise(scene)
+        _check_distance(scene, discrete, self.precision)
         self.positions = discrete.fluid.positions
         """(n, d) first positions [m]."""
         self.velocities = discrete.fluid.velocities
@@ -73,6 +77,7 @@ class Simulation:
         self.state.set(self.positions, self.velocities, self.mass_fractions)
         for array in (self.positions, self.velocities, self.mass_fractions):
             array.setflags(write=False)
+        check_sizes(self.parameters(), self.precision)
 
     @property
     def dimension(self) -> int:
@@ -180,10 +185,9 @@ class Simulation:
 
     def _solver(self, discrete: DiscreteScene) -> Pcisph:
         discretisation, support = Discretisation(discrete.kernel, self.precision), discrete.lattice.support
-        everything = np.concatenate([self.positions, self.walls])
         grid = Grid.around(
-            everything.min(axis=0),
-            everything.max(axis=0),
+            discrete.near.lower,
+            discrete.near.upper,
             discrete.periods,
             reach=(1.0 + SKIN) * support,
             most=max(4 * self.particles, 512),
@@ -206,7 +210,14 @@ class Simulation:
             [*discrete.periods, *np.zeros(3 - self.dimension)],
             self._phases(discretisation),
             self._nozzle(discrete.fluid),
+            self._walled(discrete),
         )
+
+    def _walled(self, discrete: DiscreteScene) -> Walled:
+        """Walls act through the pressure: without it they hold nothing."""
+        holds = self.scene.container if self.scene.forces.pressure else NoContainer()
+        region = holds.region(self.dimension).opened(discrete.periods)
+        return Walled(region, discrete.near, self.scene.discretisation.spacing)
 
     def _nozzle(self, fluid: FluidSample) -> Nozzle | None:
         scene, sample = self.scene, fluid.emitter
@@ -244,6 +255,18 @@ class Simulation:
             solver.maximum_iterations,
             solver.density_tolerance,
             float("inf") if greatest is None else greatest,
+        )
+
+
+def _check_distance(scene: Scene, discrete: DiscreteScene, precision: Precision) -> None:
+    """Far from the origin, positions are rounded to coarse steps; raises `InputError`."""
+    spacing = scene.discretisation.spacing
+    furthest = max(np.abs(discrete.near.lower).max(), np.abs(discrete.near.upper).max()) / spacing
+    if furthest > precision.furthest:
+        raise InputError(
+            f"The scene reaches {furthest:.3g} spacings of {spacing:g} m from the origin, but must be within "
+            f"{precision.furthest:g} in {precision.name}, which rounds positions there to steps of "
+            f"{furthest * np.finfo(precision.numpy).eps:.1g} spacings: move it to the origin, or use another precision."
         )
 
 

@@ -85,7 +85,7 @@ def _solved(made: Assignment, folder: RunFolder, resume: bool) -> str:
         result, policy = _search(made, folder, resume)
     except DivergedError as error:
         advice = "; ".join(filter(None, [f"{error.advice}, or a smaller learning rate", _kept(folder)]))
-        raise DivergedError(error.step, error.particle, advice) from error
+        raise error.with_advice(advice) from error
     found = made.search.parameters(result.parameters)
     noise = None
     if made.renderer is not None:

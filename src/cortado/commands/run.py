@@ -53,7 +53,7 @@ def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record
     except DivergedError as error:
         _write_pictures(simulation.scene, simulation, folder)
         advice = f"{error.advice}; the frames so far are in {folder.path}"
-        raise DivergedError(error.step, error.particle, advice) from error
+        raise error.with_advice(advice) from error
     _write_pictures(simulation.scene, simulation, folder)
 
 

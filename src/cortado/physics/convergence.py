@@ -5,16 +5,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from cortado.physics.containment import NO_PARTICLE
 from cortado.precision import Precision
-
-NO_PARTICLE = 2**31 - 1
-"""What stands for 'every particle is well' where the first bad one would be named."""
 
 
 @cache
 def convergence_kernels(precision: Precision) -> SimpleNamespace:
-    """Kernels ``decide`` (go on iterating?), ``check`` (has a particle left every bound?), ``finish`` (a step)."""
-    real, vector, pair = precision.real, precision.vector, precision.pair
+    """Kernels ``decide`` (go on iterating?) and ``finish`` (a step)."""
+    real, pair = precision.real, precision.pair
     module = wp.get_module(f"cortado_convergence_{precision.name}")
     module.options["enable_backward"] = False
 
@@ -38,25 +36,6 @@ def convergence_kernels(precision: Precision) -> SimpleNamespace:
         active[0] = wp.where(count < most and (average > tolerance or sums[0][1] > greatest_tolerance), 1, 0)
 
     @wp.kernel(module=module, enable_backward=False)
-    def check(
-        order: wp.array(dtype=wp.int32),
-        origin: vector,
-        bound: real,
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        rho_0: wp.array(dtype=real),
-        # out
-        bad: wp.array(dtype=wp.int32),
-    ):
-        """``bad``: the first particle, in scene order, not finite, further than ``bound`` from ``origin`` [m], or of a
-        mixture without a volume."""
-        i = wp.tid()
-        x_i = x[i] - origin
-        size = wp.max(wp.max(wp.abs(x_i[0]), wp.abs(x_i[1])), wp.abs(x_i[2]))
-        if not (size < bound and wp.isfinite(v[i]) and rho_0[i] > real(0.0)):
-            wp.atomic_min(bad, 0, order[i])
-
-    @wp.kernel(module=module, enable_backward=False)
     def finish(
         particles: int,
         sums: wp.array(dtype=pair),
@@ -78,4 +57,4 @@ def convergence_kernels(precision: Precision) -> SimpleNamespace:
         iteration[0] = 0
         step[0] = n + 1
 
-    return SimpleNamespace(decide=decide, check=check, finish=finish)
+    return SimpleNamespace(decide=decide, finish=finish)

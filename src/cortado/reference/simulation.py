@@ -15,6 +15,7 @@ from cortado.reference.digits import Digits
 from cortado.reference.engine import extension, precisions
 from cortado.reference.histories import Gradient, History
 from cortado.reference.losses import Loss
+from cortado.region import TOLERANCE
 from cortado.scene import Scene
 
 METHODS = (
@@ -70,6 +71,7 @@ class Simulation:
         """(n, d) first positions [m]."""
         self.velocities = discrete.fluid.velocities
         """(n, d) first velocities [m / s]."""
+        self._region = scene.container.region(scene.dimension).opened(discrete.periods)
         if threads is None:
             least = LEAST_PARALLEL.get(precision, 1000)
             threads = min(len(os.sched_getaffinity(0)), 1 + len(self.positions) // least)
@@ -195,9 +197,24 @@ class Simulation:
     def _history(self, raw: Any) -> History:
         time_step = self.scene.solver.time_step
         if raw.bad_step >= 0:
-            advice = f"try a smaller time step than {time_step:g} s, or more pressure iterations"
-            raise DivergedError(step=raw.bad_step + 1, particle=raw.bad_particle, advice=advice)
-        return History.of(raw, self.positions.shape, time_step)
+            raise DivergedError(step=raw.bad_step + 1, particle=raw.bad_particle, advice=self._advice)
+        history = History.of(raw, self.positions.shape, time_step)
+        if self.scene.forces.pressure:
+            self._check_contained(history)
+        return history
+
+    @property
+    def _advice(self) -> str:
+        return f"try a smaller time step than {self.scene.solver.time_step:g} s, or more pressure iterations"
+
+    def _check_contained(self, history: History) -> None:
+        """Raises `DivergedError` if a particle is beyond the walls in a recorded state."""
+        region, tolerance = self._region, TOLERANCE * self.scene.discretisation.spacing
+        frames = history.positions.high
+        for step, before, after in zip(history.steps[1:], frames, frames[1:], strict=False):
+            lost = np.flatnonzero(region.escaped(before, after, tolerance))
+            if lost.size:
+                raise DivergedError(int(step), int(lost[0]), self._advice, "left the container", lost.size - 1)
 
 
 def _engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:

@@ -14,8 +14,8 @@ from cortado.discrete_scene import Lattice
 from cortado.launching import Launcher, sum_and_maximum
 from cortado.neighbours import NeighbourSearch
 from cortado.particles import Fields, Parameters, State
-from cortado.physics.convergence import NO_PARTICLE
 from cortado.physics.surroundings import Discretisation, surroundings_type
+from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.emitter import Emitter, Nozzle
 from cortado.solvers.forces import ForceTerm, Moment
 from cortado.solvers.mixture import Mixture, Phases
@@ -35,6 +35,7 @@ class Pcisph:
         periods: Sequence[float],
         phases: Phases,
         nozzle: Nozzle | None,
+        walled: Walled,
         requires_grad: bool = False,
     ):
         """``pressure`` None leaves the pressure out; ``periods`` (3,) [m], 0 along an axis that is not periodic."""
@@ -49,8 +50,8 @@ class Pcisph:
         def vectors() -> wp.array:
             return wp.zeros(particles, dtype=precision.vector, device=device, requires_grad=requires_grad)
 
-        def count(value: int = 0) -> wp.array:
-            return wp.full(1, value, dtype=wp.int32, device=device)
+        def count() -> wp.array:
+            return wp.zeros(1, dtype=wp.int32, device=device)
 
         self.emitter = Emitter(nozzle, precision, self.launch, self.new_state(requires_grad)) if nozzle else None
         self.fields = Fields.zeros(particles, precision, device, requires_grad)
@@ -68,7 +69,7 @@ class Pcisph:
         self._error_sums = wp.zeros(1, dtype=precision.pair, device=device)
         self.step_number = count()
         self._iteration, self._active = count(), count()
-        self.bad_particle, self.bad_step = count(NO_PARTICLE), count(-1)
+        self.containment = Containment(walled, precision, self.launch)
         self._surroundings: Any = None
         self.growth = 0
         """How often arrays, or the work of a step, were replaced; what was captured before is stale."""
@@ -108,6 +109,7 @@ class Pcisph:
             self.periods,
             self.mixture.phases,
             self.emitter.nozzle if self.emitter else None,
+            self.containment.walled,
             requires_grad=True,
         )
 
@@ -132,8 +134,7 @@ class Pcisph:
         """Forget the counts and flags of an earlier run, also of one that was interrupted."""
         self._iteration.zero_()
         self.step_number.zero_()
-        self.bad_particle.fill_(NO_PARTICLE)
-        self.bad_step.fill_(-1)
+        self.containment.reset()
 
     # ---- forward -------------------------------------------------------------------------------------------------
 
@@ -143,17 +144,11 @@ class Pcisph:
         if self.pressure is not None:
             self._solve_pressure(self.pressure, parameters)
         self.recorded(0, parameters, new_state)
-        f, c = self.iterates, self.kernels.convergence
+        self.containment.look(self.search.order, self.fields.x, self.fields.rho_0, new_state)
         self.launch(
-            c.check,
-            [self.search.order, self.search.origin, 1e6 * self.lattice.support, f.x_star[0], f.v_star[0]]
-            + [self.fields.rho_0],
-            [self.bad_particle],
-        )
-        self.launch(
-            c.finish,
-            [self.search.particles, self._error_sums, self.bad_particle],
-            [self.step_number, self._iteration, self.bad_step, *records],
+            self.kernels.convergence.finish,
+            [self.search.particles, self._error_sums, self.containment.bad_particle],
+            [self.step_number, self._iteration, self.containment.bad_step, *records],
             threads=1,
         )
 

@@ -1,0 +1,59 @@
+"""Whether parameters make sense for a scene: numbers that a precision holds, places inside of the container, and time
+steps below the limit of stability."""
+
+from typing import Any
+
+import numpy as np
+
+from cortado.errors import InputError
+from cortado.parameter_values import POSITIVE, Arrays
+from cortado.precision import Precision
+from cortado.region import TOLERANCE
+from cortado.scene import Scene, stability_limit
+
+
+def check_sizes(values: Arrays, precision: Precision) -> None:
+    """Numbers are no larger than the precision bears, nor smaller where they must be positive; raises `InputError`."""
+    for name, value in values.items():
+        size = np.abs(value)
+        if size.max(initial=0.0) > precision.greatest:
+            wanted = f"at most {precision.greatest:g} in {precision.name}"
+            raise InputError(f"parameter {name} has a value of size {size.max():g}, but must be {wanted}.")
+        if name in POSITIVE and size.min(initial=1.0) < 1.0 / precision.greatest:
+            wanted = f"at least {1.0 / precision.greatest:g} in {precision.name}"
+            raise InputError(f"parameter {name} is {size.min():g}, but must be {wanted}.")
+
+
+def check_places(values: Arrays, scene: Scene, free: int) -> None:
+    """Fluid starts inside of the container, and a nozzle stays there; raises `InputError`. Only the first ``free``
+    particles do not wait in the nozzle, where they may be outside."""
+    spacing = scene.discretisation.spacing
+    if "initial_positions" in values and scene.forces.pressure:
+        positions = values["initial_positions"]
+        for particle in _outside(scene, positions[:free])[:1]:
+            place = _place(positions[particle])
+            raise InputError(f"parameter initial_positions has particle {particle} at {place}, outside the container.")
+    if "nozzle_path" in values and scene.emitter is not None:
+        path, opening = np.atleast_2d(values["nozzle_path"]), scene.emitter.opening(spacing) - scene.emitter.outlet
+        for step in _outside(scene, (path[:, None] + opening).reshape(-1, scene.dimension))[:1] // len(opening):
+            raise InputError(
+                f"parameter nozzle_path is at {_place(path[step])} in step {step + 1}, but must be where all of the "
+                "opening is inside the container."
+            )
+
+
+def unstable_sentence(values: Arrays, scene: Scene) -> str | None:
+    """What to say of a time step beyond the limit of stability under these parameters; None if there is nothing."""
+    time_step, limit = float(values.get("time_step", scene.solver.time_step)), stability_limit(scene, values)
+    if time_step <= limit * (1.0 + 1e-9):
+        return None
+    return f"time_step is {time_step:g} s, but the limit of stability with these parameters is about {limit:.3g} s."
+
+
+def _outside(scene: Scene, points: Any) -> np.ndarray:
+    """The numbers of the points (n, d) [m] that are outside of the container."""
+    return np.flatnonzero(~scene.container.contains(points, TOLERANCE * scene.discretisation.spacing))
+
+
+def _place(point: np.ndarray) -> str:
+    return f"({', '.join(f'{x:g}' for x in point)}) m"

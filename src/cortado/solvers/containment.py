@@ -1,0 +1,110 @@
+"""Looks for lost particles at the end of every step, on the device. Any solver can use it."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.launching import Launcher
+from cortado.particles import State, padded
+from cortado.physics.containment import NO_PARTICLE, bounds_type, lost_kernel
+from cortado.precision import Precision
+from cortado.region import TOLERANCE, Region
+
+FURTHEST = 1e6
+"""In spacings from the region of the first particles and walls: particles beyond are lost."""
+
+
+@dataclass(frozen=True)
+class Walled:
+    """Where particles may go."""
+
+    region: Region
+    """The container, without the sides that nothing closes: along a period, or where no pressure acts."""
+    near: Region
+    """A box around the first particles and the walls."""
+    spacing: float
+    """[m]"""
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return len(self.near.lower)
+
+    def furthest(self, precision: Precision) -> Region:
+        """The box that positions must not leave [m]: far away, and as far from the origin as a precision resolves."""
+        limit, reach = precision.furthest * self.spacing, FURTHEST * self.spacing
+        return Region.between(np.maximum(self.near.lower - reach, -limit), np.minimum(self.near.upper + reach, limit))
+
+
+@dataclass(frozen=True)
+class Lost:
+    """The first particles that were lost, all in one step."""
+
+    step: int
+    """From 0."""
+    particle: int
+    """The first of them, in the scene's order."""
+    others: int
+    """How many more there are."""
+
+
+class Containment:
+    """What one solver asks at the end of each step."""
+
+    def __init__(self, walled: Walled, precision: Precision, launch: Launcher):
+        self.walled, self._precision, self._launch = walled, precision, launch
+        self._kernel, self._bounds = lost_kernel(precision), self._made_bounds()
+        self.bad_step = wp.full(1, -1, dtype=wp.int32, device=launch.device)
+        """The first step in which a particle was lost; -1 while none was."""
+        self.bad_particle = wp.full(1, NO_PARTICLE, dtype=wp.int32, device=launch.device)
+        """The first particle that was lost in it; `NO_PARTICLE` while none was."""
+        self._count = wp.zeros(1, dtype=wp.int32, device=launch.device)
+
+    def reset(self) -> None:
+        """Forget an earlier run."""
+        self.bad_step.fill_(-1)
+        self.bad_particle.fill_(NO_PARTICLE)
+        self._count.zero_()
+
+    def look(self, order: wp.array, x_before: wp.array, rho_0: wp.array, state: State) -> None:
+        """Look at the end of a step: sorted positions and rest densities before it, and the state after it."""
+        self._launch(
+            self._kernel,
+            [self._bounds, order, x_before, rho_0, state.positions, state.velocities, self.bad_step],
+            [self.bad_particle, self._count],
+        )
+
+    def lost(self) -> Lost | None:
+        """Which particles were lost since `reset`; reads from the device."""
+        step = int(self.bad_step.numpy()[0])
+        if step < 0:
+            return None
+        return Lost(step, int(self.bad_particle.numpy()[0]), int(self._count.numpy()[0]) - 1)
+
+    def where(self, position: np.ndarray) -> str:
+        """What happened to a lost particle that is now at a position (d,) [m], in words."""
+        place = f"({', '.join(f'{x:g}' for x in position)}) m"
+        if not np.isfinite(position).all():
+            return "has no finite position"
+        if not self.walled.region.contains(position[None], TOLERANCE * self.walled.spacing)[0]:
+            return f"left the container and was at {place}"
+        if not self.walled.furthest(self._precision).contains(position[None], 0.0)[0]:
+            limit = f"{self._precision.furthest:g} spacings from the origin"
+            return f"was at {place}, further than positions are precise in {self._precision.name}, {limit}"
+        return f"at {place} has no finite velocity or no volume"
+
+    def _made_bounds(self) -> Any:
+        precision, region, tolerance = self._precision, self.walled.region, TOLERANCE * self.walled.spacing
+        furthest, up = self.walled.furthest(precision), np.isfinite(region.rim) * (1.0 - region.across)
+        bounds = bounds_type(precision)()
+
+        def vector(values: np.ndarray) -> Any:
+            return precision.vector(*padded(values[None])[0])
+
+        bounds.lower, bounds.upper = vector(region.lower - tolerance), vector(region.upper + tolerance)
+        bounds.base, bounds.across, bounds.up = vector(region.base), vector(region.across), vector(up)
+        bounds.radius, bounds.rim = region.radius + tolerance, region.rim
+        bounds.nearest, bounds.furthest = vector(furthest.lower), vector(furthest.upper)
+        return bounds
