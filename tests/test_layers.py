@@ -23,7 +23,7 @@ LAYERS = """
     physics.frozen_pressure physics.adjoint_filters
     physics.containment physics.convergence physics.reduction physics.matching
     physics.tint physics.colour_field physics.interpolation physics.rays physics.absorption
-    shapes region launching neighbours particles
+    shapes region restart launching neighbours particles
     render.cameras render.views render.fields render.marching render.renderer
     scene_kinds scene_tables scene_toml scene_points
     scene_fluids scene_emitter scene_mixture scene_render scene_containers scene_stability scene_checks scene sampling

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cortado.errors import CortadoWarning, InputError
-from cortado.masses import masses, masses_adjoint, masses_tangent
-from cortado.parameter_checks import check_places, check_sizes, unstable_sentence
+from cortado.masses import masses as masses_of
+from cortado.masses import masses_adjoint, masses_tangent
+from cortado.parameter_checks import check_places, check_sizes, check_state, unstable_sentence
 from cortado.parameter_values import (
     MATERIALS,
     NAMES,
@@ -25,6 +26,7 @@ from cortado.parameter_values import (
     parameter_shapes,
 )
 from cortado.particles import Parameters, State
+from cortado.restart import Elapsed, RestartState
 from cortado.rollout import Rollout
 
 if TYPE_CHECKING:
@@ -56,24 +58,45 @@ class Controls:
         """(phases, 3) the colours of the phases."""
         return values.get("colours", self._scene["colours"])
 
-    def begin(self, rollout: Rollout, values: Arrays, varied: Iterable[str] = ()) -> None:
+    def begin(
+        self, rollout: Rollout, values: Arrays, varied: Iterable[str] = (), state: RestartState | None = None
+    ) -> None:
         """Give a rollout its first state and its parameters: ``values``, and the scene's for what is not among them.
 
         ``varied`` are parameters that a derivative is wanted for: with the mobility among them there is a substep of
-        diffusion even where it is 0.
+        diffusion even where it is 0. ``state`` replaces the scene's first state.
         """
         simulation, parameters = self._simulation, rollout.parameters
         rollout.evaluation += 1
-        if values.keys().isdisjoint(STATES):
+        rollout.elapsed = Elapsed() if state is None else state.elapsed
+        if state is not None:
+            fractions = self._scene["mass_fractions"] if state.mass_fractions is None else state.mass_fractions
+            rollout.initial.set(state.positions, state.velocities, fractions)
+        elif values.keys().isdisjoint(STATES):
             rollout.initial.assign(simulation.state)
         else:
             rollout.initial.set(*(values.get(name, self._scene[name]) for name in STATES))
         chosen = {name: values.get(name, self._scene[name]) for name in (*MATERIALS, *NUMBERS)}
         parameters.set_tables(**{name: values.get(name, self._scene[name]) for name in TABLES})
-        parameters.set_constants(**chosen, masses=self._masses(values))
+        masses = self._masses(values) if state is None else state.constants.reference_density
+        parameters.set_constants(**chosen, masses=masses)
         diffusion = ("time_step", "mobility", "interface_width", "rest_density")
         needed = simulation.substeps(**{name: chosen[name] for name in diffusion})
         rollout.substeps = max(needed, 1) if "mobility" in varied and self._phases > 1 else needed
+
+    def check_restart(self, state: RestartState, values: Arrays) -> None:
+        """Whether a state is one of this simulation, and ``values`` go with it; raises `InputError`."""
+        for name in (*STATES, "rest_density"):
+            if name in values:
+                raise InputError(f"control {name} is given, but must be left out with a state, which has its own.")
+        check_state(state, self._simulation.positions.shape, self._phases)
+        if self._simulation.scene.emitter is not None:
+            constants, real = state.constants, self._simulation.precision.numpy
+            for name, before in (("time_step", constants.time_step), ("flow_rate", constants.flow_rate)):
+                now = float(real(values.get(name, self._scene[name])))
+                if now != before:
+                    wanted = f"{before} with this state, whose nozzle ran with that"
+                    raise InputError(f"{name} is {now:g}, but must be {wanted}.")
 
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
         """A direction by name as tangents of the first state and of the parameters, at ``values``."""
@@ -125,7 +148,7 @@ class Controls:
         """(n,) of the particles; fractions a little below 0, as diffusion leaves them, may still make one negative."""
         fractions, density = self._composition(values)
         with np.errstate(divide="ignore"):
-            found = masses(fractions, density)
+            found = masses_of(fractions, density)
         bad = np.flatnonzero(~(np.isfinite(found) & (found > 0.0)))
         if bad.size:
             raise InputError(

@@ -5,10 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from cortado.errors import InputError
+from cortado.arrays import as_numbers
+from cortado.errors import InputError, shown
 from cortado.parameter_values import POSITIVE, Arrays
 from cortado.precision import Precision
 from cortado.region import TOLERANCE
+from cortado.restart import RestartState
 from cortado.scene import Scene, stability_limit
 
 
@@ -40,6 +42,23 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
                 f"parameter nozzle_path is at {_place(path[step])} in step {step + 1}, but must be where all of the "
                 "opening is inside the container."
             )
+
+
+def check_state(state: RestartState, shape: tuple[int, int], phases: int) -> None:
+    """A state to go on from is one of particles in this shape (n, d); raises `InputError`."""
+    if not isinstance(state, RestartState):
+        raise InputError(f"state is {shown(state)}, but must be a RestartState, such as trajectory.last_state.")
+    parts: dict[str, tuple[Any, tuple[int, ...]]] = {
+        "positions": (state.positions, shape),
+        "velocities": (state.velocities, shape),
+        "constants.reference_density": (state.constants.reference_density, shape[:1]),
+    }
+    if phases > 1:
+        parts["mass_fractions"] = (state.mass_fractions, (shape[0], phases))
+    for name, (value, wanted) in parts.items():
+        array = as_numbers(f"state.{name}", value)
+        if array.shape != wanted or not np.isfinite(array).all():
+            raise InputError(f"state.{name} has shape {array.shape}, but must be {wanted} and finite.")
 
 
 def unstable_sentence(values: Arrays, scene: Scene) -> str | None:

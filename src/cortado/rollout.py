@@ -16,6 +16,7 @@ import warp as wp
 from cortado.errors import DivergedError
 from cortado.launching import Replayed, add
 from cortado.particles import Parameters, State
+from cortado.restart import Elapsed
 from cortado.solvers.containment import Lost
 from cortado.solvers.pcisph import Pcisph
 from cortado.solvers.pcisph_derivatives import PcisphTangent
@@ -65,6 +66,8 @@ class Rollout:
         self.parameters = solver.new_parameters(steps)
         self.substeps = 0
         """Explicit steps of diffusion within each step."""
+        self.elapsed = Elapsed()
+        """What went before the first state."""
         self._records = (
             wp.zeros(max(steps, 1), dtype=wp.int32, device=self._device),
             wp.zeros(max(steps, 1), dtype=solver.discretisation.precision.pair, device=self._device),
@@ -82,6 +85,11 @@ class Rollout:
         self.errors = np.zeros((0, 2))
         """(steps, 2) average and greatest compression (rho* - rho_0)+ / rho_0 at each step."""
 
+    @property
+    def time_step(self) -> float:
+        """[s], as the device has it."""
+        return float(self.parameters.time_step.numpy()[0])
+
     # ---- forward -------------------------------------------------------------------------------------------------
 
     def forward(self, observe: Observer | None = None, keep: bool = True) -> State:
@@ -89,7 +97,7 @@ class Rollout:
         back. Raises `DivergedError` after the good states were observed."""
         self._states = {0: self.initial}
         state, step = self.initial, 0
-        self.solver.diffuse(self.substeps)
+        self._set_solver()
         self._forget_stale_graphs()
         self.solver.reset()
         try:
@@ -112,6 +120,12 @@ class Rollout:
         finally:
             self._read_records(step)
         return state
+
+    def _set_solver(self) -> None:
+        """What the solver must know of this rollout before any of its steps, as rollouts share it."""
+        self.solver.diffuse(self.substeps)
+        if self.solver.emitter:
+            self.solver.emitter.go_on(self.elapsed)
 
     def _advance(self, state: State, first: int, last: int) -> list[State]:
         self.solver.step_number.fill_(first)
@@ -144,12 +158,12 @@ class Rollout:
         self._steps_back: dict[tuple[StepDerivative, int], Replayed] = {}
 
     def _diverged(self, lost: Lost, state: State) -> DivergedError:
-        containment, dt = self.solver.containment, float(self.parameters.time_step.numpy()[0])
+        containment = self.solver.containment
         position = state.positions.numpy()[lost.particle][: containment.walled.dimension]
         return DivergedError(
             step=lost.step + 1,
             particle=lost.particle,
-            advice=f"try a smaller time step than {dt:g} s, or more pressure iterations",
+            advice=f"try a smaller time step than {self.time_step:g} s, or more pressure iterations",
             where=containment.where(position),
             others=lost.others,
         )
@@ -165,7 +179,7 @@ class Rollout:
 
         ``observe`` is given the adjoint of every state, from the last to the first; the next step overwrites it.
         """
-        self.solver.diffuse(self.substeps)
+        self._set_solver()
         derivative.begin()
         self._forget_stale_graphs()
         self._bar.clear()
@@ -195,7 +209,7 @@ class Rollout:
     def tangent(self, dot: State, parameters_dot: Parameters, observe: Observer) -> None:
         """From ``dot``, the tangent of the first state, to that of every state, given to ``observe``; `forward` has
         run."""
-        self.solver.diffuse(self.substeps)
+        self._set_solver()
         derivative = PcisphTangent(self.solver)
         state = self.initial.like()
         state.assign(self.initial)

@@ -19,6 +19,7 @@ from cortado.physics.diffusion import Diffusion
 from cortado.physics.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
 from cortado.physics.surroundings import Discretisation
 from cortado.precision import Precision, precision_named
+from cortado.restart import RestartState, RunConstants
 from cortado.rollout import Rollout
 from cortado.sampling import FluidSample
 from cortado.scene import Scene
@@ -84,14 +85,21 @@ class Simulation:
         """2 or 3."""
         return self.scene.dimension
 
-    def run(self, steps: int, controls: Mapping[str, Any] | None = None, record_every: int = 1) -> Trajectory:
+    def run(
+        self,
+        steps: int,
+        controls: Mapping[str, Any] | None = None,
+        record_every: int = 1,
+        state: RestartState | None = None,
+    ) -> Trajectory:
         """Run from the scene's first state and return the frames, the first and the last state included.
 
         ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity; so does any other parameter
-        of `Problem`. Warns when the pressure did
-        not converge; raises `DivergedError` when a particle is lost.
+        of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same scene, the run goes on
+        from there, with the same bits as if it had not stopped; a control over time is then that of the steps to come.
+        Warns when the pressure did not converge; raises `DivergedError` when a particle is lost.
         """
-        return self.collect(self.rollout(steps, controls), record_every)
+        return self.collect(self.rollout(steps, controls, state), record_every)
 
     def collect(self, rollout: Rollout, record_every: int = 1) -> Trajectory:
         """Run a rollout forward and return its frames; warnings and errors as of `run`."""
@@ -109,8 +117,8 @@ class Simulation:
             warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=3)
         numbers, positions, velocities, fractions = (np.array(column) for column in zip(*frames, strict=True))
         return Trajectory(
-            times=numbers * float(rollout.parameters.time_step.numpy()[0]),
-            steps=numbers,
+            times=rollout.elapsed.times(numbers, rollout.time_step),
+            steps=rollout.elapsed.steps + numbers,
             positions=positions,
             velocities=velocities,
             mass_fractions=fractions if len(self.scene.phase) > 1 else None,
@@ -118,13 +126,31 @@ class Simulation:
             density_errors=rollout.errors[:, 0],
             converged=converged,
             substeps=rollout.substeps,
+            constants=self.constants(rollout, numbers),
         )
 
-    def rollout(self, steps: int, controls: Mapping[str, Any] | None = None) -> Rollout:
-        """A rollout that is ready to go forward from the scene's first state; see `run` for ``controls``."""
+    def constants(self, rollout: Rollout, frames: np.ndarray) -> RunConstants:
+        """What a restart needs besides the frames, which are after so many steps (frames,) of the rollout."""
+        parameters, elapsed = rollout.parameters, rollout.elapsed
+        density = parameters.masses.numpy()
+        if self.scene.emitter is None:
+            return RunConstants(density, rollout.time_step)
+        path = parameters.nozzle_path.numpy()[:, : self.dimension]
+        first = path[:1] if elapsed.outlet is None else elapsed.outlet[None]
+        outlets = np.concatenate([first, path]).astype(path.dtype)[frames]
+        return RunConstants(density, rollout.time_step, float(parameters.flow_rate.numpy()[0]), outlets)
+
+    def rollout(
+        self, steps: int, controls: Mapping[str, Any] | None = None, state: RestartState | None = None
+    ) -> Rollout:
+        """A rollout that is ready to go forward from the scene's first state; see `run` for ``controls`` and
+        ``state``."""
         rollout = Rollout(self.solver, check_steps(steps))
         space = Controls(self, rollout.steps)
-        space.begin(rollout, space.checked(controls or {}, "control"))
+        values = space.checked(controls or {}, "control")
+        if state is not None:
+            space.check_restart(state, values)
+        space.begin(rollout, values, state=state)
         return rollout
 
     def parameters(self) -> dict[str, np.ndarray]:

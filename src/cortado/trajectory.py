@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cortado import vtkhdf
 from cortado.errors import InputError
+from cortado.restart import Elapsed, RestartState, RunConstants
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,8 @@ class Trajectory:
     """(frames, n, phases) [-]; None with one phase"""
     substeps: int = 0
     """[-] explicit steps of diffusion within each step"""
+    constants: RunConstants | None = None
+    """what a restart needs besides; None in a file of an earlier version"""
 
     def __post_init__(self) -> None:
         frames = {len(self.times), len(self.steps), len(self.positions), len(self.velocities)}
@@ -68,6 +71,20 @@ class Trajectory:
     def not_converged(self) -> int:
         """Number of steps at which the pressure solver did not reach its tolerance."""
         return int(np.count_nonzero(~self.converged))
+
+    @property
+    def last_state(self) -> RestartState:
+        """The state of the last frame, from which `Simulation.run` goes on bit for bit.
+
+        Raises:
+            InputError: the trajectory is from a file that does not hold all of it.
+        """
+        if self.constants is None:
+            raise InputError("The trajectory is from an earlier version of Cortado, without what a restart needs.")
+        outlets = self.constants.outlets
+        elapsed = Elapsed(int(self.steps[-1]), float(self.times[-1]), None if outlets is None else outlets[-1])
+        fractions = None if self.mass_fractions is None else self.mass_fractions[-1]
+        return RestartState(self.positions[-1], self.velocities[-1], fractions, self.constants, elapsed)
 
     def save(self, path: str | Path) -> None:
         """Writes a VTKHDF file, which ParaView opens; a file of that name is replaced.

@@ -6,7 +6,8 @@ dt, while s = u - w t > 0, w = Q / A:
     x = q_n + o - s e,   v = (q_n - q_(n-1)) / dt + w e
 
 q_n is where the opening is after step n (it rests before the first), e its direction, Q the flow rate and A its area.
-Position and velocity do not jump when a particle becomes free.
+Position and velocity do not jump when a particle becomes free. A run that goes on with another one counts its steps
+from where that began, and the opening moves from where that left it.
 """
 
 from functools import cache
@@ -21,7 +22,8 @@ from cortado.precision import Precision
 @cache
 def nozzle_kernels(precision: Precision) -> SimpleNamespace:
     """Kernels ``forward``, ``tangent`` and ``adjoint`` of the end of a step, in the scene's order of particles, and
-    ``collect``, which adds up what the led ones leave. ``path`` (steps,) is that of the opening."""
+    ``collect``, which adds up what the led ones leave. ``path`` (steps,) is that of the opening, ``before`` (1,) how
+    many steps an earlier run took, and ``outlet`` (1,) where it left the opening."""
     real, vector = precision.real, precision.vector
 
     @wp.func
@@ -32,16 +34,21 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         area: real,
         flow_rate: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
+        before: wp.array(dtype=wp.int32),
         step: wp.array(dtype=wp.int32),
     ) -> real:
         """s of a particle; 0 for one that is no part of the emitter."""
         if i < first:
             return real(0.0)
-        return upstream[i - first] - flow_rate[0] / area * (real(step[0] + 1) * time_step[0])
+        return upstream[i - first] - flow_rate[0] / area * (real(before[0] + step[0] + 1) * time_step[0])
 
     @wp.func
-    def advance(path: wp.array(dtype=vector), n: int) -> vector:
+    def advance(
+        path: wp.array(dtype=vector), n: int, before: wp.array(dtype=wp.int32), outlet: wp.array(dtype=vector)
+    ) -> vector:
         """q_n - q_(n-1)"""
+        if n == 0 and before[0] > 0:
+            return path[0] - outlet[0]
         return path[n] - path[wp.max(n - 1, 0)]
 
     @wp.kernel(module=integration_module(precision, True))
@@ -54,6 +61,8 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         path: wp.array(dtype=vector),
         flow_rate: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
+        before: wp.array(dtype=wp.int32),
+        outlet: wp.array(dtype=vector),
         step: wp.array(dtype=wp.int32),
         x_free: wp.array(dtype=vector),
         v_free: wp.array(dtype=vector),
@@ -62,11 +71,11 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         v: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        s = left(i, first, upstream, area, flow_rate, time_step, step)
+        s = left(i, first, upstream, area, flow_rate, time_step, before, step)
         if s > real(0.0):
             n = step[0]
             x[i] = path[n] + offsets[i - first] - s * direction
-            v[i] = advance(path, n) / time_step[0] + (flow_rate[0] / area) * direction
+            v[i] = advance(path, n, before, outlet) / time_step[0] + (flow_rate[0] / area) * direction
         else:
             x[i] = x_free[i]
             v[i] = v_free[i]
@@ -83,18 +92,21 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         flow_rate_dot: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
+        before: wp.array(dtype=wp.int32),
+        outlet: wp.array(dtype=vector),
+        outlet_dot: wp.array(dtype=vector),
         step: wp.array(dtype=wp.int32),
         # in and out
         x_dot: wp.array(dtype=vector),
         v_dot: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        if left(i, first, upstream, area, flow_rate, time_step, step) > real(0.0):
+        if left(i, first, upstream, area, flow_rate, time_step, before, step) > real(0.0):
             n = step[0]
             dt = time_step[0]
             way = flow_rate_dot[0] * dt + flow_rate[0] * time_step_dot[0]
-            turn = advance(path_dot, n) - advance(path, n) * (time_step_dot[0] / dt)
-            x_dot[i] = path_dot[n] + (real(n + 1) * way / area) * direction
+            turn = advance(path_dot, n, before, outlet_dot) - advance(path, n, before, outlet) * (time_step_dot[0] / dt)
+            x_dot[i] = path_dot[n] + (real(before[0] + n + 1) * way / area) * direction
             v_dot[i] = turn / dt + (flow_rate_dot[0] / area) * direction
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
@@ -104,6 +116,7 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         area: real,
         flow_rate: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
+        before: wp.array(dtype=wp.int32),
         step: wp.array(dtype=wp.int32),
         x_bar: wp.array(dtype=vector),
         v_bar: wp.array(dtype=vector),
@@ -115,7 +128,7 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
     ):
         """What reaches free particles, and what reaches led ones."""
         i = wp.tid()
-        led = left(i, first, upstream, area, flow_rate, time_step, step) > real(0.0)
+        led = left(i, first, upstream, area, flow_rate, time_step, before, step) > real(0.0)
         x_free_bar[i] = wp.where(led, vector(), x_bar[i])
         v_free_bar[i] = wp.where(led, vector(), v_bar[i])
         x_led_bar[i] = wp.where(led, x_bar[i], vector())
@@ -128,6 +141,8 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         path: wp.array(dtype=vector),
         flow_rate: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
+        before: wp.array(dtype=wp.int32),
+        outlet: wp.array(dtype=vector),
         step: wp.array(dtype=wp.int32),
         x_total: wp.array(dtype=vector),
         v_total: wp.array(dtype=vector),
@@ -140,11 +155,13 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         dt = time_step[0]
         x_bar = x_total[0]
         v_bar = v_total[0]
-        before = wp.max(n - 1, 0)
+        last = wp.max(n - 1, 0)
         path_bar[n] = path_bar[n] + x_bar + v_bar / dt
-        path_bar[before] = path_bar[before] - v_bar / dt
-        along = real(n + 1) * wp.dot(direction, x_bar) / area
+        if n > 0 or before[0] == 0:
+            path_bar[last] = path_bar[last] - v_bar / dt
+        along = real(before[0] + n + 1) * wp.dot(direction, x_bar) / area
         flow_rate_bar[0] = flow_rate_bar[0] + along * dt + wp.dot(direction, v_bar) / area
-        time_step_bar[0] = time_step_bar[0] + along * flow_rate[0] - wp.dot(v_bar, advance(path, n)) / (dt * dt)
+        turn = wp.dot(v_bar, advance(path, n, before, outlet)) / (dt * dt)
+        time_step_bar[0] = time_step_bar[0] + along * flow_rate[0] - turn
 
     return SimpleNamespace(forward=lead, tangent=lead_tangent, adjoint=lead_adjoint, collect=collect)

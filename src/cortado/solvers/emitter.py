@@ -6,9 +6,10 @@ import numpy as np
 import warp as wp
 
 from cortado.launching import Launcher, add, sum_of
-from cortado.particles import Parameters, State, to_device
+from cortado.particles import Parameters, State, padded, to_device
 from cortado.physics.nozzle import nozzle_kernels
 from cortado.precision import Precision
+from cortado.restart import Elapsed
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,17 @@ class Emitter:
         self.upstream = wp.array(nozzle.upstream, dtype=precision.real, device=launch.device)
         self.offsets = to_device(nozzle.offsets, precision, launch.device)
         self.direction = precision.vector(*np.pad(nozzle.direction, (0, 3 - len(nozzle.direction))))
+        self.before = wp.zeros(1, dtype=wp.int32, device=launch.device)
+        """Steps of the run that this one goes on with."""
+        self.outlet = wp.zeros(1, dtype=precision.vector, device=launch.device)
+        """Where that left the opening [m]."""
+        self._fixed = wp.zeros_like(self.outlet)
+
+    def go_on(self, elapsed: Elapsed) -> None:
+        """Count steps from, and move the opening from, what went before."""
+        self.before.fill_(elapsed.steps)
+        if elapsed.outlet is not None:
+            self.outlet.assign(padded(elapsed.outlet[None]))
 
     def lead(self, parameters: Parameters, step: wp.array, state: State) -> None:
         """Write positions and velocities at the end of a step; ``free`` holds those without the nozzle."""
@@ -44,7 +56,8 @@ class Emitter:
         self.launch(
             self.kernels.forward,
             [nozzle.first, self.upstream, self.offsets, self.direction, nozzle.area]
-            + [p.nozzle_path, p.flow_rate, p.time_step, step, self.free.positions, self.free.velocities],
+            + [p.nozzle_path, p.flow_rate, p.time_step, self.before, self.outlet, step]
+            + [self.free.positions, self.free.velocities],
             [state.positions, state.velocities],
         )
 
@@ -54,7 +67,7 @@ class Emitter:
         self.launch(
             self.kernels.tangent,
             [nozzle.first, self.upstream, self.direction, nozzle.area, p.nozzle_path, dot.nozzle_path]
-            + [p.flow_rate, dot.flow_rate, p.time_step, dot.time_step, step],
+            + [p.flow_rate, dot.flow_rate, p.time_step, dot.time_step, self.before, self.outlet, self._fixed, step],
             [state_dot.positions, state_dot.velocities],
         )
 
@@ -77,14 +90,15 @@ class EmitterAdjoint:
         led, free = self._led, self.free
         launch(
             emitter.kernels.adjoint,
-            [nozzle.first, emitter.upstream, nozzle.area, p.flow_rate, p.time_step, step]
+            [nozzle.first, emitter.upstream, nozzle.area, p.flow_rate, p.time_step, emitter.before, step]
             + [state_bar.positions, state_bar.velocities],
             [free.positions, free.velocities, led.positions, led.velocities],
         )
         totals = [add_up(array) for add_up, array in zip(self._sums, (led.positions, led.velocities), strict=True)]
         launch(
             emitter.kernels.collect,
-            [emitter.direction, nozzle.area, p.nozzle_path, p.flow_rate, p.time_step, step, *totals],
+            [emitter.direction, nozzle.area, p.nozzle_path, p.flow_rate, p.time_step]
+            + [emitter.before, emitter.outlet, step, *totals],
             [bar.nozzle_path, bar.flow_rate, self._time_step_bar],
             threads=1,
         )

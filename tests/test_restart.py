@@ -1,0 +1,60 @@
+"""A run that goes on from the last state of another one has the bits of a run that did not stop."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cortado import InputError, Simulation
+from scenes import plane, plane_of_three, two_layers
+from test_emitter import jet, pour
+
+FIRST, REST = 17, 24
+MAKERS = {"plane": plane, "two layers": two_layers, "plane of three": plane_of_three, "jet": jet, "pour": pour}
+
+
+def controls_of(simulation):
+    """Gravity, and a nozzle's path where there is one, that change in every step."""
+    steps, d = FIRST + REST, simulation.dimension
+    sway = 0.01 * np.sin(0.3 * np.arange(steps))[:, None] * np.eye(d)[0]
+    controls = {"gravity": np.array(simulation.scene.forces.gravity) + 100.0 * sway}
+    if simulation.scene.emitter is not None:
+        controls["nozzle_path"] = np.array(simulation.scene.emitter.outlet) + sway
+    return controls
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_restart_has_the_bits_of_a_run_that_did_not_stop(name, precision, tmp_path):
+    simulation = Simulation(MAKERS[name](), precision=precision)
+    controls = controls_of(simulation)
+    whole = simulation.run(FIRST + REST, controls)
+    first = simulation.run(FIRST, {key: table[:FIRST] for key, table in controls.items()}, record_every=5)
+    first.save(tmp_path / "first.vtkhdf")
+    later = {key: table[FIRST:] for key, table in controls.items()}
+    for state in (first.last_state,):
+        rest = simulation.run(REST, later, state=state)
+        assert rest.steps.tolist() == list(range(FIRST, FIRST + REST + 1))
+        assert rest.times.tobytes() == whole.times[FIRST:].tobytes()
+        for field in ("positions", "velocities", "mass_fractions"):
+            found, wanted = getattr(rest, field), getattr(whole, field)
+            assert (found is None) == (wanted is None)
+            assert found is None or found.tobytes() == wanted[FIRST:].tobytes(), field
+        assert rest.density_errors.tobytes() == whole.density_errors[FIRST:].tobytes()
+        again = simulation.run(FIRST, {key: table[:FIRST] for key, table in controls.items()})
+        assert again.positions.tobytes() == whole.positions[: FIRST + 1].tobytes()  # nothing of the restart stays
+
+
+def test_states_that_do_not_fit_are_refused():
+    simulation = Simulation(pour(), precision="float64")
+    state = simulation.run(3).last_state
+    few = replace(state, positions=state.positions[:-1])
+    for arguments, what in [
+        ({"state": few}, "state.positions has shape"),
+        ({"state": simulation.state}, "must be a RestartState"),
+        ({"state": state, "controls": {"flow_rate": 0.01}}, "flow_rate is 0.01, but must be"),
+        ({"state": state, "controls": {"time_step": 0.001}}, "time_step is 0.001, but must be"),
+        ({"state": state, "controls": {"initial_velocities": state.velocities}}, "must be left out with a state"),
+    ]:
+        with pytest.raises(InputError, match=what):
+            simulation.run(3, **arguments)
