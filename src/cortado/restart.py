@@ -18,7 +18,8 @@ class Elapsed:
 
 
     def times(self, steps: NDArray, time_step: float) -> NDArray:
-        """(frames,) [s] after so many steps more of ``time_step`` [s], bit for bit those of one run if it is the same."""
+        """(frames,) [s] after so many steps more of ``time_step`` [s]; of the same size they are those of one run, bit
+        for bit."""
         return (self.time - self.steps * time_step) + (self.steps + steps) * time_step
 
 
