@@ -1,0 +1,24 @@
+"""The code in the documents runs as printed."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = {path.name: path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").glob("*.md"))}
+CODE = {name: re.findall(r"```python\n(.*?)```", text, re.DOTALL) for name, text in DOCUMENTS.items()}
+
+
+@pytest.mark.parametrize("name", [name for name, blocks in CODE.items() if blocks])
+def test_the_code_runs_as_printed(name, tmp_path, monkeypatch):
+    """All of a document in one go, in a folder that has the examples."""
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    shutil.copytree(ROOT / "docs" / "figures", tmp_path / "docs" / "figures")
+    monkeypatch.chdir(tmp_path)
+    exec(compile("\n".join(CODE[name]), name, "exec"), {"__name__": "__main__"})
+
+
+def test_there_is_code():
+    assert CODE["runs.md"]
