@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cortado import InputError, Simulation
+from cortado import InputError, Simulation, Trajectory
 from scenes import plane, plane_of_three, two_layers
 from test_emitter import jet, pour
 
@@ -32,7 +32,7 @@ def test_a_restart_has_the_bits_of_a_run_that_did_not_stop(name, precision, tmp_
     first = simulation.run(FIRST, {key: table[:FIRST] for key, table in controls.items()}, record_every=5)
     first.save(tmp_path / "first.vtkhdf")
     later = {key: table[FIRST:] for key, table in controls.items()}
-    for state in (first.last_state,):
+    for state in (first.last_state, Trajectory.load(tmp_path / "first.vtkhdf").last_state):
         rest = simulation.run(REST, later, state=state)
         assert rest.steps.tolist() == list(range(FIRST, FIRST + REST + 1))
         assert rest.times.tobytes() == whole.times[FIRST:].tobytes()

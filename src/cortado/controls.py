@@ -77,6 +77,7 @@ class Controls:
         else:
             rollout.initial.set(*(values.get(name, self._scene[name]) for name in STATES))
         chosen = {name: values.get(name, self._scene[name]) for name in (*MATERIALS, *NUMBERS)}
+        rollout.time_step, rollout.flow_rate = float(chosen["time_step"]), float(chosen["flow_rate"])
         parameters.set_tables(**{name: values.get(name, self._scene[name]) for name in TABLES})
         masses = self._masses(values) if state is None else state.constants.reference_density
         parameters.set_constants(**chosen, masses=masses)
@@ -91,9 +92,8 @@ class Controls:
                 raise InputError(f"control {name} is given, but must be left out with a state, which has its own.")
         check_state(state, self._simulation.positions.shape, self._phases)
         if self._simulation.scene.emitter is not None:
-            constants, real = state.constants, self._simulation.precision.numpy
-            for name, before in (("time_step", constants.time_step), ("flow_rate", constants.flow_rate)):
-                now = float(real(values.get(name, self._scene[name])))
+            for name in ("time_step", "flow_rate"):
+                before, now = getattr(state.constants, name), float(values.get(name, self._scene[name]))
                 if now != before:
                     wanted = f"{before} with this state, whose nozzle ran with that"
                     raise InputError(f"{name} is {now:g}, but must be {wanted}.")

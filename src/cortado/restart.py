@@ -1,7 +1,10 @@
 """What a run needs to go on from where another one stopped, bit for bit."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Self
 
+import numpy as np
 from numpy.typing import NDArray
 
 
@@ -36,6 +39,19 @@ class RunConstants:
     """Of the nozzle [m3/s], in 2-D [m2/s]; None without an emitter."""
     outlets: NDArray | None = None
     """(frames, d) where the opening of the nozzle was at each frame [m]; None without an emitter."""
+
+    def arrays(self) -> dict[str, NDArray]:
+        """By name, without those that are None."""
+        return {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, NDArray], frames: int) -> Self | None:
+        """From arrays by name, of a run that may have recorded fewer frames; None if there are none."""
+        if not arrays:
+            return None
+        numbers = {name: float(arrays[name]) for name in ("time_step", "flow_rate") if name in arrays}
+        outlets = arrays["outlets"][:frames] if "outlets" in arrays else None
+        return cls(reference_density=arrays["reference_density"], outlets=outlets, **numbers)
 
 
 @dataclass(frozen=True, eq=False)

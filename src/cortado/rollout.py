@@ -66,6 +66,8 @@ class Rollout:
         self.parameters = solver.new_parameters(steps)
         self.substeps = 0
         """Explicit steps of diffusion within each step."""
+        self.time_step = self.flow_rate = 0.0
+        """[s] and [m3/s], in 2-D [m2/s], as they were given: the device rounds them."""
         self.elapsed = Elapsed()
         """What went before the first state."""
         self._records = (
@@ -84,11 +86,6 @@ class Rollout:
         """(steps,) pressure iterations of the last forward run."""
         self.errors = np.zeros((0, 2))
         """(steps, 2) average and greatest compression (rho* - rho_0)+ / rho_0 at each step."""
-
-    @property
-    def time_step(self) -> float:
-        """[s], as the device has it."""
-        return float(self.parameters.time_step.numpy()[0])
 
     # ---- forward -------------------------------------------------------------------------------------------------
 

@@ -138,7 +138,7 @@ class Simulation:
         path = parameters.nozzle_path.numpy()[:, : self.dimension]
         first = path[:1] if elapsed.outlet is None else elapsed.outlet[None]
         outlets = np.concatenate([first, path]).astype(path.dtype)[frames]
-        return RunConstants(density, rollout.time_step, float(parameters.flow_rate.numpy()[0]), outlets)
+        return RunConstants(density, rollout.time_step, rollout.flow_rate, outlets)
 
     def rollout(
         self, steps: int, controls: Mapping[str, Any] | None = None, state: RestartState | None = None

@@ -102,6 +102,7 @@ class Trajectory:
             precision="float32" if single else "float64",
             steps=len(self.iterations),
             scalars=fraction_names(0 if self.mass_fractions is None else self.mass_fractions.shape[2]),
+            constants=None if self.constants is None else self.constants.arrays(),
         ) as writer:
             writer.append_steps(self.iterations, self.density_errors, self.converged)
             for k, step in enumerate(self.steps):
@@ -119,7 +120,9 @@ class Trajectory:
         names = ("times", "steps", "positions", "velocities", "iterations", "density_errors", "converged")
         phases = sum(name.startswith(FRACTION) for name in arrays)
         fractions = np.stack([arrays[name] for name in fraction_names(phases)], axis=-1) if phases else None
-        return cls(**{name: arrays[name] for name in names} | {"mass_fractions": fractions})  # type: ignore[arg-type]
+        constants = RunConstants.of(arrays["constants"], len(arrays["times"]))
+        found = {name: arrays[name] for name in names}
+        return cls(**found, mass_fractions=fractions, constants=constants)
 
 
 FRACTION = "mass_fraction_"

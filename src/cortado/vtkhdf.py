@@ -12,7 +12,7 @@ import os
 import shutil
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -40,6 +40,7 @@ class TrajectoryWriter:
         precision: of the stored positions, velocities and scalars.
         steps: the most steps of which `append_steps` will be told.
         scalars: names of further scalar fields of every frame, such as "density" and "pressure".
+        constants: arrays by name that hold for the whole run, or for each of the frames that will come.
 
     Raises:
         InputError: a size that makes no sense, or a path that cannot be written.
@@ -56,6 +57,7 @@ class TrajectoryWriter:
         precision: Literal["float32", "float64"] = "float32",
         steps: int = 0,
         scalars: Sequence[str] = (),
+        constants: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         moments = np.array(times, dtype=np.float64, ndmin=1)
         if len(moments) < 1 or particles < 1 or dimension not in (2, 3) or steps < 0:
@@ -66,7 +68,8 @@ class TrajectoryWriter:
         self.path = Path(path)
         self.frames_written = 0
         self.steps_written = 0
-        self._layout = Layout(moments, (particles, dimension), np.dtype(precision), steps, tuple(scalars))
+        fixed = {name: np.asarray(value) for name, value in (constants or {}).items()}
+        self._layout = Layout(moments, (particles, dimension), np.dtype(precision), steps, tuple(scalars), fixed)
         self._unfinished = unfinished(self.path)
         with sentences(self.path):
             _require_room(self._layout, self.path)
@@ -177,13 +180,13 @@ class TrajectoryWriter:
             ) from problem
 
 
-def read(path: str | Path) -> dict[str, NDArray[Any]]:
+def read(path: str | Path) -> dict[str, Any]:
     """Reads the frames and steps that were completed, while the writer is at work or after its death.
 
     Returns:
         times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s],
-        iterations (steps,), density_errors (steps,) and converged (steps,) bool as in `Trajectory`, and
-        under its own name every scalar field (frames, n).
+        iterations (steps,), density_errors (steps,) and converged (steps,) bool as in `Trajectory`,
+        under its own name every scalar field (frames, n), and constants, by name what holds for the whole run.
 
     Raises:
         InputError: the file is missing, damaged, or none of Cortado's trajectories.
@@ -207,7 +210,7 @@ def read(path: str | Path) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _read_arrays(file: Any, size: int) -> dict[str, NDArray[Any]] | None:
+def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
     """None where a checksum is wrong."""
     vtk, own = file["VTKHDF"], file["cortado"]
     (frames, frames_checksum), (steps, steps_checksum) = own["progress"][:].tolist()
@@ -215,14 +218,15 @@ def _read_arrays(file: Any, size: int) -> dict[str, NDArray[Any]] | None:
     rows = {"VTKHDF/Points": vtk["Points"]}
     rows |= {f"VTKHDF/PointData/{name}": dataset for name, dataset in sorted(vtk["PointData"].items())}
     columns = [vtk["Steps/Values"], own["frame_steps"], *(own[name] for name in STEP_RECORD.names or ())]
-    if any(dataset.nbytes > size for dataset in (*columns, *rows.values())):
+    if any(dataset.nbytes > size for dataset in (*columns, *rows.values(), *own["constants"].values())):
         return None
+    constants = {name: dataset[()] for name, dataset in own["constants"].items()}
     times, numbers = (column[:frames] for column in columns[:2])
     records = _records([column[:steps] for column in columns[2:]])
     fields = {name: dataset[: frames * particles] for name, dataset in rows.items()}
     fields = {name: field.reshape(frames, particles, *field.shape[1:]) for name, field in fields.items()}
 
-    checksum = frames_seed((particles, dimension), {name: field.dtype for name, field in fields.items()})
+    checksum = frames_seed((particles, dimension), {name: field.dtype for name, field in fields.items()}, constants)
     for k in range(frames):
         checksum = _frame_checksum(checksum, times[k], numbers[k], [field[k].tobytes() for field in fields.values()])
     if checksum != frames_checksum or zlib.crc32(records.tobytes(), STEPS_SEED) != steps_checksum:
@@ -231,7 +235,7 @@ def _read_arrays(file: Any, size: int) -> dict[str, NDArray[Any]] | None:
     arrays["velocities"] = np.ascontiguousarray(arrays.pop("velocity")[..., :dimension])
     arrays["positions"] = np.ascontiguousarray(arrays.pop("Points")[..., :dimension])
     arrays |= {name: np.ascontiguousarray(records[name]) for name in STEP_RECORD.names or ()}
-    return arrays | {"times": times, "steps": numbers}
+    return arrays | {"times": times, "steps": numbers, "constants": constants}
 
 
 def _frame_checksum(checksum: int, time: Any, number: Any, rows: Sequence[bytes]) -> int:

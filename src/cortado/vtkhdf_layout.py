@@ -47,6 +47,8 @@ class Layout:
     """Of positions, velocities and scalars."""
     steps: int
     scalars: tuple[str, ...]
+    constants: Mapping[str, NDArray[Any]]
+    """Arrays of any shape that hold for the whole run."""
 
     @property
     def rows(self) -> dict[str, tuple[int, ...]]:
@@ -57,14 +59,15 @@ class Layout:
     @property
     def seed(self) -> int:
         """The checksum of no frames."""
-        return frames_seed(self.shape, dict.fromkeys(self.rows, self.dtype))
+        return frames_seed(self.shape, dict.fromkeys(self.rows, self.dtype), self.constants)
 
     @property
     def size(self) -> int:
         """About how many bytes the file takes when it is full."""
         numbers = sum(int(np.prod(row, dtype=int)) for row in self.rows.values())
         frame = self.shape[0] * numbers * self.dtype.itemsize + 8 * (17 + len(self.scalars))
-        return len(self.times) * frame + self.steps * STEP_RECORD.itemsize + 8 * 2 * self.shape[0]
+        constants = sum(array.nbytes for array in self.constants.values())
+        return len(self.times) * frame + self.steps * STEP_RECORD.itemsize + 8 * 2 * self.shape[0] + constants
 
     def create(self) -> tuple[Pages, dict[str, int]]:
         """The empty file, and the byte at which each dataset begins."""
@@ -79,6 +82,9 @@ class Layout:
 
     def _create_own(self, own: Any) -> dict[str, int]:
         own.attrs["format"], own.attrs["dimension"] = FORMAT, self.shape[1]
+        group = own.create_group("constants")
+        for name, array in self.constants.items():
+            group[name] = array
         own["progress"] = np.array([[0, self.seed], [0, STEPS_SEED]], np.uint32)
         places = {"cortado/progress": own["progress"].id.get_offset()}
         places["cortado/frame_steps"] = _reserve(own, "frame_steps", (len(self.times),), np.int64)
@@ -112,9 +118,13 @@ class Layout:
         return places | {"VTKHDF/Steps/PartOffsets": series["PartOffsets"].id.get_offset()}
 
 
-def frames_seed(shape: tuple[int, int], dtypes: Mapping[str, np.dtype[Any]]) -> int:
-    """The checksum that those of the frames begin with: it changes with whatever says how to read them."""
-    return zlib.crc32(repr((shape, [(name, dtype.str) for name, dtype in dtypes.items()])).encode())
+def frames_seed(
+    shape: tuple[int, int], dtypes: Mapping[str, np.dtype[Any]], constants: Mapping[str, NDArray[Any]]
+) -> int:
+    """The checksum that those of the frames begin with: it changes with whatever says how to read them, and with what
+    holds for all of them."""
+    fixed = [(name, array.dtype.str, array.shape, array.tobytes()) for name, array in sorted(constants.items())]
+    return zlib.crc32(repr((shape, [(name, dtype.str) for name, dtype in dtypes.items()], fixed)).encode())
 
 
 def _reserve(group: Any, name: str, shape: tuple[int, ...], dtype: Any) -> int:

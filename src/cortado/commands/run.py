@@ -58,17 +58,18 @@ def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record
 
 
 def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:
-    steps, time_step = rollout.steps, simulation.scene.solver.time_step
+    steps = rollout.steps
     recorded = np.append(np.arange(0, steps, record_every), steps)
     with (
         TrajectoryWriter(
             folder.trajectory,
-            times=recorded * time_step,
+            times=rollout.elapsed.times(recorded, rollout.time_step),
             particles=simulation.particles,
             dimension=simulation.dimension,
             precision=simulation.precision.name,  # type: ignore[arg-type]
             steps=steps,
             scalars=fraction_names(len(simulation.scene.phase)),
+            constants=simulation.constants(rollout, recorded).arrays(),
         ) as writer,
         track(steps, "run") as advance,
     ):
