@@ -154,6 +154,7 @@ def test_a_run_that_diverges_says_where_and_keeps_its_frames(cortado_command):
     assert f"diverged in step {lost}: particle " in sentence and "left the container and was at (" in sentence
     assert "try a smaller time step" in sentence and sentence.endswith("dam.")
     assert {path.name for path in Path("dam").iterdir()} == RUN_FILES and len(metrics("dam")) == lost
+    assert f"<td>The simulation diverged in step {lost}" in Path("dam/report.html").read_text()
 
 
 def interrupting(after):
@@ -286,9 +287,15 @@ def test_an_optimisation_that_diverges_says_so(cortado_command):
     assert len(metrics("found")) == 1
 
 
+def test_a_target_beyond_the_precision_is_named(cortado_command):
+    far = ["--set", "problem.target.gravity=[0,-1e30]"]
+    result = cortado_command("optimise", "task.toml", "--out", "found", *far)
+    assert_refused(result, "problem.target: parameter gravity has a value of size 1e+30")
+
+
 def test_a_target_that_diverges_is_named(cortado_command, folder):
     code, out, err = cortado_command(
-        "optimise", "task.toml", "--out", "found", "--set", "problem.target.gravity=[0,-1e30]"
+        "optimise", "task.toml", "--out", "found", "--set", "problem.target.gravity=[0,-1e6]"
     )
     assert (code, out) == (1, "") and "problem.target" in err and "learning rate" not in err
     assert_one_sentence(err.splitlines()[-1])

@@ -352,8 +352,11 @@ def test_a_mistake_gives_a_sentence(call, sentence):
 
 def test_a_lost_particle_is_named():
     wild = {"initial_velocities": np.full((125, 3), 1e12)}
-    with pytest.raises(DivergedError, match="diverged in step 1, where particle 0 was lost; try a smaller time step"):
+    with pytest.raises(DivergedError, match="diverged in step 1: particle 0 was lost; try a smaller time step"):
         reference.Simulation(splash()).run(5, wild)
+    down = {"initial_velocities": np.tile([0.0, -200.0, 0.0], (125, 1))}
+    with pytest.raises(DivergedError, match=r"diverged in step 1: particle 0 \(and 49 more\) left the container"):
+        reference.Simulation(splash()).run(5, down)
 
 
 def test_without_the_extension_module_there_is_one_sentence():

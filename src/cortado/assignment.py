@@ -91,7 +91,9 @@ def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> d
         ends = Problem(simulation, task.problem.steps, nothing).states(task.hidden, steps)
     except DivergedError as error:
         advice = f"this is the run with the parameters of problem.target, so change those, or {error.advice}"
-        raise DivergedError(error.step, error.particle, advice) from None
+        raise error.with_advice(advice) from None
+    except InputError as error:
+        raise InputError(f"problem.target: {error}") from None
     if renderer is None:
         return {step: end.positions for step, end in ends.items()}
     return {

@@ -84,6 +84,8 @@ def _solved(made: Assignment, folder: RunFolder, resume: bool) -> str:
     try:
         result, policy = _search(made, folder, resume)
     except DivergedError as error:
+        evaluations = len(folder.read_metrics())
+        write_report(folder, made.task.scene.name, [("ended early", error), ("evaluations", evaluations)], [])
         advice = "; ".join(filter(None, [f"{error.advice}, or a smaller learning rate", _kept(folder)]))
         raise error.with_advice(advice) from error
     found = made.search.parameters(result.parameters)

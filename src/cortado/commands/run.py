@@ -51,10 +51,10 @@ def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record
     try:
         _write_trajectory(simulation, rollout, folder, record_every)
     except DivergedError as error:
-        _write_pictures(simulation.scene, simulation, folder)
+        _write_pictures(simulation.scene, simulation, folder, [("ended early", error)])
         advice = f"{error.advice}; the frames so far are in {folder.path}"
         raise error.with_advice(advice) from error
-    _write_pictures(simulation.scene, simulation, folder)
+    _write_pictures(simulation.scene, simulation, folder, [])
 
 
 def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:
@@ -115,7 +115,8 @@ def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], 
     return figures
 
 
-def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder) -> None:
+def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder, remarks: list[tuple[str, object]]) -> None:
+    """The report with its pictures; ``remarks`` are its first rows."""
     trajectory = Trajectory.load(folder.trajectory)
     shown = sorted({0, len(trajectory.times) // 2, len(trajectory.times) - 1})
     speeds = [np.linalg.norm(trajectory.velocities[frame], axis=1) for frame in shown]
@@ -140,6 +141,7 @@ def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder) -> 
         figures.append(("Average density error of each step, and the tolerance asked.", path))
     substeps = simulation.solver.mixture.substeps  # of the run that has just ended
     rows = [
+        *remarks,
         ("particles", simulation.particles),
         *([("substeps of diffusion in each step", substeps)] if substeps else []),
         ("wall particles", len(simulation.walls)),
