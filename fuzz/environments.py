@@ -14,9 +14,12 @@ from subprocess import run
 from fuzz import bases
 from fuzz.answers import run_complaints, search_complaints
 from fuzz.cases import Case
+from fuzz.judge import CODES
 from fuzz.processes import Kill, Limits, by_console, console
 from fuzz.toml_text import to_toml
 
+PIPE = 128 + signal.SIGPIPE
+"""Exit code where nobody reads the result."""
 COMPILING = 180.0
 """[s] that a command may take which finds no kernels that it could use again."""
 
@@ -34,6 +37,7 @@ class Environment:
     """Whether stderr is open."""
     interrupted: bool = False
     """Whether SIGINT comes while the program starts."""
+    codes: tuple[int, ...] = CODES
 
 
 def _home(name: str, mount: str) -> Environment:
@@ -75,8 +79,8 @@ ENVIRONMENTS = (
     Environment("everything closed", "run <&- >&- 2>&-", heard=False),
     Environment("stdout on a full disk", "run >/dev/full"),
     Environment("stdout and stderr on a full disk", "run >/dev/full 2>&1", heard=False),
-    Environment("a reader that goes away", "set -o pipefail; (run) | true"),
-    Environment("a reader of both that goes away", "set -o pipefail; (run) 2>&1 | true", heard=False),
+    Environment("a reader that goes away", "set -o pipefail; (run) | true", codes=(0, PIPE)),
+    Environment("a reader of both that goes away", "set -o pipefail; (run) 2>&1 | true", heard=False, codes=(0, PIPE)),
     Environment(
         "working directory removed",
         'here="$PWD"; mkdir gone; cd gone; rmdir "$here/gone"; run "$here/$file" "$here/out"',
@@ -119,7 +123,7 @@ ENVIRONMENTS = (
     Environment("no folder for matplotlib", "MPLCONFIGDIR=/nowhere run"),
     Environment("umask 0777", "umask 0777; run"),
     Environment("no PATH", "PATH=/nowhere; run"),
-    Environment("SIGINT at the start", "run", interrupted=True),
+    Environment("SIGINT at the start", "run", interrupted=True, codes=(0, 130, -signal.SIGINT)),
 )
 
 
@@ -141,7 +145,7 @@ def run_in_environment(case: Case) -> None:
     script = shell_script(environment, kind, kernels)
     words = [*(["unshare", "--mount"] if environment.mounts else []), "bash", "-c", script]
     outcome = by_console(words, case.folder, limits=limits, kill=kill)
-    case.judged(outcome, limits, (0, 1, 2, 130, -signal.SIGINT) if kill else (0, 1, 2), environment.heard)
+    case.judged(outcome, limits, environment.codes, environment.heard)
     out = case.folder / "out"
     if out.is_dir() and environment.name != "umask 0777":
         check = run_complaints if kind == "run" else search_complaints

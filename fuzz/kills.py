@@ -64,7 +64,7 @@ def kill_search(case: Case) -> None:
     words = _search_words(precision)
     _cortado_killed(case, words, _seconds(whole))
     if case.random.random() < 0.2:
-        _cortado_killed(case, [*words, "--resume"], _seconds(whole))
+        _cortado_killed(case, [*words, "--resume"], _seconds(whole), 2)
     out = case.folder / "out"
     if not (out / "report.html").exists():
         resumed = case.cortado(*words, "--resume", codes=(0, 2))
@@ -80,14 +80,13 @@ def kill_search(case: Case) -> None:
             case.complaints.append(f"{file} differs from that of the undisturbed search")
 
 
-def _cortado_killed(case: Case, words: Sequence[str], seconds: float) -> None:
-    """Run a command that gets a signal before it would end, or just after."""
+def _cortado_killed(case: Case, words: Sequence[str], seconds: float, *codes: int) -> None:
+    """Run a command that gets a signal before it would end, or just after; ``codes`` may it end with besides."""
     start = 4.0 if case.in_console else 0.0
     after = float(case.random.uniform(0.0, 1.05 * seconds + start))
     number = _SIGNALS[case.random.integers(len(_SIGNALS))]
     case.notes.append(f"{number.name} after {after:.2f} s")
-    codes = (0, 130, -number)
-    case.cortado(*words, kill=Kill(after, number), codes=codes)
+    case.cortado(*words, kill=Kill(after, number), codes=(0, -number, 128 + number, *codes))
 
 
 def _choose(case: Case, choices: Sequence[tuple[str, str]]) -> tuple[str, str, Path]:

@@ -73,10 +73,10 @@ def by_fork(arguments: Sequence[str], folder: Path, limits: Limits = LIMITS, kil
     """Run ``cortado`` with these arguments in a fork of this process, with the folder as working directory."""
 
     def command() -> None:
-        from cortado.cli import main
+        from cortado.__main__ import main
 
         sys.argv = ["cortado", *arguments]
-        main(list(arguments))
+        main()
 
     return call(command, tuple(arguments), folder, limits, kill)
 
@@ -119,7 +119,7 @@ def by_console(
 
 def console() -> list[str]:
     """The command line as a program of its own."""
-    return [sys.executable, "-c", "from cortado.cli import main; main()"]
+    return [sys.executable, "-m", "cortado"]
 
 
 def _file(folder: Path, name: str) -> Path:
@@ -137,7 +137,7 @@ def _be_program(function: Callable[[], None], folder: Path, out: Path, err: Path
     try:
         os.setsid()
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+            signal.signal(number, signal.SIG_DFL)
         for path, descriptor in ((os.devnull, 0), (out, 1), (err, 2)):
             os.dup2(os.open(path, os.O_RDWR), descriptor)
         sys.stdout, sys.stderr = (os.fdopen(k, "w", closefd=False, errors="backslashreplace") for k in (1, 2))

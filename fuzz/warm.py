@@ -10,6 +10,7 @@ MODULES = (
     "matplotlib.backends.backend_agg",
     "matplotlib.figure",
     "scipy.spatial",
+    "cortado.__main__",
     "cortado.cli",
     "cortado.commands.optimise",
     "cortado.commands.run",
