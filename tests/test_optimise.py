@@ -1,5 +1,6 @@
 """The optimisers against closed forms and plain twins, and resuming bit for bit."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -294,9 +295,16 @@ def test_damage_before_the_last_record_is_refused(tmp_path):
     assert log.read_bytes() == content
 
 
-def test_a_foreign_file_is_refused(tmp_path):
-    (tmp_path / FILE_NAME).write_bytes(b"something else\n")
+@pytest.mark.parametrize("content", [b"something else\n", b"[" * 100_000, b"\n", b'{"format": 1}\n'])
+def test_a_foreign_file_is_refused(tmp_path, content):
+    (tmp_path / FILE_NAME).write_bytes(content)
     with pytest.raises(InputError, match="no log of evaluations"):
+        rosenbrock(Adam(0.05), 5, checkpoint=tmp_path, resume=True)
+
+
+def test_a_log_that_is_no_file_is_refused(tmp_path):
+    os.mkfifo(tmp_path / FILE_NAME)
+    with pytest.raises(InputError, match="no regular file"):
         rosenbrock(Adam(0.05), 5, checkpoint=tmp_path, resume=True)
 
 

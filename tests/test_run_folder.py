@@ -103,6 +103,25 @@ def test_resume_needs_the_same_scene_and_is_noted(tmp_path):
         RunFolder.resume(tmp_path / "b", SCENE, COMMAND)
 
 
+@pytest.mark.parametrize("name", ["scene.json", "environment.json", "metrics.jsonl"])
+@pytest.mark.parametrize("damage", ["deep", "pipe", "endless", "huge"])
+def test_a_damaged_folder_is_a_sentence(tmp_path, name, damage):
+    folder = new_run(tmp_path / "a")
+    path = folder.path / name
+    path.unlink(missing_ok=True)
+    if damage == "deep":
+        path.write_text("[" * 100_000 + "\n")
+    elif damage == "pipe":
+        os.mkfifo(path)
+    elif damage == "endless":
+        path.symlink_to("/dev/zero")
+    else:
+        path.write_bytes(b"{}\n")
+        os.truncate(path, 2**40)
+    with pytest.raises(InputError, match=r"cannot be|no run in|not JSON"):
+        RunFolder.resume(folder.path, SCENE, COMMAND).read_metrics()
+
+
 def test_a_refused_resume_names_the_setting(tmp_path):
     settings = {"problem": {"steps": 20, "target": {"gravity": np.array([0.0, -9.5])}}, "extinctions": (0.5, 1.0)}
     folder = new_run(tmp_path / "a", kind="optimise", settings=settings)

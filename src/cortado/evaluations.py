@@ -17,11 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from cortado.errors import ComputationError, InputError
-from cortado.files import sentences, write_atomically, write_fully
+from cortado.files import parsed_json, sentences, write_atomically, write_fully
 
 Vector = npt.NDArray[np.float64]
 
 FORMAT = "cortado evaluations 1"
+LONGEST_HEADER = 2**20
+"""Bytes of the first line of a log."""
 FILE_NAME = "evaluations.log"
 
 
@@ -152,6 +154,8 @@ class EvaluationLog:
             _require_unused(self._path)
         if not resume or not self._path.exists():
             _begin(self._path, header)
+        if not self._path.is_file():
+            raise InputError(f"'{self._path}' is no regular file; give another checkpoint folder.")
         with sentences(self._path):
             self._file: BinaryIO = open(self._path, "r+b", buffering=0)  # noqa: SIM115 closed by close()
         try:
@@ -253,7 +257,7 @@ def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> int:
 def _read_header(file: BinaryIO, path: Path) -> dict[str, Any]:
     """The first line of the log."""
     try:
-        found = json.loads(file.readline())
+        found = parsed_json(file.readline(LONGEST_HEADER))
     except ValueError:
         found = None
     if not isinstance(found, dict) or found.get("format") != FORMAT:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,12 +12,14 @@ from typing import Any, Self
 
 from cortado.errors import InputError
 from cortado.evaluations import FILE_NAME
-from cortado.files import UNFINISHED, sentences, write_atomically
+from cortado.files import UNFINISHED, parsed_json, read_regular, sentences, write_atomically
 from cortado.parameter_values import NAMES
 from cortado.run_environment import as_json, plain, require_same, session
 
 _RESUMABLE = "optimise"
 """The command that has --resume."""
+_LARGEST = 2**31
+"""Bytes of a file that is read again when a run goes on."""
 _FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html")
 _FOLDERS = ("checkpoint", "figures")
 _PICTURES = ("particles", "rendered", "density_errors", "loss", "images", "progress", *NAMES)
@@ -166,15 +169,16 @@ class RunFolder:
         """
         if not self.metrics.exists():
             return []
-        lines = self.metrics.read_bytes().split(b"\n")[:-1]
         try:
-            return [json.loads(line) for line in lines]
+            return [parsed_json(line) for line in read_regular(self.metrics, _LARGEST).split(b"\n")[:-1]]
+        except OSError as problem:
+            raise InputError(f"{self.metrics} cannot be read: {problem}.") from problem
         except ValueError as problem:
             raise InputError(f"{self.metrics} holds a line that is not JSON: {problem}.") from problem
 
     def _holds_run(self) -> bool:
         try:
-            return "cortado" in dict(json.loads(self.environment.read_text(encoding="utf-8")))
+            return "cortado" in dict(parsed_json(read_regular(self.environment, _LARGEST)))
         except (OSError, ValueError, TypeError):
             return False
 
@@ -221,7 +225,7 @@ class RunFolder:
 
 def _read_json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parsed_json(read_regular(path, _LARGEST))
     except (OSError, ValueError) as problem:
         raise InputError(f"{path} cannot be read: {problem}.") from problem
 
@@ -229,5 +233,4 @@ def _read_json(path: Path) -> Any:
 def _cut_torn_line(path: Path) -> None:
     """Removes what a killed run left of a last line, so that the next line begins a line."""
     if path.exists():
-        with open(path, "r+b") as file:
-            file.truncate(file.read().rfind(b"\n") + 1)
+        os.truncate(path, read_regular(path, _LARGEST).rfind(b"\n") + 1)
