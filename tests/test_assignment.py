@@ -8,10 +8,11 @@ from bad_tasks import GOOD_TASK, LATTE_PARTICLES, PARTICLES, PLANE_PICTURE, TINY
 from cortado import InputError, optimise
 from cortado.assignment import assignment
 from cortado.image_losses import Pyramid, SquaredDifference
-from cortado.optimisers import Adam
+from cortado.optimisers import LBFGS, Adam
 from cortado.pictures import heart, rosetta, write_picture
 from cortado.reparametrisation import Knots, Logarithm, Softmax
 from cortado.task import load_task
+from cortado.tilt import Tilt
 
 
 @pytest.fixture
@@ -168,6 +169,20 @@ def test_coordinates_are_those_that_the_task_asks_for(made):
     np.testing.assert_allclose(assigned.start["gravity"], np.tile([0.0, -9.81, 0.0], (3, 1)), atol=1e-14)
     np.testing.assert_allclose(assigned.bounds["viscosity"], np.log([[0.01, 0.02], [0.1, 0.2]]))
     assert assigned.bounds["gravity"] == (-20.0, 20.0)
+
+
+def test_a_tilt_is_hidden_searched_and_bounded(made):
+    text = TINY_LATTE.replace("[[0.0, -9.81, 4.0], [4.0, -9.81, 0.0]]", "[[0.0, 20.0], [20.0, 0.0]]")
+    text = text.replace("[[0.0, -9.81, 0.0], [0.0, -9.81, 0.0]]", "[[0.0, 0.0], [0.0, 0.0]]").replace("gravity", "tilt")
+    assigned = made(text, "optimise.bounds.tilt=[-15,15]")
+    assert assigned.search.coordinates == {"tilt": Knots(6, 3)} and assigned.start["tilt"].shape == (3, 2)
+    gravity = Tilt((0.0, -9.81, 0.0)).gravity(assigned.hidden("tilt"))
+    np.testing.assert_allclose(np.linalg.norm(gravity, axis=1), 9.81, rtol=1e-14)
+    end = assigned.problem.states({"gravity": gravity}, [6])[6]
+    np.testing.assert_array_equal(assigned.targets[6], assigned.image(end))
+    found = optimise(assigned.search, assigned.start, LBFGS(scale=10.0), 3, bounds=assigned.bounds)
+    assert found.loss < found.history[0].loss
+    assert 0.0 < max(np.abs(record.parameters["tilt"]).max() for record in found.history) <= 15.0
 
 
 def test_what_cannot_be_negative_is_bounded(made):

@@ -14,7 +14,7 @@ ROOT = Path(cortado.__file__).parent
 LAYERS = """
     errors files arrays interruption terminal kernel_cache
     image_losses srgb masses
-    smoothing calibration parameter_values
+    smoothing calibration parameter_values tilt
     precision cells
     physics.smoothing_functions physics.surroundings
     physics.density physics.walls physics.contrast physics.integration physics.gravity

@@ -71,6 +71,13 @@ def test_a_few_rows_are_interpolated_to_one_for_each_step(task_file):
     np.testing.assert_allclose(task.start["gravity"], [[0, -7], [1, -7], [2, -7], [1, -6], [0, -5]], atol=1e-15)
 
 
+def test_a_tilt_is_a_parameter_over_time(task_file):
+    task_file.write_text(GOOD_TASK.replace("gravity", "tilt").replace("[1.5, -9.81]", "[[9.0], [-3.0]]"))
+    task = load_task(task_file, ["optimise.start.tilt=[[0],[0]]", "optimise.knots=2", "optimise.bounds.tilt=[-30,30]"])
+    np.testing.assert_allclose(task.hidden["tilt"], [[9.0], [6.0], [3.0], [0.0], [-3.0]], atol=1e-14)
+    assert task.start["tilt"].shape == (5, 1) and not task.start["tilt"].any()
+
+
 def test_what_may_be_left_out(task_file):
     task = load_task(task_file)
     assert (task.problem.loss, task.problem.frames, task.problem.picture) == ("positions", 1, None)

@@ -7,7 +7,7 @@ import numpy as np
 
 from cortado.errors import DivergedError, InputError
 from cortado.losses import FinalPositions, Frames, Image, Loss, TrajectoryEnd
-from cortado.parameter_values import NOT_NEGATIVE, TABLES, Arrays
+from cortado.parameter_values import NOT_NEGATIVE, OVER_TIME, Arrays
 from cortado.pictures import heart, read_picture, rosetta
 from cortado.problem import Problem
 from cortado.render.renderer import Renderer
@@ -139,7 +139,7 @@ def _coordinates(task: Task, start: Arrays) -> dict[str, Coordinates]:
     for name, value in start.items():
         if name == "mass_fractions":
             found[name] = Softmax()
-        elif name in TABLES and value.ndim == 2 and task.optimise.knots is not None:
+        elif name in OVER_TIME and value.ndim == 2 and task.optimise.knots is not None:
             found[name] = Knots(task.problem.steps, task.optimise.knots)
     return found
 

@@ -18,6 +18,7 @@ from cortado.parameter_values import (
     NAMES,
     NUMBERS,
     OF_EMITTER,
+    OVER_TIME,
     STATES,
     TABLES,
     Arrays,
@@ -28,6 +29,7 @@ from cortado.parameter_values import (
 from cortado.particles import Parameters, State
 from cortado.restart import Elapsed, RestartState
 from cortado.rollout import Rollout
+from cortado.tilt import Tilt
 
 if TYPE_CHECKING:
     from cortado.simulation import Simulation
@@ -49,6 +51,8 @@ class Controls:
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
         """Values as float64 arrays; raises `InputError` in a sentence. A ``what`` of "direction" may be negative."""
+        if "tilt" in values and "gravity" in values:
+            raise InputError(f"{what} gravity is given, but must be left out, as the tilt says where it points.")
         found = {name: self._checked(name, value, what) for name, value in values.items()}
         if what != "direction":
             self._check(found)
@@ -66,7 +70,7 @@ class Controls:
         ``varied`` are parameters that a derivative is wanted for: with the mobility among them there is a substep of
         diffusion even where it is 0. ``state`` replaces the scene's first state.
         """
-        simulation, parameters = self._simulation, rollout.parameters
+        simulation, parameters, values = self._simulation, rollout.parameters, self._upright(values)
         rollout.evaluation += 1
         rollout.elapsed = Elapsed() if state is None else state.elapsed
         if state is not None:
@@ -101,6 +105,11 @@ class Controls:
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
         """A direction by name as tangents of the first state and of the parameters, at ``values``."""
         dot, parameters = rollout.solver.new_state(), rollout.solver.new_parameters(self._steps)
+        if "tilt" in along:
+            if "gravity" in values:
+                raise InputError("direction tilt is given, but must be left out, as gravity is given in its place.")
+            angles = values.get("tilt", np.zeros(self._simulation.dimension - 1))
+            along = {**along, "gravity": self._tilt.tangent(angles, along["tilt"])}
         zeros = {name: np.zeros_like(self._scene[name]) for name in self._scene}
         dot.set(*(along.get(name, zeros[name]) for name in STATES))
         parameters.set_tables(**{name: along.get(name, zeros[name]) for name in TABLES})
@@ -120,7 +129,10 @@ class Controls:
         for name in (*TABLES, *MATERIALS, *NUMBERS):
             if name in values:
                 found[name] = getattr(parameters, name).numpy().astype(np.float64)
-        for name in TABLES:
+        if "tilt" in values:
+            gravity = parameters.gravity.numpy()[:, : self._simulation.dimension].astype(np.float64)
+            found["tilt"] = self._tilt.adjoint(values["tilt"], gravity)
+        for name in OVER_TIME:
             if name in values:
                 table = found[name][:, : self._simulation.dimension]
                 found[name] = table if values[name].ndim == 2 else table.sum(axis=0)
@@ -144,6 +156,14 @@ class Controls:
             self._warned = True
             warnings.warn(sentence, CortadoWarning, stacklevel=4)
 
+    @property
+    def _tilt(self) -> Tilt:
+        return Tilt(self._simulation.scene.forces.gravity)
+
+    def _upright(self, values: Arrays) -> Arrays:
+        """The values, with gravity in the place of a tilt."""
+        return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values
+
     def _masses(self, values: Arrays) -> np.ndarray:
         """(n,) of the particles; fractions a little below 0, as diffusion leaves them, may still make one negative."""
         fractions, density = self._composition(values)
@@ -166,4 +186,6 @@ class Controls:
             raise InputError(f"{what} {name!r} is unknown, but must be one of {', '.join(NAMES)}.")
         if name in OF_EMITTER and self._simulation.scene.emitter is None:
             raise InputError(f"{what} {name} is given, but must be left out, as the scene has no emitter.")
+        if name == "tilt" and not np.any(self._scene["gravity"]):
+            raise InputError(f"{what} tilt is given, but must be left out, as the scene has no gravity to lean.")
         return checked_parameter(name, value, self.shapes(name), what)

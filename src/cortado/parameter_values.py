@@ -16,6 +16,7 @@ Arrays = dict[str, np.ndarray]
 
 UNITS = {
     "gravity": "m/s²",
+    "tilt": "°",
     "initial_positions": "m",
     "initial_velocities": "m/s",
     "mass_fractions": "",
@@ -44,13 +45,16 @@ SUM_TOLERANCE = 0.01
 """How far the mass fractions of a particle may add up to something else than 1: differences need some room."""
 TABLES = ("gravity", "nozzle_path")
 """Parameters that are a vector for each step."""
+OVER_TIME = (*TABLES, "tilt")
+"""Parameters that may have a row for each step; a tilt takes the place of gravity."""
 
 
 def parameter_shapes(name: str, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:
     """The shapes that a parameter may have, () for a number, where positions are (n, d)."""
     n, d = positions
-    if name in TABLES:
-        return [(d,), (steps, d)] if steps > 0 else [(d,)]
+    if name in OVER_TIME:
+        components = d - 1 if name == "tilt" else d
+        return [(components,), (steps, components)] if steps > 0 else [(components,)]
     if name in MATERIALS:
         return [() if phases == 1 else (phases,)]
     several = {"mass_fractions": (n, phases), "colours": (phases, 3)}

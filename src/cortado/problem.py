@@ -28,6 +28,8 @@ class Problem:
     Parameters, any of them together:
 
     - ``gravity`` (d,) or (steps, d) [m / s2]; ``time_step`` [s];
+    - in the place of gravity ``tilt`` (d - 1,) or (steps, d - 1) [degrees], how far the scene's gravity leans, with its
+      size kept: where it is along -y, towards x and, in 3-D, z; see `cortado.tilt.Tilt`;
     - ``initial_positions`` [m] and ``initial_velocities`` [m / s], (n, d);
     - ``viscosity`` [Pa s] and ``rest_density`` [kg / m3], a number, with several phases (phases,);
     - with several phases the first ``mass_fractions`` (n, phases), ``mobility`` [m2 / s], ``interface_width`` [m];

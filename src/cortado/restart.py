@@ -19,7 +19,6 @@ class Elapsed:
     outlet: NDArray | None = None
     """(d,) where the opening of the nozzle was at the end [m]; None without an emitter."""
 
-
     def times(self, steps: NDArray, time_step: float) -> NDArray:
         """(frames,) [s] after so many steps more of ``time_step`` [s]; of the same size they are those of one run, bit
         for bit."""

@@ -12,9 +12,9 @@ from cortado.errors import Phrase, SceneError
 from cortado.parameter_values import (
     NOT_NEGATIVE,
     OF_EMITTER,
+    OVER_TIME,
     POSITIVE,
     SUM_TOLERANCE,
-    TABLES,
     Arrays,
     parameter_shapes,
 )
@@ -71,15 +71,20 @@ def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int) -
         field = f"{table}.{name}"
         if name in OF_EMITTER and scene.emitter is None:
             raise SceneError(None, field, Phrase("given"), "left out, as the scene has no emitter")
+        if name == "tilt" and not any(scene.forces.gravity):
+            raise SceneError(None, field, Phrase("given"), "left out, as the scene has no gravity to lean")
+        if name == "gravity" and "tilt" in values:
+            wanted = "left out, as the tilt says where it points"
+            raise SceneError(None, field, Phrase("given"), wanted)
         if isinstance(array, str):
             found[name] = array
             continue
         shapes = _shapes(name, scene, steps)
-        if name in TABLES and array.ndim == 2 and 2 <= len(array) <= steps and array.shape[1:] == shapes[0]:
+        if name in OVER_TIME and array.ndim == 2 and 2 <= len(array) <= steps and array.shape[1:] == shapes[0]:
             array = Knots(steps, len(array)).parameter(array)
         if array.shape not in shapes:
             wanted = _in_words(shapes)
-            if name in TABLES and steps > 1:
+            if name in OVER_TIME and steps > 1:
                 wanted = f"{_in_words(shapes[:1])}, or 2 to {steps} rows of it"
             raise SceneError(None, field, Phrase(_in_words([array.shape])), wanted)
         _check_range(name, field, array)
@@ -102,7 +107,7 @@ def _check_range(name: str, field: str, array: np.ndarray) -> None:
 
 def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mapping[str, Any]) -> None:
     """Raises `SceneError` for an option that does not fit the others; none is silently left unused."""
-    over_time = [name for name in TABLES if name in start and start[name].ndim == 2]
+    over_time = [name for name in OVER_TIME if name in start and start[name].ndim == 2]
     if optimise.knots is not None and not over_time:
         raise SceneError(None, "optimise.knots", optimise.knots, "left out, as nothing that is optimised has rows")
     if optimise.knots is not None and optimise.knots > problem.steps:
@@ -147,7 +152,7 @@ def _check_bounds(name: str, pair: np.ndarray, optimise: OptimiseTable, start: M
         raise SceneError(None, field, pair.tolist(), "greater than 0, as the parameter is changed by factors")
     _check_range(name, field, pair)
     shape = _shapes(name, scene, 0)[0] if isinstance(value, str) else value.shape
-    if optimise.knots is not None and name in TABLES and len(shape) == 2:
+    if optimise.knots is not None and name in OVER_TIME and len(shape) == 2:
         shape = (optimise.knots, shape[1])
     try:
         np.broadcast_to(pair[0], shape)

@@ -8,8 +8,9 @@ import numpy as np
 from cortado.assignment import Assignment
 from cortado.figures import curve, images, loss_curve, parameters, particles
 from cortado.optimisation import Result
-from cortado.parameter_values import MATERIALS, TABLES, UNITS
+from cortado.parameter_values import MATERIALS, OVER_TIME, UNITS
 from cortado.report import Figures
+from cortado.tilt import Tilt
 from cortado.video import MOST_FRAMES, write_video
 
 MOST_CURVES = 12
@@ -65,11 +66,12 @@ def _images(made: Assignment, result: Result, folder: Path) -> Figures:
 def _parameter(made: Assignment, result: Result, name: str, folder: Path) -> Figures:
     """A small parameter over the iterations, one over time as it was found."""
     found, hidden = made.search.parameters(result.parameters)[name], made.hidden(name)
-    if name in TABLES and np.ndim(found) == 2:
-        series = {f"{axis}, found": column for axis, column in zip("xyz", found.T, strict=False)}
+    if name in OVER_TIME and np.ndim(found) == 2:
+        axes = Tilt(made.task.scene.forces.gravity).towards if name == "tilt" else "xyz"
+        series = {f"{axis}, found": column for axis, column in zip(axes, found.T, strict=False)}
         if hidden is not None:
             hidden = np.broadcast_to(hidden, found.shape)
-            series |= {f"{axis}, hidden": column for axis, column in zip("xyz", hidden.T, strict=False)}
+            series |= {f"{axis}, hidden": column for axis, column in zip(axes, hidden.T, strict=False)}
         path = folder / f"{name}.png"
         curve(np.arange(len(found)), series, path, title=name, x_label="step", y_label=f"{name} [{UNITS[name]}]")
         return [(f"The parameter {name} over time.", path)]

@@ -6,7 +6,7 @@ import numpy as np
 
 from cortado.controls import Controls
 from cortado.errors import InputError
-from cortado.parameter_values import NUMBERS, STATES, TABLES, Arrays, Values
+from cortado.parameter_values import NUMBERS, OVER_TIME, STATES, Arrays, Values
 from cortado.problem import Problem
 
 CHANGE = 0.05
@@ -35,10 +35,11 @@ def everything(problem: Problem, chosen: Arrays) -> Arrays:
     idle = {"mass_fractions"} if len(problem.simulation.scene.phase) == 1 else set()
     idle |= {"mobility", "interface_width"} if idle or not values["mobility"] > 0.0 else set()
     idle |= {"viscosity"} if not (values["viscosity"] > 0.0).all() else set()
-    idle |= set(TABLES) if problem.steps == 0 else set()
+    idle |= set(OVER_TIME) if problem.steps == 0 else set()
+    idle |= {"gravity"} if "tilt" in chosen else set()
     found = {name: value for name, value in values.items() if name not in idle}
-    for name in set(TABLES) & found.keys():
-        found[name] = np.broadcast_to(found[name], (problem.steps, problem.simulation.dimension)).copy()
+    for name in set(OVER_TIME) & found.keys():
+        found[name] = np.broadcast_to(found[name], (problem.steps, found[name].shape[-1])).copy()
     return found
 
 
@@ -51,6 +52,7 @@ def scales(problem: Problem, values: Arrays, change: float = CHANGE) -> Arrays:
     speed = np.sqrt(gravity * height)
     units = {
         "gravity": gravity,
+        "tilt": np.degrees(1.0),
         "initial_positions": spacing,
         "initial_velocities": speed,
         "nozzle_path": spacing,
@@ -74,7 +76,7 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
     x = problem.simulation.positions - problem.simulation.positions.mean(axis=0)
     x = x / (np.abs(x).max() or 1.0)
     found = directions(values, sizes, random)
-    for name in found.keys() & {*STATES, *TABLES}:
+    for name in found.keys() & {*STATES, *OVER_TIME}:
         columns = values[name].shape[-1]
         field = random.standard_normal(columns)
         if name in STATES:
