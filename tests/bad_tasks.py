@@ -109,6 +109,8 @@ BAD_TASKS = [
     ("no learning rate", "learning_rate = 0.5", "", "optimise.learning_rate"),
     ("negative learning rate", "learning_rate = 0.5", "learning_rate = -0.5", "optimise.learning_rate"),
     ("learning rate that is not a number", "learning_rate = 0.5", "learning_rate = nan", "optimise.learning_rate"),
+    ("tolerance of Adam", _RATE, f"{_RATE}\ntolerance = 1e-5", "optimise.tolerance"),
+    ("tolerance of all", '"adam"', '"lbfgs"\ntolerance = 1.0', "optimise.tolerance"),
     ("reduction below one", "loss_reduction = 2.0", "loss_reduction = 0.5", "optimise.check.loss_reduction"),
     ("error of zero", "parameter_error = 0.5", "parameter_error = 0.0", "optimise.check.parameter_error"),
     ("unknown check", "parameter_error", "gravity_error", "optimise.check.gravity_error"),

@@ -1,6 +1,7 @@
 """Run folders, their reports, and the progress lines that go with them."""
 
 import io
+import itertools
 import json
 import os
 import re
@@ -222,6 +223,16 @@ def test_progress_on_a_file_is_a_line_now_and_then():
         advance(3)
     assert quiet.getvalue() == ""
     assert chatty.getvalue() == "run 1/4, 0:00:00 left, loss 0.1235\nrun 4/4, 0:00:00 left\n"
+
+
+def test_no_time_is_left_after_more_than_was_expected(monkeypatch):
+    """As of an optimiser that evaluates more than once an iteration."""
+    seconds, chatty = itertools.count(0.0, 30.0), io.StringIO()
+    monkeypatch.setattr("time.monotonic", lambda: next(seconds))
+    with track(2, "optimise", stream=chatty, interval=0.0) as advance:
+        for _ in range(3):
+            advance()
+    assert [line.split(", ")[1] for line in chatty.getvalue().splitlines()] == ["0:00:30 left"] + 2 * ["0:00:00 left"]
 
 
 def test_progress_on_a_terminal_is_a_bar_with_fields(monkeypatch):

@@ -56,6 +56,11 @@ def test_an_optimiser_is_chosen_by_name(task_file, name, wanted):
     assert load_task(task_file, [f"optimise.optimiser={name}"]).optimise.algorithm() == wanted
 
 
+def test_a_tolerance_of_lbfgs(task_file):
+    task = load_task(task_file, ["optimise.optimiser=lbfgs", "optimise.tolerance=1e-5"])
+    assert task.optimise.algorithm() == LBFGS(scale=0.5, tolerance=1e-5)
+
+
 def test_gravity_may_change_with_time(task_file):
     table = [[0.0, -float(step)] for step in range(5)]
     task = load_task(task_file, [f"problem.target.gravity={table}", f"optimise.start.gravity={table}"])

@@ -75,7 +75,7 @@ class _Lines:
         if now - self._last_line < self._interval and not finished_late:
             return
         self._last_line = now
-        left = (now - self._started) * (self._total - self._done) / max(self._done, 1)
+        left = (now - self._started) * max(self._total - self._done, 0) / max(self._done, 1)
         line = f"{self._description} {self._done}/{self._total}, {_clock(left)} left"
         print(", ".join([line, *filter(None, [_text(fields)])]), file=self._stream, flush=True)
 

@@ -1,7 +1,7 @@
 """The tables [problem] and [optimise] of a task, with the kinds of values that only they have."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Annotated, Any, Self
 
@@ -208,6 +208,8 @@ class OptimiseTable(Table):
     """Name of the algorithm."""
     learning_rate: Annotated[float, Quantity(above=0.0)]
     """In units of the parameters; for L-BFGS the size of its first step."""
+    tolerance: Annotated[float | None, Quantity(above=0.0, most=0.5)] = None
+    """Of L-BFGS: it ends where the gradient is this part of the first; None: where round-off stops it."""
     iterations: Annotated[int, Count(1, 10_000_000)]
     """Updates at most, of each search."""
     policy: PolicyTable = PolicyTable()
@@ -215,9 +217,18 @@ class OptimiseTable(Table):
     check: CheckTable = CheckTable()
     """What the run has to reach."""
 
+    @model_validator(mode="after")
+    def _check_tolerance(self) -> Self:
+        if self.tolerance is not None and self.optimiser != "lbfgs":
+            raise wrong(("tolerance",), self.tolerance, 'left out, as only "lbfgs" has one')
+        return self
+
     def algorithm(self) -> Optimiser:
         """The optimiser as an object."""
-        return OPTIMISERS[self.optimiser](self.learning_rate)
+        made = OPTIMISERS[self.optimiser](self.learning_rate)
+        if isinstance(made, LBFGS) and self.tolerance is not None:
+            return replace(made, tolerance=self.tolerance)
+        return made
 
 
 class TaskTables(Table):
