@@ -100,6 +100,16 @@ def test_steps_that_did_not_converge_are_marked(tmp_path):
     pixels(figures.density_errors(trajectory_of(0), tmp_path / "c.png"))
 
 
+def test_what_is_hidden_is_seen_where_it_was_found(tmp_path):
+    labels = {"title": "", "x_label": "", "y_label": ""}
+    found, ink = {"found": [0.0, 1.0, 2.0]}, (0x2B, 0x2A, 0x28)
+    alone, both = (
+        pixels(figures.curve([0.0, 1.0, 2.0], found, tmp_path / f"{k}.png", **labels, hidden=hidden))
+        for k, hidden in enumerate([(), ([0.0, 1.0, 2.0],)])
+    )
+    assert share_of(ink, both) > share_of(ink, alone) + 1e-3
+
+
 def test_a_curve_leaves_out_what_has_no_place_on_it(tmp_path):
     labels = {"title": "a", "x_label": "iteration", "y_label": "loss"}
     odd = {"odd": [1.0, np.nan, 0.0, 10.0], "none": [-1.0, 0.0, np.inf, np.nan]}

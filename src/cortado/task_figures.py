@@ -69,11 +69,10 @@ def _parameter(made: Assignment, result: Result, name: str, folder: Path) -> Fig
     if name in OVER_TIME and np.ndim(found) == 2:
         axes = Tilt(made.task.scene.forces.gravity).towards if name == "tilt" else "xyz"
         series = {f"{axis}, found": column for axis, column in zip(axes, found.T, strict=False)}
-        if hidden is not None:
-            hidden = np.broadcast_to(hidden, found.shape)
-            series |= {f"{axis}, hidden": column for axis, column in zip(axes, hidden.T, strict=False)}
+        truth = () if hidden is None else tuple(np.broadcast_to(hidden, found.shape).T)
         path = folder / f"{name}.png"
-        curve(np.arange(len(found)), series, path, title=name, x_label="step", y_label=f"{name} [{UNITS[name]}]")
+        label = f"{name} [{UNITS[name]}]"
+        curve(np.arange(len(found)), series, path, title=name, x_label="step", y_label=label, hidden=truth)
         return [(f"The parameter {name} over time.", path)]
     if hidden is None or max(np.size(found), hidden.size) > MOST_CURVES:
         return []

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cortado.errors import InputError
-from cortado.figures.canvas import DASHED, FAINT, PALETTE, drawing, whole_numbers
+from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE, drawing, whole_numbers
 from cortado.trajectory import Trajectory
 
 
@@ -40,6 +40,7 @@ def curve(
     x_label: str,
     y_label: str,
     logarithmic: bool = False,
+    hidden: Sequence[ArrayLike] = (),
 ) -> Path:
     """Several series over the same numbers.
 
@@ -47,6 +48,7 @@ def curve(
         x: (k,), at whole numbers only if they are integers.
         series: label -> (k,); what is not finite is left out. Labels are shown if there are two or more.
         logarithmic: scale of the series, where any is positive; zeros and negative numbers are left out.
+        hidden: (k,) each, what the series should be, dashed on top of them.
     """
     x, lines = np.asarray(x), {label: np.asarray(values, dtype=float) for label, values in series.items()}
     for label, values in lines.items():
@@ -57,11 +59,13 @@ def curve(
         axes = figure.subplots()
         for k, (label, values) in enumerate(lines.items()):
             _line(axes, x, values, logarithmic, color=PALETTE[k % len(PALETTE)], label=label)
+        for k, truth in enumerate(hidden):
+            axes.plot(x, np.asarray(truth, dtype=float), **DASHED, color=INK, label=None if k else "hidden")
         axes.margins(x=0.03, y=0.08)
         axes.set(title=title, xlabel=x_label, ylabel=y_label)
         if np.issubdtype(x.dtype, np.integer):
             whole_numbers(axes.xaxis)
-        if len(lines) > 1:
+        if len(lines) + len(hidden) > 1:
             axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     return Path(path)
 
