@@ -147,10 +147,11 @@ def test_frames_and_records():
 
 
 def test_any_number_of_threads_gives_the_same_bits(monkeypatch):
-    def once(parts):
+    def once(cores, parts):
         monkeypatch.setattr(launching, "LEAST_PART", 125 // parts)
-        monkeypatch.setattr(launching.os, "sched_getaffinity", lambda _: range(parts), raising=False)
+        monkeypatch.setattr(launching.os, "sched_getaffinity", lambda _: range(cores), raising=False)
         simulation = Simulation(splash(minimum_iterations=2, maximum_iterations=20), precision="float64")
+        assert simulation.solver.launch.parts == parts
         assert simulation.solver.launch.capturable == (parts == 1)
         simulation.solver.grow(8)
         problem = Problem(simulation, 120, losses.FinalPositions(np.zeros_like(simulation.positions)))
@@ -159,7 +160,7 @@ def test_any_number_of_threads_gives_the_same_bits(monkeypatch):
         tangent = problem.tangent(point, {"gravity": np.ones(3)})
         return [np.array(loss), np.array(tangent), problem.iterations(), *gradient.values()]
 
-    wanted = once(1)
-    for parts in (2, 5):
-        for found, exact in zip(once(parts), wanted, strict=True):
+    wanted = once(1, 1)
+    for cores, parts in ((2, 2), (2, 7), (5, 5)):
+        for found, exact in zip(once(cores, parts), wanted, strict=True):
             assert found.tobytes() == exact.tobytes()

@@ -29,6 +29,7 @@ from cortado.parameter_values import (
 from cortado.particles import Parameters, State
 from cortado.restart import Elapsed, RestartState
 from cortado.rollout import Rollout
+from cortado.threads import WARP
 from cortado.tilt import Tilt
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ class Controls:
         """(phases, 3) the colours of the phases."""
         return values.get("colours", self._scene["colours"])
 
+    @WARP
     def begin(
         self, rollout: Rollout, values: Arrays, varied: Iterable[str] = (), state: RestartState | None = None
     ) -> None:
@@ -102,6 +104,7 @@ class Controls:
                     wanted = f"{before} with this state, whose nozzle ran with that"
                     raise InputError(f"{name} is {now:g}, but must be {wanted}.")
 
+    @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
         """A direction by name as tangents of the first state and of the parameters, at ``values``."""
         dot, parameters = rollout.solver.new_state(), rollout.solver.new_parameters(self._steps)

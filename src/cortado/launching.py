@@ -2,38 +2,45 @@
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from functools import cache
+from concurrent.futures import wait
+from contextlib import nullcontext
 from typing import Any
 
 import warp as wp
 
 from cortado.physics.reduction import add_kernel, sum_and_maximum_kernel, sum_kernel
 from cortado.precision import Precision
+from cortado.threads import MOST_CORES, WARP, helpers
 
 BRANCHES = 32
 """Values that one thread of a tree sum adds up."""
 
 
-MOST_PARTS = 16
-"""Ranges of particles at most that a launch on a CPU is cut into."""
+PARTS_A_CORE = 4
+"""Ranges of particles for each of them: a core that is busy elsewhere leaves some of its own to the others."""
+MOST_PARTS = 32
+"""Ranges at most that a launch is cut into."""
 LEAST_PART = 2000
-"""Particles at least in such a range: below, starting it costs more than it saves."""
+"""Particles at least in a range: below, starting it costs more than it saves."""
 
 
 class Launcher:
     """Launches kernels with one thread a particle on one device.
 
     On a CPU Warp launches in one thread; a kernel that sums over neighbours, which begins with its surroundings, is cut
-    into ranges of particles for the cores there are. Its sums are gathers, so that the bits do not depend on the cut.
+    into ranges of particles, more than there are cores, and each core takes the next range when it has done one. The
+    sums are gathers, so that the bits do not depend on the cut, or on who took what.
     """
 
     def __init__(self, particles: int, device: Any, record_tape: bool):
         """``record_tape`` False keeps launches off a tape that a user may have open."""
         self.particles, self.device, self._record_tape = particles, device, record_tape
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        parts = min(cores, MOST_PARTS, particles // LEAST_PART) if device.is_cpu and not record_tape else 1
-        self._bounds = [particles * part // max(parts, 1) for part in range(max(parts, 1) + 1)]
+        self._cores = min(cores, MOST_CORES) if device.is_cpu and not record_tape else 1
+        most = min(PARTS_A_CORE * self._cores, MOST_PARTS) if self._cores > 1 else 1
+        self.parts = max(min(most, particles // LEAST_PART), 1)
+        """Ranges of particles that a sum over neighbours is cut into."""
+        self._bounds = [particles * part // self.parts for part in range(self.parts + 1)]
         self._compiled: set[Any] = set()
         self._whole: Any = None
         self._parts: list[Any] = []
@@ -41,7 +48,7 @@ class Launcher:
     @property
     def capturable(self) -> bool:
         """Whether launches may be captured as a graph: those of one thread."""
-        return len(self._bounds) == 2
+        return self.parts == 1
 
     def __call__(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any], threads: int | None = None) -> None:
         if not self.capturable and hasattr(inputs[0], "neighbours"):
@@ -60,24 +67,29 @@ class Launcher:
 
     def _launch_parts(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
         if self._whole is not inputs[0]:
-            self._whole, self._parts = inputs[0], [self._part(inputs[0], n) for n in range(len(self._bounds) - 1)]
+            self._whole, self._parts = inputs[0], [self._part(inputs[0], n) for n in range(self.parts)]
 
-        def launch(part: int) -> None:
-            wp.launch(
-                kernel,
-                self._bounds[part + 1] - self._bounds[part],
-                inputs=[self._parts[part], *inputs[1:]],
-                outputs=outputs,
-                device=self.device,
-                record_tape=False,
-            )
+        waiting = iter(range(self.parts))
 
-        running = [_pool().submit(launch, part) for part in range(len(self._parts))]
+        def take() -> None:
+            for part in waiting:
+                wp.launch(
+                    kernel,
+                    self._bounds[part + 1] - self._bounds[part],
+                    inputs=[self._parts[part], *inputs[1:]],
+                    outputs=outputs,
+                    device=self.device,
+                    record_tape=False,
+                )
+
+        called = [helpers().submit(take) for _ in range(min(self._cores, self.parts) - 1)]
         try:
-            for part in running:
-                part.result()
+            take()
         finally:
-            wait(running)  # also after an interruption: nothing may go on writing behind the back of what comes next
+            begun = [helper for helper in called if not helper.cancel()]
+            wait(begun)  # also after an interruption: nothing may go on writing behind the back of what comes next
+        for helper in begun:
+            helper.result()
 
     def _part(self, surroundings: Any, number: int) -> Any:
         """The surroundings as one range sees them."""
@@ -86,11 +98,6 @@ class Launcher:
             setattr(part, name, getattr(surroundings, name))
         part.first, part.part = self._bounds[number], number
         return part
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(MOST_PARTS, thread_name_prefix="cortado")
 
 
 class Replayed:
@@ -113,7 +120,8 @@ class Replayed:
             with wp.ScopedCapture(device=self._launch.device) as capture:
                 self._work()
             self._graph = capture.graph
-        wp.capture_launch(self._graph)
+        with WARP.lent() if self._launch.device.is_cpu else nullcontext():  # a GPU has one queue for all threads
+            wp.capture_launch(self._graph)
 
 
 class TreeSum:

@@ -16,6 +16,7 @@ from cortado.launching import sum_of
 from cortado.particles import State, to_device
 from cortado.physics.matching import matching_kernels
 from cortado.precision import FLOAT32, FLOAT64, Precision
+from cortado.threads import WARP
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,7 @@ class FinalPositions:
         """Tells one target from another, for checkpoints."""
         self._on_device: dict[Any, wp.array] = {}
 
+    @WARP
     def value(self, end: TrajectoryEnd) -> float:
         x, target, device = self._positions_and_target(end)
         squares = wp.empty(len(x), dtype=wp.float64, device=device)
@@ -111,6 +113,7 @@ class FinalPositions:
         total = sum_of(wp.float64, len(x), device)(squares)
         return float(total.numpy()[0]) / len(x)
 
+    @WARP
     def adjoint(self, end: TrajectoryEnd) -> State:
         x, target, device = self._positions_and_target(end)
         bar = end.state.like()
@@ -229,11 +232,13 @@ class Image:
         """The picture (rows, columns, 3) of a state."""
         return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
 
+    @WARP
     def value(self, end: TrajectoryEnd) -> float:
         if self._seen is not None and self._seen[0] is end:
             return self._seen[1]
         return self.distance.value(self.image(end), self.target)
 
+    @WARP
     def adjoint(self, end: TrajectoryEnd) -> EndAdjoint:
         image = self.image(end)
         self._seen = (end, self.distance.value(image, self.target))
@@ -271,10 +276,12 @@ class Recorded:
     def __init__(self, function: WarpFunction):
         self.function = function
 
+    @WARP
     def value(self, end: TrajectoryEnd) -> float:
         loss, _, _ = self._run(end)
         return float(loss.numpy()[0])
 
+    @WARP
     def adjoint(self, end: TrajectoryEnd) -> tuple[np.ndarray, np.ndarray]:
         with wp.Tape() as tape:
             loss, positions, velocities = self._run(end)

@@ -17,6 +17,7 @@ from cortado.particles import State
 from cortado.policies import AdjointPolicy, Estimate, Policy, estimate
 from cortado.rollout import MEMORY_BUDGET, Observer, Rollout, StepDerivative
 from cortado.simulation import Simulation, check_steps
+from cortado.threads import Turn, in_turn
 from cortado.trajectory import Trajectory
 
 __all__ = ["NAMES", "UNITS", "Problem"]
@@ -66,6 +67,12 @@ class Problem:
         self._rollout = Rollout(simulation.solver, self.steps, memory_budget)
         self._derivatives: dict[AdjointPolicy, StepDerivative] = {}
 
+    @property
+    def turn(self) -> Turn:
+        """What a thread holds that uses the problem's simulation."""
+        return self.simulation.turn
+
+    @in_turn
     def value(self, parameters: Values) -> float:
         """The loss, forward only."""
         return self._total(self._ends(self._controls.checked(parameters), self._losses, keep=False))
@@ -74,10 +81,12 @@ class Problem:
         """The last state of the rollout under these parameters."""
         return self.states(parameters, [self.steps])[self.steps]
 
+    @in_turn
     def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, TrajectoryEnd]:
         """States of the rollout under these parameters, by the number of steps before them."""
         return self._ends(self._controls.checked(parameters), steps, keep=False)
 
+    @in_turn
     def run(self, parameters: Values, record_every: int = 1) -> Trajectory:
         """The whole trajectory under these parameters; see `Simulation.run`."""
         self._controls.begin(self._rollout, self._controls.checked(parameters))
@@ -88,6 +97,7 @@ class Problem:
         found = self.estimate(parameters, policy)
         return found.loss, found.gradient
 
+    @in_turn
     def estimate(self, parameters: Values, policy: Policy | None = None, observe: Observer | None = None) -> Estimate:
         """The same, with what the policy (`policies.Exact` by default) reports.
 
@@ -105,6 +115,7 @@ class Problem:
             )
         return found
 
+    @in_turn
     def passage(self, parameters: Values) -> "Passage":
         """A forward run that can be gone back through, until the next evaluation: what policies work with."""
         values = self._controls.checked(parameters)
@@ -113,6 +124,7 @@ class Problem:
         rollout = self._rollout
         return Passage(self._total(ends), rollout, values, bars, self._controls, self._derivatives, rollout.evaluation)
 
+    @in_turn
     def tangent(self, parameters: Values, directions: Values) -> float:
         """The derivative of the loss along ``directions`` (any of the parameters), by forward mode."""
         values = self._controls.checked(parameters)
@@ -196,12 +208,19 @@ class Passage:
     _derivatives: dict[AdjointPolicy, StepDerivative]
     _evaluation: int
 
+    @property
+    def turn(self) -> Turn:
+        """What a thread holds that uses the rollout."""
+        return self.rollout.turn
+
+    @in_turn
     def derivative(self, policy: AdjointPolicy) -> StepDerivative:
         """The policy's backward step, made once for each problem."""
         if policy not in self._derivatives:
             self._derivatives[policy] = policy.derivative(self.rollout)
         return self._derivatives[policy]
 
+    @in_turn
     def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:
         """The gradient; ``observe`` is given the number and the adjoint of every state, from the last to the first.
 

@@ -20,6 +20,7 @@ from cortado.restart import Elapsed
 from cortado.solvers.containment import Lost
 from cortado.solvers.pcisph import Pcisph
 from cortado.solvers.pcisph_derivatives import PcisphTangent
+from cortado.threads import WARP, Turn, in_turn
 
 CHUNK = 16
 """Steps between two looks of the host, on a GPU."""
@@ -59,6 +60,7 @@ def checkpoint_interval(steps: int, affordable: int) -> int:
 class Rollout:
     """A number of steps of a solver from a first state, which can be repeated and differentiated."""
 
+    @WARP
     def __init__(self, solver: Pcisph, steps: int, memory_budget: int = MEMORY_BUDGET):
         self.solver, self.steps = solver, steps
         self._device = solver.search.device
@@ -87,8 +89,14 @@ class Rollout:
         self.errors = np.zeros((0, 2))
         """(steps, 2) average and greatest compression (rho* - rho_0)+ / rho_0 at each step."""
 
+    @property
+    def turn(self) -> Turn:
+        """What a thread holds that uses the solver."""
+        return self.solver.turn
+
     # ---- forward -------------------------------------------------------------------------------------------------
 
+    @in_turn
     def forward(self, observe: Observer | None = None, keep: bool = True) -> State:
         """Run all steps and return the last state. ``observe`` is given every state; ``keep`` checkpoints for a way
         back. Raises `DivergedError` after the good states were observed."""
@@ -171,6 +179,7 @@ class Rollout:
 
     # ---- derivatives ---------------------------------------------------------------------------------------------
 
+    @in_turn
     def backward(self, derivative: StepDerivative, bars: Mapping[int, State], observe: Observer | None = None) -> State:
         """The adjoint of the first state, for ``bars``, adjoints of states by their number; `forward` has run.
 
@@ -203,6 +212,7 @@ class Rollout:
             self._steps_back[key] = Replayed(work, self.solver.launch)
         self._steps_back[key]()
 
+    @in_turn
     def tangent(self, dot: State, parameters_dot: Parameters, observe: Observer) -> None:
         """From ``dot``, the tangent of the first state, to that of every state, given to ``observe``; `forward` has
         run."""

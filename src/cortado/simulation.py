@@ -30,6 +30,7 @@ from cortado.solvers.forces import ForceTerm, Gravity, laminar_viscosity, pairwi
 from cortado.solvers.mixture import Phases
 from cortado.solvers.pcisph import Pcisph
 from cortado.solvers.pcisph_parts import PressureSolve
+from cortado.threads import WARP, Turn, in_turn
 from cortado.trajectory import Trajectory
 
 MOST_SUBSTEPS = 10_000
@@ -40,6 +41,7 @@ VISCOSITIES = {"pairwise": pairwise_viscosity, "laminar": laminar_viscosity}
 class Simulation:
     """A scene made ready to run: particles sampled, masses calibrated, kernels chosen."""
 
+    @WARP
     def __init__(
         self,
         scene: Scene,
@@ -85,6 +87,12 @@ class Simulation:
         """2 or 3."""
         return self.scene.dimension
 
+    @property
+    def turn(self) -> Turn:
+        """What a thread holds that uses the simulation."""
+        return self.solver.turn
+
+    @in_turn
     def run(
         self,
         steps: int,
@@ -101,6 +109,7 @@ class Simulation:
         """
         return self.collect(self.rollout(steps, controls, state), record_every)
 
+    @in_turn
     def collect(self, rollout: Rollout, record_every: int = 1) -> Trajectory:
         """Run a rollout forward and return its frames; warnings and errors as of `run`."""
         if record_every < 1:
@@ -114,7 +123,7 @@ class Simulation:
         rollout.forward(keep, keep=False)
         converged = self.converged(rollout)
         if not converged.all():
-            warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=3)
+            warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=5)
         numbers, positions, velocities, fractions = (np.array(column) for column in zip(*frames, strict=True))
         return Trajectory(
             times=rollout.elapsed.times(numbers, rollout.time_step),
@@ -140,6 +149,7 @@ class Simulation:
         outlets = np.concatenate([first, path]).astype(path.dtype)[frames]
         return RunConstants(density, rollout.time_step, rollout.flow_rate, outlets)
 
+    @in_turn
     def rollout(
         self, steps: int, controls: Mapping[str, Any] | None = None, state: RestartState | None = None
     ) -> Rollout:

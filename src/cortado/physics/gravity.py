@@ -29,9 +29,9 @@ def gravity_kernels(precision: Precision) -> SimpleNamespace:
     def gravity_adjoint(
         total: wp.array(dtype=vector),
         step: wp.array(dtype=wp.int32),
-        # out
+        # in and out
         table_bar: wp.array(dtype=vector),
     ):
-        table_bar[step[0]] = total[0]
+        table_bar[step[0]] = table_bar[step[0]] + total[0]
 
     return SimpleNamespace(forward=gravity, tangent=gravity, adjoint=gravity_adjoint)

@@ -16,6 +16,7 @@ from cortado.render.fields import ColourField
 from cortado.render.marching import RayMarcher
 from cortado.render.views import View
 from cortado.smoothing import SmoothingKernel
+from cortado.threads import WARP
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Renderer:
     respect to the pose is one-sided.
     """
 
+    @WARP
     def __init__(
         self,
         view: View,
@@ -121,6 +123,7 @@ class Renderer:
         columns, rows = self.view.camera.resolution
         return rows, columns, 3
 
+    @WARP
     def render(self, positions: Any, fractions: Any, colours: Any) -> np.ndarray:
         """The picture (rows, columns, 3), in float64, row 0 at the top.
 
@@ -137,6 +140,7 @@ class Renderer:
         self._rendered = True
         return self._rays.image.numpy().astype(np.float64).reshape(self.shape)
 
+    @WARP
     def adjoint(self, image_bar: np.ndarray) -> RenderAdjoint:
         """The derivative of a function of the last picture, from its derivative with respect to that picture (rows,
         columns, 3)."""
@@ -146,6 +150,7 @@ class Renderer:
         field_bar, pose = self._rays.adjoint(image_bar.reshape(-1, 3), self._field.values)
         return RenderAdjoint(*self._field.adjoint(field_bar), pose[:3], pose[3:])
 
+    @WARP
     def field(self) -> tuple[np.ndarray, np.ndarray]:
         """Coverage (nx, ny, nz) and colour times coverage (nx, ny, nz, 3) [-] at the nodes, of the last picture."""
         found = self._field.values.numpy().astype(np.float64).transpose(2, 1, 0, 3)

@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.launching import Launcher, sum_of
+from cortado.launching import Launcher, add, sum_of
 from cortado.neighbours import NeighbourSearch
 from cortado.particles import Fields, Parameters
 from cortado.physics.diffusion import Diffusion, diffusion_kernels
@@ -108,9 +108,9 @@ class MixtureAdjoint:
             array.zero_()
 
     def collect(self, bar: Parameters) -> None:
-        """Write the adjoints of the phases' rest densities and viscosities, of all steps since `clear`."""
-        for add, array, total in zip(self._sums, self._phase_bars, (bar.rest_density, bar.viscosity), strict=True):
-            wp.copy(total, add(array).view(total.dtype).flatten())
+        """Add the adjoints of the phases' rest densities and viscosities, of all steps since `clear`."""
+        for add_up, array, total in zip(self._sums, self._phase_bars, (bar.rest_density, bar.viscosity), strict=True):
+            add(add_up(array).view(total.dtype).flatten(), total)
 
     def step(
         self,

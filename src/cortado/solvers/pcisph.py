@@ -20,6 +20,7 @@ from cortado.solvers.emitter import Emitter, Nozzle
 from cortado.solvers.forces import ForceTerm, Moment
 from cortado.solvers.mixture import Mixture, Phases
 from cortado.solvers.pcisph_parts import Iterates, Kernels, PressureSolve
+from cortado.threads import Turn
 
 
 class Pcisph:
@@ -43,6 +44,8 @@ class Pcisph:
         self.discretisation, self.lattice, self.search = discretisation, lattice, search
         self.terms, self.pressure, self.periods = tuple(terms), pressure, tuple(periods)
         self.launch = Launcher(particles, device, record_tape=requires_grad)
+        self.turn = Turn(device)
+        """Whose arrays these are now."""
         self.mixture = Mixture(phases, precision, search, self.launch, requires_grad)
         self.kernels = Kernels.of(discretisation)
         self._sum = sum_and_maximum(particles, precision, device)

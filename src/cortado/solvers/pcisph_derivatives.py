@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.launching import sum_of
+from cortado.launching import add, sum_of
 from cortado.particles import Fields, Parameters, State
 from cortado.physics.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.emitter import EmitterAdjoint
@@ -49,13 +49,14 @@ class PcisphAdjoint:
             self._emitter.clear()
 
     def collect(self, bar: Parameters) -> None:
-        """Write the adjoints that were kept particle by particle, of all steps since `clear`."""
+        """Add to ``bar`` the adjoints that were kept particle by particle since `clear`, and forget them."""
         self._mixture.collect(bar)
         totals = self._sum(self._scalars_bar).view(bar.time_step.dtype).flatten()
         for k, total in enumerate((bar.time_step, bar.mobility, bar.interface_width)):
-            wp.copy(total, totals, src_offset=k, count=1)
+            add(totals[k : k + 1], total)
         if self._emitter:
             self._emitter.collect(bar)
+        self.clear()
 
     def step(
         self, iterations: int, new_state_bar: State, state_bar: State, parameters: Parameters, bar: Parameters
