@@ -6,8 +6,21 @@ import tomllib
 from collections.abc import Sequence
 from typing import Any
 
-from cortado.errors import SceneError
+from cortado.errors import LONGEST, SceneError, shown
+from cortado.input_files import content, reason
 
+MOST_BYTES = 1_000_000
+"""Of a file: TOML of that size, made to be as bad as it can, takes a few seconds and some hundred MB."""
+MOST_PARTS = 10
+"""Of a dotted key: the time and the memory that one takes grow with the square of their number."""
+
+_ASIDE = re.compile(
+    r'''#[^\n]*|"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5}|\Z)|"(?:[^"\\\n]|\\.)*+"?'''
+    r"""|'{3}(?:[^']|'(?!''))*+(?:'{3,5}|\Z)|'[^'\n]*+'?""",
+    re.DOTALL,
+)
+"""Comments and quoted texts, unfinished ones too."""
+_TOO_DEEP = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_PARTS}}}[\w-]++")
 _KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
 
 
@@ -19,15 +32,16 @@ def read_toml(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> di
     """
     file = os.fspath(path)
     try:
-        with open(path, "rb") as stream:
-            data = tomllib.loads(stream.read().decode("utf-8"))
+        text = content(path, MOST_BYTES).decode("utf-8")
+        _require_shallow(text, file)
+        data = tomllib.loads(text)
     except UnicodeDecodeError as problem:
         line = problem.object[: problem.start].count(b"\n") + 1
         raise _unreadable(file, f"is not text in UTF-8 (at line {line}).") from None
     except (ValueError, RecursionError) as problem:  # among them TOMLDecodeError, which names the line
-        raise _unreadable(file, f"is not valid TOML: {_reason(problem)}.") from None
+        raise _unreadable(file, f"is not valid TOML: {reason(problem)}.") from None
     except OSError as problem:
-        raise _unreadable(file, f"cannot be read: {_reason(problem)}.") from None
+        raise _unreadable(file, f"cannot be read: {reason(problem)}.") from None
     for override in overrides:
         _apply(data, override, file)
     return data
@@ -37,29 +51,45 @@ def _unreadable(file: str, sentence: str) -> SceneError:
     return SceneError(file, "", sentence=sentence)
 
 
-def _reason(problem: BaseException) -> str:
-    text = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
-    return " ".join(text.split()).rstrip(".")
+def _require_shallow(text: str, file: str) -> None:
+    """Raises `SceneError` for a key of very many parts, wherever it stands, before anything is made of it."""
+    plain = _ASIDE.sub(lambda found: "" if found[0].startswith("#") else "text", text)
+    deep = _TOO_DEEP.search(plain)
+    if deep:
+        raise _too_deep(file, deep[0])
+
+
+def _too_deep(file: str, key: str) -> SceneError:
+    return _unreadable(file, f"has a key of more than {MOST_PARTS} parts, {shown(key)}, but no table lies that deep.")
 
 
 def _apply(data: dict[str, Any], override: str, file: str) -> None:
     """Put one override in."""
+    if len(override) > MOST_BYTES:
+        sentence = f"is the beginning of {len(override)} characters, but an override must have at most {MOST_BYTES}."
+        raise SceneError(file, repr(override[:LONGEST]), sentence=sentence)
+    _require_shallow(override, file)
     key, equals, text = override.partition("=")
     key = key.strip()
     if not equals or not _KEY.fullmatch(key):
         raise SceneError(file, repr(override), sentence="is not an override of the form key=value.")
     parts = key.replace("[", ".").replace("]", "").split(".")
+    if len(parts) > MOST_PARTS:
+        raise _too_deep(file, key)
+    field = key if len(key) <= LONGEST else shown(key)
     place: Any = data
     for depth, part in enumerate(parts):
         last = depth == len(parts) - 1
         index: str | int = part
         if isinstance(place, list):
-            if not part.isdecimal() or int(part) >= len(place):
+            if not part.isdecimal() or len(part) > 9 or int(part) >= len(place):
                 wanted = f"an index from 0 to {len(place) - 1}" if place else "left out, as the list is empty"
-                raise SceneError(file, key, part, wanted)
+                raise SceneError(file, field, part, wanted)
             index = int(part)
         elif not isinstance(place, dict):
-            raise SceneError(file, key, sentence=f"cannot be set, as {'.'.join(parts[:depth])} is not a table.")
+            raise SceneError(
+                file, field, sentence=f"cannot be set, as {'.'.join(parts[:depth])[:LONGEST]} is not a table."
+            )
         elif not last:
             place.setdefault(part, {})
         if last:
