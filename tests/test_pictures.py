@@ -1,9 +1,14 @@
 """Target pictures: that a heart is a heart and a rosetta a rosetta, and that files keep their light."""
 
+import os
+import struct
+import zlib
+
 import numpy as np
 import pytest
 from PIL import Image
 
+from bad_scenes import assert_one_sentence
 from cortado.errors import InputError
 from cortado.pictures import COFFEE, MILK, WHITE, heart, read_picture, rosetta, write_picture
 from cortado.srgb import from_srgb, to_srgb
@@ -124,6 +129,60 @@ def test_unreadable_pictures_are_sentences(tmp_path):
     Image.fromarray(np.zeros((4, 4), np.uint16)).save(tmp_path / "deep.png")
     with pytest.raises(InputError, match="more than 8 bits"):
         read_picture(tmp_path / "deep.png")
+
+
+def header_only(columns: int, rows: int) -> bytes:
+    """A PNG of some dozen bytes that says how large it is, and holds nothing."""
+    size = struct.pack(">II5B", columns, rows, 8, 2, 0, 0, 0)
+    chunks = [struct.pack(">I", len(data)) + kind + data for kind, data in ((b"IHDR", size), (b"IDAT", b""))]
+    sums = [struct.pack(">I", zlib.crc32(chunk[4:])) for chunk in chunks]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk + end for chunk, end in zip(chunks, sums, strict=True))
+
+
+@pytest.mark.parametrize(
+    "columns, rows, words",
+    [
+        (10_000, 10_000, "has 10000 x 10000 pixels, but must have at most 67108864 of them"),
+        (12_000, 12_000, "has 12000 x 12000 pixels"),
+        (30_000, 30_000, "has very many pixels, but must have at most 67108864"),
+        (2**31 - 1, 2**31 - 1, "pixels"),
+        (4000, 4000, "cannot be read: "),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_a_picture_is_judged_by_its_header(tmp_path, columns, rows, words):
+    (tmp_path / "bomb.png").write_bytes(header_only(columns, rows))
+    with pytest.raises(InputError, match=words) as caught:
+        read_picture(tmp_path / "bomb.png", 32)
+    assert_one_sentence(str(caught.value))
+
+
+def test_a_picture_that_is_kept_as_it_is_may_have_fewer_pixels(tmp_path):
+    (tmp_path / "large.png").write_bytes(header_only(5000, 5000))
+    with pytest.raises(InputError, match="must have at most 16777216"):
+        read_picture(tmp_path / "large.png")
+
+
+def test_only_regular_files_of_known_formats_are_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "zero.png").symlink_to("/dev/zero")
+    Image.new("RGB", (4, 4)).save(tmp_path / "other.png", format="TIFF")
+    for name, words in (("pipe", "a pipe"), ("zero", "a device"), ("other", "none of PNG, JPEG, WEBP, GIF, BMP")):
+        with pytest.raises(InputError, match=f"cannot be read: it is {words}"):
+            read_picture(tmp_path / f"{name}.png")
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "P"])
+def test_bands_of_rows_make_the_same_picture(tmp_path, monkeypatch, mode):
+    noise = np.random.default_rng(1).integers(0, 256, (37, 53, 4), dtype=np.uint8)
+    image = Image.fromarray(noise).convert(mode)
+    image.save(tmp_path / "a.png")
+    wanted = [read_picture(tmp_path / "a.png", size) for size in (None, 16)]
+    over_white = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image.convert("RGBA"))
+    np.testing.assert_array_equal(wanted[0], from_srgb(np.asarray(over_white)[..., :3]))
+    monkeypatch.setattr("cortado.pictures.PIXELS_AT_ONCE", 100)
+    for size, one in zip((None, 16), wanted, strict=True):
+        np.testing.assert_array_equal(read_picture(tmp_path / "a.png", size), one)
 
 
 def test_unwritable_pictures_are_sentences(tmp_path):

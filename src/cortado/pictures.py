@@ -1,4 +1,4 @@
-"""Pictures to aim at: latte art drawn at any resolution, and PNG and other files read and written.
+"""Pictures to aim at: latte art drawn at any resolution, and picture files read and written.
 
 A picture is (rows, columns, 3) red, green and blue, linear light from 0 to 1, float64, its first row at the top. A
 resolution is (columns, rows), as in a scene, or one number for a square.
@@ -6,7 +6,8 @@ resolution is (columns, rows), as in a scene, or one number for a square.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cortado.errors import InputError
 from cortado.files import write_atomically
+from cortado.input_files import reason, regular_file
+from cortado.render.cameras import check_resolution, positive, vector
 from cortado.srgb import from_srgb, to_srgb
 
 Picture = NDArray[np.float64]
@@ -29,6 +32,17 @@ COFFEE: Colour = (0.30, 0.16, 0.08)
 WHITE: Colour = (1.0, 1.0, 1.0)
 SAMPLES = 6
 """Points along either side of a pixel that tell how much of it a shape covers."""
+FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
+"""Of the files that are read."""
+MOST_BYTES = 2**28
+"""Of a file."""
+MOST_PIXELS = 2**26
+"""Of a picture that is resampled."""
+MOST_PIXELS_KEPT = 2**24
+"""Of one that is not."""
+PIXELS_AT_ONCE = 2**20
+LIGHT = from_srgb(np.arange(256, dtype=np.uint8))
+"""Linear light of every value in a file."""
 
 
 def heart(
@@ -69,27 +83,48 @@ def rosetta(
 
 
 def read_picture(path: str | Path, resolution: Resolution | None = None) -> Picture:
-    """The picture of a file that Pillow can read, transparent parts on white.
+    """The picture of a file of one of `FORMATS`, transparent parts on white.
 
     Args:
         resolution: columns and rows wanted: the largest part in the middle with their proportions is resampled,
             in linear light. None keeps the pixels as they are.
 
     Raises:
-        InputError: there is no such file, or no picture in it.
+        InputError: there is no such file, no picture in it, or one of too many pixels.
     """
-    from PIL import Image, ImageOps
+    from PIL import Image, ImageOps, UnidentifiedImageError
 
+    most = MOST_PIXELS_KEPT if resolution is None else MOST_PIXELS
+    shape = None if resolution is None else _columns_and_rows(resolution)
     try:
-        with Image.open(path) as file:
-            if file.mode.startswith(("I", "F")):
-                raise InputError(f"The picture {path} has more than 8 bits for a colour; save it with 8.")
-            picture = ImageOps.exif_transpose(file).convert("RGBA")
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as problem:  # whatever Pillow raises
-        raise InputError(f"The picture {path} cannot be read: {problem}.") from problem
-    opaque = Image.alpha_composite(Image.new("RGBA", picture.size, "white"), picture)
-    linear = from_srgb(np.asarray(opaque)[..., :3])
-    return linear if resolution is None else _resampled(linear, *_columns_and_rows(resolution))
+        regular_file(path, MOST_BYTES)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow warns of large pictures, which are judged here
+            with Image.open(path, formats=FORMATS) as file:
+                _check_header(path, file, most)
+                file.load()
+                ImageOps.exif_transpose(file, in_place=True)
+                return _whole(file) if shape in (None, file.size) else _resampled(file, *shape)
+    except InputError:
+        raise
+    except Image.DecompressionBombError:
+        raise _too_many(path, "very many pixels", most) from None
+    except UnidentifiedImageError:
+        raise InputError(f"The picture {path} cannot be read: it is none of {', '.join(FORMATS)}.") from None
+    except Exception as problem:  # of many types, where a file is damaged
+        raise InputError(f"The picture {path} cannot be read: {reason(problem)}.") from problem
+
+
+def _check_header(path: str | Path, file: Any, most: int) -> None:
+    """Before anything is decoded."""
+    if file.width * file.height > most:
+        raise _too_many(path, f"{file.width} x {file.height} pixels", most)
+    if file.mode.startswith(("I", "F")):
+        raise InputError(f"The picture {path} has more than 8 bits for a colour; save it with 8.")
+
+
+def _too_many(path: str | Path, found: str, most: int) -> InputError:
+    return InputError(f"The picture {path} has {found}, but must have at most {most} of them; save it smaller.")
 
 
 def write_picture(path: str | Path, image: ArrayLike) -> Path:
@@ -109,11 +144,10 @@ def write_picture(path: str | Path, image: ArrayLike) -> Path:
 def _drawn(
     shape: Shape, resolution: Resolution, cup: float | None, size: float, colours: tuple[Colour, Colour, Colour]
 ) -> Picture:
-    for name, value in (("cup", cup), ("size", size)):
-        if value is not None and not 0.0 < value < np.inf:
-            raise InputError(f"{name} is {value}, but must be a positive number.")
+    for name, value in (("cup", 1.0 if cup is None else cup), ("size", size)):
+        positive(name, value)
     columns, rows = _columns_and_rows(resolution)
-    milk, coffee, background = (np.array(colour, dtype=float) for colour in colours)
+    milk, coffee, background = (np.array(vector("A colour", colour)) for colour in colours)
     scale = size * (1.0 if cup is None else cup)
     picture = _mixed(_coverage(lambda x, y: shape(x / scale, y / scale), columns, rows), milk, coffee)
     if cup is None:
@@ -157,22 +191,44 @@ def _in_rosetta(x: Any, y: Any) -> Any:
 
 
 def _columns_and_rows(resolution: Resolution) -> tuple[int, int]:
-    columns, rows = (resolution, resolution) if isinstance(resolution, int) else resolution
-    if min(columns, rows) < 1:
-        raise InputError(f"resolution is {resolution}, but must be positive numbers of columns and rows.")
+    columns, rows = found = (resolution, resolution) if isinstance(resolution, int) else resolution
+    check_resolution(found)
     return columns, rows
 
 
-def _resampled(linear: Picture, columns: int, rows: int) -> Picture:
+def _bands(picture: Any) -> Iterator[tuple[int, Any]]:
+    """A few rows after the other, opaque, each with the number of its first row: what is made of all rows at once would
+    take many times the room of the picture."""
+    from PIL import Image
+
+    height = max(PIXELS_AT_ONCE // picture.width, 1)
+    for top in range(0, picture.height, height):
+        band = picture.crop((0, top, picture.width, min(top + height, picture.height)))
+        if picture.has_transparency_data:
+            band = band.convert("RGBA")
+            band = Image.alpha_composite(Image.new("RGBA", band.size, "white"), band)
+        yield top, band.convert("RGB")
+
+
+def _whole(picture: Any) -> Picture:
+    linear = np.empty((picture.height, picture.width, 3))
+    for top, band in _bands(picture):
+        linear[top : top + band.height] = LIGHT[np.asarray(band)]
+    return linear
+
+
+def _resampled(picture: Any, columns: int, rows: int) -> Picture:
     """(rows, columns, 3) from the largest part in the middle that has these proportions."""
     from PIL import Image
 
-    height, width = linear.shape[:2]
-    if (height, width) == (rows, columns):
-        return linear
+    width, height = picture.size
     scale = min(width / columns, height / rows)
     left, top = 0.5 * (width - scale * columns), 0.5 * (height - scale * rows)
     box = (left, top, width - left, height - top)
-    channels = [Image.fromarray(linear[..., k].astype(np.float32)) for k in range(3)]
-    small = [channel.resize((columns, rows), Image.Resampling.BILINEAR, box=box) for channel in channels]
-    return np.stack([np.asarray(channel, dtype=np.float64) for channel in small], axis=-1)
+    small, light = np.empty((rows, columns, 3)), LIGHT.astype(np.float32)
+    for k in range(3):
+        channel = Image.new("F", picture.size)
+        for first, band in _bands(picture):
+            channel.paste(Image.fromarray(light[np.asarray(band.getchannel(k))]), (0, first))
+        small[..., k] = np.asarray(channel.resize((columns, rows), Image.Resampling.BILINEAR, box=box))
+    return small
