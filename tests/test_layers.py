@@ -25,7 +25,7 @@ LAYERS = """
     physics.tint physics.colour_field physics.interpolation physics.rays physics.absorption
     shapes region restart launching neighbours particles
     render.cameras render.views render.fields render.marching render.renderer
-    scene_kinds scene_tables scene_toml scene_points
+    scene_kinds scene_tables scene_toml point_reader scene_points
     scene_fluids scene_emitter scene_mixture scene_render scene_containers scene_stability scene_checks scene sampling
     discrete_scene
     reference.digits reference.engine reference.losses reference.histories reference.simulation reference

@@ -1,11 +1,16 @@
 """Positions from files: read from where the scene is, and a sentence where they cannot be used."""
 
+import os
+import struct
+
 import numpy as np
 import pytest
 
 from bad_scenes import GOOD_SCENE, assert_one_sentence, plane
-from cortado.errors import SceneError
+from cortado.errors import InputError, SceneError
 from cortado.scene import Scene, load_scene
+from cortado.scene_points import read_points
+from cortado.vtkhdf import TrajectoryWriter
 
 
 def test_positions_are_read_from_beside_the_scene(tmp_path, monkeypatch):
@@ -46,7 +51,7 @@ def test_positions_are_read_from_vtk(tmp_path, suffix):
         (np.zeros((0, 2)), "cannot be used"),
         (np.array([["a", "b"]]), "shape"),
         (np.array([[0.0, np.nan]]), "finite"),
-        (np.array([[None, 1.0]], dtype=object), "NumPy"),
+        (np.array([[None, 1.0]], dtype=object), "object of shape"),
         (np.zeros((1000, 2)), "overlapping itself"),
         (np.array([[0.0, 0.0], [0.0, 0.04], [0.0, 1.0]]), "overlapping itself"),
         (np.array([[0.0, 1e20]]), "origin"),
@@ -68,3 +73,102 @@ def test_files_of_rubbish_are_a_sentence(tmp_path, name, capfd):
         Scene(**plane(fluid=[fluid]))
     assert_one_sentence(str(caught.value))
     assert capfd.readouterr().err == ""
+
+
+def npy(header: str, numbers: int = 2) -> bytes:
+    """A file of NumPy's with that header, and so many numbers of 8 bytes."""
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode() + bytes(8 * numbers)
+
+
+def header(shape: str, kind: str = "'<f8'") -> str:
+    return f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}}}"
+
+
+@pytest.mark.parametrize(
+    "content, words",
+    [
+        (npy(header("(5, 2)")), r"says that it holds float64 of shape \(5, 2\), which takes 147 bytes, but it has 83"),
+        (npy(header("(1, 2)"), 200), "which takes 83 bytes, but it has 1667"),
+        (npy(header("(1000000000000, 2)")), "holds 1000000000000 points, but must hold at most"),
+        (npy(header("(-1, 2)")), r"shape \(-1, 2\), but must hold numbers of shape \(n, 2\)"),
+        (npy(header("(-1, -2)")), "but must hold numbers"),
+        (npy(header("(1, 2)", "'<c16'")), "holds complex128"),
+        (npy(header("(1, 2)", "'|O'")), "holds object"),
+        (npy(header("(1, 2)", "[('x', '<f8')]")), "but must hold numbers"),
+        (npy(header("(1,)", "('<f8', (2,))")), "but must hold numbers"),
+        (npy(header("(1, 2)", "'\\q'")), "no array that NumPy can read"),
+        (npy("[" * 60_000), "no array that NumPy can read"),
+        (npy("(" * 9_000), "no array that NumPy can read"),
+        (npy("-" * 9_000 + "1"), "no array that NumPy can read"),
+        (b"PK\x03\x04" + bytes(100), "no array that NumPy can read"),
+        (b"\x93NUMPY\x02\x00\xff\xff\xff\xff{", "no array that NumPy can read"),
+        (b"\x93NUMPY\x09\x00", "no array that NumPy can read"),
+        (b"", "no array that NumPy can read"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_an_array_whose_header_lies_is_a_sentence(tmp_path, content, words):
+    (tmp_path / "a.npy").write_bytes(content)
+    with pytest.raises(InputError, match=words) as caught:
+        read_points(str(tmp_path / "a.npy"), 2)
+    assert_one_sentence(str(caught.value))
+
+
+def test_arrays_by_columns_and_of_other_types_are_read(tmp_path):
+    wanted = np.arange(12.0).reshape(4, 3)
+    for k, array in enumerate((np.asfortranarray(wanted), wanted.astype(">f4"), wanted.astype(np.int16))):
+        np.save(tmp_path / f"{k}.npy", array)
+        np.testing.assert_array_equal(read_points(str(tmp_path / f"{k}.npy"), 3), wanted)
+
+
+LEGACY = b"# vtk DataFile Version 3.0\nx\nASCII\nDATASET POLYDATA\n"
+POLY_DATA = """<VTKFile type="PolyData" version="1.0"><PolyData><Piece NumberOfPoints="100000000000"><Points>
+<DataArray type="Float64" NumberOfComponents="3" format="ascii">1 2 3</DataArray></Points></Piece></PolyData></VTKFile>
+"""
+
+
+@pytest.mark.parametrize(
+    "name, content",
+    [
+        ("much.vtp", POLY_DATA.encode()),
+        ("much.vtk", LEGACY + b"POINTS 100000000000 double\n1 2 3\n"),
+        ("bytes.vtk", LEGACY + b"POINTS 2 \xff\xfe\n1 0 1 0 1 0\n"),
+    ],
+)
+def test_what_ends_vtk_is_a_sentence(tmp_path, name, content, capfd):
+    """Some of these take the process with them that reads them."""
+    pytest.importorskip("vtkmodules")
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match="holds no points that") as caught:
+        read_points(str(tmp_path / name), 3)
+    assert_one_sentence(str(caught.value))
+    assert capfd.readouterr().err == ""
+
+
+def test_the_first_frame_of_a_trajectory_is_read_and_a_damaged_one_is_a_sentence(tmp_path, capfd):
+    first, path = np.random.default_rng(2).random((40, 2)), tmp_path / "run.vtkhdf"
+    with TrajectoryWriter(path, frames=3, particles=40, dimension=2, precision="float64") as writer:
+        for k in range(3):
+            writer.append(0.1 * k, first + k, first)
+    np.testing.assert_array_equal(read_points(str(path), 2), first)
+    whole = path.read_bytes()
+    for name, content in (("cut", whole[:-1]), ("bad", whole.replace(b"NumberOfPoints", b"NumberOfJoints"))):
+        (tmp_path / f"{name}.vtkhdf").write_bytes(content)
+        with pytest.raises(InputError, match="holds no points that can be read; it may be damaged"):
+            read_points(str(tmp_path / f"{name}.vtkhdf"), 2)
+    assert capfd.readouterr().err == ""
+
+
+def test_only_regular_files_are_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe.npy")
+    (tmp_path / "zero.vtp").symlink_to("/dev/zero")
+    for name, words in (("pipe.npy", "it is a pipe"), ("zero.vtp", "it is a device")):
+        with pytest.raises(InputError, match=rf"cannot be opened \({words}, but must be a regular file\)"):
+            read_points(str(tmp_path / name), 3)
+
+
+def test_a_file_that_takes_for_ever_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr("cortado.scene_points.SECONDS", 0.01)
+    (tmp_path / "a.vtk").write_bytes(LEGACY)
+    with pytest.raises(InputError, match="was not read within 0 s; it may be damaged"):
+        read_points(str(tmp_path / "a.vtk"), 3)

@@ -143,7 +143,8 @@ class PointsFluid(Fluid):
 
     shape: Literal["points"] = "points"
     file: Annotated[str, Text()]
-    """An array (n, d) [m] as .npy, or a .vtk, .vtp or .vtkhdf file; beside the scene file, and absolute once read."""
+    """An array (n, d) [m] as .npy, or a .vtk, .vtp or .vtkhdf file, of which the first step is read; beside the scene
+    file, and absolute once read."""
 
     @field_validator("file")
     @classmethod
