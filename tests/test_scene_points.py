@@ -152,7 +152,8 @@ def test_the_first_frame_of_a_trajectory_is_read_and_a_damaged_one_is_a_sentence
             writer.append(first + k, first)
     np.testing.assert_array_equal(read_points(str(path), 2), first)
     whole = path.read_bytes()
-    for name, content in (("cut", whole[: len(whole) // 2]), ("bad", whole.replace(b"NumberOfPoints", b"NumberOfJoints"))):
+    damaged = {"cut": whole[: len(whole) // 2], "bad": whole.replace(b"NumberOfPoints", b"NumberOfJoints")}
+    for name, content in damaged.items():
         (tmp_path / f"{name}.vtkhdf").write_bytes(content)
         with pytest.raises(InputError, match="holds no points that can be read; it may be damaged"):
             read_points(str(tmp_path / f"{name}.vtkhdf"), 2)
