@@ -15,11 +15,12 @@ from fuzz import bases
 from fuzz.answers import run_complaints, search_complaints
 from fuzz.cases import Case
 from fuzz.judge import CODES
-from fuzz.processes import Kill, Limits, by_console, console
+from fuzz.processes import Kill, Limits, Outcome, by_console, by_fork, console
 from fuzz.toml_text import to_toml
 
 PIPE = 128 + signal.SIGPIPE
 """Exit code where nobody reads the result."""
+KINDS = ("run", "optimise")
 COMPILING = 180.0
 """[s] that a command may take which finds no kernels that it could use again."""
 
@@ -111,7 +112,7 @@ ENVIRONMENTS = (
     _limit("-v 1500000"),
     _limit("-f 8"),
     _limit("-f 60"),
-    _limit("-s 256"),
+    _limit("-s 2048"),
     _cache("cut short", "find cache -name '*.o' -exec truncate -s 1000 {} +"),
     _cache("of noise", "find cache -name '*.o' -exec sh -c 'head -c 9000 /dev/urandom >\"$1\"' sh {} \\;"),
     _cache("without descriptions", "find cache -name '*.meta' -exec truncate -s 0 {} +"),
@@ -127,16 +128,26 @@ ENVIRONMENTS = (
 )
 
 
+def prepare(folder: Path) -> list[Outcome]:
+    """The run and the search where nothing is odd, so that their kernels are compiled."""
+    outcomes = []
+    for kind in KINDS:
+        _write(folder, kind)
+        outcomes.append(by_fork([kind, "file.toml", "--out", kind], folder, Limits(COMPILING)))
+        if outcomes[-1].code:
+            raise RuntimeError(f"{kind} fails where nothing is odd: {outcomes[-1].err}")
+    return outcomes
+
+
 def run_in_environment(case: Case) -> None:
     """A small run, or a small search, by the real command in one of the environments."""
     environment = ENVIRONMENTS[case.number // 2]
-    kind = ("run", "optimise")[case.number % 2]
+    kind = KINDS[case.number % 2]
     case.notes += [environment.name, kind]
     if environment.mounts and not _can_mount():
         case.notes.append("left out, as nothing can be mounted here")
         return
-    tables = bases.scenes()["dam_break_plane"] if kind == "run" else bases.tasks()["recover_gravity_small"]
-    (case.folder / "file.toml").write_text(to_toml({**tables, "name": "wäter"}))
+    _write(case.folder, kind)
     limits = Limits(environment.seconds)
     kill = None
     if environment.interrupted:
@@ -150,6 +161,11 @@ def run_in_environment(case: Case) -> None:
     if out.is_dir() and environment.name != "umask 0777":
         check = run_complaints if kind == "run" else search_complaints
         case.complaints += check(out, outcome.code == 0)
+
+
+def _write(folder: Path, kind: str) -> None:
+    tables = bases.scenes()["dam_break_plane"] if kind == "run" else bases.tasks()["recover_gravity_small"]
+    (folder / "file.toml").write_text(to_toml({**tables, "name": "wäter"}))
 
 
 def shell_script(environment: Environment, kind: str, cache: Path) -> str:

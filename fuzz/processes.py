@@ -199,7 +199,7 @@ def _is_hung(child: int, seconds: float, limit: float) -> bool:
     if seconds < limit:
         return False
     used = _processor_seconds(child)
-    return used >= limit or used < 0.25 * seconds or seconds >= PATIENCE * limit
+    return used >= limit or used + _queued_seconds(child) < 0.25 * seconds or seconds >= PATIENCE * limit
 
 
 def _processor_seconds(child: int) -> float:
@@ -210,6 +210,13 @@ def _processor_seconds(child: int) -> float:
             fields = path.read_text().rpartition(")")[2].split()
             ticks += (int(fields[11]) + int(fields[12])) * (int(fields[3]) == child)
     return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def _queued_seconds(child: int) -> float:
+    """[s] for which a process could have computed, but others did."""
+    with suppress(OSError):
+        return 1e-9 * int(Path(f"/proc/{child}/schedstat").read_text().split()[1])
+    return 0.0
 
 
 def _resident(child: int) -> int:
