@@ -1,6 +1,8 @@
 """Threads take turns, a fork leaves a child that works, and simulations are copied."""
 
+import copy
 import os
+import pickle
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -11,9 +13,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado import ComputationError, Problem, Simulation, losses
+from cortado import ComputationError, InputError, Problem, Simulation, losses
 from cortado.threads import WARP, Turn
-from scenes import splash
+from scenes import plane, splash, two_layers
 
 DOWN = {"gravity": np.array([0.0, -9.81, 0.0])}
 PATIENCE = 60.0
@@ -106,6 +108,28 @@ def test_a_forked_process_has_no_gpu():
     turn.forked()
     with pytest.raises(ComputationError, match="forked from the one that made it"):
         turn.__enter__()
+
+
+@pytest.mark.parametrize("copied", [lambda it: pickle.loads(pickle.dumps(it)), copy.deepcopy], ids=["pickle", "copy"])
+@pytest.mark.parametrize("made", [splash, two_layers])
+def test_a_copy_gives_the_same_bits(made, copied):
+    problem = problem_of(Simulation(made(), precision="float64"), 3)
+    wanted = gradient(problem)
+    again = copied(problem)
+    assert again.fingerprint == problem.fingerprint
+    assert gradient(again) == wanted
+    assert copied(problem.simulation).run(2).positions.tobytes() == problem.simulation.run(2).positions.tobytes()
+
+
+def test_a_pickle_whose_points_have_changed_is_refused(tmp_path):
+    points = np.stack(np.meshgrid(*[np.arange(0.05, 0.3, 0.05)] * 2), axis=-1).reshape(-1, 2)
+    np.save(tmp_path / "points.npy", points)
+    fluid = {"shape": "points", "file": str(tmp_path / "points.npy"), "phase": "water"}
+    pickled = pickle.dumps(Simulation(plane(fluid=[fluid])))
+    assert pickle.loads(pickled).particles == len(points)
+    np.save(tmp_path / "points.npy", points + 0.01)
+    with pytest.raises(InputError, match="file of points that its scene names has changed"):
+        pickle.loads(pickled)
 
 
 FORKS = """

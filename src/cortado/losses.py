@@ -104,6 +104,10 @@ class FinalPositions:
         """Tells one target from another, for checkpoints."""
         self._on_device: dict[Any, wp.array] = {}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled and copied as what it is made from."""
+        return FinalPositions, (self.target,)
+
     @WARP
     def value(self, end: TrajectoryEnd) -> float:
         x, target, device = self._positions_and_target(end)

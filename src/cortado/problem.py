@@ -67,6 +67,10 @@ class Problem:
         self._rollout = Rollout(simulation.solver, self.steps, memory_budget)
         self._derivatives: dict[AdjointPolicy, StepDerivative] = {}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled and copied as what it is made from."""
+        return Problem, (self.simulation, self.steps, self.loss, self.memory_budget)
+
     @property
     def turn(self) -> Turn:
         """What a thread holds that uses the problem's simulation."""
@@ -111,7 +115,7 @@ class Problem:
                 f"the gradient with respect to {', '.join(broken)} is not finite, as it grew beyond what "
                 f"{self.simulation.precision.name} holds: try fewer steps, float64, or a policy for long runs.",
                 CortadoWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
         return found
 

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,10 @@ VISCOSITIES = {"pairwise": pairwise_viscosity, "laminar": laminar_viscosity}
 
 
 class Simulation:
-    """A scene made ready to run: particles sampled, masses calibrated, kernels chosen."""
+    """A scene made ready to run: particles sampled, masses calibrated, kernels chosen.
+
+    Threads that use it take turns, and other processes can have it, pickled or by a fork: see `docs/processes.md`.
+    """
 
     @WARP
     def __init__(
@@ -82,10 +86,20 @@ class Simulation:
             array.setflags(write=False)
         check_sizes(self.parameters(), self.precision)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled and copied as what it is made from."""
+        energy = self.free_energy if len(self.scene.phase) > 1 else None
+        return _made_again, (self.scene, self.device.alias, self.precision.name, energy, self._points)
+
     @property
     def dimension(self) -> int:
         """2 or 3."""
         return self.scene.dimension
+
+    @property
+    def _points(self) -> str:
+        """A checksum of the first positions."""
+        return sha256(self.positions.tobytes()).hexdigest()
 
     @property
     def turn(self) -> Turn:
@@ -304,6 +318,17 @@ def _check_distance(scene: Scene, discrete: DiscreteScene, precision: Precision)
             f"{precision.furthest:g} in {precision.name}, which rounds positions there to steps of "
             f"{furthest * np.finfo(precision.numpy).eps:.1g} spacings: move it to the origin, or use another precision."
         )
+
+
+def _made_again(scene: Scene, device: str, precision: str, free_energy: FreeEnergy | None, points: str) -> Simulation:
+    """A simulation from what it was made from, first positions of the same checksum included."""
+    simulation = Simulation(scene, device, precision, free_energy)
+    if simulation._points != points:
+        raise InputError(
+            "The first positions of a simulation are others than when it was pickled, but must be the same: the file "
+            "of points that its scene names has changed. Restore it, or make the simulation anew."
+        )
+    return simulation
 
 
 def check_steps(steps: int, least: int = 1) -> int:

@@ -107,6 +107,9 @@ class Renderer:
         self._rays = RayMarcher(view, self._field.nodes, precision, self._device)
         self._rendered = False
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        raise InputError("A Renderer cannot be pickled or copied; make another one where it is needed.")
+
     @property
     def fingerprint(self) -> str:
         """Tells one view from another, for checkpoints, and one grid of nodes."""
