@@ -25,11 +25,12 @@ LAYERS = """
     physics.tint physics.colour_field physics.interpolation physics.rays physics.absorption
     shapes region restart launching neighbours particles
     render.cameras render.views render.fields render.marching render.renderer
+    vtkhdf_layout vtkhdf
     scene_kinds scene_tables scene_toml point_reader scene_points
     scene_fluids scene_emitter scene_mixture scene_render scene_containers scene_stability scene_checks scene sampling
     discrete_scene
     reference.digits reference.engine reference.losses reference.histories reference.simulation reference
-    vtkhdf_layout vtkhdf trajectory
+    trajectory
     solvers.forces solvers.mixture solvers.containment solvers.emitter
     solvers.pcisph_parts solvers.pcisph solvers.pcisph_derivatives solvers.adjoint_filters
     rollout

@@ -152,12 +152,31 @@ def test_the_first_frame_of_a_trajectory_is_read_and_a_damaged_one_is_a_sentence
             writer.append(first + k, first)
     np.testing.assert_array_equal(read_points(str(path), 2), first)
     whole = path.read_bytes()
-    damaged = {"cut": whole[: len(whole) // 2], "bad": whole.replace(b"NumberOfPoints", b"NumberOfJoints")}
-    for name, content in damaged.items():
+    flipped = bytearray(whole)
+    flipped[whole.index(first[7].tobytes()) + 6] ^= 0x10
+    damaged = {
+        "cut": (whole[: len(whole) // 2], "holds no points that can be read; it may be damaged"),
+        "names": (whole.replace(b"NumberOfPoints", b"NumberOfJoints"), "is a damaged trajectory"),
+        "numbers": (flipped, "is a damaged trajectory, or one of another version of Cortado"),
+    }
+    for name, (content, words) in damaged.items():
         (tmp_path / f"{name}.vtkhdf").write_bytes(content)
-        with pytest.raises(InputError, match="holds no points that can be read; it may be damaged"):
+        with pytest.raises(InputError, match=words):
             read_points(str(tmp_path / f"{name}.vtkhdf"), 2)
     assert capfd.readouterr().err == ""
+
+
+def test_the_first_step_of_another_programs_file_is_read(tmp_path):
+    vtk = pytest.importorskip("vtk")
+    points, data, writer = vtk.vtkPoints(), vtk.vtkPolyData(), vtk.vtkHDFWriter()
+    for x in (0.0, 0.5, 0.25):
+        points.InsertNextPoint(x, 0.5 * x, 1.0)
+    data.SetPoints(points)
+    writer.SetFileName(str(tmp_path / "drop.vtkhdf"))
+    writer.SetInputData(data)
+    writer.Write()
+    wanted = [[0.0, 0.0, 1.0], [0.5, 0.25, 1.0], [0.25, 0.125, 1.0]]
+    np.testing.assert_array_equal(read_points(str(tmp_path / "drop.vtkhdf"), 3), wanted)
 
 
 def test_only_regular_files_are_read(tmp_path):

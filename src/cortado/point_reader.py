@@ -2,7 +2,7 @@
 
 VTK and HDF5 trust what a file says of itself: a damaged one may make them print pages, wait, take all memory or end
 the process. Here this happens to a process that has limits, and whose messages nobody sees. It writes the points (n, 3)
-in NumPy's own format to its standard output, or, with exit code `REFUSED`, why there are none.
+or (n, 2) in NumPy's own format to its standard output, or, with exit code `REFUSED`, why there are none.
 """
 
 import io
@@ -55,10 +55,12 @@ def _read_by_vtk(reader: Any, path: str) -> Any:
 
 
 def _hdf5(path: str) -> Any:
-    """The points of the first step, of all its parts."""
+    """The points of the first step, of all its parts; those of a trajectory of Cortado's only if its checksums hold."""
     import h5py
 
     with h5py.File(path, "r") as file:
+        if "cortado" in file:
+            return _trajectory(path)
         root = file["VTKHDF"]
         points, parts, begin = root["Points"], slice(None), 0
         if "Steps" in root:
@@ -73,6 +75,20 @@ def _hdf5(path: str) -> Any:
         if begin < 0 or begin + count > len(points) or points.shape[1:] != (3,):
             raise Refused(f"holds points of shape {points.shape}, but says that its first {count} begin at {begin}")
         return points[begin : begin + count]
+
+
+def _trajectory(path: str) -> Any:
+    from cortado import vtkhdf
+    from cortado.errors import InputError
+
+    try:
+        positions = vtkhdf.read(path)["positions"]
+    except InputError:
+        raise Refused("is a damaged trajectory, or one of another version of Cortado") from None
+    if not len(positions):
+        raise Refused("holds no step")
+    _check_count(positions.shape[1])
+    return positions[0]
 
 
 READERS: dict[str, Callable[[str], Any]] = {".vtk": _legacy, ".vtp": _poly_data, ".vtkhdf": _hdf5}

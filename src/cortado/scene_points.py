@@ -20,7 +20,7 @@ from cortado.shapes import Points
 
 SUFFIXES = (".npy", *READERS)
 MOST_BYTES = 2**30
-"""Of a file of points; one in HDF5 has many more where it holds the frames of a run."""
+"""Of a file of points."""
 SECONDS, BYTES_PER_SECOND = 15.0, 5e6
 """How long a file may take to be read at most: this long, and its size over this pace."""
 
@@ -30,7 +30,7 @@ def read_points(path: str, dimension: int) -> Points:
     if Path(path).suffix not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}.")
     try:
-        stat = regular_file(path, sys.maxsize if Path(path).suffix == ".vtkhdf" else MOST_BYTES)
+        stat = regular_file(path, MOST_BYTES)
     except OSError as problem:
         raise InputError(f"{path!r} cannot be opened ({reason(problem)}).") from None
     return _read(path, dimension, stat.st_mtime_ns, stat.st_size)
@@ -78,7 +78,7 @@ def _read_npy(path: str, size: int, dimension: int) -> Any:
 
 def _read_apart(path: str, size: int) -> Any:
     """What another process reads: see `cortado.point_reader`."""
-    limit = SECONDS + min(size, MOST_BYTES) / BYTES_PER_SECOND
+    limit = SECONDS + size / BYTES_PER_SECOND
     command = [sys.executable, "-P", "-m", "cortado.point_reader", path]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")  # each would reserve memory
     environment = {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
