@@ -30,6 +30,11 @@ class Precision:
     greatest: float
     """No parameter is larger, as products of several of them must stay finite."""
 
+    @property
+    def bytes(self) -> int:
+        """Of a number."""
+        return np.dtype(self.numpy).itemsize
+
     def fractions(self, phases: int) -> Any:
         """Warp vector type of one number for each phase."""
         return _vector_type(self.real, phases)

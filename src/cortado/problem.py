@@ -12,6 +12,7 @@ from cortado.checked_loss import as_loss
 from cortado.controls import Controls
 from cortado.errors import CortadoWarning, InputError
 from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd, fingerprint
+from cortado.memory import gradient_parts, require
 from cortado.parameter_values import NAMES, UNITS, Arrays, Values
 from cortado.particles import State
 from cortado.policies import AdjointPolicy, Estimate, Policy, estimate
@@ -221,6 +222,9 @@ class Passage:
     def derivative(self, policy: AdjointPolicy) -> StepDerivative:
         """The policy's backward step, made once for each problem."""
         if policy not in self._derivatives:
+            search, iterations = self.rollout.solver.search, int(self.rollout.iterations.max(initial=0))
+            parts = gradient_parts(search.particles, iterations, self.rollout.solver.discretisation.precision.bytes)
+            require(parts, "take a larger spacing or fewer pressure iterations", search.device)
             self._derivatives[policy] = policy.derivative(self.rollout)
         return self._derivatives[policy]
 

@@ -15,6 +15,7 @@ import warp as wp
 
 from cortado.errors import DivergedError
 from cortado.launching import Replayed, add
+from cortado.memory import require, step_parts, within
 from cortado.particles import Parameters, State
 from cortado.restart import Elapsed
 from cortado.solvers.containment import Lost
@@ -64,6 +65,7 @@ class Rollout:
     def __init__(self, solver: Pcisph, steps: int, memory_budget: int = MEMORY_BUDGET):
         self.solver, self.steps = solver, steps
         self._device = solver.search.device
+        require(step_parts(steps, solver.discretisation.precision.bytes), "take fewer steps", self._device)
         self.initial = solver.new_state()
         self.parameters = solver.new_parameters(steps)
         self.substeps = 0
@@ -77,7 +79,7 @@ class Rollout:
             wp.zeros(max(steps, 1), dtype=solver.discretisation.precision.pair, device=self._device),
         )
         state_bytes = sum(array.capacity for array in self.initial.arrays())
-        self._interval = checkpoint_interval(steps, memory_budget // state_bytes)
+        self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
         self._states: dict[int, State] = {}
         self._buffer, self._bar = self.initial.like(), self.initial.like()
         self._growth = -1

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cortado.errors import InputError, Phrase, shown
+from cortado.memory import sampling_parts, shortage
 from cortado.scene_containers import check_length
 from cortado.scene_emitter import Emitter
 from cortado.scene_fluids import Body, Fluid, PointsFluid
@@ -83,6 +84,10 @@ def _check_counts(scene: "Scene") -> None:
         if count > MOST_PARTICLES:
             wanted = f"so large that there are at most {MOST_PARTICLES:.0e} {what}, not about {count:.1e}"
             raise wrong(("discretisation", "spacing"), spacing, wanted)
+    lack = shortage(sampling_parts(fluid, walls))
+    if lack:
+        wanted = f"larger, or the fluid and the container smaller: the scene needs {lack}"
+        raise wrong(("discretisation", "spacing"), spacing, wanted)
 
 
 def _check_place(scene: "Scene") -> None:

@@ -12,6 +12,7 @@ from cortado.calibration import SKIN, WallLayer, diffusion_limit
 from cortado.controls import Controls
 from cortado.discrete_scene import DiscreteScene, discretise
 from cortado.errors import CortadoWarning, InputError, shown
+from cortado.memory import frame_parts, require, simulation_parts
 from cortado.neighbours import Grid, NeighbourSearch
 from cortado.parameter_checks import check_sizes
 from cortado.parameter_values import MATERIALS
@@ -66,6 +67,10 @@ class Simulation:
         self.device = _device(device)
         self.precision = precision_named(precision)
         discrete = discretise(scene)
+        room = first_capacity(scene.discretisation.support, scene.dimension)
+        counts = len(discrete.fluid.positions), len(discrete.walls.positions)
+        parts = simulation_parts(*counts, room, self.precision.bytes)
+        require(parts, "take a larger spacing or a smaller container", self.device)
         _check_distance(scene, discrete, self.precision)
         self.positions = discrete.fluid.positions
         """(n, d) first positions [m]."""
@@ -128,6 +133,9 @@ class Simulation:
         """Run a rollout forward and return its frames; warnings and errors as of `run`."""
         if record_every < 1:
             raise InputError(f"record_every is {record_every}, but must be at least 1.")
+        numbers_in_frame = self.particles * (2 * self.dimension + len(self.scene.phase))
+        parts = frame_parts(2 + rollout.steps // record_every, 2 * numbers_in_frame, self.precision.bytes)
+        require(parts, "take a larger record_every or fewer steps")
         frames = [(0, *rollout.initial.numpy(self.dimension))]
 
         def keep(step: int, state: State) -> None:

@@ -9,6 +9,7 @@ from cortado.errors import DivergedError
 from cortado.figures import density_errors, images, particles
 from cortado.folder_lock import locked
 from cortado.interruption import keeping
+from cortado.memory import frame_parts, require
 from cortado.particles import State
 from cortado.progress import track
 from cortado.render.scene_renderer import scene_renderer
@@ -37,6 +38,9 @@ def run_scene(
     scene = load_scene(scene_file, overrides)
     simulation = Simulation(scene, device, precision)
     rollout = simulation.rollout(check_steps(steps))
+    numbers = simulation.particles * (6 + len(scene.phase))
+    frames = frame_parts(2 + steps // record_every, numbers, simulation.precision.bytes)
+    require(frames, "take a larger --record-every or fewer steps")
     with locked(out):
         folder = RunFolder.create(out, scene.to_json(), command, device=str(simulation.device), overwrite=overwrite)
         with keeping(lambda: f"the frames so far are in {folder.trajectory}" if folder.trajectory.exists() else ""):
@@ -107,7 +111,7 @@ def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], 
         return renderer.render(state.positions, state.mass_fractions, colours)
 
     titles = [f"t = {trajectory.times[frame]:.3f} s" for frame in shown]
-    path = images([image(frame) for frame in shown], titles, folder / "rendered.png")
+    path = images(map(image, shown), titles, folder / "rendered.png")
     figures: Figures = [("The same, rendered.", path)]
     if len(trajectory.times) > 1 and find_spec("av"):
         frames = range(0, len(trajectory.times), -(-len(trajectory.times) // MOST_FRAMES))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from math import ceil, sqrt
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from cortado.srgb import to_srgb
 _MOST_IN_A_ROW = 4
 
 
-def images(images: Sequence[ArrayLike], titles: Sequence[str], path: str | Path, title: str = "") -> Path:
+def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path, title: str = "") -> Path:
     """Images in a row, such as start, target and result; more than 4 in a grid, such as moments on the way.
 
     Args:

@@ -1,6 +1,7 @@
 """The colour field of particles on a device, and the way back from it."""
 
 from functools import partial
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import warp as wp
 from cortado.cells import CellSort, Grid
 from cortado.errors import InputError
 from cortado.launching import sum_of
+from cortado.memory import field_parts, require
 from cortado.physics.colour_field import colour_field_kernels, ink_type, nodes_type
 from cortado.physics.surroundings import Discretisation
 from cortado.physics.tint import colours_type, tint_kernels
@@ -83,6 +85,7 @@ class ColourField:
         self._sum = sum_of(palette, particles, device)
         self.nodes = nodes_over(lower, upper, periods, cell, support, precision)
         """The struct that kernels see."""
+        require(field_parts(prod(self.nodes.shape), precision.bytes), "take a larger cell", device)
         self.values = zeros(tuple(self.nodes.shape)[::-1], dtype=ink_type(precision))
         """(nz, ny, nx) colour times coverage, and coverage [-]."""
 

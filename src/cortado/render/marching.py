@@ -1,12 +1,14 @@
 """A picture of a colour field on a device, and the way back from it."""
 
 from functools import cached_property, partial
+from math import prod
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from cortado.launching import sum_of
+from cortado.memory import field_parts, picture_parts, require, sample_parts
 from cortado.physics.absorption import absorption_kernels, pose_type
 from cortado.physics.colour_field import ink_type
 from cortado.physics.rays import camera_type
@@ -42,7 +44,8 @@ class RayMarcher:
         self._launch = partial(wp.launch, device=device, record_tape=False)
         self._zeros = partial(wp.zeros, device=device)
         self._ink, self._pose = ink_type(precision), pose_type(precision)
-        self.pixels = self._camera.rows * self._camera.columns
+        self.pixels, self._precision, self._device = self._camera.rows * self._camera.columns, precision, device
+        require(picture_parts(self.pixels, precision.bytes), "take a smaller resolution", device)
         self.image, self._image_bar = (self._zeros(self.pixels, dtype=precision.vector) for _ in range(2))
         """(pixels,) linear RGB, row by row."""
         self._spans = self._zeros(self.pixels, dtype=wp.vec2i)
@@ -82,6 +85,9 @@ class RayMarcher:
         field than its diagonal has room for."""
         cells = np.linalg.norm(np.array(self._nodes.shape) + 1)
         samples = min(int(cells * SAMPLES_PER_CELL) + 4, self._camera.samples)
+        parts = sample_parts(samples, self.pixels, self._precision.bytes)
+        parts |= field_parts(prod(self._nodes.shape), self._precision.bytes)
+        require(parts, "take a smaller resolution or a larger spacing", self._device)
         return self._zeros((samples, self.pixels), dtype=self._ink)
 
     @cached_property

@@ -1,0 +1,132 @@
+"""How much memory a computation will take, and how much is free: said before it is asked for.
+
+What is counted: particles with their neighbour lists, wall particles, tables and records of every step, the frames that
+a report reads back, and in a renderer nodes, pixels and samples. The bytes of each were measured, and hold to a factor
+of about 1.5. Checkpoints are not counted, as a rollout keeps no more of them than there is room for.
+"""
+
+import os
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from cortado.errors import InputError
+
+_PARTICLE, _WALL, _STEP, _FRAME, _PIXEL = 56.0, 110.0, 50.0, 150.0, 110.0
+"""[bytes]"""
+_REALS_OF_PARTICLE, _REALS_OF_WALL, _REALS_OF_STEP, _REALS_OF_PIXEL = 90.0, 12.0, 8.0, 12.0
+_REALS_BACKWARD, _REALS_OF_ITERATION = 40.0, 8.0
+"""[numbers]"""
+_CGROUP = Path("/sys/fs/cgroup")
+_LIMITS = (("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"))
+
+
+def sampling_parts(particles: float, walls: float) -> dict[str, float]:
+    """[bytes] of a scene that is cut into particles."""
+    return {f"{particles:.3g} particles of fluid": 100.0 * particles, f"{walls:.3g} wall particles": _WALL * walls}
+
+
+def simulation_parts(particles: int, walls: int, neighbours: int, real: int) -> dict[str, float]:
+    """[bytes] of a simulation with so many neighbours in each list and so many bytes in a number."""
+    return {
+        f"{particles:.3g} particles of fluid": particles * (_PARTICLE + 4.0 * neighbours + _REALS_OF_PARTICLE * real),
+        f"{walls:.3g} wall particles": walls * (_WALL + _REALS_OF_WALL * real),
+    }
+
+
+def step_parts(steps: int, real: int) -> dict[str, float]:
+    """[bytes] of the tables and records of a run."""
+    return {f"what is kept of {steps:.3g} steps": steps * (_STEP + _REALS_OF_STEP * real)}
+
+
+def frame_parts(frames: int, numbers: int, real: int) -> dict[str, float]:
+    """[bytes] of frames in memory with so many numbers in each."""
+    return {f"{frames:.3g} frames": frames * (_FRAME + float(numbers) * real)}
+
+
+def gradient_parts(particles: int, iterations: int, real: int) -> dict[str, float]:
+    """[bytes] of a way back, with so many iterations of the pressure in a step."""
+    return {
+        f"the gradient of {particles:.3g} particles": particles
+        * real
+        * (_REALS_BACKWARD + _REALS_OF_ITERATION * iterations)
+    }
+
+
+def field_parts(nodes: float, real: int) -> dict[str, float]:
+    """[bytes] of a field of colours, or of its adjoint."""
+    return {f"{nodes:.3g} nodes of the field of colours": 4.0 * nodes * real}
+
+
+def picture_parts(pixels: int, real: int) -> dict[str, float]:
+    """[bytes] of a picture, and of showing it in a report."""
+    return {f"{pixels:.3g} pixels": pixels * (_PIXEL + _REALS_OF_PIXEL * real)}
+
+
+def sample_parts(samples: int, pixels: int, real: int) -> dict[str, float]:
+    """[bytes] of the adjoints of so many samples along the ray of every pixel."""
+    return {f"{samples} samples behind each of {pixels:.3g} pixels": 4.0 * samples * pixels * real}
+
+
+def require(parts: Mapping[str, float], advice: str, device: Any = None) -> None:
+    """Raises `InputError` if that memory [bytes], by what it is for, is not free; ``device`` as Warp has it."""
+    lack = shortage(parts, device)
+    if lack:
+        raise InputError(f"This needs {lack}; {advice}.")
+
+
+def shortage(parts: Mapping[str, float], device: Any = None) -> str:
+    """What is needed and what is free, in words; empty if it suffices."""
+    needed, free = sum(parts.values()), available(device)
+    if needed <= free:
+        return ""
+    most = max(parts, key=lambda name: parts[name])
+    where = "" if device is None or device.is_cpu else f" on {device}"
+    return f"about {_gb(needed)} of memory, most of it for {most}, but only {_gb(free)} are free{where}"
+
+
+def within(budget: float, device: Any = None) -> int:
+    """[bytes] of a budget for what can be computed again, at most half of what is free."""
+    return int(min(budget, 0.5 * available(device)))
+
+
+def available(device: Any = None) -> float:
+    """[bytes] that are free on a device as Warp has it, or for this process on a CPU; infinite where nobody says."""
+    if device is not None and not device.is_cpu:
+        return float(device.free_memory)
+    return max(min(_of_machine(), _of_container(), _of_process()), 0.0)
+
+
+def _of_machine() -> float:
+    with suppress(OSError, ValueError, IndexError):
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+    with suppress(OSError, ValueError, AttributeError):
+        return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
+    return float("inf")
+
+
+def _of_container() -> float:
+    """The limit of the control group, less what is in use; cached files do not count, as they give way."""
+    for limit, used in _LIMITS:
+        with suppress(OSError, ValueError):
+            stat = (_CGROUP / used).with_name("memory.stat").read_text().split()
+            cached = int(stat[stat.index("inactive_file") + 1])
+            return float((_CGROUP / limit).read_text()) - float((_CGROUP / used).read_text()) + cached
+    return float("inf")
+
+
+def _of_process() -> float:
+    """The limit of the address space (``ulimit -v``), less what is in use."""
+    with suppress(ImportError, OSError, ValueError):
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY:
+            return float(limit - int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize())
+    return float("inf")
+
+
+def _gb(size: float) -> str:
+    return f"{size / 1e9:.3g} GB"

@@ -1,0 +1,120 @@
+"""What is needed against what is free: estimates against what is measured, and sentences that come in time."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from bad_scenes import plane
+from cortado import InputError, Problem, SceneError, Simulation, losses, memory
+from cortado.render.scene_renderer import scene_renderer
+from cortado.scene import scene_from_dict
+
+MEASURE = """
+import resource, sys
+import numpy as np
+from cortado import Problem, Simulation, losses, memory
+from cortado.commands.bench import dam_break
+
+def run(particles):
+    simulation = Simulation(dam_break(particles), precision=sys.argv[1])
+    simulation.rollout(1).forward(keep=False)
+    forward = peak()
+    problem = Problem(simulation, 1, losses.FinalPositions(simulation.positions))
+    problem.value_and_gradient({"gravity": np.array(simulation.scene.forces.gravity)})
+    return simulation, forward
+
+def peak():
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+run(27)
+before = peak()
+simulation, forward = run(60_000)
+real = simulation.precision.bytes
+parts = memory.simulation_parts(simulation.particles, len(simulation.walls), simulation.solver.search.capacity, real)
+back = memory.gradient_parts(simulation.particles, 5, real)
+print((forward - before) / sum(parts.values()), (peak() - forward) / sum(back.values()))
+"""
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_the_estimate_is_what_a_run_and_its_gradient_take(precision):
+    done = subprocess.run([sys.executable, "-c", MEASURE, precision], capture_output=True, text=True, check=True)
+    for ratio in map(float, done.stdout.splitlines()[-1].split()):
+        assert 1 / 1.5 < ratio < 1.5
+
+
+@pytest.fixture
+def scarce(monkeypatch) -> Callable[[float], None]:
+    """Sets what is free [bytes]."""
+    return lambda free: monkeypatch.setattr(memory, "available", lambda device=None: free)
+
+
+def problem() -> Problem:
+    simulation = Simulation(scene_from_dict(plane()))
+    return Problem(simulation, 2, losses.FinalPositions(simulation.positions))
+
+
+def gradient(one: Problem) -> None:
+    one.value_and_gradient({"gravity": np.array(one.simulation.scene.forces.gravity)})
+
+
+def test_a_scene_is_refused_before_it_is_cut_into_particles(scarce):
+    tall = plane(container={"shape": "box", "lower": [0, 0], "upper": [1, 4e6]})
+    scarce(1e9)
+    with pytest.raises(SceneError, match=r"spacing is 0\.1, but must be larger.* 8e\+07 wall.* only 1 GB are free"):
+        scene_from_dict(tall)
+
+
+@pytest.mark.parametrize(
+    ("work", "words"),
+    [
+        (lambda one: Simulation(one.simulation.scene), "50 particles of fluid.* larger spacing"),
+        (lambda one: one.simulation.rollout(1000), "1e\\+03 steps.* take fewer steps"),
+        (lambda one: one.simulation.run(2), "frames.* larger record_every"),
+        (gradient, "the gradient of 50 particles"),
+        (lambda one: scene_renderer(one.simulation), "nodes.* larger cell"),
+    ],
+    ids=["simulation", "steps", "frames", "gradient", "picture"],
+)
+def test_what_does_not_fit_is_refused_in_a_sentence(scarce, work, words):
+    one = problem()
+    scarce(1e3)
+    with pytest.raises(InputError, match=f"This needs about .* GB of memory, most of it for .*{words}"):
+        work(one)
+    scarce(1e9)
+    work(one)
+
+
+def test_more_steps_than_any_machine_has_room_for():
+    with pytest.raises(InputError, match="what is kept of 1e\\+11 steps"):
+        problem().simulation.rollout(100_000_000_000)
+
+
+def test_the_limit_of_a_process_counts():
+    program = "from cortado import memory; print(memory.available())"
+    line = f'ulimit -v 2000000; "{sys.executable}" -c "{program}"'
+    free = float(subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True).stdout)
+    assert 1e8 < free < 2.05e9
+
+
+def test_the_limit_of_a_container_counts(monkeypatch, tmp_path):
+    for name, content in (
+        ("memory.max", "3000"),
+        ("memory.current", "1500"),
+        ("memory.stat", "anon 1\ninactive_file 400"),
+    ):
+        (tmp_path / name).write_text(content)
+    monkeypatch.setattr(memory, "_CGROUP", tmp_path)
+    assert memory.available() == 1900.0
+    (tmp_path / "memory.max").write_text("max")
+    assert memory.available() > 1e6
+
+
+def test_checkpoints_leave_room(scarce):
+    one = problem().simulation
+    assert one.rollout(100)._interval == 1
+    scarce(50_000)
+    assert one.rollout(100)._interval > 1
