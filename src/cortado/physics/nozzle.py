@@ -27,6 +27,11 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
     real, vector = precision.real, precision.vector
 
     @wp.func
+    def taken(n: int, before: wp.array(dtype=wp.int32)) -> real:
+        """Steps that have been taken at the end of step n."""
+        return real(before[0] + n + 1)
+
+    @wp.func
     def left(
         i: int,
         first: int,
@@ -40,7 +45,7 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         """s of a particle; 0 for one that is no part of the emitter."""
         if i < first:
             return real(0.0)
-        return upstream[i - first] - flow_rate[0] / area * (real(before[0] + step[0] + 1) * time_step[0])
+        return upstream[i - first] - flow_rate[0] / area * (taken(step[0], before) * time_step[0])
 
     @wp.func
     def advance(
@@ -106,7 +111,7 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
             dt = time_step[0]
             way = flow_rate_dot[0] * dt + flow_rate[0] * time_step_dot[0]
             turn = advance(path_dot, n, before, outlet_dot) - advance(path, n, before, outlet) * (time_step_dot[0] / dt)
-            x_dot[i] = path_dot[n] + (real(before[0] + n + 1) * way / area) * direction
+            x_dot[i] = path_dot[n] + (taken(n, before) * way / area) * direction
             v_dot[i] = turn / dt + (flow_rate_dot[0] / area) * direction
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
@@ -159,7 +164,7 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         path_bar[n] = path_bar[n] + x_bar + v_bar / dt
         if n > 0 or before[0] == 0:
             path_bar[last] = path_bar[last] - v_bar / dt
-        along = real(before[0] + n + 1) * wp.dot(direction, x_bar) / area
+        along = taken(n, before) * wp.dot(direction, x_bar) / area
         flow_rate_bar[0] = flow_rate_bar[0] + along * dt + wp.dot(direction, v_bar) / area
         turn = wp.dot(v_bar, advance(path, n, before, outlet)) / (dt * dt)
         time_step_bar[0] = time_step_bar[0] + along * flow_rate[0] - turn
