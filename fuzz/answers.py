@@ -11,8 +11,8 @@ from cortado.errors import CortadoError, CortadoWarning
 from cortado.scene import Scene
 from cortado.trajectory import Trajectory
 
-TOLERANCE = 1e-3
-"""How far outside of its container a particle may be, in spacings."""
+TOLERANCE = 0.5
+"""How far outside of its container a particle may be, in spacings: up to there it has not passed the wall particles."""
 
 
 def run_complaints(folder: Path, finished: bool, steps: int | None = None, record_every: int = 1) -> list[str]:
@@ -51,7 +51,8 @@ def trajectory_complaints(scene: Scene, trajectory: Trajectory) -> list[str]:
     spacing, precision = scene.discretisation.spacing, np.finfo(trajectory.positions.dtype).eps
     positions = trajectory.positions.astype(np.float64)
     tolerance = TOLERANCE * spacing + 4.0 * float(precision) * float(np.abs(positions).max())
-    lost = [~scene.container.contains(points, tolerance) & ~_waiting(scene, points) for points in positions]
+    region = scene.container.region(scene.dimension).opened(scene.container.periods(scene.dimension)[1])
+    lost = [~region.contains(points, tolerance) & ~_waiting(scene, points) for points in positions]
     first = next((k for k, outside in enumerate(lost) if outside.any()), None)
     if first is None:
         return []

@@ -108,8 +108,8 @@ def trajectory_of(positions, at=0.3):
 
 def test_a_particle_that_leaked_is_found():
     scene = plane()
-    inside = trajectory_of(np.array([[0.0, 0.1], [0.7, 0.8]]))
-    outside = trajectory_of(np.array([[0.3, 0.1], [0.7 + 0.01 * 0.05, 0.1]]))
+    inside = trajectory_of(np.array([[0.0, 0.1], [0.7 + 0.49 * 0.05, 0.8]]))
+    outside = trajectory_of(np.array([[0.3, 0.1], [0.7 + 0.51 * 0.05, 0.1]]))
     nowhere = trajectory_of(np.array([[0.3, np.nan], [0.3, 0.1]]))
     assert answers.trajectory_complaints(scene, inside) == []
     assert "1 of 2 particles end outside" in answers.trajectory_complaints(scene, outside)[0]
