@@ -1,14 +1,18 @@
 """How Cortado is built: with the C++ engine where there is a compiler, and without it where there is none."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+
+import cortado
 
 ROOT = Path(__file__).parent.parent
 
@@ -42,7 +46,7 @@ def test_without_a_compiler_the_wheel_is_pure_python(small, tmp_path, hook):
     assert built.returncode == 0, built.stdout + built.stderr
     assert "retrying due to override" in built.stdout
     (wheel,) = (tmp_path / "dist").glob("*.whl")
-    assert wheel.name.endswith("-py3-none-any.whl")
+    assert wheel.name.startswith("cortado_sph-") and wheel.name.endswith("-py3-none-any.whl")
     assert ("cortado/__init__.py" in zipfile.ZipFile(wheel).namelist()) == (hook == "build_wheel")
 
 
@@ -62,6 +66,15 @@ def test_the_source_distribution_holds_every_source(tmp_path):
         held = {name.partition("/")[2] for name in contents.getnames()}
     sources = [*(ROOT / "cpp").rglob("*.*pp"), *(ROOT / "src/cortado").rglob("*.py"), ROOT / "cpp/CMakeLists.txt"]
     assert {str(source.relative_to(ROOT)) for source in sources} <= held
+
+
+def test_one_name_stands_wherever_cortado_is_installed():
+    """Another project has the name cortado on the package index."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert (project["name"], project["version"]) == ("cortado-sph", cortado.__version__)
+    files = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "src").rglob("*.py"), ROOT / "pyproject.toml"]
+    named = {name for file in files for name in re.findall(r"([\w-]+)\[(?:video|test)\]", file.read_text())}
+    assert named == {"cortado-sph"}
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")

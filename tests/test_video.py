@@ -61,5 +61,5 @@ def test_what_cannot_be_filmed_is_a_sentence(tmp_path, name, frames, rate, words
 
 def test_a_missing_package_is_a_sentence(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match=r"pip install 'cortado\[video\]'"):
+    with pytest.raises(InputError, match=r"pip install 'cortado-sph\[video\]'"):
         write_video(tmp_path / "a.mp4", [heart(16)])

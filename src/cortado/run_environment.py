@@ -11,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from cortado import __version__
 from cortado.errors import InputError, shown
 
 _PACKAGES = ("warp-lang", "numpy", "scipy", "pydantic", "h5py", "matplotlib")
@@ -19,7 +20,7 @@ _PACKAGES = ("warp-lang", "numpy", "scipy", "pydantic", "h5py", "matplotlib")
 def session(command: Sequence[str], device: str) -> dict[str, Any]:
     """Where and when a part of a run happens: operating system, Python, the versions that matter, the command."""
     return {
-        "cortado": _version("cortado"),
+        "cortado": __version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
         "executable": sys.executable,

@@ -62,7 +62,7 @@ def _pyav() -> Any:
     try:
         import av
     except ImportError as problem:
-        raise InputError("Videos need PyAV, which is not installed: pip install 'cortado[video]'.") from problem
+        raise InputError("Videos need PyAV, which is not installed: pip install 'cortado-sph[video]'.") from problem
     return av
 
 
