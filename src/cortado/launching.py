@@ -16,20 +16,22 @@ BRANCHES = 32
 """Values that one thread of a tree sum adds up."""
 
 
-PARTS_A_CORE = 4
-"""Ranges of particles for each of them: a core that is busy elsewhere leaves some of its own to the others."""
 MOST_PARTS = 32
-"""Ranges at most that a launch is cut into."""
+"""Ranges of particles at most that a launch on a CPU is cut into."""
 LEAST_PART = 2000
 """Particles at least in a range: below, starting it costs more than it saves."""
+PARTS_A_CORE = 4
+"""Ranges for each core at most: one that is busy elsewhere leaves some of its own to the others."""
+LEAST_SHARED_PART = 10_000
+"""Particles at least in a range where there is more than one for each core."""
 
 
 class Launcher:
     """Launches kernels with one thread a particle on one device.
 
     On a CPU Warp launches in one thread; a kernel that sums over neighbours, which begins with its surroundings, is cut
-    into ranges of particles, more than there are cores, and each core takes the next range when it has done one. The
-    sums are gathers, so that the bits do not depend on the cut, or on who took what.
+    into ranges of particles, several for each core where there are many, and a core that has done one takes the next.
+    The sums are gathers, so that the bits do not depend on the cut, or on who took what.
     """
 
     def __init__(self, particles: int, device: Any, record_tape: bool):
@@ -37,7 +39,8 @@ class Launcher:
         self.particles, self.device, self._record_tape = particles, device, record_tape
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._cores = min(cores, MOST_CORES) if device.is_cpu and not record_tape else 1
-        most = min(PARTS_A_CORE * self._cores, MOST_PARTS) if self._cores > 1 else 1
+        each = min(PARTS_A_CORE, MOST_PARTS // self._cores, particles // (self._cores * LEAST_SHARED_PART))
+        most = self._cores * max(each, 1) if self._cores > 1 else 1
         self.parts = max(min(most, particles // LEAST_PART), 1)
         """Ranges of particles that a sum over neighbours is cut into."""
         self._bounds = [particles * part // self.parts for part in range(self.parts + 1)]
