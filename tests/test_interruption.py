@@ -47,6 +47,11 @@ def test_an_import_is_interrupted_in_one_sentence(tmp_path, number):
     assert found == (128 + number, "Interrupted.\n")
 
 
+def test_a_silenced_stderr_does_not_swallow_the_sentence():
+    silenced = f"import os; {START} os.dup2(os.open(os.devnull, os.O_WRONLY), 2); {STOPPED}"
+    assert stopped(signal.SIGINT, "-c", silenced) == (130, "Interrupted.\n")
+
+
 @pytest.mark.parametrize(
     "work", [STOPPED, "Late()\n        time.sleep(60)"], ids=["at work", "in a finaliser, which drops exceptions"]
 )

@@ -15,6 +15,9 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN = 0.01
 """[s] after which an interruption is tried again that came where Python drops exceptions, such as in a finaliser."""
 
+_stderr = 2
+"""A copy of its own, as stderr is silenced for a while when Warp starts."""
+
 
 class Interrupted(KeyboardInterrupt):
     """A signal; takes its number and what is kept, the rest of the sentence."""
@@ -31,6 +34,9 @@ class Interrupted(KeyboardInterrupt):
 
 def leave_at_once() -> None:
     """From now on, end the process on the spot; a signal that is ignored stays so (nohup, background jobs)."""
+    global _stderr
+    with suppress(OSError):  # it may be closed
+        _stderr = os.dup(2)
     for number in SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _leave)
@@ -61,7 +67,7 @@ def keeping(kept: Callable[[], str]) -> Iterator[None]:
 
 def _leave(number: int, _: FrameType | None) -> None:
     with suppress(OSError):
-        os.write(2, b"Interrupted.\n")
+        os.write(_stderr, b"Interrupted.\n")
     os._exit(128 + number)
 
 
