@@ -68,3 +68,11 @@ def test_large_files_and_pipes_are_not_read(tmp_path):
     os.mkfifo(tmp_path / "pipe.toml")
     with pytest.raises(SceneError, match="scene cannot be read: it is a pipe, but must be a regular file"):
         read_toml(tmp_path / "pipe.toml")
+
+
+def test_a_long_override_is_not_repeated_whole(tmp_path):
+    file = tmp_path / "scene.toml"
+    file.write_text("")
+    with pytest.raises(SceneError, match="is not an override of the form key=value") as caught:
+        read_toml(file, [".=" + "é" * 5000])
+    assert len(str(caught.value)) < 300 + len(str(file))

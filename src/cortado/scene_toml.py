@@ -67,12 +67,12 @@ def _apply(data: dict[str, Any], override: str, file: str) -> None:
     """Put one override in."""
     if len(override) > MOST_BYTES:
         sentence = f"is the beginning of {len(override)} characters, but an override must have at most {MOST_BYTES}."
-        raise SceneError(file, repr(override[:LONGEST]), sentence=sentence)
+        raise SceneError(file, shown(override), sentence=sentence)
     _require_shallow(override, file)
     key, equals, text = override.partition("=")
     key = key.strip()
     if not equals or not _KEY.fullmatch(key):
-        raise SceneError(file, repr(override), sentence="is not an override of the form key=value.")
+        raise SceneError(file, shown(override), sentence="is not an override of the form key=value.")
     parts = key.replace("[", ".").replace("]", "").split(".")
     if len(parts) > MOST_PARTS:
         raise _too_deep(file, key)
