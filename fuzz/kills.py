@@ -63,10 +63,10 @@ def kill_search(case: Case) -> None:
     (case.folder / "file.toml").write_text(to_toml(_longer(bases.tasks()[name])))
     words = _search_words(precision)
     _cortado_killed(case, words, _seconds(whole))
-    if case.random.random() < 0.2:
+    out, twice = case.folder / "out", case.random.random() < 0.2
+    if twice:
         _cortado_killed(case, [*words, "--resume"], _seconds(whole), 2)
-    out = case.folder / "out"
-    if not (out / "report.html").exists():
+    if twice or not (out / "report.html").exists():
         resumed = case.cortado(*words, "--resume", codes=(0, 2))
         if resumed.code == 2:
             case.notes.append("begun again")

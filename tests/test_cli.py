@@ -136,6 +136,11 @@ def test_a_path_need_not_be_utf_8(cortado_command, folder):
     assert set(os.listdir(f"{place}/dam")) == RUN_FILES
 
 
+def test_one_frame_at_either_end_is_recorded_if_no_other_is(cortado_command):
+    code, _, err = cortado_command("run", "scene.toml", "--steps", 3, "--record-every", 10**17, "--out", "dam")
+    assert (code, Trajectory.load("dam/trajectory.vtkhdf").steps.tolist()) == (0, [0, 3]), err
+
+
 def test_steps_that_did_not_converge_are_mentioned(cortado_command):
     few = ["--set", "solver.maximum_iterations=4", "--set", "solver.density_tolerance=0"]
     code, out, _ = cortado_command("run", "scene.toml", "--steps", 30, "--out", "dam", *few)

@@ -157,4 +157,6 @@ def add_square(x: wp.array(dtype=wp.vec3d), count: wp.float64, loss: wp.array(dt
 
 
 def mean_square(positions, velocities, loss):
-    wp.launch(add_square, len(positions), inputs=[positions, float(len(positions))], outputs=[loss])
+    wp.launch(
+        add_square, len(positions), inputs=[positions, float(len(positions))], outputs=[loss], device=positions.device
+    )

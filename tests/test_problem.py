@@ -227,3 +227,11 @@ class Overflowing:
 def test_a_gradient_that_is_not_finite_is_warned_of(simulation):
     with pytest.warns(CortadoWarning, match="gradient with respect to gravity is not finite"):
         Problem(simulation, 3, Overflowing()).value_and_gradient(GRAVITY)
+
+
+@pytest.mark.parametrize("steps", [10**400, 2.5, "3", None, np.inf, 0, -1])
+def test_numbers_of_steps_that_cannot_be_are_sentences(simulation, steps):
+    with pytest.raises(InputError, match=r"steps is .*, but must be"):
+        simulation.run(steps)
+    with pytest.raises(InputError, match=r"record_every is .*, but must be"):
+        simulation.run(3, record_every=steps)

@@ -37,6 +37,8 @@ from cortado.trajectory import Trajectory
 
 MOST_SUBSTEPS = 10_000
 """Explicit steps of diffusion in a time step; beyond it the mobility is taken for a mistake."""
+GREATEST_NUMBER = 10**18
+"""Of steps: within a 64-bit number."""
 VISCOSITIES = {"pairwise": pairwise_viscosity, "laminar": laminar_viscosity}
 
 
@@ -131,8 +133,7 @@ class Simulation:
     @in_turn
     def collect(self, rollout: Rollout, record_every: int = 1) -> Trajectory:
         """Run a rollout forward and return its frames; warnings and errors as of `run`."""
-        if record_every < 1:
-            raise InputError(f"record_every is {record_every}, but must be at least 1.")
+        record_every = whole_number("record_every", record_every, 1)
         numbers_in_frame = self.particles * (2 * self.dimension + len(self.scene.phase))
         parts = frame_parts(2 + rollout.steps // record_every, 2 * numbers_in_frame, self.precision.bytes)
         require(parts, "take a larger record_every or fewer steps")
@@ -341,10 +342,17 @@ def _made_again(scene: Scene, device: str, precision: str, free_energy: FreeEner
 
 def check_steps(steps: int, least: int = 1) -> int:
     """The number of steps, or an `InputError` in a sentence."""
-    number = isinstance(steps, (int, float, np.number)) and np.isfinite(steps)
-    if not number or int(steps) != steps or steps < least:
-        raise InputError(f"steps is {steps}, but must be a whole number of at least {least}.")
-    return int(steps)
+    return whole_number("steps", steps, least)
+
+
+def whole_number(what: str, value: Any, least: int) -> int:
+    """A whole number of at least so much, also if it is a float, or an `InputError` in a sentence."""
+    whole = isinstance(value, (int, np.integer)) or (isinstance(value, (float, np.floating)) and value.is_integer())
+    if not whole or value < least:
+        raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
+    if value > GREATEST_NUMBER:
+        raise InputError(f"{what} is {shown(value)}, but must be at most {GREATEST_NUMBER:g}.")
+    return int(value)
 
 
 def first_capacity(support: float, dimension: int) -> int:

@@ -63,7 +63,7 @@ def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record
 
 def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:
     steps = rollout.steps
-    recorded = np.append(np.arange(0, steps, record_every), steps)
+    recorded = np.array([*range(0, steps, record_every), steps])
     with (
         TrajectoryWriter(
             folder.trajectory,
