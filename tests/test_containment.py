@@ -16,6 +16,7 @@ from cortado.region import Region
 from cortado.scene_containers import CylinderContainer
 from cortado.solvers.containment import Containment, Walled
 from scenes import plane, scene
+from test_emitter import jet
 
 SUPPORTS = {"cubic_spline": 2.0, "wendland_c2": 2.6, "wendland_c4": 3.0}
 
@@ -133,6 +134,7 @@ def test_the_device_finds_the_particles_that_numpy_finds(name, precision):
         to_device(before[order[:n].astype(int)], real, device),
         wp.array(step + 1.0, dtype=real.real, device=device),
         state,
+        state,
     )
     assert int(containment.bad_particle.numpy()[0]) == np.flatnonzero(wanted)[0]
     assert int(containment._count.numpy()[0]) == wanted.sum()
@@ -143,6 +145,23 @@ def test_over_the_rim_of_an_open_cup_fluid_may_go():
     tables["container"] |= {"lid": False, "height": 0.6, "radius": 0.62}
     trajectory = Simulation(Scene(**{**tables, "forces": {"gravity": [9.0, -6.0, 0.0]}}), precision="float64").run(300)
     assert np.linalg.norm(trajectory.positions[-1][:, [0, 2]], axis=1).max() > 0.8  # some is spilled
+
+
+def test_what_waits_in_a_nozzle_passes_walls_with_it():
+    """The column reaches from the opening at 0.26 m to 0.56 m, below a lid at 0.8 m; then the nozzle is drawn up."""
+    path = np.column_stack([np.full(30, 0.3), np.linspace(0.26, 0.7, 30)])
+    trajectory = Simulation(jet(), precision="float64").run(30, {"nozzle_path": path})
+    assert (trajectory.positions[0, :, 1] < 0.8).all() and trajectory.positions[-1, :, 1].max() > 0.83
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_fluid_that_has_gone_round_a_period_may_be_where_it_is():
+    round_along_x = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.8], "periodic": [True, False]}
+    simulation = Simulation(plane(container=round_along_x), precision="float64")
+    problem = Problem(simulation, 1, losses.FinalPositions(simulation.positions))
+    problem.value({"initial_positions": simulation.positions + [3.0 * 0.7, 0.0]})
+    with pytest.raises(InputError, match="outside the container"):
+        problem.value({"initial_positions": simulation.positions - [0.0, 1.0]})
 
 
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")

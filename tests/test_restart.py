@@ -49,8 +49,12 @@ def test_states_that_do_not_fit_are_refused():
     simulation = Simulation(pour(), precision="float64")
     state = simulation.run(3).last_state
     few = replace(state, positions=state.positions[:-1])
+    elsewhere = replace(state, positions=state.positions + [0.0, 0.0, 5.0])
+    weightless = replace(state, constants=replace(state.constants, reference_density=np.zeros(simulation.particles)))
     for arguments, what in [
         ({"state": few}, "state.positions has shape"),
+        ({"state": elsewhere}, "state.positions has particle 0 at .* m, outside the container of this scene"),
+        ({"state": weightless}, "state.constants.reference_density must be greater than 0"),
         ({"state": simulation.state}, "must be a RestartState"),
         ({"state": state, "controls": {"flow_rate": 0.01}}, "flow_rate is 0.01, but must be"),
         ({"state": state, "controls": {"time_step": 0.001}}, "time_step is 0.001, but must be"),

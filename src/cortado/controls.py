@@ -96,7 +96,7 @@ class Controls:
         for name in (*STATES, "rest_density"):
             if name in values:
                 raise InputError(f"control {name} is given, but must be left out with a state, which has its own.")
-        check_state(state, self._simulation.positions.shape, self._phases)
+        check_state(state, self._simulation.scene, self._simulation.positions.shape, self._free)
         if self._simulation.scene.emitter is not None:
             for name in ("time_step", "flow_rate"):
                 before, now = getattr(state.constants, name), float(values.get(name, self._scene[name]))
@@ -152,12 +152,17 @@ class Controls:
         check_sizes(values, simulation.precision)
         if self._steps == 0:
             return
-        emitter = simulation.solver.emitter
-        check_places(values, simulation.scene, emitter.nozzle.first if emitter else simulation.particles)
+        check_places(values, simulation.scene, self._free)
         sentence = unstable_sentence(values, simulation.scene) if values and not self._warned else None
         if sentence is not None:
             self._warned = True
             warnings.warn(sentence, CortadoWarning, stacklevel=4)
+
+    @property
+    def _free(self) -> int:
+        """How many particles, the first ones, do not wait in the nozzle."""
+        emitter = self._simulation.solver.emitter
+        return emitter.nozzle.first if emitter else self._simulation.particles
 
     @property
     def _tilt(self) -> Tilt:

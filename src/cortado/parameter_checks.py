@@ -44,8 +44,9 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
             )
 
 
-def check_state(state: RestartState, shape: tuple[int, int], phases: int) -> None:
-    """A state to go on from is one of particles in this shape (n, d); raises `InputError`."""
+def check_state(state: RestartState, scene: Scene, shape: tuple[int, int], free: int) -> None:
+    """A state to go on from is one of the scene, with positions of a shape (n, d); raises `InputError`. Only the first
+    ``free`` particles never waited in the nozzle."""
     if not isinstance(state, RestartState):
         raise InputError(f"state is {shown(state)}, but must be a RestartState, such as trajectory.last_state.")
     parts: dict[str, tuple[Any, tuple[int, ...]]] = {
@@ -53,12 +54,18 @@ def check_state(state: RestartState, shape: tuple[int, int], phases: int) -> Non
         "velocities": (state.velocities, shape),
         "constants.reference_density": (state.constants.reference_density, shape[:1]),
     }
-    if phases > 1:
-        parts["mass_fractions"] = (state.mass_fractions, (shape[0], phases))
+    if len(scene.phase) > 1:
+        parts["mass_fractions"] = (state.mass_fractions, (shape[0], len(scene.phase)))
     for name, (value, wanted) in parts.items():
         array = as_numbers(f"state.{name}", value)
         if array.shape != wanted or not np.isfinite(array).all():
             raise InputError(f"state.{name} has shape {array.shape}, but must be {wanted} and finite.")
+    if (state.constants.reference_density <= 0.0).any():
+        raise InputError("state.constants.reference_density must be greater than 0.")
+    held = scene.forces.pressure and np.isinf(scene.container.region(scene.dimension).rim)
+    for particle in _outside(scene, state.positions[:free])[:1] if held else ():
+        place = _place(state.positions[particle])
+        raise InputError(f"state.positions has particle {particle} at {place}, outside the container of this scene.")
 
 
 def unstable_sentence(values: Arrays, scene: Scene) -> str | None:
@@ -70,8 +77,9 @@ def unstable_sentence(values: Arrays, scene: Scene) -> str | None:
 
 
 def _outside(scene: Scene, points: Any) -> np.ndarray:
-    """The numbers of the points (n, d) [m] that are outside of the container."""
-    return np.flatnonzero(~scene.container.contains(points, TOLERANCE * scene.discretisation.spacing))
+    """The numbers of the points (n, d) [m] that are outside of the container; along a period nothing is."""
+    walled = scene.container.region(scene.dimension).opened(scene.container.periods(scene.dimension)[1])
+    return np.flatnonzero(~walled.contains(points, TOLERANCE * scene.discretisation.spacing))
 
 
 def _place(point: np.ndarray) -> str:

@@ -67,6 +67,7 @@ def lost_kernel(precision: Precision) -> Any:
         order: wp.array(dtype=wp.int32),
         x_before: wp.array(dtype=vector),
         rho_0: wp.array(dtype=real),
+        x_free: wp.array(dtype=vector),
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         bad_step: wp.array(dtype=wp.int32),
@@ -78,8 +79,9 @@ def lost_kernel(precision: Precision) -> Any:
         is looked for.
 
         Lost is what is not finite, too far away, of a mixture without a volume, or what went through a wall: it was
-        inside before the step and is outside after it. Over the rim of an open cup fluid may go, and particles that
-        wait in a nozzle may start outside. ``x_before`` and ``rho_0`` are sorted, ``x`` and ``v`` in scene order.
+        inside before the step and is outside after it. Over the rim of an open cup fluid may go, and what a nozzle
+        leads, so that it is not where it would be without one, ``x_free``, passes walls with it. ``x_before`` and
+        ``rho_0`` are sorted, the others in scene order.
         """
         if bad_step[0] >= 0:
             return
@@ -89,7 +91,8 @@ def lost_kernel(precision: Precision) -> Any:
         before = x_before[i]
         good = between(x_i, bounds.nearest, bounds.furthest) and wp.isfinite(v[p]) and rho_0[i] > real(0.0)
         escaped = (
-            contains(before, bounds)
+            x_i == x_free[p]
+            and contains(before, bounds)
             and not contains(x_i, bounds)
             and below_rim(before, bounds)
             and below_rim(x_i, bounds)

@@ -68,11 +68,13 @@ class Containment:
         self.bad_particle.fill_(NO_PARTICLE)
         self._count.zero_()
 
-    def look(self, order: wp.array, x_before: wp.array, rho_0: wp.array, state: State) -> None:
-        """Look at the end of a step: sorted positions and rest densities before it, and the state after it."""
+    def look(self, order: wp.array, x_before: wp.array, rho_0: wp.array, free: State, state: State) -> None:
+        """Look at the end of a step: sorted positions and rest densities before it, and the state after it, without
+        and with what a nozzle leads."""
         self._launch(
             self._kernel,
-            [self._bounds, order, x_before, rho_0, state.positions, state.velocities, self.bad_step],
+            [self._bounds, order, x_before, rho_0, free.positions, state.positions, state.velocities]
+            + [self.bad_step],
             [self.bad_particle, self._count],
         )
 

@@ -147,7 +147,7 @@ class Pcisph:
         if self.pressure is not None:
             self._solve_pressure(self.pressure, parameters)
         self.recorded(0, parameters, new_state)
-        self.containment.look(self.search.order, self.fields.x, self.fields.rho_0, new_state)
+        self.containment.look(self.search.order, self.fields.x, self.fields.rho_0, self._free(new_state), new_state)
         self.launch(
             self.kernels.convergence.finish,
             [self.search.particles, self._error_sums, self.containment.bad_particle],
@@ -166,7 +166,7 @@ class Pcisph:
         """The new state of the step that was recorded: its last prediction, in the scene's order, but for particles
         that a nozzle leads."""
         it = self.iterates
-        free = self.emitter.free if self.emitter else new_state
+        free = self._free(new_state)
         self.launch(
             self.kernels.integration.unsort,
             [self.search.order, it.x_star[iterations], it.v_star[iterations]],
@@ -175,6 +175,10 @@ class Pcisph:
         self.mixture.result(new_state.mass_fractions)
         if self.emitter:
             self.emitter.lead(parameters, self.step_number, new_state)
+
+    def _free(self, new_state: State) -> State:
+        """The new state as it is before a nozzle leads particles."""
+        return self.emitter.free if self.emitter else new_state
 
     def moment(self, parameters: Parameters) -> Moment:
         """The present step as a force term sees it."""
