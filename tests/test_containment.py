@@ -154,6 +154,15 @@ def test_what_waits_in_a_nozzle_passes_walls_with_it():
     assert (trajectory.positions[0, :, 1] < 0.8).all() and trajectory.positions[-1, :, 1].max() > 0.83
 
 
+def test_what_is_spilled_may_fall_on():
+    tables = cup().model_dump(mode="json")
+    tables["container"] |= {"lid": False}
+    simulation = Simulation(Scene(**tables), precision="float32")
+    state = simulation.run(1).last_state
+    state.positions[0] = [5.0, -2e4 * 0.1, 0.0]
+    assert simulation.run(2, state=state).positions[-1, 0, 1] <= -2e4 * 0.1
+
+
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
 def test_fluid_that_has_gone_round_a_period_may_be_where_it_is():
     round_along_x = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.8], "periodic": [True, False]}
@@ -184,6 +193,10 @@ def test_a_time_step_beyond_the_limit_of_stability_is_warned_of_once():
     with pytest.warns(CortadoWarning, match="time_step is 0.012 s, but the limit of stability with these"):
         problem.value({"time_step": 0.012})
     problem.value({"time_step": 0.012})
+    shallow = plane(container={"shape": "box", "lower": [0.0, 0.0], "upper": [70.0, 0.8]})
+    aside = Problem(Simulation(shallow, precision="float64"), 2, losses.CentreOfMass([0.0, 0.0]))
+    with pytest.warns(CortadoWarning, match="limit of stability"):
+        aside.value({"tilt": [90.0]})
     with pytest.warns(CortadoWarning, match="limit of stability"):
         simulation.run(2, controls={"gravity": [[0.0, -9.81], [0.0, -400.0]]})
 

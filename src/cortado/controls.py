@@ -153,7 +153,7 @@ class Controls:
         if self._steps == 0:
             return
         check_places(values, simulation.scene, self._free)
-        sentence = unstable_sentence(values, simulation.scene) if values and not self._warned else None
+        sentence = unstable_sentence(self._upright(values), simulation.scene) if values and not self._warned else None
         if sentence is not None:
             self._warned = True
             warnings.warn(sentence, CortadoWarning, stacklevel=4)

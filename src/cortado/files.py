@@ -50,15 +50,6 @@ def write_fully(file: Any, content: bytes) -> None:
         rest = rest[file.write(rest) :]
 
 
-def read_regular(path: Path, most: int) -> bytes:
-    """All of a file; raises `OSError` for what is no file, such as a pipe, or is larger than ``most`` bytes."""
-    if path.exists() and not path.is_file():
-        raise OSError("it is no regular file")
-    if path.stat().st_size > most:
-        raise OSError(f"it is larger than {most / 2**20:.0f} MiB")
-    return path.read_bytes()
-
-
 def parsed_json(text: bytes) -> Any:
     """What a text in JSON says; raises `ValueError`, also for one that is nested too deeply."""
     try:

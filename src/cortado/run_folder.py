@@ -12,7 +12,8 @@ from typing import Any, Self
 
 from cortado.errors import InputError
 from cortado.evaluations import FILE_NAME
-from cortado.files import UNFINISHED, parsed_json, read_regular, sentences, write_atomically
+from cortado.files import UNFINISHED, parsed_json, sentences, write_atomically
+from cortado.input_files import reason, regular_file
 from cortado.parameter_values import NAMES
 from cortado.run_environment import as_json, plain, require_same, session
 
@@ -170,16 +171,14 @@ class RunFolder:
         if not self.metrics.exists():
             return []
         try:
-            return [parsed_json(line) for line in read_regular(self.metrics, _LARGEST).split(b"\n")[:-1]]
-        except OSError as problem:
-            raise InputError(f"{self.metrics} cannot be read: {problem}.") from problem
+            return [parsed_json(line) for line in _bytes_of(self.metrics).split(b"\n")[:-1]]
         except ValueError as problem:
             raise InputError(f"{self.metrics} holds a line that is not JSON: {problem}.") from problem
 
     def _holds_run(self) -> bool:
         try:
-            return "cortado" in dict(parsed_json(read_regular(self.environment, _LARGEST)))
-        except (OSError, ValueError, TypeError):
+            return "cortado" in dict(parsed_json(_bytes_of(self.environment)))
+        except (InputError, ValueError, TypeError):
             return False
 
     def _complete(self, noted: Mapping[str, Any], scene_json: str) -> None:
@@ -223,14 +222,23 @@ class RunFolder:
         return [*self.checkpoint.glob("[0-9]*/"), self.checkpoint]
 
 
+def _bytes_of(path: Path) -> bytes:
+    """All of a file; raises `InputError` if it is no regular one, or very large."""
+    try:
+        regular_file(path, _LARGEST)
+        return path.read_bytes()
+    except OSError as problem:
+        raise InputError(f"{path} cannot be read: {reason(problem)}.") from problem
+
+
 def _read_json(path: Path) -> Any:
     try:
-        return parsed_json(read_regular(path, _LARGEST))
-    except (OSError, ValueError) as problem:
-        raise InputError(f"{path} cannot be read: {problem}.") from problem
+        return parsed_json(_bytes_of(path))
+    except ValueError as problem:
+        raise InputError(f"{path} cannot be read: {reason(problem)}.") from problem
 
 
 def _cut_torn_line(path: Path) -> None:
     """Removes what a killed run left of a last line, so that the next line begins a line."""
     if path.exists():
-        os.truncate(path, read_regular(path, _LARGEST).rfind(b"\n") + 1)
+        os.truncate(path, _bytes_of(path).rfind(b"\n") + 1)

@@ -33,8 +33,10 @@ class Walled:
         return len(self.near.lower)
 
     def furthest(self, precision: Precision) -> Region:
-        """The box that positions must not leave [m]: far away, and as far from the origin as a precision resolves."""
-        limit, reach = precision.furthest * self.spacing, FURTHEST * self.spacing
+        """The box that positions must not leave [m]: far away, and as far from the origin as a precision resolves; what
+        is spilled over the rim of an open cup may fall on."""
+        spilled, reach = np.isfinite(self.region.rim), FURTHEST * self.spacing
+        limit = np.inf if spilled else precision.furthest * self.spacing
         return Region.between(np.maximum(self.near.lower - reach, -limit), np.minimum(self.near.upper + reach, limit))
 
 
@@ -73,8 +75,7 @@ class Containment:
         and with what a nozzle leads."""
         self._launch(
             self._kernel,
-            [self._bounds, order, x_before, rho_0, free.positions, state.positions, state.velocities]
-            + [self.bad_step],
+            [self._bounds, order, x_before, rho_0, free.positions, state.positions, state.velocities] + [self.bad_step],
             [self.bad_particle, self._count],
         )
 
