@@ -60,10 +60,10 @@ def check_state(state: RestartState, scene: Scene, shape: tuple[int, int], free:
         array = as_numbers(f"state.{name}", value)
         if array.shape != wanted or not np.isfinite(array).all():
             raise InputError(f"state.{name} has shape {array.shape}, but must be {wanted} and finite.")
-    if (state.constants.reference_density <= 0.0).any():
+    if (np.asarray(state.constants.reference_density) <= 0.0).any():
         raise InputError("state.constants.reference_density must be greater than 0.")
     held = scene.forces.pressure and np.isinf(scene.container.region(scene.dimension).rim)
-    for particle in _outside(scene, state.positions[:free])[:1] if held else ():
+    for particle in _outside(scene, np.asarray(state.positions)[:free])[:1] if held else ():
         place = _place(state.positions[particle])
         raise InputError(f"state.positions has particle {particle} at {place}, outside the container of this scene.")
 
