@@ -219,8 +219,13 @@ def test_particles_that_go_further_than_a_precision_resolves_are_lost():
     with pytest.warns(CortadoWarning, match="limit of stability"):
         fast = plane(fluid=[block], container={"shape": "none"}, forces={"gravity": [0.0, 0.0]}, solver=solver)
     assert Simulation(fast, precision="float64").run(12).positions[-1].max() > 500.0
-    with pytest.raises(DivergedError, match=r"in step 11: .* further than positions are precise in float32"):
+    with pytest.raises(
+        DivergedError, match=r"in step 11: .* further than positions are precise in float32.* or float64"
+    ):
         Simulation(fast).run(12)
+    kicked = {"initial_velocities": np.full((64, 2), 1e6)}
+    with pytest.raises(DivergedError, match=r"m, further than 1e\+06 spacings from the scene; .* iterations.$"):
+        Simulation(fast, precision="float64").run(12, kicked)
 
 
 def test_points_that_are_packed_are_refused(tmp_path):

@@ -167,10 +167,11 @@ class Rollout:
     def _diverged(self, lost: Lost, state: State) -> DivergedError:
         containment = self.solver.containment
         position = state.positions.numpy()[lost.particle][: containment.walled.dimension]
+        imprecise = ", or float64 for fluid that flies that far" if containment.is_imprecise(position) else ""
         return DivergedError(
             step=lost.step + 1,
             particle=lost.particle,
-            advice=f"try a smaller time step than {self.time_step:g} s, or more pressure iterations",
+            advice=f"try a smaller time step than {self.time_step:g} s, or more pressure iterations{imprecise}",
             where=containment.where(position),
             others=lost.others,
         )

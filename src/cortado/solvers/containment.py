@@ -86,6 +86,11 @@ class Containment:
             return None
         return Lost(step, int(self.bad_particle.numpy()[0]), int(self._count.numpy()[0]) - 1)
 
+    def is_imprecise(self, position: np.ndarray) -> bool:
+        """Whether a position (d,) [m] is further from the origin than the precision resolves."""
+        distance = float(np.abs(position).max())
+        return self._precision.furthest * self.walled.spacing < distance < np.inf
+
     def where(self, position: np.ndarray) -> str:
         """What happened to a lost particle that is now at a position (d,) [m], in words."""
         place = f"({', '.join(f'{x:g}' for x in position)}) m"
@@ -93,9 +98,11 @@ class Containment:
             return "has no finite position"
         if not self.walled.region.contains(position[None], TOLERANCE * self.walled.spacing)[0]:
             return f"left the container and was at {place}"
-        if not self.walled.furthest(self._precision).contains(position[None], 0.0)[0]:
+        if self.is_imprecise(position):
             limit = f"{self._precision.furthest:g} spacings from the origin"
             return f"was at {place}, further than positions are precise in {self._precision.name}, {limit}"
+        if not self.walled.furthest(self._precision).contains(position[None], 0.0)[0]:
+            return f"was at {place}, further than {FURTHEST:g} spacings from the scene"
         return f"at {place} has no finite velocity or no volume"
 
     def _made_bounds(self) -> Any:
