@@ -213,15 +213,14 @@ def test_scenes_that_a_precision_does_not_resolve_are_refused():
         Simulation(moved(1.1e4))
 
 
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
 def test_particles_that_go_further_than_a_precision_resolves_are_lost():
     block = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "velocity": [490.0, 0.0], "phase": "water"}
     solver = {"time_step": 0.1, "minimum_iterations": 3, "maximum_iterations": 3}
     with pytest.warns(CortadoWarning, match="limit of stability"):
         fast = plane(fluid=[block], container={"shape": "none"}, forces={"gravity": [0.0, 0.0]}, solver=solver)
     assert Simulation(fast, precision="float64").run(12).positions[-1].max() > 500.0
-    with pytest.raises(
-        DivergedError, match=r"in step 11: .* further than positions are precise in float32.* or float64"
-    ):
+    with pytest.raises(DivergedError, match=r"in step 11: .* than positions are precise in float32.* or float64"):
         Simulation(fast).run(12)
     kicked = {"initial_velocities": np.full((64, 2), 1e6)}
     with pytest.raises(DivergedError, match=r"m, further than 1e\+06 spacings from the scene; .* iterations.$"):
