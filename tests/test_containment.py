@@ -227,14 +227,29 @@ def test_particles_that_go_further_than_a_precision_resolves_are_lost():
         Simulation(fast, precision="float64").run(12, kicked)
 
 
+def points(tmp_path, apart):
+    """12 x 12 points in a scene of the spacing 0.05 m."""
+    lattice = np.stack(np.meshgrid(*[apart * (np.arange(12) + 0.5)] * 2), axis=-1).reshape(-1, 2)
+    np.save(tmp_path / "points.npy", lattice)
+    return plane(
+        fluid=[{"shape": "points", "file": str(tmp_path / "points.npy"), "phase": "water"}],
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.5, 1.5]},
+    )
+
+
 def test_points_that_are_packed_are_refused(tmp_path):
-    lattice = np.stack(np.meshgrid(*[0.025 * (np.arange(12) + 0.5)] * 2), axis=-1).reshape(-1, 2)
-    body = {"shape": "points", "file": str(tmp_path / "points.npy"), "phase": "water"}
-    for squeezed in (1.0, 0.8):
-        np.save(tmp_path / "points.npy", 2.0 * squeezed * lattice)
-        fits = plane(fluid=[body])
-        if squeezed == 1.0:
-            Simulation(fits)
-        else:
-            with pytest.raises(InputError, match=r"have 1.56 times the rest density .* discretisation.spacing is 0.05"):
-                Simulation(fits)
+    wanted = r"have 1.56 times the rest density .* spacing is 0.05 m, and these points would fit one of 0.04 m"
+    with pytest.raises(InputError, match=wanted):
+        Simulation(points(tmp_path, 0.04))
+
+
+@pytest.mark.parametrize(("apart", "words"), [(0.0485, "fly apart: .* fit one of 0.0485"), (0.1, "hardly touch each")])
+def test_points_for_another_spacing_are_warned_of(tmp_path, apart, words):
+    with pytest.warns(CortadoWarning, match=words):
+        Simulation(points(tmp_path, apart))
+
+
+@pytest.mark.filterwarnings("error::cortado.CortadoWarning")
+def test_points_that_fit_are_taken(tmp_path):
+    Simulation(points(tmp_path, 0.05))
+    Simulation(points(tmp_path, 0.051))

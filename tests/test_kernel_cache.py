@@ -42,11 +42,21 @@ def twice(tmp_path):
     return run
 
 
-@pytest.mark.parametrize("ending", [".o", ".meta"])
-def test_a_damaged_kernel_is_said_in_a_sentence(twice, tmp_path, ending):
+@pytest.mark.skipif(sys.platform != "linux", reason="object files are looked at on Linux")
+@pytest.mark.parametrize("damage", [lambda file: file[:-50], lambda file: b"noise" * 100, lambda file: b""])
+def test_a_damaged_kernel_is_compiled_again_elsewhere(twice, tmp_path, damage):
     out, err = twice(tmp_path / "cache")
     assert out.startswith("6.0") and err == ""
-    (file,) = (tmp_path / "cache").rglob(f"*{ending}")
+    (file,) = (tmp_path / "cache").rglob("*.o")
+    file.write_bytes(damage(file.read_bytes()))
+    out, err = twice(tmp_path / "cache")
+    assert out.startswith("6.0") and len(err.splitlines()) == 1
+    assert f"({file.parent.name} in it is damaged and should be deleted)" in err
+
+
+def test_a_damaged_note_of_a_kernel_is_said_in_a_sentence(twice, tmp_path):
+    twice(tmp_path / "cache")
+    (file,) = (tmp_path / "cache").rglob("*.meta")
     file.write_bytes(file.read_bytes()[:100])
     out, _ = twice(tmp_path / "cache")
     assert out.startswith(f"A compiled kernel in {file.parent.parent} cannot be used (") and len(out.splitlines()) == 1

@@ -5,6 +5,7 @@ user's, or of the machine, is one sentence on stderr, never a traceback.
 """
 
 import io
+import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -200,6 +201,7 @@ def bench(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command; exits with its code unless that is 0."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    os.environ["MPLBACKEND"] = "agg"  # pictures go to files, whatever the user has chosen for windows
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # type: ignore[assignment]

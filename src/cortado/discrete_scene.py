@@ -3,6 +3,7 @@
 It is the same for every device, every precision and every engine.
 """
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from cortado.calibration import (
     wall_layer,
     wall_rigidity,
 )
-from cortado.errors import InputError
+from cortado.errors import CortadoWarning, InputError
 from cortado.region import Region
 from cortado.sampling import FluidSample, boundary_particles, boundary_volumes, fluid_particles, period
 from cortado.scene import Scene
@@ -29,6 +30,10 @@ bursts."""
 MOST_DENSITY = 1.5
 """Greatest number density of a first particle; on a disturbed lattice with all particles half a spacing apart it is
 1.4."""
+NOTED_COMPRESSION = 0.03
+"""Average compression that is warned of; a lattice whose points are disturbed by a tenth of a spacing has 0.02."""
+NOTED_DENSITY = 0.5
+"""Where no particle has more, there is no fluid to speak of."""
 
 
 @dataclass(frozen=True)
@@ -120,18 +125,33 @@ def discretise(scene: Scene) -> DiscreteScene:
 
 
 def _check_packing(scene: Scene, positions: Points, kernel: SmoothingKernel, lattice: Lattice) -> None:
-    """Fluid that starts compressed flies apart; points of a file may be any, those of a lattice are not compressed."""
+    """Points of a file may have any density: fluid that starts compressed flies apart, and points that do not touch each
+    other are no fluid. Raises `InputError`, or warns where it may be meant."""
     volumes = boundary_volumes(
         positions, lambda r: kernel.weight(r, scene.dimension, lattice.support), lattice.support, *period(scene)
     )
     densities = lattice.volume / volumes
     average, greatest = np.maximum(densities - 1.0, 0.0).mean(), densities.max()
+    spacing, inside = scene.discretisation.spacing, float(np.quantile(densities, 0.75))  # away from the surface
+    fit = spacing * inside ** (-1.0 / scene.dimension)
+    advice = f"discretisation.spacing is {spacing:g} m, and these points would fit one of {fit:.3g} m"
     if average > MOST_AVERAGE_COMPRESSION or greatest > MOST_DENSITY:
-        spacing = scene.discretisation.spacing
         place = ", ".join(f"{x:g}" for x in positions[densities.argmax()])
         raise InputError(
             f"The points of the fluid have {greatest:.3g} times the rest density at ({place}) m and are compressed by "
             f"{average:.0%} on average, but must have at most {MOST_DENSITY:g} times and be compressed by at most "
-            f"{MOST_AVERAGE_COMPRESSION:.0%}: discretisation.spacing is {spacing:g} m, and with "
-            f"{spacing * (1.0 + average) ** (-1.0 / scene.dimension):.3g} m they would fit."
+            f"{MOST_AVERAGE_COMPRESSION:.0%}: {advice}."
+        )
+    if average > NOTED_COMPRESSION:
+        warnings.warn(
+            f"the points of the fluid are compressed by {average:.0%} on average, and will fly apart: {advice}.",
+            CortadoWarning,
+            stacklevel=4,
+        )
+    if greatest < NOTED_DENSITY:
+        warnings.warn(
+            f"the points of the fluid have {greatest:.2g} times the rest density at most, and hardly touch each other: "
+            f"{advice}.",
+            CortadoWarning,
+            stacklevel=4,
         )

@@ -7,6 +7,8 @@ import atexit
 import logging
 import os
 import shutil
+import struct
+import sys
 import tempfile
 import traceback
 from contextlib import suppress
@@ -43,8 +45,8 @@ def start_warp() -> None:
         )
     _start()
     say(
-        f"Warning: Compiled kernels cannot be kept in {folder} ({reason}), so they are compiled again in every run; "
-        f"set the environment variable {VARIABLE} to a folder that can be written."
+        f"Warning: Compiled kernels cannot be kept in {folder} ({reason}), so new ones are compiled in every "
+        f"run; mend that, or set the environment variable {VARIABLE} to a folder that can be written."
     )
 
 
@@ -83,20 +85,42 @@ def _start() -> str | None:
 
 
 def _trouble(folder: str) -> str | None:
-    """Why a folder has no room for kernels; None if it has."""
+    """Why a folder has no room for kernels, or that one in it is damaged; None if all is well."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             free = shutil.disk_usage(folder).free
     except OSError as problem:
         return problem.strerror or str(problem)
-    return None if free >= ROOM else f"only {free / 2**20:.1f} MiB are free there"
+    if free < ROOM:
+        return f"only {free / 2**20:.1f} MiB are free there"
+    damaged = next((kernel.name for kernel in Path(folder).glob("wp_*") if not _is_whole(kernel)), None)
+    return None if damaged is None else f"{damaged} in it is damaged and should be deleted"
+
+
+def _is_whole(kernel: Path) -> bool:
+    """Whether the object files of a kernel have their table of sections, which stands at the end of a file; what prints
+    more than a sentence where one has not is the loader. Elsewhere than on Linux nothing is looked at."""
+    if sys.platform != "linux":
+        return True
+    for file in kernel.glob("*.o"):
+        try:
+            with file.open("rb") as stream:
+                head, size = stream.read(64), file.stat().st_size
+        except OSError:
+            return False
+        if len(head) < 64 or head[:4] != b"\x7fELF":
+            return False
+        (table,), (length, entries) = struct.unpack_from("<Q", head, 0x28), struct.unpack_from("<HH", head, 0x3A)
+        if table + length * entries > size:
+            return False
+    return True
 
 
 def _replacement(folder: str) -> str:
-    """A temporary folder for kernels, with those that are in the cache, until the process ends."""
+    """A temporary folder for kernels, with those of the cache that are whole, until the process ends."""
     temporary = tempfile.mkdtemp(prefix="cortado-kernels-")
     atexit.register(shutil.rmtree, temporary, ignore_errors=True)
     with suppress(OSError):
-        for kernel in Path(folder).glob("wp_*"):
+        for kernel in filter(_is_whole, Path(folder).glob("wp_*")):
             (Path(temporary) / kernel.name).symlink_to(kernel)
     return temporary

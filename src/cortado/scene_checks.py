@@ -4,6 +4,7 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
+from pydantic_core import PydanticCustomError
 from scipy.spatial import cKDTree
 
 from cortado.errors import InputError, Phrase, shown
@@ -115,15 +116,27 @@ def _check_distance(path: FieldPath, body: Body, spacing: float) -> None:
 
 
 def _check_inside(scene: "Scene", index: int, fluid: Fluid) -> None:
-    """Containers are convex: if the corners of a box around the particles are inside, all are."""
+    """Containers are convex: if the corners of a box around the particles are inside, all are. A body that is too long
+    along an axis is refused before any of its particles is made."""
     spacing = scene.discretisation.spacing
     if scene.container.contains(fluid.corners(spacing), 1e-6 * spacing).all():
         return
+    region, (lower, upper) = scene.container.region(scene.dimension), fluid.extent(spacing)
+    for ends, beyond in ((lower, region.lower - lower), (upper, upper - region.upper)):
+        axis = int(np.argmax(beyond))
+        if beyond[axis] > 1e-6 * spacing:
+            place = 0.5 * (lower + upper)
+            place[axis] = ends[axis]
+            raise _outside(index, place)
     witnesses = fluid.witnesses(spacing)
     outside = ~scene.container.contains(witnesses, 1e-6 * spacing)
     if outside.any():
-        found = Phrase(f"partly outside, for example at {_place(witnesses[outside][0])}")
-        raise wrong(("fluid", index), found, "inside the container")
+        raise _outside(index, witnesses[outside][0])
+
+
+def _outside(index: int, place: Points) -> PydanticCustomError:
+    found = Phrase(f"partly outside, for example at {_place(place)}")
+    return wrong(("fluid", index), found, "inside the container")
 
 
 def _check_outlet(scene: "Scene", emitter: Emitter) -> None:

@@ -18,6 +18,8 @@ FRACTIONS = 0.001
 def point(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
     """The values of parameters, given as values or as names of the scene's."""
     values = problem.simulation.parameters()
+    if values["gravity"].any():
+        values["tilt"] = np.zeros(problem.simulation.dimension - 1)
     if isinstance(parameters, Mapping):
         values = dict(parameters)
     unknown = [name for name in parameters if name not in values]

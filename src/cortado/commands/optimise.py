@@ -169,17 +169,12 @@ def _search(made: Assignment, folder: RunFolder, resume: bool) -> tuple[Result, 
     return replace(result, history=tuple(history), evaluations=len(history)), policy
 
 
-def _iterations(made: Assignment, result: Result) -> int:
-    """Of all searches, each of which evaluates its start besides."""
-    return len(result.history) - len(made.searches)
-
-
 def _summary(made: Assignment, result: Result, verdict: Verdict) -> str:
     reached = [f"{name} within {100 * error:.3g}% of the hidden one" for name, error in verdict.errors.items()]
     if verdict.psnr is not None:
         reached.insert(0, f"the image is matched to {verdict.psnr:.3g} dB")
     fell = f"fell {verdict.reduction:.3g} times" if result.loss > 0.0 else f"went from {verdict.first:.3g} to 0"
-    text = f"The loss {fell} in {_iterations(made, result)} iterations"
+    text = f"The loss {fell} in {len(result.history)} evaluations"
     return f"{'; '.join([text, ', '.join(reached)]) if reached else text}."
 
 
@@ -188,7 +183,7 @@ def _rows(made: Assignment, found: dict[str, np.ndarray], result: Result, verdic
         ("particles", made.problem.simulation.particles),
         ("steps", made.problem.steps),
         ("gradients", repr(policy)),
-        ("iterations", _iterations(made, result)),
+        ("evaluations", len(result.history)),
         ("first loss", f"{verdict.first:.4g}"),
         ("best loss", f"{result.loss:.4g}"),
         ("loss reduction", f"{verdict.reduction:.4g}"),
