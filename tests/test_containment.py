@@ -238,7 +238,7 @@ def points(tmp_path, apart):
 
 
 def test_points_that_are_packed_are_refused(tmp_path):
-    wanted = r"have 1.56 times the rest density .* spacing is 0.05 m, and these points would fit one of 0.04 m"
+    wanted = r"have 1.56 times the rest density .*spacing is 0.05 m, and these points would fit one of 0.04 m"
     with pytest.raises(InputError, match=wanted):
         Simulation(points(tmp_path, 0.04))
 

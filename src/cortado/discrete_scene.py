@@ -125,8 +125,8 @@ def discretise(scene: Scene) -> DiscreteScene:
 
 
 def _check_packing(scene: Scene, positions: Points, kernel: SmoothingKernel, lattice: Lattice) -> None:
-    """Points of a file may have any density: fluid that starts compressed flies apart, and points that do not touch each
-    other are no fluid. Raises `InputError`, or warns where it may be meant."""
+    """Points of a file may have any density: fluid that starts compressed flies apart, and points that do not touch
+    each other are no fluid. Raises `InputError`, or warns where it may be meant."""
     volumes = boundary_volumes(
         positions, lambda r: kernel.weight(r, scene.dimension, lattice.support), lattice.support, *period(scene)
     )

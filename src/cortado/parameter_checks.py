@@ -58,8 +58,10 @@ def check_state(state: RestartState, scene: Scene, shape: tuple[int, int], free:
         parts["mass_fractions"] = (state.mass_fractions, (shape[0], len(scene.phase)))
     for name, (value, wanted) in parts.items():
         array = as_numbers(f"state.{name}", value)
-        if array.shape != wanted or not np.isfinite(array).all():
-            raise InputError(f"state.{name} has shape {array.shape}, but must be {wanted} and finite.")
+        if array.shape != wanted:
+            raise InputError(f"state.{name} has shape {array.shape}, but must be {wanted}.")
+        if not np.isfinite(array).all():
+            raise InputError(f"state.{name} has a value that is not finite, but must be numbers.")
     if (np.asarray(state.constants.reference_density) <= 0.0).any():
         raise InputError("state.constants.reference_density must be greater than 0.")
     held = scene.forces.pressure and np.isinf(scene.container.region(scene.dimension).rim)

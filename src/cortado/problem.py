@@ -125,9 +125,9 @@ class Problem:
         """A forward run that can be gone back through, until the next evaluation: what policies work with."""
         values = self._controls.checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
+        evaluation = self._rollout.evaluation  # before the loss, which may evaluate the problem itself
         bars = {step: self._adjoint(step, end) for step, end in ends.items()}
-        rollout = self._rollout
-        return Passage(self._total(ends), rollout, values, bars, self._controls, self._derivatives, rollout.evaluation)
+        return Passage(self._total(ends), self._rollout, values, bars, self._controls, self._derivatives, evaluation)
 
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> float:

@@ -86,7 +86,8 @@ def _solved(made: Assignment, folder: RunFolder, resume: bool) -> str:
     except DivergedError as error:
         evaluations = len(folder.read_metrics())
         write_report(folder, made.task.scene.name, [("ended early", error), ("evaluations", evaluations)], [])
-        advice = "; ".join(filter(None, [f"{error.advice}, or a smaller learning rate", _kept(folder)]))
+        advice = f"{error.advice}, a smaller learning rate, or bounds on the parameters"
+        advice = "; ".join(filter(None, [advice, _kept(folder)]))
         raise error.with_advice(advice) from error
     found = made.search.parameters(result.parameters)
     noise = None
