@@ -125,15 +125,16 @@ def test_the_device_finds_the_particles_that_numpy_finds(name, precision):
     assert wanted.sum() == 2 if name == "space" else 10 < wanted.sum() < n - 10
     device = wp.get_device("cpu")
     near = Region.between(np.full(d, -2.0), np.full(d, 3.0))
-    containment = Containment(Walled(region, near, spacing), real, Launcher(n, device, record_tape=False))
-    order = np.concatenate([random.permutation(n), np.zeros(n)])
-    state, step = State.zeros(n, 1, real, device), np.zeros(n)
+    containment = Containment(Walled(region, near, spacing), real, Launcher(n, device, record_tape=False), n)
+    order = random.permutation(n)
+    state = State.zeros(n, 1, real, device)
     state.set(after, np.zeros((n, d)), np.ones((n, 1)))
     containment.look(
-        wp.array(order, dtype=wp.int32, device=device),
-        to_device(before[order[:n].astype(int)], real, device),
-        wp.array(step + 1.0, dtype=real.real, device=device),
-        state,
+        wp.array(np.tile(order, 2), dtype=wp.int32, device=device),
+        to_device(before[order], real, device),
+        wp.array(np.ones(n), dtype=real.real, device=device),
+        to_device(after[order], real, device),
+        to_device(np.zeros((n, d)), real, device),
         state,
     )
     assert int(containment.bad_particle.numpy()[0]) == np.flatnonzero(wanted)[0]

@@ -64,12 +64,13 @@ def lost_kernel(precision: Precision) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     def find_lost(
         bounds: bounds_struct,
+        first_waiting: int,
         order: wp.array(dtype=wp.int32),
         x_before: wp.array(dtype=vector),
         rho_0: wp.array(dtype=real),
         x_free: wp.array(dtype=vector),
+        v_free: wp.array(dtype=vector),
         x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
         bad_step: wp.array(dtype=wp.int32),
         # in and out
         bad: wp.array(dtype=wp.int32),
@@ -80,18 +81,23 @@ def lost_kernel(precision: Precision) -> Any:
 
         Lost is what is not finite, too far away, of a mixture without a volume, or what went through a wall: it was
         inside before the step and is outside after it. Over the rim of an open cup fluid may go, and what a nozzle
-        leads, so that it is not where it would be without one, ``x_free``, passes walls with it. ``x_before`` and
-        ``rho_0`` are sorted, the others in scene order.
+        leads, so that it is not where it would be without one, passes walls with it: such are only among the particles
+        from ``first_waiting`` on, in scene order. ``x`` is the new state in that order; the others are sorted, and
+        ``x_free`` and ``v_free`` are the new state without the nozzle.
         """
         if bad_step[0] >= 0:
             return
         i = wp.tid()
         p = order[i]
-        x_i = x[p]
+        x_i = x_free[i]
+        let_go = bool(True)
+        if p >= first_waiting:
+            let_go = x[p] == x_i
+            x_i = x[p]
         before = x_before[i]
-        good = between(x_i, bounds.nearest, bounds.furthest) and wp.isfinite(v[p]) and rho_0[i] > real(0.0)
+        good = between(x_i, bounds.nearest, bounds.furthest) and wp.isfinite(v_free[i]) and rho_0[i] > real(0.0)
         escaped = (
-            x_i == x_free[p]
+            let_go
             and contains(before, bounds)
             and not contains(x_i, bounds)
             and below_rim(before, bounds)

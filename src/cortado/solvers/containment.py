@@ -55,8 +55,10 @@ class Lost:
 class Containment:
     """What one solver asks at the end of each step."""
 
-    def __init__(self, walled: Walled, precision: Precision, launch: Launcher):
+    def __init__(self, walled: Walled, precision: Precision, launch: Launcher, first_waiting: int):
+        """``first_waiting``: the first particle, in the scene's order, that may wait in a nozzle."""
         self.walled, self._precision, self._launch = walled, precision, launch
+        self._first_waiting = first_waiting
         self._kernel, self._bounds = lost_kernel(precision), self._made_bounds()
         self.bad_step = wp.full(1, -1, dtype=wp.int32, device=launch.device)
         """The first step in which a particle was lost; -1 while none was."""
@@ -70,12 +72,14 @@ class Containment:
         self.bad_particle.fill_(NO_PARTICLE)
         self._count.zero_()
 
-    def look(self, order: wp.array, x_before: wp.array, rho_0: wp.array, free: State, state: State) -> None:
-        """Look at the end of a step: sorted positions and rest densities before it, and the state after it, without
-        and with what a nozzle leads."""
+    def look(
+        self, order: wp.array, x_before: wp.array, rho_0: wp.array, x_free: wp.array, v_free: wp.array, state: State
+    ) -> None:
+        """Look at the end of a step: sorted positions and rest densities before it, sorted positions and velocities
+        after it without what a nozzle leads, and the state with it."""
         self._launch(
             self._kernel,
-            [self._bounds, order, x_before, rho_0, free.positions, state.positions, state.velocities] + [self.bad_step],
+            [self._bounds, self._first_waiting, order, x_before, rho_0, x_free, v_free, state.positions, self.bad_step],
             [self.bad_particle, self._count],
         )
 

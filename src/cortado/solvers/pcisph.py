@@ -72,7 +72,7 @@ class Pcisph:
         self._error_sums = wp.zeros(1, dtype=precision.pair, device=device)
         self.step_number = count()
         self._iteration, self._active = count(), count()
-        self.containment = Containment(walled, precision, self.launch)
+        self.containment = Containment(walled, precision, self.launch, nozzle.first if nozzle else particles)
         self._surroundings: Any = None
         self.growth = 0
         """How often arrays, or the work of a step, were replaced; what was captured before is stale."""
@@ -147,7 +147,8 @@ class Pcisph:
         if self.pressure is not None:
             self._solve_pressure(self.pressure, parameters)
         self.recorded(0, parameters, new_state)
-        self.containment.look(self.search.order, self.fields.x, self.fields.rho_0, self._free(new_state), new_state)
+        f, it = self.fields, self.iterates
+        self.containment.look(self.search.order, f.x, f.rho_0, it.x_star[0], it.v_star[0], new_state)
         self.launch(
             self.kernels.convergence.finish,
             [self.search.particles, self._error_sums, self.containment.bad_particle],
@@ -166,7 +167,7 @@ class Pcisph:
         """The new state of the step that was recorded: its last prediction, in the scene's order, but for particles
         that a nozzle leads."""
         it = self.iterates
-        free = self._free(new_state)
+        free = self.emitter.free if self.emitter else new_state
         self.launch(
             self.kernels.integration.unsort,
             [self.search.order, it.x_star[iterations], it.v_star[iterations]],
@@ -175,10 +176,6 @@ class Pcisph:
         self.mixture.result(new_state.mass_fractions)
         if self.emitter:
             self.emitter.lead(parameters, self.step_number, new_state)
-
-    def _free(self, new_state: State) -> State:
-        """The new state as it is before a nozzle leads particles."""
-        return self.emitter.free if self.emitter else new_state
 
     def moment(self, parameters: Parameters) -> Moment:
         """The present step as a force term sees it."""
