@@ -5,6 +5,7 @@ It is the same for every device, every precision and every engine.
 
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -99,7 +100,7 @@ class DiscreteScene:
     periods: Points
     """(d,) lengths of the period [m], 0 along an axis that is not periodic."""
 
-    @property
+    @cached_property
     def near(self) -> Region:
         """A box around all first particles and walls."""
         everything = np.concatenate([self.fluid.positions, self.walls.positions])

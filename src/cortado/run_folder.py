@@ -13,7 +13,7 @@ from typing import Any, Self
 from cortado.errors import InputError
 from cortado.evaluations import FILE_NAME
 from cortado.files import UNFINISHED, parsed_json, sentences, write_atomically
-from cortado.input_files import reason, regular_file
+from cortado.input_files import content, reason
 from cortado.parameter_values import NAMES
 from cortado.run_environment import as_json, plain, require_same, session
 
@@ -225,8 +225,7 @@ class RunFolder:
 def _bytes_of(path: Path) -> bytes:
     """All of a file; raises `InputError` if it is no regular one, or very large."""
     try:
-        regular_file(path, _LARGEST)
-        return path.read_bytes()
+        return content(path, _LARGEST)
     except OSError as problem:
         raise InputError(f"{path} cannot be read: {reason(problem)}.") from problem
 
