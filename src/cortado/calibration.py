@@ -1,11 +1,9 @@
 """Constants of a filled neighbourhood on the lattice of the rest spacing, in float64."""
 
 import itertools
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.optimize import brentq
 
 from cortado.smoothing import SmoothingKernel
 
@@ -66,67 +64,6 @@ def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
     waves = np.array(list(itertools.product(np.linspace(0.0, np.pi / spacing, 25), repeat=dimension)))
     answers = np.sin(waves @ offsets.T) @ gradients
     return float((answers**2).sum(axis=1).max() / wall_rigidity(kernel, spacing, support, dimension))
-
-
-@dataclass(frozen=True)
-class WallLayer:
-    """Where the one layer of wall particles lies, and how much each of them counts."""
-
-    depth: float
-    """Distance behind the surface of the container [m]."""
-    factor: float
-    """What the volumes of Akinci et al. (2012) are multiplied with."""
-    push: float
-    """What the pressure force of a wall is multiplied with: as if a wall had push - 1 times the particle's pressure."""
-    friction: float
-    """What the laminar viscous force of a wall without slip is multiplied with."""
-
-
-STANDOFF = 0.1
-"""Distance from the container's surface, in spacings, at which a particle alone is stopped by a flat wall."""
-
-
-def wall_layer(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> WallLayer:
-    """The layer that meets four conditions at a flat wall, with fluid on the lattice, half a spacing from the surface:
-
-    - the fluid has the rest density, so that it does not jump off at the start (Band et al. 2018 scale volumes for
-      that; with a layer half a spacing deep the factor is their 0.7);
-    - a particle alone reaches the rest density, and with it a pressure, before it reaches the surface;
-    - a uniform pressure pushes no particle;
-    - a uniform shear, at rest at the surface, drags no particle (laminar viscosity, no slip).
-    """
-    offsets = lattice_offsets(spacing, support, dimension)
-    weights = kernel.weight(np.linalg.norm(offsets, axis=1), dimension, support)
-    beyond = np.rint(offsets[:, 0] / spacing) < 0
-    in_plane = np.unique(offsets[:, 1:], axis=0)
-
-    def plane(distance: float) -> float:
-        """Sum of W over a layer at a distance, as a part of the whole lattice's sum."""
-        distances = np.hypot(distance, np.linalg.norm(in_plane, axis=1))
-        return float(kernel.weight(distances, dimension, support).sum() / weights.sum())
-
-    def weight(depth: float) -> float:
-        return float(weights[beyond].sum() / weights.sum() / plane(depth + 0.5 * spacing))
-
-    def excess(depth: float) -> float:
-        """Of the density of a particle alone that stands off as wanted."""
-        alone = kernel.weight(np.zeros(1), dimension, support)[0] / weights.sum()
-        return float(alone + weight(depth) * plane(depth + STANDOFF * spacing) - 1.0)
-
-    shallow = 0.5 * spacing
-    depth = shallow if excess(shallow) >= 0.0 else brentq(excess, shallow, support - 0.55 * spacing)
-    to_wall = np.hstack([np.full((len(in_plane), 1), depth + 0.5 * spacing), in_plane])
-    pull_of_wall = weight(depth) * kernel.gradient(to_wall, support)[:, 0].sum()
-    pull_of_fluid = -kernel.gradient(offsets[beyond], support)[:, 0].sum()
-    below = offsets[beyond]
-    drag_of_wall = weight(depth) * 0.5 * spacing * shear_factor(kernel, to_wall, support).sum()
-    drag_of_fluid = -(below[:, 0] * shear_factor(kernel, below, support)).sum()
-    return WallLayer(
-        depth,
-        weight(depth) * plane(0.0),
-        push=float(2.0 * pull_of_fluid / pull_of_wall) if pull_of_wall else 1.0,
-        friction=float(drag_of_fluid / drag_of_wall) if drag_of_wall else 1.0,
-    )
 
 
 def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: float) -> np.ndarray:

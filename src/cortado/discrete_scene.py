@@ -10,20 +10,21 @@ from functools import cached_property
 import numpy as np
 
 from cortado.calibration import (
-    WallLayer,
     laplacian_evenness,
     pressure_stiffness,
     rest_volume,
-    wall_layer,
     wall_rigidity,
 )
 from cortado.errors import CortadoWarning, InputError
+from cortado.pairs import pairs_within
 from cortado.region import Region
-from cortado.sampling import FluidSample, boundary_particles, boundary_volumes, fluid_particles, period
+from cortado.sampling import FluidSample, fluid_particles, period, wall_particles
 from cortado.scene import Scene
 from cortado.scene_fluids import PointsFluid
 from cortado.shapes import Points
 from cortado.smoothing import SmoothingKernel, smoothing_kernel
+from cortado.walls.layers import WallLayers, wall_layers
+from cortado.walls.weights import RestLattice, wall_weights
 
 MOST_AVERAGE_COMPRESSION = 0.1
 """Of the first particles, the mean of (n - 1)+ where n is the number density: a lattice that is squeezed by more
@@ -80,7 +81,7 @@ class Walls:
     positions: Points
     """(b, d) [m]"""
     weights: Points
-    """(b,) w_b = factor V_b / V [-]: what each counts for, a fluid particle being 1."""
+    """(b,) w_b [-]: what each counts for in the density, a fluid particle being 1."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,8 @@ class DiscreteScene:
     """Constants."""
     fluid: FluidSample
     """The first fluid particles."""
-    wall_layer: WallLayer
-    """Where the walls lie and how they push and drag; also for a scene without walls."""
+    wall_layers: WallLayers
+    """How the walls lie and how they drag; also for a scene without walls."""
     walls: Walls
     """The wall particles; none without a container."""
     periods: Points
@@ -112,26 +113,30 @@ def discretise(scene: Scene) -> DiscreteScene:
     points are packed too densely."""
     kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
-    layer = wall_layer(kernel, spacing, support, dimension)
-    lattice = Lattice.of(kernel, spacing, support, dimension, layer.push)
-    walls = boundary_particles(scene, layer.depth)
-    lower, lengths = period(scene)
-    volumes = layer.factor * boundary_volumes(
-        walls, lambda r: kernel.weight(r, dimension, support), support, lower, lengths
-    )
+    layers = wall_layers(kernel, spacing, support, dimension)
+    lattice = Lattice.of(kernel, spacing, support, dimension, 1.0)
     fluid = fluid_particles(scene)
     if any(isinstance(body, PointsFluid) for body in scene.fluid):
         _check_packing(scene, fluid.positions, kernel, lattice)
-    return DiscreteScene(kernel, lattice, fluid, layer, Walls(walls, volumes / lattice.volume), lengths)
+    walls = _walls(scene, layers, RestLattice(kernel, spacing, support))
+    return DiscreteScene(kernel, lattice, fluid, layers, walls, period(scene)[1])
+
+
+def _walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
+    particles = wall_particles(scene, layers.depths)
+    flat = np.repeat(layers.weights, [len(layer) for layer in particles])
+    positions, (lower, lengths) = np.concatenate(particles), period(scene)
+    places = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
+    region = scene.container.region(scene.dimension).opened(lengths)
+    return Walls(positions, wall_weights(positions, flat, lattice, places, region, lower, lengths))
 
 
 def _check_packing(scene: Scene, positions: Points, kernel: SmoothingKernel, lattice: Lattice) -> None:
     """Points of a file may have any density: fluid that starts compressed flies apart, and points that do not touch
     each other are no fluid. Raises `InputError`, or warns where it may be meant."""
-    volumes = boundary_volumes(
-        positions, lambda r: kernel.weight(r, scene.dimension, lattice.support), lattice.support, *period(scene)
-    )
-    densities = lattice.volume / volumes
+    point, _, distances = pairs_within(positions, positions, lattice.support, *period(scene))
+    seen = kernel.weight(distances, scene.dimension, lattice.support)
+    densities = lattice.volume * np.bincount(point, seen, minlength=len(positions))
     average, greatest = np.maximum(densities - 1.0, 0.0).mean(), densities.max()
     spacing, inside = scene.discretisation.spacing, float(np.quantile(densities, 0.75))  # away from the surface
     fit = spacing * inside ** (-1.0 / scene.dimension)

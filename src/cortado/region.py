@@ -44,6 +44,14 @@ class Region:
         within = (points >= self.lower - tolerance) & (points <= self.upper + tolerance)
         return np.asarray(within.all(axis=1) & (from_axis <= self.radius + tolerance))
 
+    def cell_shares(self, points: Points, spacing: float) -> Points:
+        """(n,) the part of the cell, a spacing [m] wide, around each of the points (n, d) [m] that is within the
+        region; along a cylinder's side the cell counts as turned with it."""
+        half, from_axis = 0.5 * spacing, np.linalg.norm((points - self.base) * self.across, axis=1)
+        widths = np.minimum(points + half, self.upper) - np.maximum(points - half, self.lower)
+        along_axes = np.clip(widths / spacing, 0.0, 1.0).prod(axis=1)
+        return np.asarray(along_axes * np.clip((self.radius - from_axis) / spacing + 0.5, 0.0, 1.0))
+
     def escaped(self, before: Points, after: Points, tolerance: float) -> np.ndarray:
         """(n,) whether particles at ``before`` (n, d) [m] went through a wall to be at ``after`` (n, d) [m].
 

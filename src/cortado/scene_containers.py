@@ -11,7 +11,9 @@ from cortado.region import Region
 from cortado.scene_fluids import INDEX_OF_AXIS, LENGTH, check_order, refuse_plane
 from cortado.scene_kinds import Choice, Components, FieldPath, Flag, Quantity, Shaped, wrong
 from cortado.scene_tables import Table
-from cortado.shapes import Points, box_walls, cup_walls
+from cortado.shapes import Points
+from cortado.walls.places import Places, box_places, cup_places
+from cortado.walls.points import box_walls, cup_walls
 
 
 class Container(Table):
@@ -31,7 +33,11 @@ class Container(Table):
 
     @abstractmethod
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
-        """(b, d) wall particles [m]"""
+        """(b, d) one layer of wall particles [m], ``depth`` [m] outside"""
+
+    @abstractmethod
+    def places(self, dimension: int, spacing: float, reach: float) -> Places:
+        """Where fluid may rest less than ``reach`` [m] from a wall."""
 
     def wall_count(self, spacing: float) -> float:
         """About how many wall particles one layer has, without making any."""
@@ -60,6 +66,9 @@ class NoContainer(Container):
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         return np.zeros((0, dimension))
 
+    def places(self, dimension: int, spacing: float, reach: float) -> Places:
+        return Places.upright(np.zeros((0, dimension)))
+
 
 class BoxContainer(Container):
     """A box, closed on all sides along which it is not periodic."""
@@ -87,6 +96,9 @@ class BoxContainer(Container):
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         return box_walls(*self.extent(), self.periodic, spacing, depth)
+
+    def places(self, dimension: int, spacing: float, reach: float) -> Places:
+        return box_places(*self.extent(), self.periodic, spacing, reach)
 
     def periods(self, dimension: int) -> tuple[Points, Points]:
         lower, upper = self.extent()
@@ -131,6 +143,10 @@ class CylinderContainer(Container):
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         upright = cup_walls(self.radius, self.height, self.lid, spacing, depth)
         return self.base + np.roll(upright, INDEX_OF_AXIS[self.axis] + 1, axis=1)
+
+    def places(self, dimension: int, spacing: float, reach: float) -> Places:
+        upright, turn = cup_places(self.radius, self.height, self.lid, spacing, reach), INDEX_OF_AXIS[self.axis] + 1
+        return Places(self.base + np.roll(upright.points, turn, axis=1), np.roll(upright.axes, turn, axis=2))
 
 
 AnyContainer = Annotated[

@@ -7,10 +7,11 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from cortado.region import Region
 from cortado.scene_kinds import Choice, Components, FieldPath, Quantity, Shaped, Text, wrong
 from cortado.scene_points import read_points
 from cortado.scene_tables import Table
-from cortado.shapes import Block, Points, block_about, block_between, corners
+from cortado.shapes import ROUND_OFF, Block, Points, block_about, block_between, corners
 
 LENGTH = Quantity("m")
 INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
@@ -49,6 +50,10 @@ class Fluid(Body):
         """(n, d) [m] particles that lie in a convex region only if all of them do."""
         return self.particles(spacing)
 
+    def particles_in(self, region: Region, spacing: float) -> Points:
+        """(n, d) [m] those that a container leaves room for."""
+        return self.particles(spacing)
+
 
 class LatticeFluid(Fluid):
     """A body of fluid whose particles are on a lattice of the spacing."""
@@ -69,6 +74,11 @@ class LatticeFluid(Fluid):
 
     def particles(self, spacing: float) -> Points:
         return self.inside(self.block(spacing).points())
+
+    def particles_in(self, region: Region, spacing: float) -> Points:
+        """(n, d) [m] those that are half a spacing or more from all walls, where they would be compressed otherwise."""
+        everything = self.particles(spacing)
+        return everything[region.contains(everything, (ROUND_OFF - 0.5) * spacing)]
 
 
 class BoxFluid(LatticeFluid):

@@ -1,4 +1,4 @@
-"""Shapes as points, in float64: blocks of a lattice, and the walls of boxes and of cups."""
+"""Shapes as points, in float64: blocks of a lattice, and discs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -83,11 +83,6 @@ def whole_cells(lengths: Points, spacing: float) -> Points:
     return np.maximum(np.floor(lengths / spacing + ROUND_OFF), 0.0)
 
 
-def nearest_cells(length: float, spacing: float) -> int:
-    """How many cells fill a length [m] best, at least 1."""
-    return max(int(np.floor(length / spacing + 0.5)), 1)
-
-
 def grid(axes: Sequence[Points]) -> Points:
     """(n, d): every combination of the values of the axes, the last axis fastest."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
@@ -96,55 +91,3 @@ def grid(axes: Sequence[Points]) -> Points:
 def corners(lower: Points, upper: Points) -> Points:
     """(2^d, d) the corners of a box."""
     return np.array(list(product(*zip(lower, upper, strict=True))), dtype=np.float64)
-
-
-# ---- walls -------------------------------------------------------------------------------------------------------
-
-
-def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, depth: float) -> Points:
-    """(n, d) one layer around a box, ``depth`` outside of it: faces, edges and corners, each point once.
-
-    Along a face the points continue the lattice inside; an axis whose length is no multiple of the spacing is stretched
-    a little between its walls. A periodic axis has no wall. Axis by axis: outside on this axis, inside on those before
-    it, either on those after it.
-    """
-    inside = [_cells(a, b, nearest_cells(b - a, spacing)) for a, b in zip(lower, upper, strict=True)]
-    outside = [
-        np.zeros(0) if open_axis else np.array([a - depth, b + depth])
-        for a, b, open_axis in zip(lower, upper, periodic, strict=True)
-    ]
-    both = [np.sort(np.concatenate(pair)) for pair in zip(inside, outside, strict=True)]
-    return np.concatenate([grid([*inside[:axis], outside[axis], *both[axis + 1 :]]) for axis in range(len(inside))])
-
-
-def cup_walls(radius: float, height: float, lid: bool, spacing: float, depth: float) -> Points:
-    """(n, 3) the walls of an upright cup whose base is centred on the origin, the third axis along its height.
-
-    The side: rings ``depth`` outside of the radius, about a spacing apart along and across. The base, and the lid if
-    there is one: concentric rings ``depth`` outside, the outermost continuing the side.
-    """
-    levels = _cells(0.0, height, nearest_cells(height, spacing))
-    rim = radius + depth
-    rings = nearest_cells(rim, spacing)
-    disc = np.concatenate([ring(value, spacing) for value in rim * np.arange(rings + 1) / rings])
-    ends = [-depth, height + depth] if lid else [-depth]
-    return np.concatenate([_stacked(ring(rim, spacing), levels), _stacked(disc, np.array(ends))])
-
-
-def ring(radius: float, spacing: float) -> Points:
-    """(n, 2) points on a circle, about a spacing apart; one point for the radius 0."""
-    if radius == 0.0:
-        return np.zeros((1, 2))
-    count = max(nearest_cells(2.0 * np.pi * radius, spacing), 3)
-    angles = 2.0 * np.pi * np.arange(count) / count
-    return radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-
-
-def _cells(lower: float, upper: float, count: int) -> Points:
-    """(count,) the centres of equal cells between two ends."""
-    return lower + (upper - lower) * (np.arange(count) + 0.5) / count
-
-
-def _stacked(flat: Points, levels: Points) -> Points:
-    """(levels n, 3) a plane set of points (n, 2) repeated at every level."""
-    return np.column_stack([np.tile(flat, (len(levels), 1)), np.repeat(levels, len(flat))])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.calibration import SKIN, WallLayer, diffusion_limit
+from cortado.calibration import SKIN, diffusion_limit
 from cortado.controls import Controls
 from cortado.discrete_scene import DiscreteScene, discretise
 from cortado.errors import CortadoWarning, InputError, shown
@@ -34,6 +34,7 @@ from cortado.solvers.pcisph import Pcisph
 from cortado.solvers.pcisph_parts import PressureSolve
 from cortado.threads import WARP, Turn, in_turn
 from cortado.trajectory import Trajectory
+from cortado.walls.layers import WallLayers
 
 MOST_SUBSTEPS = 10_000
 """Explicit steps of diffusion in a time step; beyond it the mobility is taken for a mistake."""
@@ -264,7 +265,7 @@ class Simulation:
             discretisation,
             discrete.lattice,
             search,
-            self._terms(discretisation, discrete.wall_layer),
+            self._terms(discretisation, discrete.wall_layers),
             self._pressure(),
             [*discrete.periods, *np.zeros(3 - self.dimension)],
             self._phases(discretisation),
@@ -297,10 +298,10 @@ class Simulation:
         diffusion = Diffusion(discretisation, count, self.free_energy, MOBILITIES[mixture.mobility_form])
         return Phases(count, diffusion, mixture.strength)
 
-    def _terms(self, discretisation: Discretisation, layer: WallLayer) -> list[ForceTerm]:
+    def _terms(self, discretisation: Discretisation, layers: WallLayers) -> list[ForceTerm]:
         terms: list[ForceTerm] = [Gravity(discretisation, self.particles, self.device)]
         if self.scene.forces.viscosity in VISCOSITIES:
-            wall = layer if getattr(self.scene.container, "slip", "free") == "no" else None
+            wall = layers if getattr(self.scene.container, "slip", "free") == "no" else None
             terms.append(VISCOSITIES[self.scene.forces.viscosity](discretisation, self.dimension, wall))
         return terms
 

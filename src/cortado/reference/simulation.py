@@ -238,7 +238,7 @@ def _engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:
         "rest_density": scene.phase[0].rest_density,
         "time_step": solver.time_step,
         "viscosity": form,
-        "friction": (discrete.wall_layer.friction if form == "laminar" else 1.0) if no_slip else 0.0,
+        "friction": (discrete.wall_layers.friction if form == "laminar" else 1.0) if no_slip else 0.0,
         "pressure": scene.forces.pressure,
         "minimum_iterations": solver.minimum_iterations,
         "maximum_iterations": solver.maximum_iterations,

@@ -9,7 +9,6 @@ from typing import Any, Protocol
 
 import warp as wp
 
-from cortado.calibration import WallLayer
 from cortado.launching import Launcher, TreeSum, sum_of
 from cortado.particles import Fields, Parameters
 from cortado.physics.gravity import gravity_kernels
@@ -20,6 +19,7 @@ from cortado.physics.viscosity import (
     pairwise_functions,
     viscosity_kernels,
 )
+from cortado.walls.layers import WallLayers
 
 
 @dataclass(frozen=True)
@@ -112,11 +112,11 @@ class Viscosity:
         )
 
 
-def pairwise_viscosity(discretisation: Discretisation, dimension: int, wall: WallLayer | None) -> Viscosity:
+def pairwise_viscosity(discretisation: Discretisation, dimension: int, wall: WallLayers | None) -> Viscosity:
     """The report's eq. 10 (Monaghan 2005): keeps linear and angular momentum. ``wall`` None: free slip."""
     return Viscosity(discretisation, pairwise_functions, 2.0 * (dimension + 2), friction=1.0 if wall else 0.0)
 
 
-def laminar_viscosity(discretisation: Discretisation, dimension: int, wall: WallLayer | None) -> Viscosity:
+def laminar_viscosity(discretisation: Discretisation, dimension: int, wall: WallLayers | None) -> Viscosity:
     """Morris, Fox and Zhu (1997): carries shear to a wall. ``wall`` None: free slip."""
     return Viscosity(discretisation, laminar_functions, 2.0, friction=wall.friction if wall else 0.0)
