@@ -89,7 +89,6 @@ NB_MODULE(_engine, m) {
         .def_rw("volume", &Scene::volume)
         .def_rw("stiffness", &Scene::stiffness)
         .def_rw("rigidity", &Scene::rigidity)
-        .def_rw("wall_push", &Scene::wall_push)
         .def_rw("evenness", &Scene::evenness)
         .def_rw("wall_positions", &Scene::wall_positions)
         .def_rw("wall_weights", &Scene::wall_weights)

@@ -49,7 +49,7 @@ class Pcisph:
         self.walls, self.wall_weights = walls, wall_weights
         self.viscosity_form = options.get("viscosity", "pairwise")
         self.friction = options.get("friction", 0.0)
-        self.reach, self.rigidity, self.push = options["reach"], options["rigidity"], options["push"]
+        self.reach, self.rigidity = options["reach"], options["rigidity"]
         self.evenness = options.get("evenness", 1.0)
 
     def _pairs(self, x, y):
@@ -96,7 +96,7 @@ class Pcisph:
             p = np.where(p.real > 0, p, 0)
             c = p / sigma**2
             force = -((c[:, None] + c[None, :])[..., None] * g).sum(1)
-            force = force - self.push * (c[:, None, None] * self.wall_weights[None, :, None] * g_walls).sum(1)
+            force = force - (c[:, None, None] * self.wall_weights[None, :, None] * g_walls).sum(1)
             push = force / mass[:, None]
         v_new = v + time_step * (acceleration + push)
         return x + time_step * v_new, v_new

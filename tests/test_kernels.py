@@ -120,7 +120,7 @@ def cloud(name: str) -> Cloud:
     s.support, s.reach = SUPPORT, 1.03 * SUPPORT
     s.normalisation = CUBIC_SPLINE.normalisation(dimension, SUPPORT)
     s.self_weight = float(CUBIC_SPLINE.weight(np.zeros(1), dimension, SUPPORT)[0])
-    s.volume, s.pliancy, s.wall_push, s.evenness = 0.11, 30.0**-0.5, 1.6, 1.3
+    s.volume, s.pliancy, s.evenness = 0.11, 30.0**-0.5, 1.3
     s.periodic, s.period = int(period.any()), wp.vec3d(*period)
     s.frequency = wp.vec3d(1.0 / side if period.any() else 0.0, 0.0, 0.0)
     search.sort(array(x))

@@ -53,7 +53,6 @@ def twin(simulation):
         friction=terms[0]._friction if terms else 0.0,
         reach=1.03 * lattice.support,
         rigidity=lattice.rigidity,
-        push=lattice.wall_push,
         evenness=lattice.evenness,
     )
 

@@ -53,14 +53,12 @@ class Lattice:
     stiffness: float
     """k [m2]: delta = k / dt^2 [Pa m3 / kg] (report eq. 7, put right) for a filled neighbourhood."""
     rigidity: float
-    """2 sum_j G_j . G_j / push [1 / m^(2 d + 2)]: the scale of the yield, see `cortado.physics.walls`."""
-    wall_push: float
-    """[-], see `cortado.calibration.WallLayer`."""
+    """2 sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of the yield, see `cortado.physics.walls`."""
     evenness: float
     """[-], see `cortado.calibration.laplacian_evenness`."""
 
     @classmethod
-    def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int, wall_push: float) -> "Lattice":
+    def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "Lattice":
         """Those of a kernel with a support radius [m] on a lattice with a spacing [m]."""
         return cls(
             support=support,
@@ -68,8 +66,7 @@ class Lattice:
             self_weight=float(kernel.weight(np.zeros(1), dimension, support)[0]),
             volume=rest_volume(kernel, spacing, support, dimension),
             stiffness=pressure_stiffness(kernel, spacing, support, dimension),
-            rigidity=wall_rigidity(kernel, spacing, support, dimension) / wall_push,
-            wall_push=wall_push,
+            rigidity=wall_rigidity(kernel, spacing, support, dimension),
             evenness=laplacian_evenness(kernel, spacing, support, dimension),
         )
 
@@ -114,7 +111,7 @@ def discretise(scene: Scene) -> DiscreteScene:
     kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     layers = wall_layers(kernel, spacing, support, dimension)
-    lattice = Lattice.of(kernel, spacing, support, dimension, 1.0)
+    lattice = Lattice.of(kernel, spacing, support, dimension)
     fluid = fluid_particles(scene)
     if any(isinstance(body, PointsFluid) for body in scene.fluid):
         _check_packing(scene, fluid.positions, kernel, lattice)

@@ -36,7 +36,7 @@ void step_adjoint(const Model<Real, D>& model, Step<Real, D>& step, const State<
                 bend += (c_i + step.p[k][j] / (step.n[j] * step.n[j])) * pair->hessian_product(u_ij);
             }
             for (auto pair = walls.begin_of(i); pair != walls.end_of(i); ++pair) {
-                const Real weight = model.wall_push * model.wall_weights[pair->other];
+                const Real weight = model.wall_weights[pair->other];
                 stretch += weight * (pair->a * pair->x.dot(push_bar[i]));
                 bend += (weight * c_i) * pair->hessian_product(push_bar[i]);
             }

@@ -27,7 +27,6 @@ struct Scene {
     double volume;          // V [m^d]
     double stiffness;       // k
     double rigidity;        // of the yield beside walls
-    double wall_push;
     double evenness;
     std::vector<double> wall_positions;  // (b, d) [m]
     std::vector<double> wall_weights;    // (b,) V_b / V, with the layer's factor

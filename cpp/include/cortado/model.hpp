@@ -17,7 +17,7 @@ struct Model {
     Period<Scalar, D> period;
     std::array<double, 3> periods;
     double reach;
-    Scalar volume, self_weight, stiffness, rigidity, wall_push, evenness, size_floor;
+    Scalar volume, self_weight, stiffness, rigidity, evenness, size_floor;
     Scalar rest_density, time_step, friction, kappa;
     Viscosity viscosity;
     bool pressure;
@@ -37,7 +37,6 @@ struct Model {
           self_weight(smoothing.weight(Scalar(0))),
           stiffness(Real(s.stiffness)),
           rigidity(Real(s.rigidity)),
-          wall_push(Real(s.wall_push)),
           evenness(Real(s.evenness)),
           size_floor(Real(1) / Real(100) * smoothing.h_squared),
           rest_density(Real(s.rest_density)),

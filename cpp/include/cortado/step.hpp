@@ -122,7 +122,7 @@ private:
             for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair)
                 total += ((c_[i] + c_[pair->other]) * pair->a) * pair->x;
             for (auto pair = walls.begin_of(i); pair != walls.end_of(i); ++pair)
-                total += (model.wall_push * model.wall_weights[pair->other] * c_[i] * pair->a) * pair->x;
+                total += (model.wall_weights[pair->other] * c_[i] * pair->a) * pair->x;
             v_star[i] = state.v[i] + dt * (acceleration[i] - model.volume / m * total);
             x_star[k + 1][i] = state.x[i] + dt * v_star[i];
         });

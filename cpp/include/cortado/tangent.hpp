@@ -73,7 +73,7 @@ Vector<Real, D> pressure_force_tangent(const Model<Real, D>& model, std::size_t 
         if (hessian) total += (c[i] + c[j]) * pair->hessian_product(dx[i] - dx[j]);
     }
     for (auto pair = step.walls.begin_of(i); pair != step.walls.end_of(i); ++pair) {
-        const Real weight = model.wall_push * model.wall_weights[pair->other];
+        const Real weight = model.wall_weights[pair->other];
         total += (weight * dc[i]) * pair->gradient();
         if (hessian) total += (weight * c[i]) * pair->hessian_product(dx[i]);
     }

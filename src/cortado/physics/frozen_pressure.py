@@ -60,7 +60,7 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             g_ib = gradient(separation(x_i, s.wall_positions[b], s), s)
-            wall_stretch = s.wall_push * s.wall_weights[b] * wp.dot(g_ib, push_bar_i)
+            wall_stretch = s.wall_weights[b] * wp.dot(g_ib, push_bar_i)
             stretch += wall_stretch
             work += c_i * wall_stretch
         m_i = m[i]

@@ -2,12 +2,13 @@
 
     p_i  = max(p_i + delta y_i (m_i n*_i - rho_0i), 0),   delta = k / dt^2
     c_i  = p_i / n_i^2
-    ap_i = -(V / m_i) (sum_j (c_i + c_j) G_ij + push sum_b (V_b / V) c_i G_ib)
+    ap_i = -(V / m_i) (sum_j (c_i + c_j) G_ij + sum_b (V_b / V) c_i G_ib)
     v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
 
 n is the number density (`cortado.physics.density`; for fluids of different masses: Solenthaler and Pajarola 2008),
-y the yield and push the factor beside walls (`cortado.physics.walls`, `cortado.calibration.WallLayer`). G is taken
-at x(t), n* at the predicted positions over the neighbours of x(t). After the last iteration (x*, v*) is the new
+y the yield beside walls (`cortado.physics.walls`). G is taken at x(t), n* at the predicted positions over the
+neighbours of x(t). The force is the transpose of the derivative of n with respect to positions, that of walls
+included: moving particles against it takes the work V sum_i c_i dn_i. After the last iteration (x*, v*) is the new
 state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
 """
 
@@ -150,7 +151,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
                 total += (c_i + c_j[u]) * gradient(separation(x_i, x_j[u], s), s)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
-            total += (s.wall_push * s.wall_weights[b] * c_i) * gradient(separation(x_i, s.wall_positions[b], s), s)
+            total += (s.wall_weights[b] * c_i) * gradient(separation(x_i, s.wall_positions[b], s), s)
         return total
 
     @wp.func
@@ -176,8 +177,8 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             x_ib = separation(x_i, s.wall_positions[b], s)
-            total += (s.wall_push * s.wall_weights[b] * c_dot_i) * gradient(x_ib, s)
-            total += (s.wall_push * s.wall_weights[b] * c_i) * hessian_product(x_ib, x_dot_i, s)
+            total += (s.wall_weights[b] * c_dot_i) * gradient(x_ib, s)
+            total += (s.wall_weights[b] * c_i) * hessian_product(x_ib, x_dot_i, s)
         return total
 
     @wp.kernel(module=discretisation.module(True))
@@ -279,7 +280,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             x_ib = separation(x_i, s.wall_positions[b], s)
-            weight = s.wall_push * s.wall_weights[b]
+            weight = s.wall_weights[b]
             wall_stretch = weight * wp.dot(gradient(x_ib, s), push_bar_i)
             stretch += wall_stretch
             bend += (weight * c_i) * hessian_product(x_ib, push_bar_i, s)

@@ -52,8 +52,6 @@ def surroundings_type(precision: Precision) -> Any:
         """[m]"""
         wall_weights: wp.array(dtype=real)
         """V_b / V [-]: the volume of a wall particle over that of a fluid particle (after Akinci et al. 2012)."""
-        wall_push: real
-        """Factor of a wall's pressure force [-], see `cortado.calibration.WallLayer`."""
         support: real
         """Support radius h [m]."""
         reach: real
@@ -63,7 +61,7 @@ def surroundings_type(precision: Precision) -> Any:
         self_weight: real
         """W(0) [1 / m^d]."""
         pliancy: real
-        """(2 sum_j G_j . G_j / push)^(-1/2) of a filled neighbourhood [m^(d + 1)], see `cortado.physics.walls`."""
+        """(2 sum_j G_j . G_j)^(-1/2) of a filled neighbourhood [m^(d + 1)], see `cortado.physics.walls`."""
         evenness: real
         """What second derivatives are multiplied with [-], see `cortado.calibration.laplacian_evenness`."""
         volume: real

@@ -230,7 +230,6 @@ def _engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:
         "volume": lattice.volume,
         "stiffness": lattice.stiffness,
         "rigidity": lattice.rigidity,
-        "wall_push": lattice.wall_push,
         "evenness": lattice.evenness,
         "wall_positions": discrete.walls.positions.ravel().tolist(),
         "wall_weights": discrete.walls.weights.tolist(),

@@ -95,7 +95,7 @@ class Pcisph:
         s.support, s.reach = lattice.support, (1.0 + SKIN) * lattice.support
         s.normalisation = lattice.normalisation
         s.self_weight, s.volume, s.pliancy = lattice.self_weight, lattice.volume, lattice.rigidity**-0.5
-        s.wall_push, s.evenness = lattice.wall_push, lattice.evenness
+        s.evenness = lattice.evenness
         s.periodic = int(any(self.periods))
         s.period = precision.vector(*self.periods)
         s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in self.periods))

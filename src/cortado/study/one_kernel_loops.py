@@ -129,7 +129,7 @@ def one_kernel_loops(discretisation: Discretisation) -> dict[str, wp.Kernel]:
             total += (c[i] + c[j]) * gradient(separation(x[i], x[j], s), s)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
-            total += (s.wall_push * s.wall_weights[b] * c[i]) * gradient(separation(x[i], s.wall_positions[b], s), s)
+            total += (s.wall_weights[b] * c[i]) * gradient(separation(x[i], s.wall_positions[b], s), s)
         dt = time_step[0]
         push = (-s.volume / m[i]) * total
         velocity = v[i] + dt * (acceleration[i] + push)
