@@ -23,7 +23,8 @@ LAYERS = """
     physics.frozen_pressure physics.adjoint_filters
     physics.containment physics.convergence physics.reduction physics.matching
     physics.tint physics.colour_field physics.interpolation physics.rays physics.absorption
-    shapes region restart launching neighbours particles
+    shapes region pairs walls.points walls.places walls.layers walls.weights walls
+    restart launching neighbours particles
     render.cameras render.views render.fields render.marching render.renderer
     vtkhdf_layout vtkhdf
     scene_kinds scene_tables scene_toml point_reader scene_points

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cortado.sampling import boundary_particles, boundary_volumes, fluid_particles, period
+from cortado.errors import InputError
+from cortado.sampling import fluid_particles, period, wall_particles
 from cortado.scene import Scene
 
 SPACING = 0.05
@@ -29,9 +30,8 @@ def nearest(points: np.ndarray) -> float:
     return cKDTree(points).query(points, k=2)[0][:, 1].min()
 
 
-def hat(distances: np.ndarray) -> np.ndarray:
-    """A smoothing kernel to sum by hand, of support 2 spacings."""
-    return np.maximum(1.0 - distances / (2.0 * SPACING), 0.0)
+def one_layer(scene: Scene, depth: float) -> np.ndarray:
+    return wall_particles(scene, [depth])[0]
 
 
 # ---- fluid -------------------------------------------------------------------------------------------------------
@@ -107,7 +107,7 @@ def test_a_box_has_each_wall_particle_once(cells):
     upper = SPACING * np.array(cells)
     dimension = len(cells)
     scene = scene_of(dimension, [box([0.0] * dimension, upper)], box([0.0] * dimension, upper))
-    walls = boundary_particles(scene, 0.5 * SPACING)
+    walls = one_layer(scene, 0.5 * SPACING)
     lattice = np.array(list(product(*[range(-1, n + 1) for n in cells])))
     wanted = lattice[((lattice < 0) | (lattice >= cells)).any(axis=1)]
     found = walls / SPACING - 0.5
@@ -116,7 +116,7 @@ def test_a_box_has_each_wall_particle_once(cells):
 
 def test_a_box_between_multiples_of_the_spacing_is_stretched():
     scene = scene_of(2, [box([0.0, 0.0], [0.1, 0.1])], box([0.0, 0.0], [0.23, 0.26]))
-    walls = boundary_particles(scene, 0.025)
+    walls = one_layer(scene, 0.025)
     assert len(walls) == 7 * 7 - 5 * 5
     inner = np.unique(walls[:, 0].round(12))
     np.testing.assert_allclose(inner, [-0.025, 0.023, 0.069, 0.115, 0.161, 0.207, 0.255])
@@ -125,18 +125,18 @@ def test_a_box_between_multiples_of_the_spacing_is_stretched():
 def test_a_periodic_axis_has_no_wall():
     container = box([0.1, 0.0], [0.5, 0.2], periodic=[True, False])
     scene = scene_of(2, [box([0.1, 0.0], [0.5, 0.2])], container)
-    walls = boundary_particles(scene, 0.03)
+    walls = one_layer(scene, 0.03)
     np.testing.assert_allclose(np.unique(walls[:, 0].round(9)), 0.1 + SPACING * (np.arange(8) + 0.5))
     np.testing.assert_allclose(np.unique(walls[:, 1].round(9)), [-0.03, 0.23])
     lower, lengths = period(scene)
     np.testing.assert_allclose((lower, lengths), ([0.1, 0.0], [0.4, 0.0]))
     everywhere = scene_of(2, [box([0.1, 0.0], [0.5, 0.2])], container | {"upper": [0.5, 0.3], "periodic": [True, True]})
-    assert boundary_particles(everywhere, 0.025).shape == (0, 2)
+    assert one_layer(everywhere, 0.025).shape == (0, 2)
 
 
 def test_free_space_has_no_walls():
     scene = scene_of(3, [box([0, 0, 0], [0.1, 0.1, 0.1])])
-    assert boundary_particles(scene, 0.025).shape == (0, 3)
+    assert one_layer(scene, 0.025).shape == (0, 3)
     np.testing.assert_array_equal(period(scene), np.zeros((2, 3)))
 
 
@@ -148,7 +148,7 @@ def test_a_cup_is_lined_all_round(axis, lid, depth):
     cup = {"shape": "cylinder", "base": base, "radius": radius, "height": height, "axis": axis, "lid": lid}
     fluid = {"shape": "cylinder", "base": base, "radius": radius, "height": height, "axis": axis}
     scene = scene_of(3, [fluid], cup)
-    walls = boundary_particles(scene, depth) - base
+    walls = one_layer(scene, depth) - base
     levels = walls[:, along]
     from_axis = np.linalg.norm(np.delete(walls, along, axis=1), axis=1)
     below, above = levels < 0, levels > height
@@ -157,46 +157,29 @@ def test_a_cup_is_lined_all_round(axis, lid, depth):
     assert above.any() == lid and below.sum() == (above.sum() if lid else below.sum())
     np.testing.assert_allclose(np.unique(from_axis[side].round(9)), [radius + depth])
     np.testing.assert_allclose(from_axis[below].max(), radius + depth)
-    base_disc = np.linspace(0.0, radius + depth, 50)[:, None]
-    assert cKDTree(from_axis[below][:, None]).query(base_disc)[0].max() < 0.55 * SPACING  # no gap between rings
-    assert nearest(walls) > 0.8 * SPACING
-    surface = cKDTree(walls).query(fluid_particles(scene).positions - base)[0]
-    assert depth <= surface.min() < depth + 0.6 * SPACING
+    fluid = fluid_particles(scene).positions - base
+    bottom = np.delete(walls[below], along, axis=1)
+    to_bottom = cKDTree(bottom).query(np.delete(fluid, along, axis=1))[0]
+    assert to_bottom.max() < 1e-9  # the lattice goes on below the base
+    assert nearest(walls) > 0.4 * SPACING
+    surface = cKDTree(walls).query(fluid)[0]
+    assert depth + 0.5 * SPACING <= surface.min() * (1.0 + 1e-9) < depth + 0.6 * SPACING
 
 
-# ---- volumes of wall particles ------------------------------------------------------------------------------------
+def test_lattice_particles_keep_half_a_spacing_from_a_wall():
+    """Those of the lattice that has no container, less the ones that are nearer to its side, and no other."""
+    cup = {"shape": "cylinder", "base": [0, 0, 0], "radius": 0.33, "height": 0.4, "axis": "z"}
+    free = fluid_particles(scene_of(3, [cup])).positions
+    room = 0.33 - np.linalg.norm(free[:, :2], axis=1)
+    assert (room < 0.4 * SPACING).any()
+    held = fluid_particles(scene_of(3, [cup], cup)).positions
+    np.testing.assert_array_equal(held, free[room >= 0.5 * SPACING])
 
 
-def test_volumes_on_a_flat_lattice_are_a_closed_sum():
-    axis = SPACING * np.arange(9)
-    plate = np.stack([*np.meshgrid(axis, axis, indexing="ij"), np.zeros((9, 9))], axis=-1).reshape(-1, 3)
-    volumes = boundary_volumes(plate, hat, 2.0 * SPACING).reshape(9, 9)
-    middle = 1.0 + 4 * 0.5 + 4 * (1.0 - np.sqrt(0.5))
-    corner = 1.0 + 2 * 0.5 + (1.0 - np.sqrt(0.5))
-    np.testing.assert_allclose(volumes[2:-2, 2:-2], 1.0 / middle)
-    np.testing.assert_allclose(volumes[[0, 0, -1, -1], [0, -1, 0, -1]], 1.0 / corner)
-
-
-def test_volumes_see_across_the_period():
-    line = np.array([0.3, 0.0]) + SPACING * np.stack([np.arange(8) + 0.5, np.zeros(8)], axis=-1)
-    lower, lengths = np.array([0.3, 0.0]), np.array([8 * SPACING, 0.0])
-    np.testing.assert_allclose(boundary_volumes(line, hat, 2 * SPACING, lower, lengths), np.full(8, 0.5))
-    np.testing.assert_allclose(boundary_volumes(line, hat, 2 * SPACING), [1 / 1.5, *(6 * [0.5]), 1 / 1.5])
-    moved = line - line[0]
-    moved[0, 0] = -1e-18  # just below 0: its remainder is the length itself
-    np.testing.assert_allclose(boundary_volumes(moved, hat, 2 * SPACING, 0.0, lengths), np.full(8, 0.5))
-
-
-def test_volumes_of_many_particles_are_those_of_all_pairs(monkeypatch):
-    points = np.random.default_rng(3).uniform(0.0, 1.0, (300, 3))
-    lengths = np.array([1.0, 0.0, 1.0])
-    apart = points[:, None] - points
-    apart -= lengths * np.round(apart)
-    wanted = 1.0 / hat(np.linalg.norm(apart, axis=-1)).sum(axis=1)
-    monkeypatch.setattr("cortado.sampling.CHUNK", 70)
-    np.testing.assert_allclose(boundary_volumes(points, hat, 2 * SPACING, np.zeros(3), lengths), wanted)
-    assert wanted.min() < 0.9  # some have neighbours
-
-
-def test_no_walls_have_no_volumes():
-    assert boundary_volumes(np.zeros((0, 3)), hat, 0.1, np.zeros(3), np.zeros(3)).shape == (0,)
+def test_a_fluid_that_walls_leave_no_room_for_is_refused():
+    drop = {"shape": "sphere", "centre": [0.3, 0.02], "radius": 0.026}
+    assert len(fluid_particles(scene_of(2, [drop])).positions) == 1
+    with pytest.raises(
+        InputError, match=r"fluid\.0 has no particle that is half a spacing, 0\.025 m, or more from all"
+    ):
+        fluid_particles(scene_of(2, [drop], box([0.0, 0.0], [1.0, 1.0])))

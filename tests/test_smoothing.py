@@ -11,11 +11,9 @@ import warp as wp
 from cortado.calibration import (
     RATE_LIMIT,
     SLACK,
-    STANDOFF,
     greatest_rate,
     pressure_stiffness,
     rest_volume,
-    wall_layer,
     wall_rigidity,
 )
 from cortado.errors import InputError
@@ -329,42 +327,6 @@ def test_pressure_stiffness_answers_an_error_with_its_correction(name, dimension
     stiffness = pressure_stiffness(kernel, SPACING, support, dimension) / lowered(name, support, dimension)
     delta = stiffness / time_step**2
     assert change == pytest.approx(-p / delta, rel=1e-9)
-
-
-def flat_wall(name, support, dimension):
-    """The layer, and rho / rho_0 of a particle in the lowest of some layers of fluid, or alone, at a height [m]."""
-    kernel, volume = KERNELS[name], rest_volume(KERNELS[name], SPACING, support, dimension)
-    layer = wall_layer(kernel, SPACING, support, dimension)
-    plane = SPACING * np.array(list(itertools.product(range(-4, 5), repeat=dimension - 1)), dtype=np.float64)
-    across = np.linalg.norm(plane, axis=1)
-    wall_volume = layer.factor / kernel.weight(across, dimension, support).sum()  # Akinci et al. (2012), scaled
-
-    def density(fluid_layers, height):
-        fluid = sum(kernel.weight(np.hypot(SPACING * k, across), dimension, support).sum() for k in range(fluid_layers))
-        fluid = fluid or float(kernel.weight(np.zeros(1), dimension, support)[0])  # none: the particle is alone
-        wall = kernel.weight(np.hypot(height + layer.depth, across), dimension, support).sum()
-        return volume * fluid + wall_volume * wall
-
-    return layer, density
-
-
-@kernels
-@dimensions
-@supports
-def test_a_flat_wall_of_one_layer_completes_the_lattice(name, dimension, support):
-    _, density = flat_wall(name, support * SPACING, dimension)
-    assert 1.0 - SLACK <= density(5, 0.5 * SPACING) < 1.0
-
-
-@kernels
-@dimensions
-@supports
-def test_a_flat_wall_stops_a_particle_alone(name, dimension, support):
-    """It has the rest density, and from there on a pressure, before it reaches the surface of the container."""
-    layer, density = flat_wall(name, support * SPACING, dimension)
-    assert 0.5 * SPACING <= layer.depth < support * SPACING
-    assert density(0, STANDOFF * SPACING) > 1.0 - 1.01 * SLACK
-    assert density(0, 0.0) > 1.0
 
 
 @kernels

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.errors import InputError
 from cortado.scene import Scene
 from cortado.scene_emitter import EmitterSample
 from cortado.shapes import Points
@@ -32,10 +33,17 @@ class FluidSample:
 
 
 def fluid_particles(scene: Scene) -> FluidSample:
-    """The fluid of a scene. Raises `InputError` if a file with points is gone since the scene was read."""
+    """The fluid of a scene. Raises `InputError` if a file with points is gone since the scene was read, or if walls
+    leave no room for any particle of a fluid."""
     spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
     room = scene.container.region(scene.dimension).opened(period(scene)[1])
     positions = [fluid.particles_in(room, spacing) for fluid in scene.fluid]
+    for index, particles in enumerate(positions):
+        if not len(particles):
+            raise InputError(
+                f"fluid.{index} has no particle that is half a spacing, {0.5 * spacing:g} m, or more from all walls: "
+                f"it must be larger, or further from them."
+            )
     velocities = [np.tile(fluid.velocity, (len(x), 1)) for fluid, x in zip(scene.fluid, positions, strict=True)]
     phases = [names.index(fluid.phase) for fluid in scene.fluid]
     emitted = None

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 from cortado.shapes import Points, disc, grid
 from cortado.walls.points import nearest_cells, ring, stacked
 
+OVERLAP = 0.8
+"""How far from the side of a cup, over the reach, fluid on the base may rest upright."""
+
 
 @dataclass(frozen=True)
 class Places:
@@ -45,8 +48,8 @@ def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: f
     """Those less than ``reach`` [m] from a wall of an upright cup whose base is centred on the origin, the third axis
     along its height.
 
-    Along the side the lattices are turned as the side is. The uppermost part of an open cup, which may overflow, has
-    none.
+    Along the side the lattices are turned as the side is; on the base, up to where the side is hardly seen, they are
+    those of fluid in the cup. The uppermost part of an open cup, which may overflow, has none.
     """
     levels = _between(0.0, height, False, spacing)
     closed = levels if lid else levels[levels < height - reach]
@@ -58,7 +61,7 @@ def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: f
     outward = np.pad(side[:, :2] / np.linalg.norm(side[:, :2], axis=1, keepdims=True), ((0, 0), (0, 1)))
     up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), side.shape)
     middle = disc(radius, spacing, 2)
-    inner = Places.upright(stacked(middle[np.linalg.norm(middle, axis=1) <= radius - reach], ends))
+    inner = Places.upright(stacked(middle[np.linalg.norm(middle, axis=1) <= radius - OVERLAP * reach], ends))
     return Places(
         np.concatenate([side, inner.points]),
         np.concatenate([np.stack([outward, np.cross(up, outward), up], axis=1), inner.axes]),

@@ -1,0 +1,196 @@
+"""Wall particles: flat walls against sums over a lattice written out here, and the density in whole containers."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from cortado.calibration import SLACK
+from cortado.discrete_scene import DiscreteScene, discretise
+from cortado.scene import Scene
+from cortado.smoothing import KERNELS
+from cortado.walls.layers import SHALLOW, wall_layers
+
+SPACING = 0.05
+kernels = pytest.mark.parametrize("name", KERNELS)
+dimensions = pytest.mark.parametrize("dimension", [2, 3])
+supports = pytest.mark.parametrize("support", [1.2, 1.6, 2.0, 2.05, 2.3, 2.6, 3.0, 3.5, 4.0])
+
+
+class FlatWall:
+    """Fluid on the lattice above a flat wall at height 0; the first axis of space is the height."""
+
+    def __init__(self, name: str, support: float, dimension: int):
+        self.kernel, self.support, self.dimension = KERNELS[name], support * SPACING, dimension
+        self.layers = wall_layers(self.kernel, SPACING, self.support, dimension)
+        self.plane = SPACING * np.array(list(itertools.product(range(-4, 5), repeat=dimension - 1)), dtype=np.float64)
+        whole = np.array(list(itertools.product(range(-4, 5), repeat=dimension)), dtype=np.float64)
+        self.total = self.weight(SPACING * whole).sum()
+
+    def weight(self, separations: np.ndarray) -> np.ndarray:
+        return self.kernel.weight(np.linalg.norm(separations, axis=-1), self.dimension, self.support)
+
+    def to_plane(self, distance: float) -> np.ndarray:
+        return np.column_stack([np.full(len(self.plane), distance), self.plane])
+
+    def of_wall(self, height: float) -> float:
+        """What the wall adds to the density of a particle at a height [m], over the rest density."""
+        pairs = zip(self.layers.depths, self.layers.weights, strict=True)
+        return sum(w * self.weight(self.to_plane(height + depth)).sum() for depth, w in pairs) / self.total
+
+    def missing(self, layer: int) -> float:
+        """What a particle of a layer misses of the lattice below height 0."""
+        return sum(self.weight(self.to_plane(SPACING * k)).sum() for k in range(layer + 1, 6)) / self.total
+
+
+@kernels
+@dimensions
+@supports
+def test_a_flat_wall_completes_the_lattice(name, dimension, support):
+    """In the layers that see it: exactly in the first two, and within 0.6 % in a third, at a support of 4."""
+    wall = FlatWall(name, support, dimension)
+    errors = [wall.of_wall((layer + 0.5) * SPACING) - wall.missing(layer) for layer in range(4)]
+    np.testing.assert_allclose(errors[:2], 0.0, atol=1e-7)
+    assert max(map(abs, errors)) < 0.006
+    assert wall.missing(0) > 1e-3 or support < 1.5
+
+
+@kernels
+@dimensions
+@supports
+def test_a_uniform_pressure_pushes_no_particle_at_a_flat_wall(name, dimension, support):
+    """With q the same everywhere the force on a particle is -q (2 sum_j G_ij + sum_b w_b G_ib)."""
+    wall = FlatWall(name, support, dimension)
+    step = 1e-6 * SPACING
+    slope_of_wall = (wall.of_wall(0.5 * SPACING + step) - wall.of_wall(0.5 * SPACING - step)) / (2.0 * step)
+    above = np.concatenate([wall.to_plane(-SPACING * k) for k in range(6)])  # from its neighbours to the particle
+    slope_of_fluid = wall.kernel.gradient(above, wall.support)[:, 0].sum() / wall.total
+    assert slope_of_fluid > 0.0
+    assert slope_of_wall == pytest.approx(-2.0 * slope_of_fluid, rel=1e-6)
+
+
+@kernels
+@dimensions
+@supports
+def test_a_flat_wall_stops_a_particle_alone(name, dimension, support):
+    """It has the rest density, and from there on a pressure, before it reaches the surface of the container."""
+    wall = FlatWall(name, support, dimension)
+    alone = wall.weight(np.zeros((1, dimension))).sum() / wall.total
+    assert alone + wall.of_wall(0.5 * SPACING) < 1.0 - SLACK
+    assert alone + wall.of_wall(0.0) > 1.0 - SLACK
+
+
+@kernels
+@dimensions
+@supports
+def test_layers_lie_behind_the_surface_in_order(name, dimension, support):
+    layers = wall_layers(KERNELS[name], SPACING, support * SPACING, dimension)
+    wall = FlatWall(name, support, dimension)
+    second = wall.missing(1) / wall.missing(0)
+    assert len(layers.depths) == len(layers.weights) == (2 if second > 1e-6 else 1)
+    assert all(0.0 < weight < 100.0 for weight in layers.weights) and list(layers.depths) == sorted(layers.depths)
+    assert layers.depths[0] == pytest.approx(SHALLOW * SPACING) or second <= 1e-6
+    assert 0.5 * SPACING < layers.depths[-1] < (support - 0.5) * SPACING
+    assert 1.0 < layers.friction < 2.5
+
+
+# ---- containers --------------------------------------------------------------------------------------------------
+
+
+def filled(container: dict[str, Any], kernel: str, support: float, **fluid: Any) -> DiscreteScene:
+    """A container full of water."""
+    dimension = len(container.get("lower", container.get("base")))
+    body = {key: value for key, value in container.items() if key not in ("periodic", "lid")}
+    scene = Scene(
+        dimension=dimension,
+        discretisation={"spacing": SPACING, "support": support, "kernel": kernel},
+        phase=[{"name": "water", "rest_density": 1000, "viscosity": 0.0}],
+        fluid=[{**body, "phase": "water", **fluid}],
+        container=container,
+        solver={"time_step": 1e-4},
+    )
+    return discretise(scene)
+
+
+def densities(discrete: DiscreteScene) -> np.ndarray:
+    """(n,) of the first particles, over the rest density, less the slack."""
+    kernel, support, dimension = discrete.kernel, discrete.lattice.support, discrete.fluid.positions.shape[1]
+    fluid, walls, periods = discrete.fluid.positions, discrete.walls.positions, discrete.periods
+    images = [np.array(s) * periods for s in itertools.product(*[(0, -1, 1) if period else (0,) for period in periods])]
+    found = np.zeros(len(fluid))
+    for points, weights in ((fluid, np.ones(len(fluid))), (walls, discrete.walls.weights)):
+        tree = cKDTree(np.concatenate([points + image for image in images]))
+        repeated = np.tile(weights, len(images))
+        for i, near in enumerate(tree.query_ball_point(fluid, support)):
+            found[i] += repeated[near] @ kernel.weight(
+                np.linalg.norm(tree.data[near] - fluid[i], axis=1), dimension, support
+            )
+    return discrete.lattice.volume * found / (1.0 - SLACK)
+
+
+def box(upper: list[float], **more: Any) -> dict[str, Any]:
+    return {"shape": "box", "lower": [0.0] * len(upper), "upper": [SPACING * x for x in upper], **more}
+
+
+KINDS = pytest.mark.parametrize(
+    ("kernel", "support"),
+    [("cubic_spline", 2.0), ("cubic_spline", 3.0), ("wendland_c2", 2.6), ("wendland_c4", 3.0), ("wendland_c4", 2.0)],
+)
+BOXES = {
+    "plane": box([12, 9]),
+    "space": box([8, 9, 10]),
+    "channel": box([12, 8], periodic=[True, False]),
+    "duct": box([12, 8, 9], periodic=[True, False, False]),
+    "slit": box([12, 12, 7], periodic=[True, True, False]),
+}
+
+
+@KINDS
+@pytest.mark.parametrize("name", BOXES)
+def test_water_that_fills_a_box_has_the_rest_density_everywhere(name, kernel, support):
+    """At faces, edges, corners, and where a period begins."""
+    discrete = filled(BOXES[name], kernel, support)
+    found = densities(discrete)
+    assert np.abs(found - 1.0).max() < 0.003
+    assert found.max() < 1.001
+
+
+@KINDS
+def test_all_weights_of_a_box_are_near_those_of_a_flat_wall(kernel, support):
+    discrete = filled(BOXES["space"], kernel, support)
+    flat = np.array(discrete.wall_layers.weights)
+    ratios = np.abs(discrete.walls.weights[:, None] / flat - 1.0).min(axis=1)
+    assert ratios.max() < 0.2
+
+
+@pytest.mark.parametrize("width", [1, 2, 3])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_gap_of_a_few_spacings_between_walls_has_the_rest_density(width, dimension):
+    found = densities(filled(box([8, 8, width][-dimension:]), "cubic_spline", 2.0))
+    assert found.max() < 1.003 and found.min() > 0.99
+
+
+@pytest.mark.parametrize("stretch", [0.97, 1.02, 1.045])
+def test_in_a_box_that_is_no_multiple_of_the_spacing_nothing_starts_compressed(stretch):
+    discrete = filled(box([8 * stretch, 9, 8]), "cubic_spline", 2.0)
+    assert densities(discrete).max() < 1.003
+    lowest = discrete.fluid.positions[:, 0] < SPACING
+    assert densities(discrete)[lowest].min() > 0.99
+
+
+@pytest.mark.parametrize(
+    ("kernel", "support"), [("cubic_spline", 2.0), ("cubic_spline", 3.0), ("wendland_c2", 2.6), ("wendland_c4", 3.5)]
+)
+@pytest.mark.parametrize(("radius", "lid"), [(6.5, True), (8.0, True), (10.3, False)])
+def test_water_that_fills_a_cup_starts_nowhere_compressed(radius, lid, kernel, support):
+    """Between the lattice and a round side there are gaps; on the base and in the middle there are none."""
+    cup = {"shape": "cylinder", "base": [0, 0, 0], "radius": radius * SPACING, "height": 8 * SPACING, "axis": "z"}
+    discrete = filled({**cup, "lid": lid}, kernel, support)
+    found, positions = densities(discrete), discrete.fluid.positions
+    assert found.max() < 1.003
+    inner = np.linalg.norm(positions[:, :2], axis=1) < (radius - support - 0.5) * SPACING
+    below = positions[:, 2] < 3.0 * SPACING
+    np.testing.assert_allclose(found[inner & below], 1.0, atol=0.003)
+    assert (discrete.walls.weights > 0.0).all()
