@@ -49,11 +49,11 @@ class FlatWall:
 @dimensions
 @supports
 def test_a_flat_wall_completes_the_lattice(name, dimension, support):
-    """In the layers that see it: exactly in the first two, and within 0.6 % in a third, at a support of 4."""
+    """In the layers that see it: exactly in the first two, and within 0.3 % in a third."""
     wall = FlatWall(name, support, dimension)
     errors = [wall.of_wall((layer + 0.5) * SPACING) - wall.missing(layer) for layer in range(4)]
     np.testing.assert_allclose(errors[:2], 0.0, atol=1e-7)
-    assert max(map(abs, errors)) < 0.006
+    assert max(map(abs, errors)) < 0.003
     assert wall.missing(0) > 1e-3 or support < 1.5
 
 
@@ -90,7 +90,7 @@ def test_layers_lie_behind_the_surface_in_order(name, dimension, support):
     wall = FlatWall(name, support, dimension)
     second = wall.missing(1) / wall.missing(0)
     assert len(layers.depths) == len(layers.weights) == (2 if second > 1e-6 else 1)
-    assert all(0.0 < weight < 100.0 for weight in layers.weights) and list(layers.depths) == sorted(layers.depths)
+    assert all(0.0 < weight < 500.0 for weight in layers.weights) and list(layers.depths) == sorted(layers.depths)
     assert layers.depths[0] == pytest.approx(SHALLOW * SPACING) or second <= 1e-6
     assert 0.5 * SPACING < layers.depths[-1] < (support - 0.5) * SPACING
     assert 1.0 < layers.friction < 2.5

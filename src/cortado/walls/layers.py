@@ -8,8 +8,10 @@ from scipy.optimize import brentq
 from cortado.calibration import lattice_offsets, shear_factor
 from cortado.smoothing import SmoothingKernel
 
-SHALLOW = 0.25
-"""Depth of the shallow layer, in spacings; there is one where the second lattice layer of the fluid sees the wall."""
+SHALLOW = 0.4
+"""Depth of the shallow layer, in spacings; there is one where the second lattice layer of the fluid sees the wall.
+
+At half a spacing the deep layer would have to be so steep that it lies where the kernel ends."""
 
 
 @dataclass(frozen=True)
