@@ -71,7 +71,7 @@ def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: f
 def _between(lower: float, upper: float, periodic: bool, spacing: float) -> Points:
     """Places along an axis: from each wall on, a spacing apart, or evenly along a period."""
     count = nearest_cells(upper - lower, spacing)
-    cells: Points = np.arange(count) + 0.5
+    cells = np.arange(count, dtype=np.float64) + 0.5
     if periodic:
         return np.asarray(lower + (upper - lower) / count * cells)
     return np.asarray(np.where(cells < 0.5 * count, lower + spacing * cells, upper - spacing * cells[::-1]))
