@@ -35,6 +35,10 @@ def point_and_direction(problem, what, seed=0):
     return name, point, SCALES[what] * direction / np.linalg.norm(direction)
 
 
+def disturbed(positions):
+    return positions + 0.001 * np.random.default_rng(3).standard_normal(positions.shape)
+
+
 def best_difference(problem, point, directions, derivative):
     """Relative distance of the derivative from the nearest central difference."""
     found = []
@@ -56,14 +60,19 @@ ITERATIONS = {"fixed": {}, "tolerance": {"minimum_iterations": 2, "maximum_itera
     "what", ["gravity", "gravity over time", "initial_positions", "initial_velocities", "viscosity"]
 )
 def test_splash(what, steps, iterations):
+    """From a start off the lattice, on which all particles without free surface have the rest density: many of them
+    would be so near the kink of the pressure's clamp that a difference crosses it before round-off is small in it."""
     problem = problem_of(splash(**ITERATIONS[iterations]), steps)
-    name, point, direction = point_and_direction(problem, what)
-    _, gradient = problem.value_and_gradient({name: point})
+    name, value, direction = point_and_direction(problem, what)
+    start = problem.simulation.positions
+    point = {name: value, "initial_positions": disturbed(start)}
+    directions = {"initial_positions": np.zeros_like(start), name: direction}
+    _, gradient = problem.value_and_gradient(point)
     adjoint = (gradient[name] * direction).sum()
-    tangent = problem.tangent({name: point}, {name: direction})
+    tangent = problem.tangent(point, directions)
     assert abs(adjoint - tangent) < 1e-10 * abs(tangent)
     limit = 1e-3 if steps == 200 else 1e-6  # at 200 steps chaos limits the difference
-    assert best_difference(problem, {name: point}, {name: direction}, tangent) < limit
+    assert best_difference(problem, point, directions, tangent) < limit
 
 
 SHAPES = {
@@ -96,10 +105,6 @@ def test_gather_adjoint_equals_warps_tape(made):
         # One fluid hardly feels its density: there what a change of its size does to the loss is below round-off.
         floor = np.finfo(np.float64).eps * loss / SCALES[name]
         assert np.linalg.norm(gradient - taped[name]) <= max(1e-9 * np.linalg.norm(gradient), floor), name
-
-
-def disturbed(positions):
-    return positions + 0.001 * np.random.default_rng(3).standard_normal(positions.shape)
 
 
 @pytest.mark.parametrize("made", SHAPES.values(), ids=SHAPES)

@@ -41,8 +41,11 @@ scenes = pytest.mark.parametrize("made", SCENES.values(), ids=SCENES)
 TERMS = [Terms(), *(Terms(**{name: False}) for name in ("viscosity", "pressure", "hessian", "density"))]
 
 
-def point_and_direction(simulation, steps, seed=0):
-    """All parameters at once, off the lattice, whose symmetry puts many particles near the clamp's kink together."""
+def point_and_direction(simulation, steps, seed=0, off_lattice=0.001):
+    """All parameters at once, off the lattice, whose symmetry puts many particles near the clamp's kink together.
+
+    Each coordinate of a particle is moved off it by about ``off_lattice`` [m].
+    """
     random, shape = np.random.default_rng(seed), simulation.positions.shape
 
     def noise(*shape):
@@ -50,7 +53,7 @@ def point_and_direction(simulation, steps, seed=0):
 
     point = {
         "gravity": np.tile(simulation.scene.forces.gravity, (steps, 1)),
-        "initial_positions": simulation.positions + 0.001 * noise(*shape),
+        "initial_positions": simulation.positions + off_lattice * noise(*shape),
         "initial_velocities": simulation.velocities + 0.01 * noise(*shape),
         "viscosity": np.array(0.05),
     }
@@ -106,13 +109,16 @@ def test_derivatives_are_those_of_the_warp_engine(made):
 
 
 def test_float32_is_as_near_to_float64_as_the_warp_engine_is():
-    """In the median of five starts: now and then a particle is at the clamp's kink to round-off, in either engine."""
+    """In the median of five starts: now and then a particle is at the clamp's kink to round-off, in either engine.
+
+    Nearer to the lattice that happens in most starts: all particles without free surface have the rest density there.
+    """
     exact, single = reference.Simulation(splash()), reference.Simulation(splash(), "float32")
     loss = reference.FinalPositions(target_of(exact))
     problem = Problem(Simulation(splash(), precision="float32"), 40, losses.FinalPositions(loss.target))
     errors = {name: [] for name in ("positions", "initial_positions", "initial_velocities", "gravity", "viscosity")}
     for seed in range(5):
-        point, _ = point_and_direction(exact, 40, seed)
+        point, _ = point_and_direction(exact, 40, seed, off_lattice=0.004)
         wanted, found = (one.gradient(point, 40, loss) for one in (exact, single))
         _, warp = problem.value_and_gradient(point)
         for name, gradient in wanted.parameters.items():
