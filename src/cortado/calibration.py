@@ -63,7 +63,7 @@ def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
     gradients = kernel.gradient(offsets, support)
     waves = np.array(list(itertools.product(np.linspace(0.0, np.pi / spacing, 25), repeat=dimension)))
     answers = np.sin(waves @ offsets.T) @ gradients
-    return float((answers**2).sum(axis=1).max() / wall_rigidity(kernel, spacing, support, dimension))
+    return float((answers**2).sum(axis=1).max() / (2.0 * (gradients**2).sum()))
 
 
 def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: float) -> np.ndarray:
@@ -73,9 +73,8 @@ def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: floa
 
 
 def wall_rigidity(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """2 sum_j G_j . G_j of the prototype [1 / m^(2 d + 2)]: what a wall's own answer is measured by, see
-    `cortado.physics.walls`."""
-    return float(2.0 * (kernel.gradient(lattice_offsets(spacing, support, dimension), support) ** 2).sum())
+    """sum_j G_j . G_j [1 / m^(2 d + 2)]: what a wall's own answer is measured by, see `cortado.physics.walls`."""
+    return float((kernel.gradient(lattice_offsets(spacing, support, dimension), support) ** 2).sum())
 
 
 @cache

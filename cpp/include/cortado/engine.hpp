@@ -29,7 +29,7 @@ struct Scene {
     double rigidity;        // of the yield beside walls
     double evenness;
     std::vector<double> wall_positions;  // (b, d) [m]
-    std::vector<double> wall_weights;    // (b,) V_b / V, with the layer's factor
+    std::vector<double> wall_weights;    // (b,) w_b, a fluid particle being 1
     std::array<double, 3> periods;       // [m], 0 along an axis that is not periodic
     double rest_density;                 // [kg / m3]
     double time_step;                    // [s]

@@ -1,6 +1,6 @@
-"""Density by summation (report eq. 5, with the wall volumes of Akinci et al. 2012), as a number density:
+"""Density by summation (report eq. 5, with wall particles of calibrated weights), as a number density:
 
-n_i = V (W(0) + sum_j W_ij + sum_b (V_b / V) W_ib),   rho_i = m_i n_i.
+n_i = V (W(0) + sum_j W_ij + sum_b w_b W_ib),   rho_i = m_i n_i.
 
 V is the rest volume on the lattice and m_i a particle's mass over V. No mass of a neighbour enters (Solenthaler and
 Pajarola 2008): the density of a heavy fluid is not smeared into a light one.
@@ -17,7 +17,7 @@ from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions,
 @cache
 def density_sums(discretisation: Discretisation) -> SimpleNamespace:
     """Raw neighbour sums: ``weights`` (sum of W, with what fills the list up), ``weights_tangent`` and
-    ``weights_adjoint`` (sum_j (r_i + r_j) G_ij + sum_b (V_b / V) r_i G_ib: the adjoint of positions for an
+    ``weights_adjoint`` (sum_j (r_i + r_j) G_ij + sum_b w_b r_i G_ib: the adjoint of positions for an
     adjoint r of the sum of every particle)."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     surroundings = surroundings_type(discretisation.precision)

@@ -2,7 +2,7 @@
 
     p_i  = max(p_i + delta y_i (m_i n*_i - rho_0i), 0),   delta = k / dt^2
     c_i  = p_i / n_i^2
-    ap_i = -(V / m_i) (sum_j (c_i + c_j) G_ij + sum_b (V_b / V) c_i G_ib)
+    ap_i = -(V / m_i) (sum_j (c_i + c_j) G_ij + sum_b w_b c_i G_ib)
     v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
 
 n is the number density (`cortado.physics.density`; for fluids of different masses: Solenthaler and Pajarola 2008),

@@ -51,7 +51,7 @@ def surroundings_type(precision: Precision) -> Any:
         wall_positions: wp.array(dtype=vector)
         """[m]"""
         wall_weights: wp.array(dtype=real)
-        """V_b / V [-]: the volume of a wall particle over that of a fluid particle (after Akinci et al. 2012)."""
+        """w_b [-]: what a wall particle counts for in the density, a fluid particle being 1."""
         support: real
         """Support radius h [m]."""
         reach: real
@@ -61,7 +61,7 @@ def surroundings_type(precision: Precision) -> Any:
         self_weight: real
         """W(0) [1 / m^d]."""
         pliancy: real
-        """(2 sum_j G_j . G_j)^(-1/2) of a filled neighbourhood [m^(d + 1)], see `cortado.physics.walls`."""
+        """(sum_j G_j . G_j)^(-1/2) of a filled neighbourhood [m^(d + 1)], see `cortado.physics.walls`."""
         evenness: real
         """What second derivatives are multiplied with [-], see `cortado.calibration.laplacian_evenness`."""
         volume: real
