@@ -204,7 +204,7 @@ def test_fingerprints_tell_grids_of_one_view_apart():
 def cup() -> Scene:
     """Milk on coffee in a round cup, as examples/latte_art_small.toml has it: about 1,000 particles."""
     spacing = 0.0035
-    radius, depth = 8.0 * spacing, 4.5 * spacing
+    radius, depth = 8.5 * spacing, 4.5 * spacing
     phases = [
         {"name": "coffee", "rest_density": 1000.0, "viscosity": 0.02, "colour": [0.20, 0.09, 0.04]},
         {"name": "milk", "rest_density": 900.0, "viscosity": 0.04, "colour": [0.95, 0.92, 0.85]},
@@ -220,7 +220,7 @@ def cup() -> Scene:
         container={"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": radius, "height": 0.05},
         mixture={"mobility": 1e-5},
         forces={"gravity": [0.0, -9.81, 0.0]},
-        solver={"time_step": 0.002, "minimum_iterations": 5, "maximum_iterations": 5},
+        solver={"time_step": 0.0018, "minimum_iterations": 5, "maximum_iterations": 5},
         render={"view": "top", "resolution": [32, 32]},
     )
 

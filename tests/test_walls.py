@@ -194,3 +194,16 @@ def test_water_that_fills_a_cup_starts_nowhere_compressed(radius, lid, kernel, s
     below = positions[:, 2] < 3.0 * SPACING
     np.testing.assert_allclose(found[inner & below], 1.0, atol=0.003)
     assert (discrete.walls.weights > 0.0).all()
+
+
+@KINDS
+def test_the_side_of_a_cup_stops_a_particle_alone(kernel, support):
+    """As a flat wall does, between its wall particles and beside them."""
+    radius, angles = 6.5 * SPACING, np.linspace(0.0, 0.3, 31)
+    cup = {"shape": "cylinder", "base": [0, 0, 0], "radius": radius, "height": 8 * SPACING, "axis": "z"}
+    discrete = filled(cup, kernel, support)
+    places = np.column_stack([radius * np.cos(angles), radius * np.sin(angles), np.full(len(angles), 4 * SPACING)])
+    apart = np.linalg.norm(places[:, None] - discrete.walls.positions, axis=-1)
+    alone = discrete.kernel.weight(np.zeros(1), 3, discrete.lattice.support)
+    of_wall = discrete.kernel.weight(apart, 3, discrete.lattice.support) @ discrete.walls.weights
+    assert (discrete.lattice.volume * (alone + of_wall)).min() > 1.0

@@ -16,6 +16,9 @@ from cortado.walls.places import Places
 STIFFNESS = 3e-3
 """How much a weight resists a change, relative, beside an error of the density: where densities leave a weight open it
 stays that of a flat wall."""
+BALANCE = 0.02
+"""What the push of a uniform pressure counts beside an error of the density. Densities alone hardly say how steep two
+layers are: round a cup they would make them so shallow that fluid passes. At 0.1 corners would be too dense."""
 CHUNK = 4096
 """How many places are looked at at a time: bounds the memory."""
 
@@ -30,26 +33,32 @@ class RestLattice:
     support: float
     """[m]"""
 
-    def weights(self, distances: np.ndarray, dimension: int) -> np.ndarray:
-        """W at distances [m], any shape, beside the sum of W over the lattice."""
+    def sums(self, separations: np.ndarray) -> np.ndarray:
+        """(m, 1 + d) W, and the gradient of W times the spacing, beside the sum of W over the lattice, at separations
+        (m, d) [m]."""
+        dimension = separations.shape[1]
         offsets = lattice_offsets(self.spacing, self.support, dimension)
         total = self.kernel.weight(np.linalg.norm(offsets, axis=1), dimension, self.support).sum()
-        return self.kernel.weight(distances, dimension, self.support) / total
+        weights = self.kernel.weight(np.linalg.norm(separations, axis=1), dimension, self.support)
+        gradients = self.kernel.gradient(separations, self.support)
+        return np.asarray(np.column_stack([weights, self.spacing * gradients]) / total)
 
     def missing(self, places: Places, region: Region) -> Points:
-        """(n,) the part of the lattice's sum of W that lies outside of a region, for a lattice at each of the places.
+        """(n, 1 + d) the part of the lattice's `sums` that lies outside of a region, for a lattice at each of the
+        places.
 
         A lattice point is outside by as much as its cell is.
         """
         dimension = places.points.shape[1]
         offsets = lattice_offsets(self.spacing, self.support, dimension)
-        weights = self.weights(np.linalg.norm(offsets, axis=1), dimension)
-        found = np.zeros(len(places.points))
+        sums = self.sums(-offsets)
+        found = np.zeros((len(places.points), 1 + dimension))
         for start in range(0, len(found), CHUNK):
             some = slice(start, start + CHUNK)
             cells = places.points[some, None] + offsets @ places.axes[some]
             shares = region.cell_shares(cells.reshape(-1, dimension), self.spacing)
-            found[some] = (1.0 - shares).reshape(-1, len(offsets)) @ weights
+            found[some] = (1.0 - shares).reshape(-1, len(offsets)) @ sums
+            found[some, 1:] = (found[some, None, 1:] @ places.axes[some])[:, 0]
         return found
 
 
@@ -64,8 +73,10 @@ def wall_weights(
 ) -> Points:
     """(b,) [-] what wall particles count for in the density, a fluid particle being 1.
 
-    With them the lattice has the rest density at all places beside the walls, as nearly as can be, in the sense of
-    least squares: along faces, edges and corners, in a cup, and across the seam of a period.
+    With them the lattice has the rest density at all places beside the walls, and a uniform pressure pushes no particle
+    less than a spacing from them, as nearly as can be, in the sense of least squares: along faces, edges and corners,
+    in a cup, and across the seam of a period. Against the push, as in `wall_layers`, the wall's part in the gradient is
+    twice that of the fluid that is missing.
 
     Args:
         walls: (b, d) wall particles [m].
@@ -78,11 +89,15 @@ def wall_weights(
     """
     if not len(walls):
         return np.zeros(0)
-    place, wall, distances = pairs_within(places.points, walls, lattice.support, lower, lengths)
-    seen = flat[wall] * lattice.weights(distances, walls.shape[1])
-    sums = coo_array((seen, (place, wall)), shape=(len(places.points), len(walls))).tocsr()
-    errors = lattice.missing(places, region) - sums.sum(axis=1)
+    place, wall, _ = pairs_within(places.points, walls, lattice.support, lower, lengths)
+    separations = places.points[place] - walls[wall]
+    separations -= lengths * np.rint(separations / np.where(lengths > 0.0, lengths, np.inf))
+    seen, missing = flat[wall, None] * lattice.sums(separations), lattice.missing(places, region)
+    shape, first = (len(missing), len(walls)), ~region.contains(places.points, -lattice.spacing)
+    densities, *gradients = (coo_array((part, (place, wall)), shape=shape).tocsr() for part in seen.T)
+    sums = vstack([densities, *(BALANCE * gradient[first] for gradient in gradients)]).tocsr()
+    wanted = np.concatenate([missing[:, 0], 2.0 * BALANCE * missing[first, 1:].T.ravel()])
     resisted = vstack([sums, STIFFNESS * identity(len(walls))]).tocsr()
-    wanted = np.concatenate([errors, np.zeros(len(walls))])
-    changes = lsq_linear(resisted, wanted, bounds=(-1.0, np.inf), lsq_solver="lsmr", tol=1e-10).x
+    errors = np.concatenate([wanted - sums.sum(axis=1), np.zeros(len(walls))])
+    changes = lsq_linear(resisted, errors, bounds=(-1.0, np.inf), lsq_solver="lsmr", tol=1e-10).x
     return np.asarray(flat * (1.0 + changes), dtype=np.float64)
