@@ -70,8 +70,8 @@ def centre(simulation):
 
 @cache
 def long():
-    """300 steps of a splash in the plane, long beyond its horizon."""
-    return certify(problem_of(plane(), 300, centre), ["gravity"])
+    """250 steps of a splash in the plane, long beyond its horizon; after 300 no policy agrees by more than 0.75."""
+    return certify(problem_of(plane(), 250, centre), ["gravity"])
 
 
 def test_beyond_the_horizon_another_policy_is_advised():

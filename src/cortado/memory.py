@@ -15,6 +15,8 @@ from cortado.errors import InputError
 
 _PARTICLE, _WALL, _STEP, _FRAME, _PIXEL = 56.0, 110.0, 50.0, 150.0, 110.0
 """[bytes]"""
+_WEIGHING = 1600.0
+"""[bytes] of a wall particle while its weight is sought"""
 _REALS_OF_PARTICLE, _REALS_OF_WALL, _REALS_OF_STEP, _REALS_OF_PIXEL = 90.0, 12.0, 8.0, 12.0
 _REALS_BACKWARD, _REALS_OF_ITERATION = 40.0, 8.0
 """[numbers]"""
@@ -24,7 +26,7 @@ _LIMITS = (("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "m
 
 def sampling_parts(particles: float, walls: float) -> dict[str, float]:
     """[bytes] of a scene that is cut into particles."""
-    return {f"{particles:.3g} particles of fluid": 100.0 * particles, f"{walls:.3g} wall particles": _WALL * walls}
+    return {f"{particles:.3g} particles of fluid": 100.0 * particles, f"{walls:.3g} wall particles": (_WALL + _WEIGHING) * walls}
 
 
 def simulation_parts(particles: int, walls: int, neighbours: int, real: int) -> dict[str, float]:

@@ -28,6 +28,10 @@ class Places:
         dimension = points.shape[1]
         return cls(points, np.broadcast_to(np.eye(dimension), (len(points), dimension, dimension)))
 
+    def some(self, which: slice) -> "Places":
+        """Some of them."""
+        return Places(self.points[which], self.axes[which])
+
 
 def box_places(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, reach: float) -> Places:
     """Those less than ``reach`` [m] from a wall of a box, with the first of them half a spacing from it.

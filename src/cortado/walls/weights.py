@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import lsq_linear
-from scipy.sparse import coo_array, identity, vstack
+from scipy.sparse import coo_array, csr_array, identity, vstack
 
 from cortado.calibration import lattice_offsets
 from cortado.pairs import pairs_within
@@ -51,15 +51,11 @@ class RestLattice:
         """
         dimension = places.points.shape[1]
         offsets = lattice_offsets(self.spacing, self.support, dimension)
-        sums = self.sums(-offsets)
-        found = np.zeros((len(places.points), 1 + dimension))
-        for start in range(0, len(found), CHUNK):
-            some = slice(start, start + CHUNK)
-            cells = places.points[some, None] + offsets @ places.axes[some]
-            shares = region.cell_shares(cells.reshape(-1, dimension), self.spacing)
-            found[some] = (1.0 - shares).reshape(-1, len(offsets)) @ sums
-            found[some, 1:] = (found[some, None, 1:] @ places.axes[some])[:, 0]
-        return found
+        cells = places.points[:, None] + offsets @ places.axes
+        shares = region.cell_shares(cells.reshape(-1, dimension), self.spacing).reshape(-1, len(offsets))
+        found = (1.0 - shares) @ self.sums(-offsets)
+        found[:, 1:] = (found[:, None, 1:] @ places.axes)[:, 0]
+        return np.asarray(found)
 
 
 def wall_weights(
@@ -89,15 +85,39 @@ def wall_weights(
     """
     if not len(walls):
         return np.zeros(0)
-    place, wall, _ = pairs_within(places.points, walls, lattice.support, lower, lengths)
-    separations = places.points[place] - walls[wall]
-    separations -= lengths * np.rint(separations / np.where(lengths > 0.0, lengths, np.inf))
-    seen, missing = flat[wall, None] * lattice.sums(separations), lattice.missing(places, region)
-    shape, first = (len(missing), len(walls)), ~region.contains(places.points, -lattice.spacing)
-    densities, *gradients = (coo_array((part, (place, wall)), shape=shape).tocsr() for part in seen.T)
-    sums = vstack([densities, *(BALANCE * gradient[first] for gradient in gradients)]).tocsr()
-    wanted = np.concatenate([missing[:, 0], 2.0 * BALANCE * missing[first, 1:].T.ravel()])
-    resisted = vstack([sums, STIFFNESS * identity(len(walls))]).tocsr()
-    errors = np.concatenate([wanted - sums.sum(axis=1), np.zeros(len(walls))])
-    changes = lsq_linear(resisted, errors, bounds=(-1.0, np.inf), lsq_solver="lsmr", tol=1e-10).x
+    container = Surface(walls, flat, lattice, region, lower, lengths)
+    chunks = range(0, len(places.points), CHUNK)
+    demands = [container.demands(places.some(slice(start, start + CHUNK))) for start in chunks]
+    sums = vstack([*(part for part, _ in demands), STIFFNESS * identity(len(walls))]).tocsr()
+    wanted = np.concatenate([*(part for _, part in demands), STIFFNESS * np.ones(len(walls))])
+    changes = lsq_linear(sums, wanted - sums.sum(axis=1), bounds=(-1.0, np.inf), lsq_solver="lsmr", tol=1e-10).x
     return np.asarray(flat * (1.0 + changes), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The walls of a container, as `wall_weights` has them."""
+
+    walls: Points
+    flat: Points
+    lattice: RestLattice
+    region: Region
+    lower: Points
+    lengths: Points
+
+    def demands(self, places: Places) -> tuple[csr_array, Points]:
+        """What places ask of the walls: a matrix (m, b) that gives, with the weights of the walls over their flat ones,
+        what is wanted, (m,)."""
+        place, wall, _ = pairs_within(places.points, self.walls, self.lattice.support, self.lower, self.lengths)
+        apart = places.points[place] - self.walls[wall]
+        apart -= self.lengths * np.rint(apart / np.where(self.lengths > 0.0, self.lengths, np.inf))
+        shape, indices = (len(places.points), len(self.walls)), (place.astype(np.int32), wall.astype(np.int32))
+        seen = self.flat[wall, None] * self.lattice.sums(apart)
+        densities, *gradients = (coo_array((part, indices), shape=shape).tocsr() for part in seen.T)
+        missing, near = self.lattice.missing(places, self.region), self._nearest(places.points)
+        sums = vstack([densities, *(BALANCE * gradient[near] for gradient in gradients)]).tocsr()
+        return sums, np.concatenate([missing[:, 0], 2.0 * BALANCE * missing[near, 1:].T.ravel()])
+
+    def _nearest(self, points: Points) -> np.ndarray:
+        """(n,) whether points are less than a spacing from a wall."""
+        return ~self.region.contains(points, -self.lattice.spacing)
