@@ -26,7 +26,8 @@ _LIMITS = (("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "m
 
 def sampling_parts(particles: float, walls: float) -> dict[str, float]:
     """[bytes] of a scene that is cut into particles."""
-    return {f"{particles:.3g} particles of fluid": 100.0 * particles, f"{walls:.3g} wall particles": (_WALL + _WEIGHING) * walls}
+    of_walls = (_WALL + _WEIGHING) * walls
+    return {f"{particles:.3g} particles of fluid": 100.0 * particles, f"{walls:.3g} wall particles": of_walls}
 
 
 def simulation_parts(particles: int, walls: int, neighbours: int, real: int) -> dict[str, float]:
