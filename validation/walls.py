@@ -54,8 +54,8 @@ def energies(made: Scene, steps: int) -> np.ndarray:
 
 
 def at_rest(kernel: str, support: float, dimension: int) -> tuple[float, float, float, float]:
-    """Speed [m/s] from 2 to 2.5 s and on to 3 s, and the error of the pressure, averaged from 2 to 3 s, over rho g H, of
-    all particles and of those within the support of a wall; all root mean squares. H is 1 m."""
+    """Speed [m/s] from 2 to 2.5 s and on to 3 s, and the error of the pressure, averaged from 2 to 3 s, over rho g H,
+    of all particles and of those within the support of a wall; all root mean squares. H is 1 m."""
     across, wide = (40, 0.8) if dimension == 2 else (16, 1.0)
     spacing = 1.0 / across
     time_step = (0.02 if dimension == 2 else 0.016) * spacing

@@ -7,8 +7,8 @@ import numpy as np
 from cortado.shapes import Points
 
 TOLERANCE = 0.5
-"""In spacings: how far outside of its container a particle may be. Up to there it has not passed the wall particles,
-which bring it back; light fluid among heavier is pressed there at times."""
+"""In spacings: how far outside of its container a particle may be. Walls bring back what is less far; light fluid among
+heavier is pressed there at times."""
 
 
 @dataclass(frozen=True)
