@@ -24,7 +24,7 @@ from cortado.scene_fluids import PointsFluid
 from cortado.shapes import Points
 from cortado.smoothing import SmoothingKernel, smoothing_kernel
 from cortado.walls.layers import WallLayers, wall_layers
-from cortado.walls.weights import RestLattice, wall_weights
+from cortado.walls.weights import RestLattice, Surface
 
 MOST_AVERAGE_COMPRESSION = 0.1
 """Of the first particles, the mean of (n - 1)+ where n is the number density: a lattice that is squeezed by more
@@ -125,7 +125,7 @@ def _walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     positions, (lower, lengths) = np.concatenate(particles), period(scene)
     places = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
     region = scene.container.region(scene.dimension).opened(lengths)
-    return Walls(positions, wall_weights(positions, flat, lattice, places, region, lower, lengths))
+    return Walls(positions, Surface(positions, flat, lattice, region, lower, lengths).weights(places))
 
 
 def _check_packing(scene: Scene, positions: Points, kernel: SmoothingKernel, lattice: Lattice) -> None:

@@ -58,66 +58,50 @@ class RestLattice:
         return np.asarray(found)
 
 
-def wall_weights(
-    walls: Points,
-    flat: Points,
-    lattice: RestLattice,
-    places: Places,
-    region: Region,
-    lower: Points,
-    lengths: Points,
-) -> Points:
-    """(b,) [-] what wall particles count for in the density, a fluid particle being 1.
-
-    With them the lattice has the rest density at all places beside the walls, and a uniform pressure pushes no particle
-    less than a spacing from them, as nearly as can be, in the sense of least squares: along faces, edges and corners,
-    in a cup, and across the seam of a period. Against the push, as in `wall_layers`, the wall's part in the gradient is
-    twice that of the fluid that is missing.
-
-    Args:
-        walls: (b, d) wall particles [m].
-        flat: (b,) their weights in a flat wall.
-        lattice: the lattice of the fluid at rest.
-        places: where the fluid may rest beside the walls.
-        region: where fluid may be.
-        lower: (d,) where the period begins [m].
-        lengths: (d,) the lengths of the period [m], 0 for axes without one.
-    """
-    if not len(walls):
-        return np.zeros(0)
-    container = Surface(walls, flat, lattice, region, lower, lengths)
-    chunks = range(0, len(places.points), CHUNK)
-    demands = [container.demands(places.some(slice(start, start + CHUNK))) for start in chunks]
-    sums = vstack([*(part for part, _ in demands), STIFFNESS * identity(len(walls))]).tocsr()
-    wanted = np.concatenate([*(part for _, part in demands), STIFFNESS * np.ones(len(walls))])
-    changes = lsq_linear(sums, wanted - sums.sum(axis=1), bounds=(-1.0, np.inf), lsq_solver="lsmr", tol=1e-10).x
-    return np.asarray(flat * (1.0 + changes), dtype=np.float64)
-
-
 @dataclass(frozen=True)
 class Surface:
-    """The walls of a container, as `wall_weights` has them."""
+    """The walls of a container, whose weights are sought."""
 
     walls: Points
+    """(b, d) wall particles [m]"""
     flat: Points
+    """(b,) their weights in a flat wall [-]"""
     lattice: RestLattice
+    """The lattice of the fluid at rest."""
     region: Region
+    """Where fluid may be."""
     lower: Points
+    """(d,) where the period begins [m]"""
     lengths: Points
+    """(d,) the lengths of the period [m], 0 for axes without one"""
 
-    def demands(self, places: Places) -> tuple[csr_array, Points]:
-        """What places ask of the walls: a matrix (m, b) that gives, with the weights of the walls over their flat ones,
-        what is wanted, (m,)."""
+    def weights(self, places: Places) -> Points:
+        """(b,) [-] what wall particles count for in the density, a fluid particle being 1.
+
+        With them the lattice has the rest density at all places, and a uniform pressure pushes no particle less than a
+        spacing from a wall, as nearly as can be, in the sense of least squares: along faces, edges and corners, in a
+        cup, and across the seam of a period. Against the push, as in `wall_layers`, the wall's part in the gradient is
+        twice that of the fluid that is missing.
+        """
+        count = len(self.walls)
+        if not count:
+            return np.zeros(0)
+        chunks = range(0, len(places.points), CHUNK)
+        demands = [self._demands(places.some(slice(start, start + CHUNK))) for start in chunks]
+        sums = vstack([*(part for part, _ in demands), STIFFNESS * identity(count)]).tocsr()
+        wanted = np.concatenate([*(part for _, part in demands), STIFFNESS * np.ones(count)])
+        changes = lsq_linear(sums, wanted - sums.sum(axis=1), bounds=(-1.0, np.inf), lsq_solver="lsmr", tol=1e-10).x
+        return np.asarray(self.flat * (1.0 + changes), dtype=np.float64)
+
+    def _demands(self, places: Places) -> tuple[csr_array, Points]:
+        """A matrix (m, b) that gives, with the weights of the walls over their flat ones, what is wanted, (m,)."""
         place, wall, _ = pairs_within(places.points, self.walls, self.lattice.support, self.lower, self.lengths)
         apart = places.points[place] - self.walls[wall]
         apart -= self.lengths * np.rint(apart / np.where(self.lengths > 0.0, self.lengths, np.inf))
         shape, indices = (len(places.points), len(self.walls)), (place.astype(np.int32), wall.astype(np.int32))
         seen = self.flat[wall, None] * self.lattice.sums(apart)
         densities, *gradients = (coo_array((part, indices), shape=shape).tocsr() for part in seen.T)
-        missing, near = self.lattice.missing(places, self.region), self._nearest(places.points)
+        missing = self.lattice.missing(places, self.region)
+        near = ~self.region.contains(places.points, -self.lattice.spacing)
         sums = vstack([densities, *(BALANCE * gradient[near] for gradient in gradients)]).tocsr()
         return sums, np.concatenate([missing[:, 0], 2.0 * BALANCE * missing[near, 1:].T.ravel()])
-
-    def _nearest(self, points: Points) -> np.ndarray:
-        """(n,) whether points are less than a spacing from a wall."""
-        return ~self.region.contains(points, -self.lattice.spacing)
