@@ -1,6 +1,7 @@
 """Where the layers of wall particles lie behind a flat wall, and what their particles count for, in float64."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import brentq
@@ -37,10 +38,14 @@ class Planes:
     """[m]"""
     dimension: int
 
+    @cached_property
+    def flat(self) -> np.ndarray:
+        """(m, d - 1) the points of a plane that are less than a support away along it [m]."""
+        return np.unique(lattice_offsets(self.spacing, self.support, self.dimension)[:, 1:], axis=0)
+
     def across(self, distance: float) -> np.ndarray:
         """(m, d) separations [m] from the points of a plane at a distance [m], whose first axis is its normal."""
-        flat = np.unique(lattice_offsets(self.spacing, self.support, self.dimension)[:, 1:], axis=0)
-        return np.hstack([np.full((len(flat), 1), distance), flat])
+        return np.hstack([np.full((len(self.flat), 1), distance), self.flat])
 
     def weight(self, distance: float) -> float:
         """Sum of W over a plane at a distance [m]."""
