@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from cortado.calibration import lattice_offsets
 from cortado.scene import Scene
 from cortado.simulation import Simulation
+from cortado.smoothing import smoothing_kernel
 
 GRAVITY = 9.81
 KERNELS = (("cubic_spline", 2.0), ("wendland_c2", 2.6), ("wendland_c4", 3.0))
@@ -91,8 +93,27 @@ def at_rest(kernel: str, support: float, dimension: int) -> tuple[float, float, 
     return halves[0], halves[1], float(np.sqrt((errors**2).mean())), float(np.sqrt((errors[near] ** 2).mean()))
 
 
+def column_slopes(kernel: str, support: float, dimension: int) -> np.ndarray:
+    """(40,) dp/dz over rho g that layers of the rest lattice beside a vertical wall need, to carry their own weight.
+
+    A frozen wall pushes along its normal alone, so that sum_k t_|k - l| s_k = 1 over the layers k of the fluid, where
+    t_k is what a layer at k spacings adds to a vertical gradient.
+    """
+    offsets = lattice_offsets(1.0, support, dimension)
+    shares = -offsets[:, 1] * smoothing_kernel(kernel).gradient(offsets, support)[:, 1]
+    apart = np.abs(offsets[:, 0]).round().astype(int)
+    t = np.array([shares[(apart == k) & (offsets[:, 0] >= 0.0)].sum() for k in range(40)])
+    t /= shares.sum()
+    return np.linalg.solve(t[np.abs(np.subtract.outer(np.arange(40), np.arange(40)))], np.ones(40))
+
+
 def lines() -> Iterator[str]:
     """The tables, a line at a time."""
+    yield "slopes of the pressure, over rho g, that the layers of the rest lattice beside a vertical wall need"
+    for dimension in (2, 3):
+        for kernel, support in KERNELS:
+            slopes = " ".join(f"{slope:.2f}" for slope in column_slopes(kernel, support, dimension)[:4])
+            yield f"{dimension}-D {kernel}: {slopes}"
     yield "dam break: greatest energy over the first, in 1.2 s"
     for kernel, support in KERNELS:
         for round_walls in (False, True):
