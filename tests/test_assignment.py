@@ -9,10 +9,10 @@ from cortado import InputError, optimise
 from cortado.assignment import assignment
 from cortado.image_losses import Pyramid, SquaredDifference
 from cortado.optimisers import LBFGS, Adam
+from cortado.parameters.tilt import Tilt
 from cortado.pictures import heart, rosetta, write_picture
 from cortado.reparametrisation import Knots, Logarithm, Softmax
 from cortado.task import load_task
-from cortado.tilt import Tilt
 
 
 @pytest.fixture

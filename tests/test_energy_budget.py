@@ -41,7 +41,7 @@ class Step:
         _, self.new_velocities, _ = rollout.forward().numpy(shape[1])
         """(n, d) in the scene's order [m/s]."""
         self.solver = rollout.solver
-        self.whole = self.solver.moment(rollout.parameters).surroundings
+        self.whole = self.solver.context(rollout.parameters).surroundings
         """What particles see: each other and the walls."""
         self.among_particles = surroundings_type(self.solver.discretisation.precision)()
         """The same without the walls."""
@@ -50,7 +50,7 @@ class Step:
         self.order = self.solver.search.order.numpy()[: shape[0]]
         self.u = random.standard_normal(shape)
         """(n, d) displacements [m]."""
-        self.masses = self.solver.lattice.volume * self.solver.fields.m.numpy().astype(np.float64)
+        self.masses = self.solver.lattice.volume * self.solver.fields["m"].numpy().astype(np.float64)
         """(n,) [kg]"""
         self.q = self.solver.iterates.c[0].numpy().astype(np.float64)
         """(n,) of the last iteration [Pa]."""
@@ -65,16 +65,23 @@ class Step:
         """(n, d) pressure forces from the solver's kernel [N]: what particles at rest gain in a second."""
         fields, real = self.solver.fields, self.solver.discretisation.precision.real
         time_step = wp.ones(1, dtype=real, device=self.solver.search.device)
-        at_rest, x_star, v_star = (wp.zeros_like(fields.x) for _ in range(3))
-        inputs = [surroundings, time_step, fields.m, fields.x, at_rest, at_rest, self.solver.iterates.c[0]]
-        self.solver.launch(self.solver.kernels.force.forward, inputs, [x_star, v_star])
+        at_rest, x_star, v_star = (wp.zeros_like(fields["x"]) for _ in range(3))
+        self.solver.launch(
+            self.solver.kernels.force.forward,
+            {"x": fields["x"], "m": fields["m"], "v": at_rest, "acceleration": at_rest},
+            s=surroundings,
+            time_step=time_step,
+            c=self.solver.iterates.c[0],
+            x_star=x_star,
+            v_star=v_star,
+        )
         return self.masses[:, None] * v_star.numpy()[:, : self.u.shape[1]]
 
     def compressions(self, surroundings):
         """(n,) changes of number densities by the displacements [-], from the solver's kernel."""
-        solver, n_dot = self.solver, wp.zeros_like(self.solver.fields.n)
+        solver, n_dot = self.solver, wp.zeros_like(self.solver.fields["n"])
         x_dot = to_device(self.u, solver.discretisation.precision, solver.search.device)
-        solver.launch(solver.kernels.density.tangent, [surroundings, solver.fields.x, x_dot], [n_dot])
+        solver.launch(solver.kernels.density.tangent, s=surroundings, x=solver.fields["x"], x_dot=x_dot, n_dot=n_dot)
         return n_dot.numpy().astype(np.float64)
 
     def gap(self, forces, compressions):

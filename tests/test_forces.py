@@ -1,12 +1,13 @@
-"""What force terms promise: they add to adjoints, whatever others have added before."""
+"""What forces promise: they add to adjoints, whatever others have added before."""
 
 import numpy as np
 import warp as wp
 
 from cortado import Simulation
 from cortado.particles import Fields
-from cortado.solvers.forces import Adjoints, Gravity
 from cortado.solvers.pcisph_derivatives import PcisphAdjoint
+from cortado.sph.gravity import Gravity
+from cortado.sph.parts import Adjoints, Shares
 from scenes import plane_of_three, splash
 
 
@@ -14,21 +15,21 @@ def test_gravity_adds_to_its_adjoint():
     simulation = Simulation(splash(), precision="float64")
     solver, n = simulation.solver, simulation.particles
     bar = solver.new_parameters(2)
-    bar.gravity.assign(np.full((2, 3), 0.5))
+    bar["gravity"].assign(np.full((2, 3), 0.5))
     fields = Fields.zeros(n, simulation.precision, simulation.device)
+    shares = Shares(["time_step"], n, 1, simulation.precision, simulation.device)
     ones = wp.array(np.ones((n, 3)), dtype=wp.vec3d, device=simulation.device)
     solver.step_number.fill_(1)
-    gravity = Gravity(solver.discretisation, n, simulation.device)
+    gravity = Gravity(simulation.precision, n, simulation.device)
     for _ in range(2):
-        gravity.adjoint(solver.moment(solver.new_parameters(2)), ones, Adjoints(fields, bar))
-    np.testing.assert_array_equal(bar.gravity.numpy(), [[0.5] * 3, [0.5 + 2 * n] * 3])
+        gravity.adjoint(solver.context(solver.new_parameters(2)), ones, Adjoints(fields, bar, shares))
+    np.testing.assert_array_equal(bar["gravity"].numpy(), [[0.5] * 3, [0.5 + 2 * n] * 3])
 
 
-def test_what_terms_added_to_parameters_is_kept_to_the_end():
+def test_what_parts_added_to_parameters_is_kept_to_the_end():
     solver = Simulation(plane_of_three(), precision="float64").solver
-    bar = solver.new_parameters(2)
-    for array in bar.arrays():
+    adjoint = PcisphAdjoint(solver, steps=2)
+    for array in adjoint.bar.parameters.arrays():
         array.fill_(0.5)
-    PcisphAdjoint(solver).collect(bar)
-    for array in bar.arrays():
+    for array in adjoint.collect().arrays():
         np.testing.assert_array_equal(array.numpy(), 0.5)

@@ -16,21 +16,26 @@ import warp as wp
 
 from cortado.cells import Grid
 from cortado.launching import TreeSum, add, sum_and_maximum, sum_of
-from cortado.masses import masses, masses_adjoint, masses_tangent
 from cortado.neighbours import NeighbourSearch
+from cortado.parameters.reference_density import (
+    reference_density,
+    reference_density_adjoint,
+    reference_density_tangent,
+)
 from cortado.physics.contrast import contrast_kernels
 from cortado.physics.density import density_kernels
 from cortado.physics.diffusion import Diffusion, diffusion_kernels
 from cortado.physics.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
-from cortado.physics.gravity import gravity_kernels
 from cortado.physics.integration import integration_kernels
 from cortado.physics.mixture import mixture_kernels
 from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
 from cortado.physics.surroundings import Discretisation, surroundings_type
-from cortado.physics.viscosity import laminar_functions, pairwise_functions, viscosity_kernels
 from cortado.physics.walls import wall_kernels
 from cortado.precision import FLOAT32, FLOAT64, Precision
 from cortado.smoothing import CUBIC_SPLINE
+from cortado.sph.gravity import gravity_kernels
+from cortado.sph.pair_forces import laminar, pairwise
+from cortado.sph.viscosity import viscosity_kernels
 
 N, WALLS = 60, 40
 SUPPORT = 1.0
@@ -50,8 +55,8 @@ class Kernels:
     force = pressure_force_kernels(DISCRETISATION)
     integration = integration_kernels(FLOAT64)
     gravity = gravity_kernels(FLOAT64)
-    pairwise = viscosity_kernels(DISCRETISATION, pairwise_functions)
-    laminar = viscosity_kernels(DISCRETISATION, laminar_functions)
+    pairwise = viscosity_kernels(DISCRETISATION, pairwise)
+    laminar = viscosity_kernels(DISCRETISATION, laminar)
     mixture = mixture_kernels(FLOAT64, 3)
     diffusion = MappingProxyType(
         {
@@ -132,7 +137,7 @@ def cloud(name: str) -> Cloud:
     return Cloud(x, s, search, dimension)
 
 
-VECTORS = ("x", "v", "acceleration", "acceleration_in", "table", "x_star")
+VECTORS = ("x", "v", "acceleration", "acceleration_in", "gravity", "x_star")
 
 
 class Operation:
@@ -156,7 +161,7 @@ class Operation:
             "y": random.uniform(0.4, 1.0, N),
             "p_in": random.uniform(0.0, 1.0, N) * (random.uniform(0.0, 1.0, N) < 0.6),
             "time_step": np.array([0.2]),
-            "table": cloud.vectors(3, n=4),
+            "gravity": cloud.vectors(3, n=4),
         }
 
     def directions(self, seed: int, names: Sequence[str] | None = None) -> Values:
@@ -191,8 +196,8 @@ def dotted(dots: Values) -> Values:
 
 
 def zeros(*names: str) -> Values:
-    """Empty adjoints: vectors for x, v, scalars and pushes, reals for the rest."""
-    vectors = ("x_bar", "v_bar", "scalars_bar", "push_bar", "acceleration_bar")
+    """Empty adjoints: vectors for x, v and pushes, reals for the rest."""
+    vectors = ("x_bar", "v_bar", "push_bar", "acceleration_bar")
     return {name: np.zeros((N, 3) if name in vectors else N) for name in names}
 
 
@@ -303,7 +308,7 @@ class LaminarWithFriction(Laminar):
 
 
 class GravityTable(Operation):
-    inputs, outputs = ("table", "acceleration_in"), ("acceleration",)
+    inputs, outputs = ("gravity", "acceleration_in"), ("acceleration",)
     step = np.array([2], dtype=np.int32)
 
     def __init__(self, cloud):
@@ -318,8 +323,8 @@ class GravityTable(Operation):
 
     def adjoint(self, values, bars):
         total = sum_of(FLOAT64.vector, N, CPU)(array(bars["acceleration"])).numpy()
-        found = launch(Kernels.gravity.adjoint, 1, total=total, step=self.step, table_bar=np.zeros((4, 3)))
-        return {"table": found["table_bar"], "acceleration_in": bars["acceleration"]}
+        found = launch(Kernels.gravity.adjoint, 1, total=total, step=self.step, gravity_bar=np.zeros((4, 3)))
+        return {"gravity": found["gravity_bar"], "acceleration_in": bars["acceleration"]}
 
 
 class Pressure(Operation):
@@ -431,7 +436,7 @@ class Iterations(Operation):
             x_scene_bar=bars["x_new"],
             v_scene_bar=bars["v_new"],
             **zeros(
-                "scalars_bar", "x_bar", "v_bar", "n_bar", "m_bar", "rho_0_bar", "mu_bar", "push_bar", "y_bar", "p_bar"
+                "time_step_bar", "x_bar", "v_bar", "n_bar", "m_bar", "rho_0_bar", "mu_bar", "push_bar", "y_bar", "p_bar"
             ),
         )
         bar = {name: value for name, value in bar.items() if name.endswith("_bar")}
@@ -448,7 +453,7 @@ class Iterations(Operation):
             **{name: bar[f"{name}_bar"] for name in ("x", "v", "n", "m", "rho_0", "y")},
             "acceleration": found["acceleration_bar"],
             "p_in": bar["p_bar"],
-            "time_step": bar["scalars_bar"][:, 0].sum(keepdims=True),
+            "time_step": bar["time_step_bar"].sum(keepdims=True),
         }
 
 
@@ -472,7 +477,7 @@ class Blend(Operation):
         return launch(self.kernels.unsort, order=self.order, c=c, c_scene=np.zeros_like(c))["c_scene"]
 
     def forward(self, values):
-        found = launch(self.kernels.blend, **{**values, "rho_0": np.zeros(N), "mu": np.zeros(N)})
+        found = launch(self.kernels.blend.forward, **{**values, "rho_0": np.zeros(N), "mu": np.zeros(N)})
         return {**found, "c_new": self.in_scene_order(values["c"])}
 
     def materials(self, values):
@@ -480,7 +485,7 @@ class Blend(Operation):
 
     def tangent(self, values, dots):
         given = {**values, **dotted(dots), **self.materials(values)}
-        found = launch(self.kernels.blend_tangent, **given, rho_0_dot=np.zeros(N), mu_dot=np.zeros(N))
+        found = launch(self.kernels.blend.tangent, **given, rho_0_dot=np.zeros(N), mu_dot=np.zeros(N))
         return {"rho_0": found["rho_0_dot"], "mu": found["mu_dot"], "c_new": self.in_scene_order(dots["c"])}
 
     def adjoint(self, values, bars):
@@ -489,7 +494,7 @@ class Blend(Operation):
         sums = {
             name: np.stack([values] * 3, axis=1) for name, values in zeros("rest_density_bar", "viscosity_bar").items()
         }
-        found = launch(self.kernels.blend_adjoint, **given, **sums)
+        found = launch(self.kernels.blend.adjoint, **given, **sums)
         return {
             "c": found["c_bar"],
             "rest_density": found["rest_density_bar"].sum(axis=0),
@@ -500,7 +505,7 @@ class Blend(Operation):
 class Potential(Operation):
     """The chemical potential, and what mobility makes of it, alone; its adjoint is part of `Substep`'s."""
 
-    inputs, outputs = ("x", "n", "m", "c", "mobility_0", "interface_width"), ("chi", "w")
+    inputs, outputs = ("x", "n", "m", "c", "mobility", "interface_width"), ("chi", "w")
     variant = "2, double well, degenerate"
 
     def __init__(self, cloud):
@@ -511,18 +516,18 @@ class Potential(Operation):
             "c": random.dirichlet(np.ones(phases), N) + 0.03 * random.standard_normal((N, phases)),
             "w": random.uniform(0.6, 1.6, N),
             "chi": random.standard_normal((N, phases)),
-            "mobility_0": np.array([0.8]),
+            "mobility": np.array([0.8]),
             "interface_width": np.array([0.4]),
         }
         self.given = {"s": self.s, "strength": 1.7, "substeps": 3}
         self.empty = np.zeros((N, phases))
 
     def forward(self, values):
-        return launch(self.kernels.potential, **{**self.given, **values, "chi": self.empty, "w": np.zeros(N)})
+        return launch(self.kernels.potential.forward, **{**self.given, **values, "chi": self.empty, "w": np.zeros(N)})
 
     def tangent(self, values, dots):
         out = {"chi_dot": self.empty, "w_dot": np.zeros(N)}
-        found = launch(self.kernels.potential_tangent, **{**self.given, **values, **dotted(dots), **out})
+        found = launch(self.kernels.potential.tangent, **{**self.given, **values, **dotted(dots), **out})
         return {"chi": found["chi_dot"], "w": found["w_dot"]}
 
 
@@ -532,17 +537,17 @@ class Flux(Potential):
     inputs, outputs = ("x", "n", "m", "c", "w", "chi", "time_step"), ("c_new",)
 
     def forward(self, values):
-        return launch(self.kernels.flux, **self.given, **values, c_new=self.empty)
+        return launch(self.kernels.flux.forward, **self.given, **values, c_new=self.empty)
 
     def tangent(self, values, dots):
-        found = launch(self.kernels.flux_tangent, **self.given, **values, **dotted(dots), c_new_dot=self.empty)
+        found = launch(self.kernels.flux.tangent, **self.given, **values, **dotted(dots), c_new_dot=self.empty)
         return {"c_new": found["c_new_dot"]}
 
 
 class Substep(Potential):
     """One step of diffusion."""
 
-    inputs, outputs = ("x", "n", "m", "c", "time_step", "mobility_0", "interface_width"), ("c_new",)
+    inputs, outputs = ("x", "n", "m", "c", "time_step", "mobility", "interface_width"), ("c_new",)
     passed = ("c",)
 
     def record(self, values):
@@ -559,14 +564,14 @@ class Substep(Potential):
     def adjoint(self, values, bars):
         given = {**self.given, **self.record(values)}
         given |= launch(self.kernels.scale_adjoint, **{**given, "c_bar": bars["c_new"], "y": self.empty})
-        bar = {"c_bar": bars["c_new"], **zeros("x_bar", "n_bar", "m_bar", "scalars_bar")}
-        found = launch(self.kernels.flux_adjoint, **{**given, **bar, "z": self.empty})
-        bar = {name: found[name] for name in bar}
-        found = launch(self.kernels.potential_adjoint, **{**given, **bar, "z": found["z"]})
-        scalars = found["scalars_bar"].sum(axis=0)
+        shares = ("time_step_bar", "mobility_bar", "interface_width_bar")
+        bar = {"c_bar": bars["c_new"], **zeros("x_bar", "n_bar", "m_bar", *shares)}
+        found = launch(self.kernels.flux.adjoint, **{**given, **bar, "z": self.empty})
+        bar |= {name: found[name] for name in bar if name in found}
+        found = bar | launch(self.kernels.potential.adjoint, **{**given, **bar, "z": found["z"]})
         return {
             **{name: found[f"{name}_bar"] for name in ("x", "n", "m", "c")},
-            **{name: scalars[k : k + 1] for k, name in enumerate(("time_step", "mobility_0", "interface_width"))},
+            **{name.removesuffix("_bar"): found[name].sum(keepdims=True) for name in shares},
         }
 
 
@@ -723,13 +728,15 @@ def test_derivatives_of_masses(phases):
     random = np.random.default_rng(71)
     c, density = random.dirichlet(np.ones(phases), N), random.uniform(800.0, 2000.0, phases)
     c_dot, density_dot, bar = random.standard_normal((N, phases)), random.standard_normal(phases), random.random(N)
-    tangent = masses_tangent(c, density, c_dot, density_dot)
+    tangent = reference_density_tangent(c, density, c_dot, density_dot)
     step = 1e-30j
-    np.testing.assert_allclose(tangent, np.imag(masses(c + step * c_dot, density + step * density_dot)) / 1e-30, 1e-13)
-    c_bar, density_bar = masses_adjoint(c, density, bar)
+    np.testing.assert_allclose(
+        tangent, np.imag(reference_density(c + step * c_dot, density + step * density_dot)) / 1e-30, 1e-13
+    )
+    c_bar, density_bar = reference_density_adjoint(c, density, bar)
     backward = (c_bar * c_dot).sum() + (density_bar * density_dot).sum()
     assert backward == pytest.approx(bar @ tangent, rel=1e-13)
-    assert masses(np.eye(phases), density) == pytest.approx(density, rel=1e-15)
+    assert reference_density(np.eye(phases), density) == pytest.approx(density, rel=1e-15)
 
 
 SIZES = [1, 2, 63, 64, 65, 128, 4096, 4097, 5000]

@@ -13,18 +13,19 @@ ROOT = Path(cortado.__file__).parent
 
 LAYERS = """
     errors threads files memory input_files arrays interruption terminal kernel_cache
-    image_losses srgb masses
-    smoothing calibration parameter_values tilt
-    precision cells
+    image_losses srgb
+    smoothing calibration parameters.registry parameters.values parameters.tilt parameters.reference_density
+    precision kernels physics.reduction launching cells
     physics.smoothing_functions physics.surroundings
-    physics.density physics.walls physics.contrast physics.integration physics.gravity
-    physics.nozzle physics.pressure physics.viscosity physics.free_energy physics.spreading physics.diffusion
+    physics.density physics.walls physics.contrast physics.integration
+    physics.nozzle physics.pressure physics.free_energy physics.spreading physics.diffusion
     physics.mixture
     physics.frozen_pressure physics.adjoint_filters
-    physics.containment physics.convergence physics.reduction physics.matching
+    physics.containment physics.convergence physics.matching
     physics.tint physics.colour_field physics.interpolation physics.rays physics.absorption
     shapes region pairs walls.points walls.places walls.layers walls.weights walls
-    restart launching neighbours particles
+    restart neighbours particles
+    sph.parts sph.gravity sph.pair_forces sph.viscosity sph.mixture sph.nozzle sph
     render.cameras render.views render.fields render.marching render.renderer
     vtkhdf_layout vtkhdf
     scene_kinds scene_tables scene_toml point_reader scene_points
@@ -32,11 +33,11 @@ LAYERS = """
     discrete_scene
     reference.digits reference.engine reference.losses reference.histories reference.simulation reference
     trajectory
-    solvers.forces solvers.mixture solvers.containment solvers.emitter
+    solvers.containment
     solvers.pcisph_parts solvers.pcisph solvers.pcisph_derivatives solvers.adjoint_filters
     rollout
     policies.policy policies.exact policies.strength policies.filters policies.cloud policies.ensemble policies
-    losses checked_loss parameter_checks controls simulation problem
+    losses checked_loss parameters.checks parameters.space parameters simulation problem
     render.scene_renderer reparametrisation
     evaluations optimisers optimisation
     folder_lock run_environment run_folder progress pictures video
@@ -223,7 +224,16 @@ def test_import_is_light():
     assert not found, f"import cortado alone imports {', '.join(found)}"
 
 
-WITHOUT_WARP = ["errors", "masses", "smoothing", "calibration", "scene", "sampling", "discrete_scene", "reference"]
+WITHOUT_WARP = [
+    "errors",
+    "parameters.values",
+    "smoothing",
+    "calibration",
+    "scene",
+    "sampling",
+    "discrete_scene",
+    "reference",
+]
 """What an engine without Warp stands on."""
 
 

@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 from cortado import InputError, Problem, Simulation, Trajectory, losses, policies
-from cortado.masses import masses
+from cortado.parameters.reference_density import reference_density
 from cortado.physics.free_energy import FreeEnergy
 from scenes import MIXING, OIL, plane, plane_of_three, scene, two_layers
 
@@ -154,7 +154,7 @@ def test_phases_keep_their_mass_and_fractions_add_up_to_1(name):
     simulation = simulation_of(name)
     trajectory = simulation.run(200)
     c, first = trajectory.mass_fractions, simulation.mass_fractions
-    weights = masses(first, simulation.parameters()["rest_density"])
+    weights = reference_density(first, simulation.parameters()["rest_density"])
     kept = np.einsum("i,tik->tk", weights, c)
     assert trajectory.substeps in (2, 3)
     assert np.abs(trajectory.positions[-1] - trajectory.positions[0]).max() > 0.1  # it flowed
@@ -170,7 +170,7 @@ def test_momentum_is_kept_in_free_space(make):
     point = point_of(free)
     chosen = {name: point[name] for name in ("initial_positions", "initial_velocities", "mass_fractions")}
     trajectory = free.run(100, chosen)
-    m = masses(point["mass_fractions"], point["rest_density"])
+    m = reference_density(point["mass_fractions"], point["rest_density"])
     assert np.abs(trajectory.velocities[-1] - trajectory.velocities[0]).max() > 0.3
     momentum = np.einsum("i,tid->td", m, trajectory.velocities)
     assert np.abs(momentum - momentum[0]).max() < 1e-10 * (m[:, None] * np.abs(trajectory.velocities[0])).sum()

@@ -6,9 +6,10 @@ import pytest
 import reference
 import reference_mixture
 from cortado import Simulation
-from cortado.controls import Controls
+from cortado.parameters.space import ParameterSpace
 from cortado.policies import Exact
 from cortado.smoothing import KERNELS
+from cortado.sph.viscosity import Viscosity
 from scenes import plane, plane_of_three, scene, two_layers
 
 GRAVITY, STEPS, ITERATIONS = np.array([0.3, -9.81, 0.1]), 3, 5
@@ -40,7 +41,7 @@ def point_of(simulation, seed=0):
 def twin(simulation):
     """The slow twin of a simulation's solver, in the simulation's own dimension."""
     lattice, search, d = simulation.solver.lattice, simulation.solver.search, simulation.dimension
-    terms = [term for term in simulation.solver.terms if hasattr(term, "_friction")]
+    viscous = [force for force in simulation.solver.forces if isinstance(force, Viscosity)]
     return reference.Pcisph(
         simulation.solver.discretisation.smoothing,
         d,
@@ -50,7 +51,7 @@ def twin(simulation):
         search.wall_positions.numpy()[:, :d].astype(np.float64),
         search.wall_weights.numpy().astype(np.float64),
         viscosity=simulation.scene.forces.viscosity,
-        friction=terms[0]._friction if terms else 0.0,
+        friction=viscous[0].friction if viscous else 0.0,
         reach=1.03 * lattice.support,
         rigidity=lattice.rigidity,
         evenness=lattice.evenness,
@@ -126,7 +127,7 @@ def test_tangents_and_adjoints_equal_complex_steps_of_the_twin(make, kernel, vis
     values, d = point_of(simulation), simulation.dimension
     random = np.random.default_rng(1)
     along = {name: RATES.get(name, 1.0) * random.standard_normal(value.shape) for name, value in values.items()}
-    rollout, controls = simulation.rollout(STEPS, values), Controls(simulation, STEPS)
+    rollout, controls = simulation.rollout(STEPS, values), ParameterSpace(simulation, STEPS)
     rollout.forward()
     states = {}
     rollout.tangent(*controls.direction(rollout, values, along), lambda step, dot: states.update({step: dot.numpy(d)}))

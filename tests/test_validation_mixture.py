@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from cortado import Scene, Simulation, Trajectory
 from cortado.calibration import shear_factor
-from cortado.masses import masses
+from cortado.parameters.reference_density import reference_density
 
 
 def resting(
@@ -226,7 +226,7 @@ def test_the_free_energy_never_rises_and_phases_keep_their_mass(form):
     assert trajectory.substeps == 1
     np.testing.assert_array_equal(trajectory.positions[-1], positions)
 
-    mass = masses(first, np.array(densities))
+    mass = reference_density(first, np.array(densities))
     energy = Energy(simulation, positions, mass)
     energies = np.array([energy(c) for c in trajectory.mass_fractions])
     assert (np.diff(energies) < 0.0).all()

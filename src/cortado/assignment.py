@@ -7,7 +7,8 @@ import numpy as np
 
 from cortado.errors import DivergedError, InputError
 from cortado.losses import FinalPositions, Frames, Image, Loss, TrajectoryEnd
-from cortado.parameter_values import NOT_NEGATIVE, OVER_TIME, Arrays
+from cortado.parameters.registry import BY_NAME, Range
+from cortado.parameters.values import OVER_TIME, Arrays
 from cortado.pictures import heart, read_picture, rosetta
 from cortado.problem import Problem
 from cortado.render.renderer import Renderer
@@ -147,7 +148,8 @@ def _coordinates(task: Task, start: Arrays) -> dict[str, Coordinates]:
 def _bounds(task: Task) -> dict[str, tuple[Any, Any]]:
     """Bounds hold for knots as they do for what lies between them, and for logarithms after they are taken. A parameter
     that cannot be negative has 0 as a bound."""
-    free = [name for name in task.start if name in NOT_NEGATIVE and name not in task.optimise.logarithmic]
+    with_zero = [name for name in task.start if BY_NAME[name].range is Range.NOT_NEGATIVE]
+    free = [name for name in with_zero if name not in task.optimise.logarithmic]
     found: dict[str, tuple[Any, Any]] = dict.fromkeys(free, (0.0, None))
     for name, pair in (task.optimise.bounds or {}).items():
         lower, upper = (np.log(b) if name in task.optimise.logarithmic else b for b in pair)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.launching import launch
 from cortado.precision import Precision
 
 
@@ -156,20 +157,10 @@ class CellSort:
         """Find the order of cells of positions (n,) [m]; ties keep the given order."""
         if self._particles == 0:
             return
-        wp.launch(
-            self._kernels.number_cells,
-            self._particles,
-            inputs=[self.grid, positions],
-            outputs=[self._keys, self.order],
-            device=self._device,
-            record_tape=False,
+        keys, order, grid = self._keys, self.order, self.grid
+        launch(
+            self._kernels.number_cells, self._particles, self._device, grid=grid, x=positions, keys=keys, order=order
         )
-        wp.utils.radix_sort_pairs(self._keys, self.order, self._particles, 0, self._bits)
-        wp.launch(
-            self._kernels.find_starts,
-            self.grid.starts.shape[0],
-            inputs=[self._keys, self._particles],
-            outputs=[self.grid.starts],
-            device=self._device,
-            record_tape=False,
-        )
+        wp.utils.radix_sort_pairs(keys, order, self._particles, 0, self._bits)
+        starts, count = grid.starts, self._particles
+        launch(self._kernels.find_starts, len(starts), self._device, keys=keys, count=count, starts=starts)

@@ -1,7 +1,7 @@
-"""Launches over particles, and sums over particles in a fixed order."""
+"""Launches of kernels with arguments by name, and sums over particles in a fixed order."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import wait
 from contextlib import nullcontext
 from typing import Any
@@ -26,8 +26,40 @@ LEAST_SHARED_PART = 10_000
 """Particles at least in a range where there is more than one for each core."""
 
 
+Named = Mapping[str, Any]
+"""Arguments of kernels by name, of which a launch takes those that its kernel has."""
+
+
+def bound(kernel: wp.Kernel, groups: Sequence[Named], given: Named) -> list[Any]:
+    """The arguments of a kernel in its order: out of ``given``, all of which it must have, and out of the first of the
+    ``groups`` that has them, which may hold more.
+
+    Kernels take many arrays of one type, and nothing else would notice a mistake: raises `TypeError` for an argument
+    that is missing or that the kernel does not have.
+    """
+    names = [argument.label for argument in kernel.adj.args]
+    surplus = [name for name in given if name not in names]
+    if surplus:
+        raise TypeError(f"kernel {kernel.key} has no argument {surplus[0]!r}; it has {', '.join(names)}.")
+    sources = (given, *groups)
+    arguments = []
+    for name in names:
+        for source in sources:
+            if name in source:
+                arguments.append(source[name])
+                break
+        else:
+            raise TypeError(f"argument {name!r} of kernel {kernel.key} is missing; it has {', '.join(names)}.")
+    return arguments
+
+
+def launch(kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, **arguments: Any) -> None:
+    """Launch a kernel, off any tape, with arguments by name; ``threads``: their number, or a shape."""
+    wp.launch(kernel, threads, inputs=bound(kernel, groups, arguments), device=device, record_tape=False)
+
+
 class Launcher:
-    """Launches kernels with one thread a particle on one device.
+    """Launches kernels with one thread a particle on one device, with arguments by name (see `bound`).
 
     On a CPU Warp launches in one thread; a kernel that sums over neighbours, which begins with its surroundings, is cut
     into ranges of particles, several for each core where there are many, and a core that has done one takes the next.
@@ -53,22 +85,17 @@ class Launcher:
         """Whether launches may be captured as a graph: those of one thread."""
         return self.parts == 1
 
-    def __call__(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any], threads: int | None = None) -> None:
+    def __call__(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
+        inputs = bound(kernel, groups, arguments)
         if not self.capturable and hasattr(inputs[0], "neighbours"):
             if kernel in self._compiled:
-                self._launch_parts(kernel, inputs, outputs)
+                self._launch_parts(kernel, inputs)
                 return
             self._compiled.add(kernel)  # by the one launch that follows
-        wp.launch(
-            kernel,
-            threads or self.particles,
-            inputs=inputs,
-            outputs=outputs,
-            device=self.device,
-            record_tape=self._record_tape,
-        )
+        threads = threads or self.particles
+        wp.launch(kernel, threads, inputs=inputs, device=self.device, record_tape=self._record_tape)
 
-    def _launch_parts(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
+    def _launch_parts(self, kernel: wp.Kernel, inputs: Sequence[Any]) -> None:
         if self._whole is not inputs[0]:
             self._whole, self._parts = inputs[0], [self._part(inputs[0], n) for n in range(self.parts)]
 
@@ -80,7 +107,6 @@ class Launcher:
                     kernel,
                     self._bounds[part + 1] - self._bounds[part],
                     inputs=[self._parts[part], *inputs[1:]],
-                    outputs=outputs,
                     device=self.device,
                     record_tape=False,
                 )
@@ -141,14 +167,8 @@ class TreeSum:
     def __call__(self, values: wp.array) -> wp.array:
         """The sum as an array (1,), which the next call overwrites."""
         for partial in self._levels:
-            wp.launch(
-                self._kernel,
-                partial.shape[0],
-                inputs=[values.shape[0], partial.shape[0], values],
-                outputs=[partial],
-                device=self._device,
-                record_tape=False,
-            )
+            size = partial.shape[0]
+            launch(self._kernel, size, self._device, count=len(values), stride=size, values=values, partial=partial)
             values = partial
         return values
 
@@ -165,11 +185,4 @@ def sum_and_maximum(particles: int, precision: Precision, device: Any) -> TreeSu
 
 def add(values: wp.array, total: wp.array) -> None:
     """total += values, element by element."""
-    wp.launch(
-        add_kernel(values.dtype),
-        len(values),
-        inputs=[values],
-        outputs=[total],
-        device=values.device,
-        record_tape=False,
-    )
+    launch(add_kernel(values.dtype), len(values), values.device, value=values, total=total)

@@ -12,7 +12,7 @@ import warp as wp
 from cortado.arrays import as_numbers
 from cortado.errors import InputError, shown
 from cortado.image_losses import ImageLoss, SquaredDifference
-from cortado.launching import sum_of
+from cortado.launching import launch, sum_of
 from cortado.particles import State, to_device
 from cortado.physics.matching import matching_kernels
 from cortado.precision import FLOAT32, FLOAT64, Precision
@@ -113,7 +113,7 @@ class FinalPositions:
         x, target, device = self._positions_and_target(end)
         squares = wp.empty(len(x), dtype=wp.float64, device=device)
         kernels = matching_kernels(end.precision)
-        wp.launch(kernels.squared_distance, len(x), inputs=[x, target], outputs=[squares], device=device)
+        launch(kernels.squared_distance, len(x), device, x=x, target=target, squares=squares)
         total = sum_of(wp.float64, len(x), device)(squares)
         return float(total.numpy()[0]) / len(x)
 
@@ -124,7 +124,7 @@ class FinalPositions:
         bar.clear()
         kernels = matching_kernels(end.precision)
         factor = 2.0 / len(x)
-        wp.launch(kernels.difference, len(x), inputs=[factor, x, target], outputs=[bar.positions], device=device)
+        launch(kernels.difference, len(x), device, factor=factor, x=x, target=target, bar=bar.positions)
         return bar
 
     def _positions_and_target(self, end: TrajectoryEnd) -> tuple[wp.array, wp.array, Any]:

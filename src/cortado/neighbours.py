@@ -169,8 +169,17 @@ class NeighbourSearch:
 
     def fill(self, surroundings: Any, positions: wp.array) -> None:
         """List the neighbours of sorted positions (n,) [m]; `needed` tells whether the lists were long enough."""
-        outputs = [self.fluid_count, self.filling, self.count, self._needed]
-        self._launch(self._fill, [surroundings, self._sort.grid, self._wall_sort.grid, positions], outputs)
+        self._launch(
+            self._fill,
+            s=surroundings,
+            grid=self._sort.grid,
+            wall_grid=self._wall_sort.grid,
+            x=positions,
+            fluid_count=self.fluid_count,
+            filling=self.filling,
+            count=self.count,
+            needed=self._needed,
+        )
 
     @property
     def needed(self) -> int:

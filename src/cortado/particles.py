@@ -1,12 +1,13 @@
-"""What a scene becomes: dataclasses of plain Warp arrays. Vectors have three components here, z is 0 in 2-D."""
+"""What a scene becomes on a device: Warp arrays by name. Vectors have three components here, z is 0 in 2-D."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
 from typing import Any, Self
 
 import numpy as np
 import warp as wp
 
-from cortado.parameter_values import TABLES
+from cortado.parameters.registry import BY_NAME, Axis, Role, names
+from cortado.parameters.values import OVER_TIME
 from cortado.precision import Precision
 
 
@@ -21,11 +22,29 @@ def to_device(values: np.ndarray, precision: Precision, device: Any) -> wp.array
 
 
 class Arrays:
-    """A dataclass of Warp arrays."""
+    """Warp arrays by name."""
+
+    def __init__(self, arrays: Mapping[str, wp.array]):
+        self._arrays = dict(arrays)
+        self._named: dict[str, dict[str, wp.array]] = {}
+
+    def __getitem__(self, name: str) -> wp.array:
+        return self._arrays[name]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Their names, in their order."""
+        return tuple(self._arrays)
 
     def arrays(self) -> list[wp.array]:
-        """Its arrays, in the order of its fields."""
-        return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]
+        """The arrays, in their order."""
+        return list(self._arrays.values())
+
+    def named(self, suffix: str = "") -> dict[str, wp.array]:
+        """The arrays as kernels call their arguments: "_dot" behind the name of a tangent, "_bar" of an adjoint."""
+        if suffix not in self._named:
+            self._named[suffix] = {name + suffix: array for name, array in self._arrays.items()}
+        return self._named[suffix]
 
     def assign(self, other: Self) -> None:
         """Copy another of the same device and sizes, without a host round trip."""
@@ -34,7 +53,11 @@ class Arrays:
 
     def like(self) -> Self:
         """One of the same sizes that is still to be written."""
-        return type(self)(*(wp.empty_like(array, requires_grad=False) for array in self.arrays()))
+        return type(self)({name: wp.empty_like(a, requires_grad=False) for name, a in self._arrays.items()})
+
+    def gradients(self) -> Self:
+        """The adjoints of the arrays that Warp's tape has written."""
+        return type(self)({name: array.grad for name, array in self._arrays.items()})
 
     def clear(self) -> None:
         """Make everything 0."""
@@ -42,25 +65,42 @@ class Arrays:
             array.zero_()
 
 
-@dataclass(frozen=True)
+def zeros(kinds: Mapping[str, tuple[int, Any]], device: Any, requires_grad: bool = False) -> dict[str, wp.array]:
+    """Arrays of zeros by name, each of a size and a Warp type."""
+    options = {"device": device, "requires_grad": requires_grad}
+    return {name: wp.zeros(size, dtype=dtype, **options) for name, (size, dtype) in kinds.items()}
+
+
 class State(Arrays):
     """Where the fluid is, how it moves and what it is, in the scene's order of particles. Also the type of its
-    derivatives."""
+    derivatives.
 
-    positions: wp.array
-    """(n,) vectors [m]."""
-    velocities: wp.array
-    """(n,) vectors [m / s]."""
-    mass_fractions: wp.array
-    """(n,) of as many numbers as there are phases [-]."""
+    ``positions`` (n,) vectors [m], ``velocities`` (n,) vectors [m / s], ``mass_fractions`` (n,) of as many numbers as
+    there are phases [-].
+    """
+
+    @property
+    def positions(self) -> wp.array:
+        """(n,) vectors [m]."""
+        return self["positions"]
+
+    @property
+    def velocities(self) -> wp.array:
+        """(n,) vectors [m / s]."""
+        return self["velocities"]
+
+    @property
+    def mass_fractions(self) -> wp.array:
+        """(n,) of as many numbers as there are phases [-]."""
+        return self["mass_fractions"]
 
     @classmethod
-    def zeros(
-        cls, particles: int, phases: int, precision: Precision, device: Any, requires_grad: bool = False
-    ) -> "State":
+    def zeros(cls, particles: int, phases: int, precision: Precision, device: Any, requires_grad: bool = False) -> Self:
         """A state of zeros."""
-        types = (precision.vector, precision.vector, precision.fractions(phases))
-        return cls(*(wp.zeros(particles, dtype=t, device=device, requires_grad=requires_grad) for t in types))
+        vectors = (particles, precision.vector)
+        fractions = (particles, precision.fractions(phases))
+        kinds = {"positions": vectors, "velocities": vectors, "mass_fractions": fractions}
+        return cls(zeros(kinds, device, requires_grad))
 
     def set(self, positions: np.ndarray, velocities: np.ndarray, mass_fractions: np.ndarray) -> None:
         """Write arrays, (n, d) vectors and (n, phases)."""
@@ -77,78 +117,45 @@ class State(Arrays):
         )
 
 
-@dataclass(frozen=True)
 class Parameters(Arrays):
-    """What a run depends on besides its first state. Also the type of its derivatives."""
+    """What steps depend on besides the state, by the names of the registry. Also the type of its derivatives.
 
-    gravity: wp.array
-    """(steps,) vectors [m / s2]: one for each step."""
-    masses: wp.array
-    """(n,) of a particle over its volume on the rest lattice [kg / m3], in the scene's order."""
-    rest_density: wp.array
-    """(phases,) [kg / m3]"""
-    viscosity: wp.array
-    """(phases,) dynamic [Pa s]"""
-    time_step: wp.array
-    """(1,) [s]"""
-    mobility: wp.array
-    """(1,) M_0 of Cahn-Hilliard diffusion [m2 / s]"""
-    interface_width: wp.array
-    """(1,) epsilon of Cahn-Hilliard diffusion [m]"""
-    nozzle_path: wp.array
-    """(steps,) vectors [m]: where the opening of the nozzle is after each step."""
-    flow_rate: wp.array
-    """(1,) of the nozzle [m3 / s]"""
+    A parameter over time is (steps,) vectors, one of phases (phases,) numbers, any other (1,) number. Besides them
+    ``reference_density`` (n,) [kg / m3]: the mass of a particle over its volume on the rest lattice, in the scene's
+    order.
+    """
 
     @classmethod
     def zeros(
         cls, steps: int, particles: int, phases: int, precision: Precision, device: Any, requires_grad: bool = False
-    ) -> "Parameters":
+    ) -> Self:
         """Parameters of a run of so many steps, all 0."""
-        options = {"device": device, "requires_grad": requires_grad}
-        sizes = {"masses": particles, "rest_density": phases, "viscosity": phases}
-        return cls(
-            *(
-                wp.zeros(max(steps, 1), dtype=precision.vector, **options)
-                if field.name in TABLES
-                else wp.zeros(sizes.get(field.name, 1), dtype=precision.real, **options)
-                for field in fields(cls)
-            )
-        )
+        sizes = {Axis.STEP: (max(steps, 1), precision.vector), Axis.PHASE: (phases, precision.real)}
+        kinds = {name: sizes.get(BY_NAME[name].axis, (1, precision.real)) for name in names(Role.RUN)}
+        return cls(zeros({**kinds, "reference_density": (particles, precision.real)}, device, requires_grad))
 
-    def set_tables(self, **values: np.ndarray) -> None:
-        """Write any of `TABLES` by name, (d,) for every step or (steps, d)."""
+    def set(self, values: Mapping[str, Any]) -> None:
+        """Write some by name: a vector (d,) for every step, or vectors (steps, d); numbers or arrays of them."""
         for name, value in values.items():
-            table = np.zeros((len(getattr(self, name)), 3))
-            table[:, : value.shape[-1]] = value
-            getattr(self, name).assign(table)
-
-    def set_constants(self, **values: Any) -> None:
-        """Write any of the others by name, numbers or arrays."""
-        for name, value in values.items():
-            array = getattr(self, name)
-            array.assign(np.broadcast_to(np.asarray(value, dtype=np.float64), array.shape))
+            array, given = self[name], np.asarray(value, dtype=np.float64)
+            if name in OVER_TIME:
+                table = np.zeros((len(array), 3))
+                table[:, : given.shape[-1]] = given
+                array.assign(table)
+            else:
+                array.assign(np.broadcast_to(given, array.shape))
 
 
-@dataclass(frozen=True)
 class Fields(Arrays):
-    """Sorted particles within a step. Also the type of tangents and adjoints."""
+    """Sorted particles within a step. Also the type of tangents and adjoints.
 
-    x: wp.array
-    """(n,) positions [m]"""
-    v: wp.array
-    """(n,) velocities [m / s]"""
-    n: wp.array
-    """(n,) number densities [-]: 1 on the rest lattice"""
-    m: wp.array
-    """(n,) masses over the volume on the rest lattice [kg / m3]: the density is m n"""
-    rho_0: wp.array
-    """(n,) rest densities [kg / m3]"""
-    mu: wp.array
-    """(n,) dynamic viscosities [Pa s]"""
+    ``x`` (n,) positions [m]; ``v`` (n,) velocities [m / s]; ``n`` (n,) number densities [-], 1 on the rest lattice;
+    ``m`` (n,) masses over the volume on the rest lattice [kg / m3], so that the density is m n; ``rho_0`` (n,) rest
+    densities [kg / m3]; ``mu`` (n,) dynamic viscosities [Pa s].
+    """
 
     @classmethod
-    def zeros(cls, particles: int, precision: Precision, device: Any, requires_grad: bool = False) -> "Fields":
+    def zeros(cls, particles: int, precision: Precision, device: Any, requires_grad: bool = False) -> Self:
         """Fields of zeros."""
-        types = [precision.vector] * 2 + [precision.real] * 4
-        return cls(*(wp.zeros(particles, dtype=t, device=device, requires_grad=requires_grad) for t in types))
+        types = dict.fromkeys("xv", precision.vector) | dict.fromkeys(("n", "m", "rho_0", "mu"), precision.real)
+        return cls(zeros({name: (particles, dtype) for name, dtype in types.items()}, device, requires_grad))

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from cortado.checked_loss import as_loss
-from cortado.controls import Controls
 from cortado.errors import CortadoWarning, InputError
 from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd, fingerprint
 from cortado.memory import gradient_parts, require
-from cortado.parameter_values import NAMES, UNITS, Arrays, Values
+from cortado.parameters.space import ParameterSpace
+from cortado.parameters.values import NAMES, UNITS, Arrays, Values
 from cortado.particles import State
 from cortado.policies import AdjointPolicy, Estimate, Policy, estimate
 from cortado.rollout import MEMORY_BUDGET, Observer, Rollout, StepDerivative
@@ -31,7 +31,7 @@ class Problem:
 
     - ``gravity`` (d,) or (steps, d) [m / s2]; ``time_step`` [s];
     - in the place of gravity ``tilt`` (d - 1,) or (steps, d - 1) [degrees], how far the scene's gravity leans, with its
-      size kept: where it is along -y, towards x and, in 3-D, z; see `cortado.tilt.Tilt`;
+      size kept: where it is along -y, towards x and, in 3-D, z; see `cortado.parameters.tilt.Tilt`;
     - ``initial_positions`` [m] and ``initial_velocities`` [m / s], (n, d);
     - ``viscosity`` [Pa s] and ``rest_density`` [kg / m3], a number, with several phases (phases,);
     - with several phases the first ``mass_fractions`` (n, phases), ``mobility`` [m2 / s], ``interface_width`` [m];
@@ -64,7 +64,7 @@ class Problem:
             if step not in range(self.steps + 1):
                 raise InputError(f"losses has the frame {step!r}, but must have frames from 0 to {self.steps}.")
         self._losses: dict[int, Loss] = {step: as_loss(one) for step, one in by_step.items()}
-        self._controls = Controls(simulation, self.steps)
+        self._space = ParameterSpace(simulation, self.steps)
         self._rollout = Rollout(simulation.solver, self.steps, memory_budget)
         self._derivatives: dict[AdjointPolicy, StepDerivative] = {}
 
@@ -80,7 +80,7 @@ class Problem:
     @in_turn
     def value(self, parameters: Values) -> float:
         """The loss, forward only."""
-        return self._total(self._ends(self._controls.checked(parameters), self._losses, keep=False))
+        return self._total(self._ends(self._space.checked(parameters), self._losses, keep=False))
 
     def end(self, parameters: Values) -> TrajectoryEnd:
         """The last state of the rollout under these parameters."""
@@ -89,12 +89,12 @@ class Problem:
     @in_turn
     def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, TrajectoryEnd]:
         """States of the rollout under these parameters, by the number of steps before them."""
-        return self._ends(self._controls.checked(parameters), steps, keep=False)
+        return self._ends(self._space.checked(parameters), steps, keep=False)
 
     @in_turn
     def run(self, parameters: Values, record_every: int = 1) -> Trajectory:
         """The whole trajectory under these parameters; see `Simulation.run`."""
-        self._controls.begin(self._rollout, self._controls.checked(parameters))
+        self._space.begin(self._rollout, self._space.checked(parameters))
         return self.simulation.collect(self._rollout, record_every)
 
     def value_and_gradient(self, parameters: Values, policy: Policy | None = None) -> tuple[float, Arrays]:
@@ -123,20 +123,20 @@ class Problem:
     @in_turn
     def passage(self, parameters: Values) -> "Passage":
         """A forward run that can be gone back through, until the next evaluation: what policies work with."""
-        values = self._controls.checked(parameters)
+        values = self._space.checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         evaluation = self._rollout.evaluation  # before the loss, which may evaluate the problem itself
         bars = {step: self._adjoint(step, end) for step, end in ends.items()}
-        return Passage(self._total(ends), self._rollout, values, bars, self._controls, self._derivatives, evaluation)
+        return Passage(self._total(ends), self._rollout, values, bars, self._space, self._derivatives, evaluation)
 
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> float:
         """The derivative of the loss along ``directions`` (any of the parameters), by forward mode."""
-        values = self._controls.checked(parameters)
-        along = self._controls.checked(directions, "direction")
+        values = self._space.checked(parameters)
+        along = self._space.checked(directions, "direction")
         ends = self._ends(values, self._losses, keep=False, varied=along)
         bars = {step: self._adjoint(step, end) for step, end in ends.items()}
-        dot, parameters_dot = self._controls.direction(self._rollout, values, along)
+        dot, parameters_dot = self._space.direction(self._rollout, values, along)
         terms = [np.sum(bar.colours * along["colours"]) for bar in bars.values()] if "colours" in along else []
 
         def observe(step: int, dot: State) -> None:
@@ -170,14 +170,14 @@ class Problem:
         self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()
     ) -> dict[int, TrajectoryEnd]:
         """States by the number of steps before them; ``keep`` checkpoints for a way back."""
-        wanted, colours = set(steps), self._controls.colours(values)
+        wanted, colours = set(steps), self._space.colours(values)
         ends: dict[int, TrajectoryEnd] = {}
 
         def observe(step: int, state: State) -> None:
             if step in wanted:
                 ends[step] = TrajectoryEnd(state, self.simulation.dimension, colours)
 
-        self._controls.begin(self._rollout, values, varied)
+        self._space.begin(self._rollout, values, varied)
         if 0 in wanted:
             first = self._rollout.initial.like()
             first.assign(self._rollout.initial)
@@ -209,7 +209,7 @@ class Passage:
     rollout: Rollout
     _values: Arrays
     _bars: Mapping[int, EndAdjoint]
-    _controls: Controls
+    _space: ParameterSpace
     _derivatives: dict[AdjointPolicy, StepDerivative]
     _evaluation: int
 
@@ -241,7 +241,7 @@ class Passage:
             )
         bars, values = self._bars, self._values
         first = self.rollout.backward(derivative, {step: bar.state for step, bar in bars.items()}, observe)
-        gradient = self._controls.gradient(values, first, derivative.parameters())
+        gradient = self._space.gradient(values, first, derivative.parameters())
         if "colours" in values:
             gradient["colours"] = np.sum([bar.colours for bar in bars.values()], axis=0)
         return {name: gradient[name] for name in values}

@@ -12,7 +12,7 @@ import numpy as np
 
 from cortado.arrays import as_numbers
 from cortado.errors import InputError
-from cortado.parameter_values import Arrays
+from cortado.parameters.values import Arrays
 from cortado.policies import Estimate, Passage, Policy, estimate
 from cortado.problem import Problem
 from cortado.rollout import Observer, StepDerivative

@@ -220,7 +220,7 @@ class Rollout:
         """From ``dot``, the tangent of the first state, to that of every state, given to ``observe``; `forward` has
         run."""
         self._set_solver()
-        derivative = PcisphTangent(self.solver)
+        derivative = PcisphTangent(self.solver, parameters_dot)
         state = self.initial.like()
         state.assign(self.initial)
         observe(0, dot)
@@ -228,7 +228,7 @@ class Rollout:
             iterations = int(self.iterations[n])
             self.solver.step_number.fill_(n)
             self.solver.record(state, self.parameters, iterations)
-            derivative.step(iterations, dot, dot, self.parameters, parameters_dot)
+            derivative.step(iterations, dot, dot, self.parameters)
             self.solver.recorded(iterations, self.parameters, state)
             observe(n + 1, dot)
 

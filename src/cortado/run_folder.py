@@ -14,7 +14,7 @@ from cortado.errors import InputError
 from cortado.evaluations import FILE_NAME
 from cortado.files import UNFINISHED, parsed_json, sentences, write_atomically
 from cortado.input_files import content, reason
-from cortado.parameter_values import NAMES
+from cortado.parameters.values import NAMES
 from cortado.run_environment import as_json, plain, require_same, session
 
 _RESUMABLE = "optimise"

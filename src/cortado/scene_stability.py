@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cortado.parameter_values import Arrays
+from cortado.parameters.values import Arrays
 from cortado.shapes import Points
 
 if TYPE_CHECKING:

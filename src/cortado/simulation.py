@@ -9,13 +9,13 @@ import numpy as np
 import warp as wp
 
 from cortado.calibration import SKIN, diffusion_limit
-from cortado.controls import Controls
 from cortado.discrete_scene import DiscreteScene, discretise
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.memory import frame_parts, require, simulation_parts
 from cortado.neighbours import Grid, NeighbourSearch
-from cortado.parameter_checks import check_sizes
-from cortado.parameter_values import MATERIALS
+from cortado.parameters.checks import check_sizes
+from cortado.parameters.space import ParameterSpace
+from cortado.parameters.values import scene_values
 from cortado.particles import State, padded
 from cortado.physics.diffusion import Diffusion
 from cortado.physics.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
@@ -27,11 +27,13 @@ from cortado.sampling import FluidSample
 from cortado.scene import Scene
 from cortado.scene_containers import NoContainer
 from cortado.solvers.containment import Walled
-from cortado.solvers.emitter import Nozzle
-from cortado.solvers.forces import ForceTerm, Gravity, laminar_viscosity, pairwise_viscosity
-from cortado.solvers.mixture import Phases
 from cortado.solvers.pcisph import Pcisph
 from cortado.solvers.pcisph_parts import PressureSolve
+from cortado.sph.gravity import Gravity
+from cortado.sph.mixture import Phases
+from cortado.sph.nozzle import Nozzle
+from cortado.sph.parts import Force
+from cortado.sph.viscosity import laminar_viscosity, pairwise_viscosity
 from cortado.threads import WARP, Turn, in_turn
 from cortado.trajectory import Trajectory
 from cortado.walls.layers import WallLayers
@@ -165,10 +167,10 @@ class Simulation:
     def constants(self, rollout: Rollout, frames: np.ndarray) -> RunConstants:
         """What a restart needs besides the frames, which are after so many steps (frames,) of the rollout."""
         parameters, elapsed = rollout.parameters, rollout.elapsed
-        density = parameters.masses.numpy()
+        density = parameters["reference_density"].numpy()
         if self.scene.emitter is None:
             return RunConstants(density, rollout.time_step)
-        path = parameters.nozzle_path.numpy()[:, : self.dimension]
+        path = parameters["nozzle_path"].numpy()[:, : self.dimension]
         first = path[:1] if elapsed.outlet is None else elapsed.outlet[None]
         outlets = np.concatenate([first, path]).astype(path.dtype)[frames]
         return RunConstants(density, rollout.time_step, rollout.flow_rate, outlets)
@@ -180,7 +182,7 @@ class Simulation:
         """A rollout that is ready to go forward from the scene's first state; see `run` for ``controls`` and
         ``state``."""
         rollout = Rollout(self.solver, check_steps(steps))
-        space = Controls(self, rollout.steps)
+        space = ParameterSpace(self, rollout.steps)
         values = space.checked(controls or {}, "control")
         if state is not None:
             space.check_restart(state, values)
@@ -189,25 +191,7 @@ class Simulation:
 
     def parameters(self) -> dict[str, np.ndarray]:
         """Every parameter of `Problem` as the scene has it."""
-        scene = self.scene
-        values: dict[str, Any] = {
-            "gravity": scene.forces.gravity,
-            "initial_positions": self.positions,
-            "initial_velocities": self.velocities,
-            "mass_fractions": self.mass_fractions,
-            "rest_density": [phase.rest_density for phase in scene.phase],
-            "viscosity": [phase.viscosity for phase in scene.phase],
-            "time_step": scene.solver.time_step,
-            "mobility": scene.mixture.mobility,
-            "interface_width": scene.mixture.width(scene.discretisation.spacing),
-            "colours": [phase.colour for phase in scene.phase],
-        }
-        if scene.emitter is not None:
-            values |= {"nozzle_path": scene.emitter.outlet, "flow_rate": scene.emitter.flow_rate}
-        arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
-        if len(scene.phase) == 1:
-            arrays |= {name: arrays[name][0] for name in MATERIALS}
-        return arrays
+        return scene_values(self)
 
     def substeps(
         self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
@@ -265,7 +249,7 @@ class Simulation:
             discretisation,
             discrete.lattice,
             search,
-            self._terms(discretisation, discrete.wall_layers),
+            self._forces(discretisation, discrete.wall_layers),
             self._pressure(),
             [*discrete.periods, *np.zeros(3 - self.dimension)],
             self._phases(discretisation),
@@ -298,12 +282,12 @@ class Simulation:
         diffusion = Diffusion(discretisation, count, self.free_energy, MOBILITIES[mixture.mobility_form])
         return Phases(count, diffusion, mixture.strength)
 
-    def _terms(self, discretisation: Discretisation, layers: WallLayers) -> list[ForceTerm]:
-        terms: list[ForceTerm] = [Gravity(discretisation, self.particles, self.device)]
+    def _forces(self, discretisation: Discretisation, layers: WallLayers) -> list[Force]:
+        forces: list[Force] = [Gravity(self.precision, self.particles, self.device)]
         if self.scene.forces.viscosity in VISCOSITIES:
             wall = layers if getattr(self.scene.container, "slip", "free") == "no" else None
-            terms.append(VISCOSITIES[self.scene.forces.viscosity](discretisation, self.dimension, wall))
-        return terms
+            forces.append(VISCOSITIES[self.scene.forces.viscosity](discretisation, self.dimension, wall))
+        return forces
 
     def _pressure(self) -> PressureSolve | None:
         solver = self.scene.solver

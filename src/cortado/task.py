@@ -9,15 +9,8 @@ from typing import Any
 import numpy as np
 
 from cortado.errors import Phrase, SceneError
-from cortado.parameter_values import (
-    NOT_NEGATIVE,
-    OF_EMITTER,
-    OVER_TIME,
-    POSITIVE,
-    SUM_TOLERANCE,
-    Arrays,
-    parameter_shapes,
-)
+from cortado.parameters.registry import BY_NAME, Range
+from cortado.parameters.values import OVER_TIME, SUM_TOLERANCE, Arrays, is_too_small
 from cortado.reparametrisation import Knots
 from cortado.sampling import fluid_particles
 from cortado.scene import Scene, read_toml, scene_from_dict
@@ -69,10 +62,9 @@ def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int) -
     found = {}
     for name, array in values.items():
         field = f"{table}.{name}"
-        if name in OF_EMITTER and scene.emitter is None:
-            raise SceneError(None, field, Phrase("given"), "left out, as the scene has no emitter")
-        if name == "tilt" and not any(scene.forces.gravity):
-            raise SceneError(None, field, Phrase("given"), "left out, as the scene has no gravity to lean")
+        parameter = BY_NAME[name]
+        if not parameter.present(scene):
+            raise SceneError(None, field, Phrase("given"), f"left out, as the scene {parameter.absent}")
         if name == "gravity" and "tilt" in values:
             wanted = "left out, as the tilt says where it points"
             raise SceneError(None, field, Phrase("given"), wanted)
@@ -93,11 +85,10 @@ def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int) -
 
 
 def _check_range(name: str, field: str, array: np.ndarray) -> None:
-    if name in POSITIVE and (array <= 0.0).any():
-        raise SceneError(None, field, float(array.min()), "greater than 0")
-    if name in NOT_NEGATIVE and (array < 0.0).any():
-        raise SceneError(None, field, float(array.min()), "at least 0")
-    if name == "mass_fractions":
+    allowed = BY_NAME[name].range
+    if is_too_small(array, allowed):
+        raise SceneError(None, field, float(array.min()), allowed.value)
+    if allowed is Range.FRACTIONS:
         row = int(np.abs(array.sum(axis=1) - 1.0).argmax())
         if abs(array[row].sum() - 1.0) > SUM_TOLERANCE:
             raise SceneError(None, f"{field}[{row}]", array[row].tolist(), "fractions that add up to 1")
@@ -167,7 +158,7 @@ def _check_bounds(name: str, pair: np.ndarray, optimise: OptimiseTable, start: M
 
 def _shapes(name: str, scene: Scene, steps: int) -> list[tuple[int, ...]]:
     """The shapes that a parameter may have; () is a number."""
-    return parameter_shapes(name, steps, len(scene.phase), fluid_particles(scene).positions.shape)
+    return BY_NAME[name].shapes(steps, len(scene.phase), fluid_particles(scene).positions.shape)
 
 
 def _in_words(shapes: Sequence[tuple[int, ...]]) -> str:

@@ -8,9 +8,10 @@ import numpy as np
 from cortado.assignment import Assignment
 from cortado.figures import curve, images, loss_curve, parameters, particles
 from cortado.optimisation import Result
-from cortado.parameter_values import MATERIALS, OVER_TIME, UNITS
+from cortado.parameters.registry import BY_NAME, Axis
+from cortado.parameters.tilt import Tilt
+from cortado.parameters.values import OVER_TIME, UNITS
 from cortado.report import Figures
-from cortado.tilt import Tilt
 from cortado.video import MOST_FRAMES, write_video
 
 MOST_CURVES = 12
@@ -80,6 +81,7 @@ def _parameter(made: Assignment, result: Result, name: str, folder: Path) -> Fig
     history = [np.broadcast_arrays(value, hidden)[0] for value in values]
     hidden = np.broadcast_to(hidden, history[0].shape)
     phases = [phase.name for phase in made.task.scene.phase]
-    names = phases if name in MATERIALS and len(phases) > 1 else None
+    is_material = BY_NAME[name].axis is Axis.PHASE and BY_NAME[name].components is None
+    names = phases if is_material and len(phases) > 1 else None
     path = parameters(history, hidden, folder / f"{name}.png", names=names, title=name, unit=UNITS[name])
     return [(f"The parameter {name} during the optimisation, and the hidden one.", path)]

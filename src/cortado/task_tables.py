@@ -11,7 +11,7 @@ from pydantic import model_validator
 from cortado.errors import Phrase
 from cortado.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisers import LBFGS, Adam, GradientDescent, Optimiser
-from cortado.parameter_values import NAMES
+from cortado.parameters.values import NAMES
 from cortado.policies import AdjointPolicy, AdjointSmoothing, Averaged, Exact, Policy, VelocityOnly
 from cortado.scene_kinds import MISSING, Choice, Count, Kind, Quantity, Text, as_number, as_sequence, wrong
 from cortado.scene_tables import Table

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cortado.errors import DivergedError
-from cortado.parameter_values import Arrays
+from cortado.parameters.values import Arrays
 from cortado.policies import AdjointSmoothing, Estimate, Exact, Policy, Smoothed, VelocityOnly
 from cortado.problem import Problem
 

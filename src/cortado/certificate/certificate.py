@@ -13,7 +13,7 @@ from cortado.certificate.horizon import Horizon, horizon
 from cortado.certificate.rightness import Comparison, balanced, compare
 from cortado.certificate.twin import in_float64
 from cortado.errors import InputError, shown
-from cortado.parameter_values import Arrays, Values
+from cortado.parameters.values import Arrays, Values
 from cortado.policies import AdjointNorms
 from cortado.policies.strength import growth
 from cortado.problem import Problem

@@ -4,22 +4,23 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from cortado.controls import Controls
 from cortado.errors import InputError
-from cortado.parameter_values import NUMBERS, OVER_TIME, STATES, Arrays, Values
+from cortado.parameters.registry import BY_NAME, Axis, Range, Role
+from cortado.parameters.space import ParameterSpace
+from cortado.parameters.values import Arrays, Values
 from cortado.problem import Problem
 
 CHANGE = 0.05
 """Of a parameter, in its own size, or in that of the flow: spacings, speeds of a fall."""
-FRACTIONS = 0.001
-"""Of mass fractions, which have to add up to 1 within 0.01."""
 
 
 def point(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
     """The values of parameters, given as values or as names of the scene's."""
-    values = problem.simulation.parameters()
-    if values["gravity"].any():
-        values["tilt"] = np.zeros(problem.simulation.dimension - 1)
+    simulation = problem.simulation
+    values = simulation.parameters()
+    tilt = BY_NAME["tilt"]
+    if tilt.present(simulation.scene):
+        values["tilt"] = tilt.value(simulation)
     if isinstance(parameters, Mapping):
         values = dict(parameters)
     unknown = [name for name in parameters if name not in values]
@@ -27,42 +28,32 @@ def point(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
         raise InputError(f"parameter {unknown[0]!r} is unknown, but must be one of {', '.join(values)}.")
     if not parameters:
         raise InputError(f"parameters is empty, but must have at least one of {', '.join(values)}.")
-    return Controls(problem.simulation, problem.steps).checked({name: values[name] for name in parameters})
+    return ParameterSpace(simulation, problem.steps).checked({name: values[name] for name in parameters})
 
 
 def everything(problem: Problem, chosen: Arrays) -> Arrays:
-    """Every parameter that can be moved both ways, tables step by step, at the chosen values and else the scene's: not
-    a viscosity or mobility of 0, nor what only acts between phases where there is but one."""
+    """Every parameter that can be moved both ways and makes a difference, tables step by step, at the chosen values and
+    else the scene's: not a viscosity or mobility of 0, nor what only acts between phases where there is but one."""
     values = {**problem.simulation.parameters(), **chosen}
-    idle = {"mass_fractions"} if len(problem.simulation.scene.phase) == 1 else set()
-    idle |= {"mobility", "interface_width"} if idle or not values["mobility"] > 0.0 else set()
-    idle |= {"viscosity"} if not (values["viscosity"] > 0.0).all() else set()
-    idle |= set(OVER_TIME) if problem.steps == 0 else set()
-    idle |= {"gravity"} if "tilt" in chosen else set()
-    found = {name: value for name, value in values.items() if name not in idle}
-    for name in set(OVER_TIME) & found.keys():
-        found[name] = np.broadcast_to(found[name], (problem.steps, found[name].shape[-1])).copy()
+    found = {}
+    for name, value in values.items():
+        parameter = BY_NAME[name]
+        over_time = parameter.axis is Axis.STEP
+        idle = over_time and problem.steps == 0
+        idle = idle or (name == "gravity" and "tilt" in chosen)
+        idle = idle or (parameter.range is Range.NOT_NEGATIVE and not (value > 0.0).all())
+        if idle or not parameter.acts(problem.simulation, values):
+            continue
+        found[name] = np.broadcast_to(value, (problem.steps, value.shape[-1])).copy() if over_time else value
     return found
 
 
 def scales(problem: Problem, values: Arrays, change: float = CHANGE) -> Arrays:
     """The size of a meaningful change of every number of these parameters."""
-    simulation = problem.simulation
-    spacing = simulation.scene.discretisation.spacing
-    gravity = float(np.linalg.norm(simulation.scene.forces.gravity)) or 1.0
-    height = float(np.ptp(simulation.positions, axis=0).max()) + spacing
-    speed = np.sqrt(gravity * height)
-    units = {
-        "gravity": gravity,
-        "tilt": np.degrees(1.0),
-        "initial_positions": spacing,
-        "initial_velocities": speed,
-        "nozzle_path": spacing,
-        "mass_fractions": FRACTIONS / CHANGE,
-        "colours": 1.0,
+    return {
+        name: np.broadcast_to(change * BY_NAME[name].change(problem.simulation, value), value.shape)
+        for name, value in values.items()
     }
-    relative = {name: np.abs(values[name]) for name in values if name in (*NUMBERS, "viscosity", "rest_density")}
-    return {name: np.broadcast_to(change * (relative | units)[name], values[name].shape) for name in values}
 
 
 def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
@@ -78,10 +69,13 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
     x = problem.simulation.positions - problem.simulation.positions.mean(axis=0)
     x = x / (np.abs(x).max() or 1.0)
     found = directions(values, sizes, random)
-    for name in found.keys() & {*STATES, *OVER_TIME}:
+    for name in found:
+        parameter = BY_NAME[name]
+        if parameter.axis not in (Axis.STEP, Axis.PARTICLE):
+            continue
         columns = values[name].shape[-1]
         field = random.standard_normal(columns)
-        if name in STATES:
+        if parameter.role is Role.STATE:
             field = field + x @ random.standard_normal((x.shape[1], columns))
         found[name] = sizes[name] * field
     return found

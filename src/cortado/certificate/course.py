@@ -8,10 +8,10 @@ from scipy.spatial import cKDTree
 
 from cortado.certificate.twin import Rounded
 from cortado.checked_loss import as_loss
-from cortado.controls import Controls
 from cortado.errors import DivergedError
 from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd
-from cortado.parameter_values import Arrays
+from cortado.parameters.space import ParameterSpace
+from cortado.parameters.values import Arrays
 from cortado.particles import State
 from cortado.problem import Problem
 from cortado.rollout import Rollout
@@ -96,7 +96,7 @@ class Course:
 
     def tangent(self, parameters: Arrays, along: Arrays) -> Tangent:
         """Derivatives along a direction, which names all or some of the parameters."""
-        simulation, controls = self.problem.simulation, Controls(self.problem.simulation, self.problem.steps)
+        simulation, controls = self.problem.simulation, ParameterSpace(self.problem.simulation, self.problem.steps)
         values, directions = controls.checked(parameters), controls.checked(along, "direction")
         rollout, colours = Rollout(simulation.solver, self.problem.steps), controls.colours(values)
         ends: dict[int, TrajectoryEnd] = {}

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cortado.certificate.course import Course
-from cortado.parameter_values import Arrays
+from cortado.parameters.values import Arrays
 
 WITHIN = 0.25
 """The exact derivative means something where it is this near to the change of the loss, relative."""

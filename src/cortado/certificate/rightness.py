@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cortado.certificate.course import Course
-from cortado.parameter_values import Arrays
+from cortado.parameters.values import Arrays
 
 STEPS = tuple(10.0**-k for k in range(3, 9))
 """Steps of the central differences, in units of the direction; they are tried until they stop getting better, and

@@ -10,17 +10,30 @@ it, those of the length of a few spacings decay: a viscosity of the adjoint. Div
 drop of a few particles as it does within the fluid; W(h / 2) is for those that hardly touch.
 """
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
 
 
+@dataclass(frozen=True)
+class FilterKernels:
+    """The kernels of filters; vectors (n,) that are filtered are in the scene's order."""
+
+    crowd: Any
+    """Comes before ``average``."""
+    average: Any
+    limit: Any
+    drag: Any
+    squares: Any
+
+
 @cache
-def adjoint_filter_kernels(discretisation: Discretisation) -> SimpleNamespace:
-    """Kernels ``crowd``, then ``average``, and ``drag`` of vectors (n,) in the scene's order, and ``squares``."""
+def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
+    """The kernels for a smoothing kernel and a precision."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     surroundings = surroundings_type(discretisation.precision)
     pair = pair_functions(discretisation)
@@ -112,4 +125,4 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> SimpleNamespace:
         if own > most:
             a[i] = real(wp.sqrt(most / own)) * a[i]
 
-    return SimpleNamespace(crowd=crowd, average=average, limit=limit, drag=drag, squares=squares)
+    return FilterKernels(crowd, average, limit, drag, squares)

@@ -10,20 +10,30 @@ which is 1 among particles of its own mass or heavier ones, and tends to the mea
 for. a makes it smooth at 0.
 """
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
+from cortado.kernels import Kernels
 from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
 
 SOFTNESS = 0.2
 """a [-]"""
 
 
+@dataclass(frozen=True)
+class ContrastKernels(Kernels):
+    """The kernels, two of them for the way back."""
+
+    factor_adjoint: Any
+    """Comes before ``adjoint``."""
+
+
 @cache
-def contrast_kernels(discretisation: Discretisation) -> SimpleNamespace:
-    """Kernels ``forward``, ``tangent``, and the two of the way back: ``factor_adjoint``, then ``adjoint``."""
+def contrast_kernels(discretisation: Discretisation) -> ContrastKernels:
+    """The kernels for a smoothing kernel and a precision."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     surroundings = surroundings_type(discretisation.precision)
     pair = pair_functions(discretisation)
@@ -138,6 +148,4 @@ def contrast_kernels(discretisation: Discretisation) -> SimpleNamespace:
         x_bar[i] = x_bar[i] + s.volume * x_sum
         m_bar[i] = m_bar[i] + s.volume * m_sum / m_i
 
-    return SimpleNamespace(
-        forward=contrast, tangent=contrast_tangent, factor_adjoint=factor_adjoint, adjoint=contrast_adjoint
-    )
+    return ContrastKernels(contrast, contrast_tangent, contrast_adjoint, factor_adjoint)

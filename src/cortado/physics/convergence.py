@@ -1,7 +1,8 @@
 """Decisions of the pressure loop and records of a step, taken on the device."""
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -9,9 +10,19 @@ from cortado.physics.containment import NO_PARTICLE
 from cortado.precision import Precision
 
 
+@dataclass(frozen=True)
+class ConvergenceKernels:
+    """The kernels of one thread that count iterations and steps."""
+
+    decide: Any
+    """Whether to go on iterating."""
+    finish: Any
+    """A step."""
+
+
 @cache
-def convergence_kernels(precision: Precision) -> SimpleNamespace:
-    """Kernels ``decide`` (go on iterating?) and ``finish`` (a step)."""
+def convergence_kernels(precision: Precision) -> ConvergenceKernels:
+    """The kernels for a precision."""
     real, pair = precision.real, precision.pair
     module = wp.get_module(f"cortado_convergence_{precision.name}")
     module.options["enable_backward"] = False
@@ -57,4 +68,4 @@ def convergence_kernels(precision: Precision) -> SimpleNamespace:
         iteration[0] = 0
         step[0] = n + 1
 
-    return SimpleNamespace(decide=decide, finish=finish)
+    return ConvergenceKernels(decide, finish)

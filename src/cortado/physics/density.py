@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from cortado.kernels import Kernels
 from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
 
 
@@ -72,7 +73,7 @@ def density_sums(discretisation: Discretisation) -> SimpleNamespace:
 
 
 @cache
-def density_kernels(discretisation: Discretisation) -> SimpleNamespace:
+def density_kernels(discretisation: Discretisation) -> Kernels:
     """Kernels ``forward``, ``tangent`` and ``adjoint`` of the number density at given positions."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     surroundings = surroundings_type(discretisation.precision)
@@ -112,4 +113,4 @@ def density_kernels(discretisation: Discretisation) -> SimpleNamespace:
         i = s.first + wp.tid()
         x_bar[i] = x_bar[i] + s.volume * weights_adjoint(i, x, n_bar, s)
 
-    return SimpleNamespace(forward=density, tangent=density_tangent, adjoint=density_adjoint)
+    return Kernels(density, density_tangent, density_adjoint)

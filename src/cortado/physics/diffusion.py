@@ -14,11 +14,11 @@ fall along the flow on particles at rest (F <= 0). Nothing is clipped: that woul
 
 from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
+from cortado.kernels import Kernels
 from cortado.physics.free_energy import FreeEnergy, Mobility
 from cortado.physics.spreading import spreading_functions
 from cortado.physics.surroundings import Discretisation, surroundings_type
@@ -39,18 +39,27 @@ class Diffusion:
         return self.discretisation.module(differentiable, topic)
 
 
+@dataclass(frozen=True)
+class DiffusionKernels:
+    """The kernels of one substep of diffusion."""
+
+    potential: Kernels
+    flux: Kernels
+    scale_adjoint: Any
+
+
 @cache
-def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
-    """Kernels ``potential`` and ``flux`` of one substep, each with ``_tangent`` and ``_adjoint``."""
+def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
+    """Kernels of the potential, of the flux, and of the adjoint of the flux's scale."""
     discretisation, phases = diffusion.discretisation, diffusion.phases
     precision = discretisation.precision
     real, vector, fractions = precision.real, precision.vector, precision.fractions(phases)
     surroundings = surroundings_type(precision)
     sums = spreading_functions(discretisation, phases)
     spread, spread_tangent, spread_adjoint = sums.spread, sums.spread_tangent, sums.spread_adjoint
-    energy, mobility = diffusion.energy.functions(precision, phases), diffusion.mobility.functions(precision, phases)
+    energy, form = diffusion.energy.functions(precision, phases), diffusion.mobility.functions(precision, phases)
     energy_slope, energy_bend = energy.slope, energy.bend
-    mobile, mobile_slope = mobility.value, mobility.slope
+    mobile, mobile_slope = form.value, form.slope
 
     @wp.func
     def project(u: fractions) -> fractions:
@@ -68,7 +77,7 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
         s: surroundings,
         strength: real,
         interface_width: wp.array(dtype=real),
-        mobility_0: wp.array(dtype=real),
+        mobility: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         n: wp.array(dtype=real),
         m: wp.array(dtype=real),
@@ -82,7 +91,7 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
         total = spread(i, x, n, m, c, s)
         stiffness = interface_width[0] * interface_width[0] * s.volume / m[i]
         chi[i] = strength * project(energy_slope(c[i])) - stiffness * total
-        w[i] = m[i] * mobility_0[0] * mobile(c[i])
+        w[i] = m[i] * mobility[0] * mobile(c[i])
 
     @wp.kernel(module=diffusion.module(True))
     def flux(
@@ -108,8 +117,8 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
         strength: real,
         interface_width: wp.array(dtype=real),
         interface_width_dot: wp.array(dtype=real),
-        mobility_0: wp.array(dtype=real),
-        mobility_0_dot: wp.array(dtype=real),
+        mobility: wp.array(dtype=real),
+        mobility_dot: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         x_dot: wp.array(dtype=vector),
         n: wp.array(dtype=real),
@@ -130,8 +139,8 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
         stiffness = width * width * scale
         stiffness_dot = real(2.0) * width * interface_width_dot[0] * scale - stiffness * m_dot[i] / m[i]
         chi_dot[i] = strength * project(energy_bend(c[i], c_dot[i])) - stiffness * total_dot - stiffness_dot * total
-        m_0 = mobility_0[0]
-        w_dot[i] = (m_dot[i] * m_0 + m[i] * mobility_0_dot[0]) * mobile(c[i]) + m[i] * m_0 * wp.dot(
+        m_0 = mobility[0]
+        w_dot[i] = (m_dot[i] * m_0 + m[i] * mobility_dot[0]) * mobile(c[i]) + m[i] * m_0 * wp.dot(
             mobile_slope(c[i]), c_dot[i]
         )
 
@@ -182,7 +191,7 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
         strength: real,
         time_step: wp.array(dtype=real),
         interface_width: wp.array(dtype=real),
-        mobility_0: wp.array(dtype=real),
+        mobility: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         n: wp.array(dtype=real),
         m: wp.array(dtype=real),
@@ -195,7 +204,8 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
         n_bar: wp.array(dtype=real),
         m_bar: wp.array(dtype=real),
         c_bar: wp.array(dtype=fractions),
-        scalars_bar: wp.array(dtype=vector),
+        time_step_bar: wp.array(dtype=real),
+        mobility_bar: wp.array(dtype=real),
         # out
         z: wp.array(dtype=fractions),
     ):
@@ -203,14 +213,15 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
         i = s.first + wp.tid()
         x_sum, n_sum, w_bar, chi_bar, own = spread_adjoint(i, x, n, w, chi, y, s)
         m_i = m[i]
-        m_0 = mobility_0[0]
+        m_0 = mobility[0]
         mobile_i = mobile(c[i])
         x_bar[i] = x_bar[i] + x_sum
         n_bar[i] = n_bar[i] + n_sum
         m_bar[i] = m_bar[i] + w_bar * m_0 * mobile_i - own / m_i
         straight = project(chi_bar)
         c_bar[i] = c_bar[i] + (w_bar * m_i * m_0) * mobile_slope(c[i]) + strength * energy_bend(c[i], straight)
-        scalars_bar[i] = scalars_bar[i] + vector(own / time_step[0], w_bar * m_i * mobile_i, real(0.0))
+        time_step_bar[i] = time_step_bar[i] + own / time_step[0]
+        mobility_bar[i] = mobility_bar[i] + w_bar * m_i * mobile_i
         z[i] = (-interface_width[0] * interface_width[0] * s.volume / m_i) * chi_bar
 
     @wp.kernel(module=diffusion.module(False), enable_backward=False)
@@ -227,7 +238,7 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
         n_bar: wp.array(dtype=real),
         m_bar: wp.array(dtype=real),
         c_bar: wp.array(dtype=fractions),
-        scalars_bar: wp.array(dtype=vector),
+        interface_width_bar: wp.array(dtype=real),
     ):
         i = s.first + wp.tid()
         x_sum, n_sum, m_sum, c_sum, own = spread_adjoint(i, x, n, m, c, z, s)
@@ -235,14 +246,10 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
         n_bar[i] = n_bar[i] + n_sum
         m_bar[i] = m_bar[i] + m_sum - own / m[i]
         c_bar[i] = c_bar[i] + c_sum
-        scalars_bar[i] = scalars_bar[i] + vector(real(0.0), real(0.0), real(2.0) * own / interface_width[0])
+        interface_width_bar[i] = interface_width_bar[i] + real(2.0) * own / interface_width[0]
 
-    return SimpleNamespace(
-        potential=potential,
-        potential_tangent=potential_tangent,
-        potential_adjoint=potential_adjoint,
-        flux=flux,
-        flux_tangent=flux_tangent,
-        flux_adjoint=flux_adjoint,
-        scale_adjoint=scale_adjoint,
+    return DiffusionKernels(
+        Kernels(potential, potential_tangent, potential_adjoint),
+        Kernels(flux, flux_tangent, flux_adjoint),
+        scale_adjoint,
     )

@@ -38,7 +38,7 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
         rho_0_bar: wp.array(dtype=real),
         y_bar: wp.array(dtype=real),
         p_bar: wp.array(dtype=real),
-        scalars_bar: wp.array(dtype=vector),
+        time_step_bar: wp.array(dtype=real),
         # out
         r: wp.array(dtype=real),
     ):
@@ -76,6 +76,6 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
         y_bar[i] = y_bar[i] + excess_bar * excess / y[i]
         p_bar[i] = p_bar_i
         r[i] = m_i * excess_bar
-        scalars_bar[i] = scalars_bar[i] - vector(real(2.0) * excess_bar * excess / time_step[0], real(0.0), real(0.0))
+        time_step_bar[i] = time_step_bar[i] - real(2.0) * excess_bar * excess / time_step[0]
 
     return adjoint

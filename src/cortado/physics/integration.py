@@ -1,7 +1,7 @@
 """Semi-implicit Euler (report eqs. 3 and 4), and the way between scene order and sorted order."""
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -18,24 +18,35 @@ def integration_module(precision: Precision, differentiable: bool) -> Any:
 
 
 @cache
-def prediction_functions(precision: Precision) -> SimpleNamespace:
-    """``adjoint``: what one prediction v* = v + dt a, x* = x + dt v* adds to the adjoints of the scalars, which are
-    kept particle by particle as (time step, mobility, interface width)."""
+def prediction_share(precision: Precision) -> Any:
+    """The Warp function of what one prediction v* = v + dt a, x* = x + dt v* adds to the adjoint of the time step."""
     real, vector = precision.real, precision.vector
 
     @wp.func
-    def adjoint(x_star_bar: vector, speed_bar: vector, v: vector, v_star: vector, dt: real) -> vector:
-        time_step_bar = wp.dot(x_star_bar, v_star) + wp.dot(speed_bar, v_star - v) / dt
-        return vector(time_step_bar, real(0.0), real(0.0))
+    def adjoint(x_star_bar: vector, speed_bar: vector, v: vector, v_star: vector, dt: real) -> real:
+        return wp.dot(x_star_bar, v_star) + wp.dot(speed_bar, v_star - v) / dt
 
-    return SimpleNamespace(adjoint=adjoint)
+    return adjoint
+
+
+@dataclass(frozen=True)
+class IntegrationKernels:
+    """The kernels of the time step."""
+
+    sort: Any
+    unsort: Any
+    predict: Any
+    predict_tangent: Any
+    begin_adjoint: Any
+    acceleration_adjoint: Any
+    collect_masses: Any
 
 
 @cache
-def integration_kernels(precision: Precision) -> SimpleNamespace:
+def integration_kernels(precision: Precision) -> IntegrationKernels:
     """Kernels of the time step: ``sort`` and ``unsort`` a state, ``predict`` without pressure, and derivatives."""
     real, vector = precision.real, precision.vector
-    adjoin_prediction = prediction_functions(precision).adjoint
+    adjoin_prediction = prediction_share(precision)
 
     @wp.kernel(module=integration_module(precision, True))
     def sort(
@@ -110,7 +121,7 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         x_scene_bar: wp.array(dtype=vector),
         v_scene_bar: wp.array(dtype=vector),
         # in and out
-        scalars_bar: wp.array(dtype=vector),
+        time_step_bar: wp.array(dtype=real),
         # out
         x_bar: wp.array(dtype=vector),
         v_bar: wp.array(dtype=vector),
@@ -136,7 +147,7 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         mu_bar[i] = real(0.0)
         y_bar[i] = real(0.0)
         p_bar[i] = real(0.0)
-        scalars_bar[i] = scalars_bar[i] + adjoin_prediction(x_star_bar, speed_bar, v[i], v_star[i], dt)
+        time_step_bar[i] = time_step_bar[i] + adjoin_prediction(x_star_bar, speed_bar, v[i], v_star[i], dt)
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def acceleration_adjoint(
@@ -159,7 +170,7 @@ def integration_kernels(precision: Precision) -> SimpleNamespace:
         i = wp.tid()
         m_scene_bar[order[i]] = m_scene_bar[order[i]] + m_bar[i]
 
-    return SimpleNamespace(
+    return IntegrationKernels(
         sort=sort,
         unsort=unsort,
         predict=predict,

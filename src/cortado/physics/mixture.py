@@ -7,12 +7,13 @@ fractions it is the mass), so that a particle's rest volume follows its rest den
 positive where fractions stray out of [0, 1].
 """
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
+from cortado.kernels import Kernels
 from cortado.precision import Precision
 
 
@@ -24,12 +25,18 @@ def mixture_module(precision: Precision, phases: int, differentiable: bool) -> A
     return module
 
 
-@cache
-def mixture_kernels(precision: Precision, phases: int) -> SimpleNamespace:
-    """Kernels ``sort`` and ``unsort`` of fractions, and ``blend`` with ``blend_tangent`` and ``blend_adjoint``.
+@dataclass(frozen=True)
+class MixtureKernels:
+    """The kernels that carry fractions into a step and out of it, and make materials of them."""
 
-    Materials of the phases are arrays (phases,).
-    """
+    sort: Any
+    unsort: Any
+    blend: Kernels
+
+
+@cache
+def mixture_kernels(precision: Precision, phases: int) -> MixtureKernels:
+    """The kernels for a number of phases; their materials are arrays (phases,)."""
     real, fractions = precision.real, precision.fractions(phases)
     tiny = wp.constant(real(precision.tiny))
 
@@ -131,10 +138,4 @@ def mixture_kernels(precision: Precision, phases: int) -> SimpleNamespace:
         viscosity_bar[i] = viscosity_bar_i
         c_bar[i] = c_bar_i
 
-    return SimpleNamespace(
-        sort=sort_fractions,
-        unsort=unsort_fractions,
-        blend=blend,
-        blend_tangent=blend_tangent,
-        blend_adjoint=blend_adjoint,
-    )
+    return MixtureKernels(sort_fractions, unsort_fractions, Kernels(blend, blend_tangent, blend_adjoint))

@@ -10,19 +10,28 @@ Position and velocity do not jump when a particle becomes free. A run that goes 
 from where that began, and the opening moves from where that left it.
 """
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
+from cortado.kernels import Kernels
 from cortado.physics.integration import integration_module
 from cortado.precision import Precision
 
 
+@dataclass(frozen=True)
+class NozzleKernels(Kernels):
+    """The kernels of the end of a step, in the scene's order of particles."""
+
+    collect: Any
+    """Adds up what led particles leave to the adjoints of the parameters, in one thread."""
+
+
 @cache
-def nozzle_kernels(precision: Precision) -> SimpleNamespace:
-    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the end of a step, in the scene's order of particles, and
-    ``collect``, which adds up what the led ones leave. ``path`` (steps,) is that of the opening, ``before`` (1,) how
+def nozzle_kernels(precision: Precision) -> NozzleKernels:
+    """The kernels for a precision. ``nozzle_path`` (steps,) is that of the opening, ``before`` (1,) how
     many steps an earlier run took, and ``outlet`` (1,) where it left the opening."""
     real, vector = precision.real, precision.vector
 
@@ -49,12 +58,12 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
 
     @wp.func
     def advance(
-        path: wp.array(dtype=vector), n: int, before: wp.array(dtype=wp.int32), outlet: wp.array(dtype=vector)
+        nozzle_path: wp.array(dtype=vector), n: int, before: wp.array(dtype=wp.int32), outlet: wp.array(dtype=vector)
     ) -> vector:
         """q_n - q_(n-1)"""
         if n == 0 and before[0] > 0:
-            return path[0] - outlet[0]
-        return path[n] - path[wp.max(n - 1, 0)]
+            return nozzle_path[0] - outlet[0]
+        return nozzle_path[n] - nozzle_path[wp.max(n - 1, 0)]
 
     @wp.kernel(module=integration_module(precision, True))
     def lead(
@@ -63,7 +72,7 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         offsets: wp.array(dtype=vector),
         direction: vector,
         area: real,
-        path: wp.array(dtype=vector),
+        nozzle_path: wp.array(dtype=vector),
         flow_rate: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
         before: wp.array(dtype=wp.int32),
@@ -79,8 +88,8 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         s = left(i, first, upstream, area, flow_rate, time_step, before, step)
         if s > real(0.0):
             n = step[0]
-            x[i] = path[n] + offsets[i - first] - s * direction
-            v[i] = advance(path, n, before, outlet) / time_step[0] + (flow_rate[0] / area) * direction
+            x[i] = nozzle_path[n] + offsets[i - first] - s * direction
+            v[i] = advance(nozzle_path, n, before, outlet) / time_step[0] + (flow_rate[0] / area) * direction
         else:
             x[i] = x_free[i]
             v[i] = v_free[i]
@@ -91,8 +100,8 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         upstream: wp.array(dtype=real),
         direction: vector,
         area: real,
-        path: wp.array(dtype=vector),
-        path_dot: wp.array(dtype=vector),
+        nozzle_path: wp.array(dtype=vector),
+        nozzle_path_dot: wp.array(dtype=vector),
         flow_rate: wp.array(dtype=real),
         flow_rate_dot: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
@@ -110,8 +119,9 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
             n = step[0]
             dt = time_step[0]
             way = flow_rate_dot[0] * dt + flow_rate[0] * time_step_dot[0]
-            turn = advance(path_dot, n, before, outlet_dot) - advance(path, n, before, outlet) * (time_step_dot[0] / dt)
-            x_dot[i] = path_dot[n] + (taken(n, before) * way / area) * direction
+            turn_dot = advance(nozzle_path_dot, n, before, outlet_dot)
+            turn = turn_dot - advance(nozzle_path, n, before, outlet) * (time_step_dot[0] / dt)
+            x_dot[i] = nozzle_path_dot[n] + (taken(n, before) * way / area) * direction
             v_dot[i] = turn / dt + (flow_rate_dot[0] / area) * direction
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
@@ -143,7 +153,7 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
     def collect(
         direction: vector,
         area: real,
-        path: wp.array(dtype=vector),
+        nozzle_path: wp.array(dtype=vector),
         flow_rate: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
         before: wp.array(dtype=wp.int32),
@@ -152,7 +162,7 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         x_total: wp.array(dtype=vector),
         v_total: wp.array(dtype=vector),
         # in and out
-        path_bar: wp.array(dtype=vector),
+        nozzle_path_bar: wp.array(dtype=vector),
         flow_rate_bar: wp.array(dtype=real),
         time_step_bar: wp.array(dtype=real),
     ):
@@ -161,12 +171,12 @@ def nozzle_kernels(precision: Precision) -> SimpleNamespace:
         x_bar = x_total[0]
         v_bar = v_total[0]
         last = wp.max(n - 1, 0)
-        path_bar[n] = path_bar[n] + x_bar + v_bar / dt
+        nozzle_path_bar[n] = nozzle_path_bar[n] + x_bar + v_bar / dt
         if n > 0 or before[0] == 0:
-            path_bar[last] = path_bar[last] - v_bar / dt
+            nozzle_path_bar[last] = nozzle_path_bar[last] - v_bar / dt
         along = taken(n, before) * wp.dot(direction, x_bar) / area
         flow_rate_bar[0] = flow_rate_bar[0] + along * dt + wp.dot(direction, v_bar) / area
-        turn = wp.dot(v_bar, advance(path, n, before, outlet)) / (dt * dt)
+        turn = wp.dot(v_bar, advance(nozzle_path, n, before, outlet)) / (dt * dt)
         time_step_bar[0] = time_step_bar[0] + along * flow_rate[0] - turn
 
-    return SimpleNamespace(forward=lead, tangent=lead_tangent, adjoint=lead_adjoint, collect=collect)
+    return NozzleKernels(lead, lead_tangent, lead_adjoint, collect)

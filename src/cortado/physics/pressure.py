@@ -13,17 +13,17 @@ state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
 """
 
 from functools import cache
-from types import SimpleNamespace
 
 import warp as wp
 
+from cortado.kernels import Kernels
 from cortado.physics.density import density_sums
-from cortado.physics.integration import prediction_functions
+from cortado.physics.integration import prediction_share
 from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
 
 
 @cache
-def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
+def pressure_kernels(discretisation: Discretisation) -> Kernels:
     """Kernels ``forward``, ``tangent``, ``adjoint`` of the pressure from the predicted density."""
     real, vector, pair_of = (
         discretisation.precision.real,
@@ -33,7 +33,7 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
     surroundings = surroundings_type(discretisation.precision)
     sums = density_sums(discretisation)
     weights, weights_tangent, weights_adjoint = sums.weights, sums.weights_tangent, sums.weights_adjoint
-    adjoin_prediction = prediction_functions(discretisation.precision).adjoint
+    adjoin_prediction = prediction_share(discretisation.precision)
 
     @wp.kernel(module=discretisation.module(True))
     def pressure(
@@ -113,7 +113,7 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         # in and out
         x_bar: wp.array(dtype=vector),
         v_bar: wp.array(dtype=vector),
-        scalars_bar: wp.array(dtype=vector),
+        time_step_bar: wp.array(dtype=real),
         # out
         push_bar: wp.array(dtype=vector),
     ):
@@ -125,13 +125,13 @@ def pressure_kernels(discretisation: Discretisation) -> SimpleNamespace:
         x_bar[i] = x_bar[i] + x_star_bar
         v_bar[i] = v_bar[i] + speed_bar
         push_bar[i] = (dt / m[i]) * speed_bar
-        scalars_bar[i] = scalars_bar[i] + adjoin_prediction(x_star_bar, speed_bar, v[i], v_star[i], dt)
+        time_step_bar[i] = time_step_bar[i] + adjoin_prediction(x_star_bar, speed_bar, v[i], v_star[i], dt)
 
-    return SimpleNamespace(forward=pressure, tangent=pressure_tangent, adjoint=pressure_adjoint)
+    return Kernels(pressure, pressure_tangent, pressure_adjoint)
 
 
 @cache
-def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
+def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     """Kernels ``forward``, ``tangent``, ``adjoint`` of the pressure force and the prediction that follows it."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     surroundings = surroundings_type(discretisation.precision)
@@ -253,7 +253,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         rho_0_bar: wp.array(dtype=real),
         y_bar: wp.array(dtype=real),
         p_bar: wp.array(dtype=real),
-        scalars_bar: wp.array(dtype=vector),
+        time_step_bar: wp.array(dtype=real),
         # out
         r: wp.array(dtype=real),
     ):
@@ -302,6 +302,6 @@ def pressure_force_kernels(discretisation: Discretisation) -> SimpleNamespace:
         y_bar[i] = y_bar[i] + excess_bar * excess / y[i]
         p_bar[i] = p_bar_i
         r[i] = m_i * excess_bar
-        scalars_bar[i] = scalars_bar[i] - vector(real(2.0) * excess_bar * excess / time_step[0], real(0.0), real(0.0))
+        time_step_bar[i] = time_step_bar[i] - real(2.0) * excess_bar * excess / time_step[0]
 
-    return SimpleNamespace(forward=pressure_force, tangent=pressure_force_tangent, adjoint=pressure_force_adjoint)
+    return Kernels(pressure_force, pressure_force_tangent, pressure_force_adjoint)

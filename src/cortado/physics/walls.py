@@ -13,15 +13,15 @@ where spacings are small.
 """
 
 from functools import cache
-from types import SimpleNamespace
 
 import warp as wp
 
+from cortado.kernels import Kernels
 from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
 
 
 @cache
-def wall_kernels(discretisation: Discretisation) -> SimpleNamespace:
+def wall_kernels(discretisation: Discretisation) -> Kernels:
     """Kernels ``forward``, ``tangent`` and ``adjoint`` of the yield."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     surroundings = surroundings_type(discretisation.precision)
@@ -82,4 +82,4 @@ def wall_kernels(discretisation: Discretisation) -> SimpleNamespace:
         total_bar = (real(-2.0) * y_bar[i] * y[i] * y[i]) * wall_gradient(i, x, s)
         x_bar[i] = x_bar[i] + wall_hessian_product(i, x, total_bar, s)
 
-    return SimpleNamespace(forward=wall_yield, tangent=wall_yield_tangent, adjoint=wall_yield_adjoint)
+    return Kernels(wall_yield, wall_yield_tangent, wall_yield_adjoint)

@@ -5,7 +5,7 @@ it says less and less, and others take its place: `AdjointSmoothing`, `VelocityO
 over a cloud, `Averaged`. `Smoothed`, from forward runs alone, is what they are measured by.
 """
 
-from cortado.parameter_values import Values
+from cortado.parameters.values import Values
 from cortado.policies.ensemble import Averaged, Smoothed
 from cortado.policies.exact import Exact, Tape, VelocityOnly
 from cortado.policies.filters import AdjointSmoothing, Damped

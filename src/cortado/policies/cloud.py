@@ -8,7 +8,7 @@ import numpy as np
 
 from cortado.arrays import as_numbers
 from cortado.errors import InputError, shown
-from cortado.parameter_values import Arrays, Values
+from cortado.parameters.values import Arrays, Values
 from cortado.policies.policy import Differentiable
 from cortado.scene_kinds import as_number
 

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from cortado.errors import InputError, shown
-from cortado.parameter_values import Arrays, Values
+from cortado.parameters.values import Arrays, Values
 from cortado.policies.cloud import Cloud
 from cortado.policies.filters import AdjointSmoothing
 from cortado.policies.policy import Differentiable, Estimate, Policy, checked_policy, tuned

@@ -61,20 +61,17 @@ class _AdjointStep:
     def __init__(self, rollout: Rollout, frozen_positions: bool):
         solver = rollout.solver
         self.solver, self._parameters = solver, rollout.parameters
-        self._adjoint = PcisphAdjoint(solver, frozen_positions)
-        self._bar = solver.new_parameters(rollout.steps)
+        self._adjoint = PcisphAdjoint(solver, rollout.steps, frozen_positions)
 
     def begin(self) -> None:
-        self._adjoint.clear()
-        self._bar.clear()
+        self._adjoint.begin()
 
     def step(self, state: State, iterations: int, bar: State) -> None:
         self.solver.record(state, self._parameters, iterations)
-        self._adjoint.step(iterations, bar, bar, self._parameters, self._bar)
+        self._adjoint.step(iterations, bar, bar, self._parameters)
 
     def parameters(self) -> Parameters:
-        self._adjoint.collect(self._bar)
-        return self._bar
+        return self._adjoint.collect()
 
 
 class _TapeStep:
@@ -119,4 +116,4 @@ class _TapeStep:
                 gradient.zero_()
 
     def parameters(self) -> Parameters:
-        return Parameters(*(array.grad for array in self._own.arrays()))
+        return self._own.gradients()

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from cortado.errors import InputError, shown
-from cortado.parameter_values import Arrays, Values
+from cortado.parameters.values import Arrays, Values
 from cortado.particles import State
 from cortado.policies.exact import Exact
 from cortado.policies.policy import AdjointPolicy, Differentiable, Estimate, Filtered, Passage
@@ -104,7 +104,7 @@ class AdjointSmoothing(AdjointPolicy):
             self._back(passage, strength, norms)
             return norms.numpy()
 
-        time_step = float(rollout.parameters.time_step.numpy()[0])
+        time_step = float(rollout.parameters["time_step"].numpy()[0])
         return min((self.order + 1) * sufficient(history, time_step), 1.0 / self.order)
 
 

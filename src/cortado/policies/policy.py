@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from cortado.errors import InputError
-from cortado.parameter_values import Arrays, Values
+from cortado.parameters.values import Arrays, Values
 from cortado.particles import Parameters, State
 from cortado.rollout import Observer, Rollout, StepDerivative
 

@@ -10,7 +10,8 @@ import numpy as np
 from cortado.calibration import SKIN
 from cortado.discrete_scene import DiscreteScene, discretise
 from cortado.errors import DivergedError, InputError, shown
-from cortado.parameter_values import checked_parameter, parameter_shapes
+from cortado.parameters.registry import BY_NAME
+from cortado.parameters.values import checked_value
 from cortado.reference.digits import Digits
 from cortado.reference.engine import extension, precisions
 from cortado.reference.histories import Gradient, History
@@ -190,8 +191,8 @@ class Simulation:
             raise InputError(
                 f"{what} {name!r} is unknown to the reference engine, but must be one of {', '.join(PARAMETERS)}."
             )
-        shapes = parameter_shapes(name, steps, 1, self.positions.shape)
-        high = checked_parameter(name, value.high if isinstance(value, Digits) else value, shapes, what)
+        shapes = BY_NAME[name].shapes(steps, 1, self.positions.shape)
+        high = checked_value(name, value.high if isinstance(value, Digits) else value, shapes, what)
         return Digits(high, value.low) if isinstance(value, Digits) else Digits.of(high)
 
     def _history(self, raw: Any) -> History:

@@ -9,7 +9,7 @@ import warp as wp
 
 from cortado.cells import CellSort, Grid
 from cortado.errors import InputError
-from cortado.launching import sum_of
+from cortado.launching import launch, sum_of
 from cortado.memory import field_parts, require
 from cortado.physics.colour_field import colour_field_kernels, ink_type, nodes_type
 from cortado.physics.surroundings import Discretisation
@@ -68,10 +68,10 @@ class ColourField:
         self._particles = particles
         self._tint = tint_kernels(precision, phases)
         self._field = colour_field_kernels(Discretisation(smoothing, precision))
-        self._launch = partial(wp.launch, device=device, record_tape=False)
+        self._device = device
         grid = Grid.around(lower, upper, periods, support, MOST_CELLS)
         self._sort = CellSort(grid, particles, precision, device)
-        self._kernel = [support, smoothing.normalisation(len(lower), support), volume]
+        self._kernel = {"h": support, "sigma": smoothing.normalisation(len(lower), support), "volume": volume}
         zeros, mix, palette = (
             partial(wp.zeros, device=device),
             precision.fractions(phases),
@@ -82,6 +82,7 @@ class ColourField:
         )
         self._fractions, self._fractions_bar = (zeros(particles, dtype=mix) for _ in range(2))
         self._colours, self._colours_bar = zeros(1, dtype=palette), zeros(particles, dtype=palette)
+        self._known = {"order": self._sort.order, "colours": self._colours, "c_scene": self._fractions}
         self._sum = sum_of(palette, particles, device)
         self.nodes = nodes_over(lower, upper, periods, cell, support, precision)
         """The struct that kernels see."""
@@ -94,33 +95,24 @@ class ColourField:
         self._sort(positions)
         wp.copy(self._fractions, fractions)
         self._colours.assign(colours[None])
-        self._launch(
-            self._tint.forward,
-            self._particles,
-            inputs=[self._colours, self._sort.order, positions, self._fractions],
-            outputs=[self._x, self._colour],
-        )
-        self._launch(
-            self._field.forward,
-            self.values.shape,
-            inputs=[self.nodes, self._sort.grid, *self._kernel, self._x, self._colour],
-            outputs=[self.values],
+        own = {"x": self._x, "colour": self._colour}
+        launch(self._tint.forward, self._particles, self._device, self._known, own, x_scene=positions)
+        grid, shape = self._sort.grid, self.values.shape
+        launch(
+            self._field.forward, shape, self._device, self._kernel, own, nodes=self.nodes, grid=grid, field=self.values
         )
 
     def adjoint(self, field_bar: wp.array) -> tuple[wp.array, wp.array, np.ndarray]:
         """The derivative with respect to positions (n,), fractions (n,) and colours (phases, 3), from that with respect
         to the field."""
-        self._launch(
-            self._field.adjoint,
-            self._particles,
-            inputs=[self.nodes, *self._kernel, self._sort.order, self._x, self._colour, field_bar],
-            outputs=[self._x_bar, self._colour_bar],
-        )
-        self._launch(
-            self._tint.adjoint,
-            self._particles,
-            inputs=[self._colours, self._fractions, self._colour_bar],
-            outputs=[self._fractions_bar, self._colours_bar],
-        )
+        own = {"x": self._x, "colour": self._colour, "nodes": self.nodes, "field_bar": field_bar}
+        bars = {
+            "x_scene_bar": self._x_bar,
+            "colour_scene_bar": self._colour_bar,
+            "c_scene_bar": self._fractions_bar,
+            "colours_bar": self._colours_bar,
+        }
+        launch(self._field.adjoint, self._particles, self._device, self._kernel, self._known, own, bars)
+        launch(self._tint.adjoint, self._particles, self._device, self._known, bars)
         colours = self._sum(self._colours_bar).numpy()[0].astype(np.float64)
         return self._x_bar, self._fractions_bar, colours

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.launching import sum_of
+from cortado.launching import launch, sum_of
 from cortado.memory import field_parts, picture_parts, require, sample_parts
 from cortado.physics.absorption import absorption_kernels, pose_type
 from cortado.physics.colour_field import ink_type
@@ -41,7 +41,6 @@ class RayMarcher:
         self._camera, self._nodes = camera_struct(view.camera, step, precision), nodes
         self._thickness, self._background = view.extinction * step, precision.vector(*view.background)
         self._kernels = absorption_kernels(precision)
-        self._launch = partial(wp.launch, device=device, record_tape=False)
         self._zeros = partial(wp.zeros, device=device)
         self._ink, self._pose = ink_type(precision), pose_type(precision)
         self.pixels, self._precision, self._device = self._camera.rows * self._camera.columns, precision, device
@@ -49,34 +48,27 @@ class RayMarcher:
         self.image, self._image_bar = (self._zeros(self.pixels, dtype=precision.vector) for _ in range(2))
         """(pixels,) linear RGB, row by row."""
         self._spans = self._zeros(self.pixels, dtype=wp.vec2i)
+        self._known = {
+            "camera": self._camera,
+            "nodes": nodes,
+            "thickness": self._thickness,
+            "image": self.image,
+            "spans": self._spans,
+        }
         self._pose_bar = self._zeros(self.pixels, dtype=self._pose)
         self._sum = sum_of(self._pose, self.pixels, device)
 
     def march(self, field: wp.array) -> None:
         """Make the image of a field (nz, ny, nx)."""
-        self._launch(
-            self._kernels.forward,
-            self.pixels,
-            inputs=[self._camera, self._nodes, self._thickness, self._background, field],
-            outputs=[self.image, self._spans],
-        )
+        launch(self._kernels.forward, self.pixels, self._device, self._known, background=self._background, field=field)
 
     def adjoint(self, image_bar: np.ndarray, field: wp.array) -> tuple[wp.array, np.ndarray]:
         """The derivative with respect to the field and to the pose (6,), from that with respect to the image (pixels,
         3) of the field."""
         self._image_bar.assign(image_bar)
-        self._launch(
-            self._kernels.adjoint,
-            self.pixels,
-            inputs=[self._camera, self._nodes, self._thickness, field, self.image, self._spans, self._image_bar],
-            outputs=[self._samples_bar, self._pose_bar],
-        )
-        self._launch(
-            self._kernels.gather,
-            field.shape,
-            inputs=[self._camera, self._nodes, self._spans, self._samples_bar],
-            outputs=[self._field_bar],
-        )
+        bars = {"image_bar": self._image_bar, "samples_bar": self._samples_bar, "pose_bar": self._pose_bar}
+        launch(self._kernels.adjoint, self.pixels, self._device, self._known, bars, field=field)
+        launch(self._kernels.gather, field.shape, self._device, self._known, bars, field_bar=self._field_bar)
         return self._field_bar, self._sum(self._pose_bar).numpy()[0].astype(np.float64)
 
     @cached_property

@@ -31,14 +31,12 @@ class Average:
 
     def __call__(self, bar: State, parameters: Parameters) -> None:
         """Blend the adjoint of the state whose step the solver has recorded."""
-        solver = self._solver
-        moment = solver.moment(parameters)
-        launch, s, x = moment.launch, moment.surroundings, moment.fields.x
-        launch(self._kernels.crowd, [s, x], [self._most])
+        context = self._solver.context(parameters)
+        context.launch(self._kernels.crowd, most=self._most)
         for name in self._fields:
-            before, after = getattr(self._before, name), getattr(bar, name)
-            wp.copy(before, after)
-            launch(self._kernels.average, [s, solver.search.order, self._strength, x, self._most, before], [after])
+            wp.copy(self._before[name], bar[name])
+            arrays = {"a": self._before[name], "a_new": bar[name]}
+            context.launch(self._kernels.average, strength=self._strength, most=self._most, **arrays)
 
 
 class Limit:
@@ -57,12 +55,12 @@ class Limit:
         self._times.fill_(times)
 
     def __call__(self, bar: State) -> None:
-        self._launch(self._kernels.squares, [bar.positions, bar.velocities], [self._squares])
-        sums = self._sum(self._squares)
+        squares = self._squares
+        self._launch(self._kernels.squares, a=bar.positions, b=bar.velocities, found=squares)
+        known = {"times": self._times, "particles": self._particles, "squares": squares, "sums": self._sum(squares)}
         for number, name in enumerate(FIELDS):
             if name in self._fields:
-                arguments = [self._times, self._particles, self._squares, sums, number]
-                self._launch(self._kernels.limit, arguments, [getattr(bar, name)])
+                self._launch(self._kernels.limit, known, field=number, a=bar[name])
 
 
 class Drag:
@@ -73,7 +71,7 @@ class Drag:
         self._kernel = adjoint_filter_kernels(solver.discretisation).drag
 
     def __call__(self, bar: State, parameters: Parameters) -> None:
-        self._launch(self._kernel, [self._rate, parameters.time_step], [bar.velocities])
+        self._launch(self._kernel, rate=self._rate, time_step=parameters["time_step"], a=bar.velocities)
 
 
 class AdjointNorms:
@@ -88,7 +86,7 @@ class AdjointNorms:
         self._history = wp.zeros(steps + 1, dtype=wp.vec2d, device=device)
 
     def __call__(self, step: int, bar: State) -> None:
-        self._launch(self._kernel, [bar.positions, bar.velocities], [self._squares])
+        self._launch(self._kernel, a=bar.positions, b=bar.velocities, found=self._squares)
         wp.copy(self._history, self._sum(self._squares), dest_offset=step, count=1)
 
     def numpy(self) -> np.ndarray:

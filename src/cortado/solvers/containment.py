@@ -79,8 +79,17 @@ class Containment:
         after it without what a nozzle leads, and the state with it."""
         self._launch(
             self._kernel,
-            [self._bounds, self._first_waiting, order, x_before, rho_0, x_free, v_free, state.positions, self.bad_step],
-            [self.bad_particle, self._count],
+            bounds=self._bounds,
+            first_waiting=self._first_waiting,
+            order=order,
+            x_before=x_before,
+            rho_0=rho_0,
+            x_free=x_free,
+            v_free=v_free,
+            x=state.positions,
+            bad_step=self.bad_step,
+            bad=self.bad_particle,
+            count=self._count,
         )
 
     def lost(self) -> Lost | None:

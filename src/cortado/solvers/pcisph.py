@@ -16,10 +16,10 @@ from cortado.neighbours import NeighbourSearch
 from cortado.particles import Fields, Parameters, State
 from cortado.physics.surroundings import Discretisation, surroundings_type
 from cortado.solvers.containment import Containment, Walled
-from cortado.solvers.emitter import Emitter, Nozzle
-from cortado.solvers.forces import ForceTerm, Moment
-from cortado.solvers.mixture import Mixture, Phases
-from cortado.solvers.pcisph_parts import Iterates, Kernels, PressureSolve
+from cortado.solvers.pcisph_parts import Iterates, PcisphKernels, PressureSolve
+from cortado.sph.mixture import Mixture, Phases
+from cortado.sph.nozzle import Emitter, Nozzle
+from cortado.sph.parts import Force, StepContext
 from cortado.threads import Turn
 
 
@@ -31,7 +31,7 @@ class Pcisph:
         discretisation: Discretisation,
         lattice: Lattice,
         search: NeighbourSearch,
-        terms: Sequence[ForceTerm],
+        forces: Sequence[Force],
         pressure: PressureSolve | None,
         periods: Sequence[float],
         phases: Phases,
@@ -42,12 +42,12 @@ class Pcisph:
         """``pressure`` None leaves the pressure out; ``periods`` (3,) [m], 0 along an axis that is not periodic."""
         precision, particles, device = discretisation.precision, search.particles, search.device
         self.discretisation, self.lattice, self.search = discretisation, lattice, search
-        self.terms, self.pressure, self.periods = tuple(terms), pressure, tuple(periods)
+        self.forces, self.pressure, self.periods = tuple(forces), pressure, tuple(periods)
         self.launch = Launcher(particles, device, record_tape=requires_grad)
         self.turn = Turn(device)
         """Whose arrays these are now."""
-        self.mixture = Mixture(phases, precision, search, self.launch, requires_grad)
-        self.kernels = Kernels.of(discretisation)
+        self.mixture = Mixture(phases, precision, particles, device, requires_grad)
+        self.kernels = PcisphKernels.of(discretisation)
         self._sum = sum_and_maximum(particles, precision, device)
 
         def vectors() -> wp.array:
@@ -56,7 +56,7 @@ class Pcisph:
         def count() -> wp.array:
             return wp.zeros(1, dtype=wp.int32, device=device)
 
-        self.emitter = Emitter(nozzle, precision, self.launch, self.new_state(requires_grad)) if nozzle else None
+        self.emitter = Emitter(nozzle, precision, device, self.new_state(requires_grad)) if nozzle else None
         self.fields = Fields.zeros(particles, precision, device, requires_grad)
 
         def numbers() -> wp.array:
@@ -65,8 +65,8 @@ class Pcisph:
         self.wall_yield, self.contrast = numbers(), numbers()
         self.pressure_yield = numbers() if phases.count > 1 else self.wall_yield
         """(n,) what delta is multiplied with [-]: beside walls, and with several phases among lighter neighbours."""
-        self.accelerations = [vectors() for _ in range(len(self.terms) + 1)]
-        """``accelerations[t]``: of the first t terms; the first is 0 and never written."""
+        self.accelerations = [vectors() for _ in range(len(self.forces) + 1)]
+        """``accelerations[t]``: of the first t forces; the first is 0 and never written."""
         self.iterates = Iterates(particles, precision, device, requires_grad)
         self._errors = wp.zeros(particles, dtype=precision.pair, device=device)
         self._error_sums = wp.zeros(1, dtype=precision.pair, device=device)
@@ -74,6 +74,7 @@ class Pcisph:
         self._iteration, self._active = count(), count()
         self.containment = Containment(walled, precision, self.launch, nozzle.first if nozzle else particles)
         self._surroundings: Any = None
+        self._context: StepContext | None = None
         self.growth = 0
         """How often arrays, or the work of a step, were replaced; what was captured before is stale."""
         self.grow(search.capacity)
@@ -99,7 +100,7 @@ class Pcisph:
         s.periodic = int(any(self.periods))
         s.period = precision.vector(*self.periods)
         s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in self.periods))
-        self._surroundings = s
+        self._surroundings, self._context = s, None
 
     def differentiable(self) -> "Pcisph":
         """The same solver, over the same neighbour search, with arrays that Warp's tape can differentiate."""
@@ -107,7 +108,7 @@ class Pcisph:
             self.discretisation,
             self.lattice,
             self.search,
-            self.terms,
+            self.forces,
             self.pressure,
             self.periods,
             self.mixture.phases,
@@ -143,79 +144,84 @@ class Pcisph:
 
     def step(self, state: State, new_state: State, parameters: Parameters, records: tuple[wp.array, wp.array]) -> None:
         """One step; ``records`` take its number of iterations and its (average, greatest) density error."""
-        self._begin(state, parameters)
+        context = self._begin(state, parameters)
         if self.pressure is not None:
-            self._solve_pressure(self.pressure, parameters)
+            self._solve_pressure(self.pressure, context)
         self.recorded(0, parameters, new_state)
-        f, it = self.fields, self.iterates
-        self.containment.look(self.search.order, f.x, f.rho_0, it.x_star[0], it.v_star[0], new_state)
+        f, it, containment = self.fields, self.iterates, self.containment
+        containment.look(self.search.order, f["x"], f["rho_0"], it.x_star[0], it.v_star[0], new_state)
+        iterations, errors = records
         self.launch(
             self.kernels.convergence.finish,
-            [self.search.particles, self._error_sums, self.containment.bad_particle],
-            [self.step_number, self._iteration, self.containment.bad_step, *records],
+            particles=self.search.particles,
+            sums=self._error_sums,
+            bad=containment.bad_particle,
+            step=self.step_number,
+            iteration=self._iteration,
+            bad_step=containment.bad_step,
+            iterations=iterations,
+            errors=errors,
             threads=1,
         )
 
     def record(self, state: State, parameters: Parameters, iterations: int) -> None:
         """The same step again, bit for bit, with every intermediate value kept (and the new state: `recorded`)."""
         self.iterates.reserve(iterations)
-        self._begin(state, parameters)
+        context = self._begin(state, parameters)
         for k in range(iterations):
-            self._iterate(k, k + 1, parameters)
+            self._iterate(k, k + 1, context)
 
     def recorded(self, iterations: int, parameters: Parameters, new_state: State) -> None:
         """The new state of the step that was recorded: its last prediction, in the scene's order, but for particles
         that a nozzle leads."""
-        it = self.iterates
+        it, context = self.iterates, self.context(parameters)
         free = self.emitter.free if self.emitter else new_state
         self.launch(
             self.kernels.integration.unsort,
-            [self.search.order, it.x_star[iterations], it.v_star[iterations]],
-            [free.positions, free.velocities],
+            order=self.search.order,
+            x=it.x_star[iterations],
+            v=it.v_star[iterations],
+            x_scene=free.positions,
+            v_scene=free.velocities,
         )
-        self.mixture.result(new_state.mass_fractions)
+        self.mixture.result(context, new_state.mass_fractions)
         if self.emitter:
-            self.emitter.lead(parameters, self.step_number, new_state)
+            self.emitter.lead(context, new_state)
 
-    def moment(self, parameters: Parameters) -> Moment:
-        """The present step as a force term sees it."""
-        return Moment(self.launch, self._surroundings, self.fields, parameters, self.step_number)
+    def context(self, parameters: Parameters) -> StepContext:
+        """The present step as its parts see it."""
+        if self._context is None or self._context.parameters is not parameters:
+            order, step = self.search.order, self.step_number
+            self._context = StepContext(self.launch, self._surroundings, order, step, self.fields, parameters)
+        return self._context
 
-    def _begin(self, state: State, parameters: Parameters) -> None:
+    def _begin(self, state: State, parameters: Parameters) -> StepContext:
         """Neighbours, density, mixture, explicit forces, and the first prediction."""
-        f, it, s = self.fields, self.iterates, self._surroundings
+        f, it, kernels, context = self.fields, self.iterates, self.kernels, self.context(parameters)
         self.search.sort(state.positions)
-        self.launch(
-            self.kernels.integration.sort,
-            [self.search.order, state.positions, state.velocities, parameters.masses],
-            [f.x, f.v, f.m],
-        )
-        self.search.fill(s, f.x)
-        self.launch(self.kernels.density.forward, [s, f.x], [f.n])
-        self.mixture.step(s, f, parameters, state.mass_fractions)
-        self.launch(self.kernels.walls.forward, [s, f.x], [self.wall_yield])
+        scene = {"x_scene": state.positions, "v_scene": state.velocities, "m_scene": parameters["reference_density"]}
+        context.launch(kernels.integration.sort, **scene)
+        self.search.fill(self._surroundings, f["x"])
+        context.launch(kernels.density.forward)
+        self.mixture.diffuse(context, state.mass_fractions)
+        context.launch(kernels.walls.forward, y=self.wall_yield)
         if self.mixture.phases.count > 1:
-            self.launch(
-                self.kernels.contrast.forward, [s, f.x, f.m, self.wall_yield], [self.contrast, self.pressure_yield]
-            )
-        moment = self.moment(parameters)
-        for t, term in enumerate(self.terms):
-            term.accelerate(moment, self.accelerations[t], self.accelerations[t + 1])
-        self.launch(
-            self.kernels.integration.predict,
-            [parameters.time_step, f.x, f.v, self.accelerations[-1]],
-            [it.x_star[0], it.v_star[0]],
-        )
+            context.launch(kernels.contrast.forward, wall_y=self.wall_yield, t=self.contrast, y=self.pressure_yield)
+        for t, force in enumerate(self.forces):
+            force.accelerate(context, self.accelerations[t], self.accelerations[t + 1])
+        first = {"x_star": it.x_star[0], "v_star": it.v_star[0]}
+        context.launch(kernels.integration.predict, acceleration=self.accelerations[-1], **first)
+        return context
 
-    def _solve_pressure(self, solve: PressureSolve, parameters: Parameters) -> None:
+    def _solve_pressure(self, solve: PressureSolve, context: StepContext) -> None:
         """Iterate in one slot until the density error is small enough; the device decides."""
         for k in range(solve.minimum_iterations):
-            self._iterate(k, 0, parameters)
+            self._iterate(k, 0, context)
         self._decide(solve, solve.minimum_iterations)
         if solve.maximum_iterations > solve.minimum_iterations:
 
             def once_more() -> None:
-                self._iterate(1, 0, parameters)
+                self._iterate(1, 0, context)
                 self._decide(solve, 1)
 
             wp.capture_while(self._active, once_more)
@@ -224,26 +230,29 @@ class Pcisph:
         self._error_sums = self._sum(self._errors)
         self.launch(
             self.kernels.convergence.decide,
-            [done, solve.maximum_iterations, self.search.particles, solve.tolerance, solve.greatest_tolerance]
-            + [self._error_sums],
-            [self._iteration, self._active],
+            done=done,
+            most=solve.maximum_iterations,
+            particles=self.search.particles,
+            tolerance=solve.tolerance,
+            greatest_tolerance=solve.greatest_tolerance,
+            sums=self._error_sums,
+            iteration=self._iteration,
+            active=self._active,
             threads=1,
         )
 
-    def _iterate(self, k: int, slot: int, parameters: Parameters) -> None:
+    def _iterate(self, k: int, slot: int, context: StepContext) -> None:
         """Iteration k, from the predicted state of the slot before to that of ``slot`` (0: the only one)."""
-        f, it, s, p = self.fields, self.iterates, self._surroundings, parameters
-        before = max(slot - 1, 0)
-        pressure_before = it.p[0] if k == 0 else it.p[max(slot - 1, 1)]
-        pressure = it.p[max(slot, 1)]
-        self.launch(
-            self.kernels.pressure.forward,
-            [s, self.lattice.stiffness, p.time_step, f.n, f.m, f.rho_0, self.pressure_yield]
-            + [it.x_star[before], pressure_before],
-            [pressure, it.c[before], self._errors],
+        it, kernels, before = self.iterates, self.kernels, max(slot - 1, 0)
+        context.launch(
+            kernels.pressure.forward,
+            stiffness=self.lattice.stiffness,
+            y=self.pressure_yield,
+            x_star=it.x_star[before],
+            p_in=it.p[0] if k == 0 else it.p[max(slot - 1, 1)],
+            p_out=it.p[max(slot, 1)],
+            c=it.c[before],
+            error=self._errors,
         )
-        self.launch(
-            self.kernels.force.forward,
-            [s, p.time_step, f.m, f.x, f.v, self.accelerations[-1], it.c[before]],
-            [it.x_star[slot], it.v_star[slot]],
-        )
+        new = {"x_star": it.x_star[slot], "v_star": it.v_star[slot]}
+        context.launch(kernels.force.forward, acceleration=self.accelerations[-1], c=it.c[before], **new)

@@ -1,15 +1,15 @@
 """What a PCISPH solver is made of: when to stop, kernels, and room for its iterates."""
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from cortado.physics.contrast import contrast_kernels
-from cortado.physics.convergence import convergence_kernels
+from cortado.kernels import Kernels
+from cortado.physics.contrast import ContrastKernels, contrast_kernels
+from cortado.physics.convergence import ConvergenceKernels, convergence_kernels
 from cortado.physics.density import density_kernels
-from cortado.physics.integration import integration_kernels
+from cortado.physics.integration import IntegrationKernels, integration_kernels
 from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
 from cortado.physics.surroundings import Discretisation
 from cortado.physics.walls import wall_kernels
@@ -28,19 +28,19 @@ class PressureSolve:
 
 
 @dataclass(frozen=True)
-class Kernels:
+class PcisphKernels:
     """The kernels of a step, each topic with its forward, tangent and adjoint."""
 
-    density: SimpleNamespace
-    walls: SimpleNamespace
-    contrast: SimpleNamespace
-    pressure: SimpleNamespace
-    force: SimpleNamespace
-    integration: SimpleNamespace
-    convergence: SimpleNamespace
+    density: Kernels
+    walls: Kernels
+    contrast: ContrastKernels
+    pressure: Kernels
+    force: Kernels
+    integration: IntegrationKernels
+    convergence: ConvergenceKernels
 
     @classmethod
-    def of(cls, discretisation: Discretisation) -> "Kernels":
+    def of(cls, discretisation: Discretisation) -> "PcisphKernels":
         """Those for a smoothing kernel and a precision."""
         return cls(
             density_kernels(discretisation),

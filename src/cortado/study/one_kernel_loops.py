@@ -10,10 +10,10 @@ silently wrong adjoint. So it is in the obvious way to write SPH in Warp, and in
 
 from dataclasses import dataclass, replace
 from functools import cache
-from types import SimpleNamespace
 
 import warp as wp
 
+from cortado.kernels import Kernels
 from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
 from cortado.policies import Tape
 from cortado.rollout import Rollout, StepDerivative
@@ -29,7 +29,7 @@ class OneKernelTape(Tape):
     def derivative(self, rollout: Rollout) -> StepDerivative:
         step = super().derivative(rollout)
         loops = one_kernel_loops(rollout.solver.discretisation)
-        wrong = {topic: SimpleNamespace(forward=loops[topic]) for topic in self.topics}
+        wrong = {topic: Kernels(loops[topic], None, None) for topic in self.topics}
         step.solver.kernels = replace(step.solver.kernels, **wrong)
         return step
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from cortado import reference
 from cortado.checked_loss import as_loss
-from cortado.controls import Controls
 from cortado.losses import Frames
-from cortado.parameter_values import Arrays, Values
+from cortado.parameters.space import ParameterSpace
+from cortado.parameters.values import Arrays, Values
 from cortado.particles import State
 from cortado.policies import AdjointNorms, AdjointPolicy, Policy
 from cortado.problem import Problem
@@ -124,7 +124,7 @@ class WarpTangent(Forward):
     """Forward mode of the Warp engine."""
 
     def along(self, problem: Problem, parameters: Values, directions: Values) -> Along:
-        controls = Controls(problem.simulation, problem.steps)
+        controls = ParameterSpace(problem.simulation, problem.steps)
         values, along = controls.checked(parameters), controls.checked(directions, "direction")
         rollout = Rollout(problem.simulation.solver, problem.steps)
         controls.begin(rollout, values, along)

@@ -10,45 +10,41 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cortado.errors import CortadoWarning, InputError
-from cortado.masses import masses as masses_of
-from cortado.masses import masses_adjoint, masses_tangent
-from cortado.parameter_checks import check_places, check_sizes, check_state, unstable_sentence
-from cortado.parameter_values import (
-    MATERIALS,
-    NAMES,
-    NUMBERS,
-    OF_EMITTER,
-    OVER_TIME,
-    STATES,
-    TABLES,
-    Arrays,
-    Values,
-    checked_parameter,
-    parameter_shapes,
+from cortado.parameters.checks import check_places, check_sizes, check_state, unstable_sentence
+from cortado.parameters.reference_density import (
+    reference_density,
+    reference_density_adjoint,
+    reference_density_tangent,
 )
+from cortado.parameters.registry import BY_NAME, Role, names
+from cortado.parameters.tilt import Tilt
+from cortado.parameters.values import OVER_TIME, Arrays, Values, check_known, checked_value, scene_values
 from cortado.particles import Parameters, State
 from cortado.restart import Elapsed, RestartState
 from cortado.rollout import Rollout
 from cortado.threads import WARP
-from cortado.tilt import Tilt
 
 if TYPE_CHECKING:
     from cortado.simulation import Simulation
 
+RUN, STATE = names(Role.RUN), names(Role.STATE)
+DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
+"""Parameters that explicit steps of diffusion have to follow."""
 
-class Controls:
+
+class ParameterSpace:
     """The parameters of one simulation over a number of steps."""
 
     def __init__(self, simulation: "Simulation", steps: int):
         self._simulation, self._steps = simulation, steps
         self._phases = len(simulation.scene.phase)
-        no_emitter = {"nozzle_path": np.zeros(simulation.dimension), "flow_rate": np.zeros(())}
-        self._scene: Arrays = no_emitter | simulation.parameters()
+        absent = {name: np.zeros(self.shapes(name)[0]) for name in RUN}
+        self._scene: Arrays = absent | scene_values(simulation)
         self._warned = False
 
     def shapes(self, name: str) -> list[tuple[int, ...]]:
         """The shapes that a parameter may have; () is a number."""
-        return parameter_shapes(name, self._steps, self._phases, self._simulation.positions.shape)
+        return BY_NAME[name].shapes(self._steps, self._phases, self._simulation.positions.shape)
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
         """Values as float64 arrays; raises `InputError` in a sentence. A ``what`` of "direction" may be negative."""
@@ -78,22 +74,20 @@ class Controls:
         if state is not None:
             fractions = self._scene["mass_fractions"] if state.mass_fractions is None else state.mass_fractions
             rollout.initial.set(state.positions, state.velocities, fractions)
-        elif values.keys().isdisjoint(STATES):
+        elif values.keys().isdisjoint(STATE):
             rollout.initial.assign(simulation.state)
         else:
-            rollout.initial.set(*(values.get(name, self._scene[name]) for name in STATES))
-        chosen = {name: values.get(name, self._scene[name]) for name in (*MATERIALS, *NUMBERS)}
+            rollout.initial.set(*(values.get(name, self._scene[name]) for name in STATE))
+        chosen = {name: values.get(name, self._scene[name]) for name in RUN}
         rollout.time_step, rollout.flow_rate = float(chosen["time_step"]), float(chosen["flow_rate"])
-        parameters.set_tables(**{name: values.get(name, self._scene[name]) for name in TABLES})
-        masses = self._masses(values) if state is None else state.constants.reference_density
-        parameters.set_constants(**chosen, masses=masses)
-        diffusion = ("time_step", "mobility", "interface_width", "rest_density")
-        needed = simulation.substeps(**{name: chosen[name] for name in diffusion})
+        density = self._reference_density(values) if state is None else state.constants.reference_density
+        parameters.set({**chosen, "reference_density": density})
+        needed = simulation.substeps(**{name: chosen[name] for name in DIFFUSION})
         rollout.substeps = max(needed, 1) if "mobility" in varied and self._phases > 1 else needed
 
     def check_restart(self, state: RestartState, values: Arrays) -> None:
         """Whether a state is one of this simulation, and ``values`` go with it; raises `InputError`."""
-        for name in (*STATES, "rest_density"):
+        for name in (*STATE, "rest_density"):
             if name in values:
                 raise InputError(f"control {name} is given, but must be left out with a state, which has its own.")
         check_state(state, self._simulation.scene, self._simulation.positions.shape, self._free)
@@ -113,37 +107,35 @@ class Controls:
                 raise InputError("direction tilt is given, but must be left out, as gravity is given in its place.")
             angles = values.get("tilt", np.zeros(self._simulation.dimension - 1))
             along = {**along, "gravity": self._tilt.tangent(angles, along["tilt"])}
-        zeros = {name: np.zeros_like(self._scene[name]) for name in self._scene}
-        dot.set(*(along.get(name, zeros[name]) for name in STATES))
-        parameters.set_tables(**{name: along.get(name, zeros[name]) for name in TABLES})
-        composition = [along.get(name, zeros[name]) for name in ("mass_fractions", "rest_density")]
-        parameters.set_constants(
-            **{name: along.get(name, zeros[name]) for name in (*MATERIALS, *NUMBERS)},
-            masses=masses_tangent(*self._composition(values), *map(np.atleast_1d, composition)),
-        )
+        along = {name: along.get(name, np.zeros_like(value)) for name, value in self._scene.items()}
+        dot.set(*(along[name] for name in STATE))
+        fractions_dot, density_dot = along["mass_fractions"], np.atleast_1d(along["rest_density"])
+        change = reference_density_tangent(*self._composition(values), fractions_dot, density_dot)
+        parameters.set({**{name: along[name] for name in RUN}, "reference_density": change})
         return dot, parameters
 
     def gradient(self, values: Arrays, state: State, parameters: Parameters) -> Arrays:
         """Adjoints of the first state and of the parameters, for the names and in the shapes of ``values``."""
+        dimension = self._simulation.dimension
         found: Arrays = {}
-        if not values.keys().isdisjoint(STATES):
-            arrays = state.numpy(self._simulation.dimension)
-            found |= {name: array.astype(np.float64) for name, array in zip(STATES, arrays, strict=True)}
-        for name in (*TABLES, *MATERIALS, *NUMBERS):
+        if not values.keys().isdisjoint(STATE):
+            found |= dict(zip(STATE, (array.astype(np.float64) for array in state.numpy(dimension)), strict=True))
+        for name in RUN:
             if name in values:
-                found[name] = getattr(parameters, name).numpy().astype(np.float64)
+                found[name] = parameters[name].numpy().astype(np.float64)
         if "tilt" in values:
-            gravity = parameters.gravity.numpy()[:, : self._simulation.dimension].astype(np.float64)
+            gravity = parameters["gravity"].numpy()[:, :dimension].astype(np.float64)
             found["tilt"] = self._tilt.adjoint(values["tilt"], gravity)
         for name in OVER_TIME:
             if name in values:
-                table = found[name][:, : self._simulation.dimension]
+                table = found[name][:, :dimension]
                 found[name] = table if values[name].ndim == 2 else table.sum(axis=0)
         if not values.keys().isdisjoint(("mass_fractions", "rest_density")):
-            bars = masses_adjoint(*self._composition(values), parameters.masses.numpy().astype(np.float64))
-            for name, bar in zip(("mass_fractions", "rest_density"), bars, strict=True):
+            bar = parameters["reference_density"].numpy().astype(np.float64)
+            bars = reference_density_adjoint(*self._composition(values), bar)
+            for name, share in zip(("mass_fractions", "rest_density"), bars, strict=True):
                 if name in found:
-                    found[name] = found[name] + bar
+                    found[name] = found[name] + share
         return {name: found[name].reshape(values[name].shape) for name in values if name in found}
 
     def _check(self, values: Arrays) -> None:
@@ -172,11 +164,11 @@ class Controls:
         """The values, with gravity in the place of a tilt."""
         return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values
 
-    def _masses(self, values: Arrays) -> np.ndarray:
-        """(n,) of the particles; fractions a little below 0, as diffusion leaves them, may still make one negative."""
+    def _reference_density(self, values: Arrays) -> np.ndarray:
+        """(n,) of the particles [kg/m3]; fractions a little below 0, left by diffusion, may make one negative."""
         fractions, density = self._composition(values)
         with np.errstate(divide="ignore"):
-            found = masses_of(fractions, density)
+            found = reference_density(fractions, density)
         bad = np.flatnonzero(~(np.isfinite(found) & (found > 0.0)))
         if bad.size:
             raise InputError(
@@ -190,10 +182,5 @@ class Controls:
         return fractions, np.atleast_1d(density)
 
     def _checked(self, name: str, value: Any, what: str) -> np.ndarray:
-        if name not in NAMES:
-            raise InputError(f"{what} {name!r} is unknown, but must be one of {', '.join(NAMES)}.")
-        if name in OF_EMITTER and self._simulation.scene.emitter is None:
-            raise InputError(f"{what} {name} is given, but must be left out, as the scene has no emitter.")
-        if name == "tilt" and not np.any(self._scene["gravity"]):
-            raise InputError(f"{what} tilt is given, but must be left out, as the scene has no gravity to lean.")
-        return checked_parameter(name, value, self.shapes(name), what)
+        check_known(name, self._simulation.scene, what)
+        return checked_value(name, value, self.shapes(name), what)

@@ -11,79 +11,20 @@ mean keeps the shear stress continuous between fluids); friction is 0 for a wall
 angular momentum too, but carries no shear to a wall, which the laminar form does.
 """
 
-from collections.abc import Callable
 from functools import cache
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
+from cortado.kernels import Kernels
 from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.sph.pair_forces import PairForm, laminar, pairwise
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+from cortado.walls.layers import WallLayers
 
 
 @cache
-def pairwise_functions(discretisation: Discretisation) -> SimpleNamespace:
-    """phi of the pairwise form: ``force``, ``tangent``, and the transposed derivatives ``adjoint_x``, ``adjoint_v``."""
-    real, vector = discretisation.precision.real, discretisation.precision.vector
-    surroundings = surroundings_type(discretisation.precision)
-    pair = pair_functions(discretisation)
-    gradient, hessian_product, size = pair.gradient, pair.hessian_product, pair.size
-
-    @wp.func
-    def force(x: vector, v: vector, s: surroundings) -> vector:
-        return (wp.dot(v, x) / size(x, s)) * gradient(x, s)
-
-    @wp.func
-    def tangent(x: vector, v: vector, x_dot: vector, v_dot: vector, s: surroundings) -> vector:
-        d = size(x, s)
-        b = wp.dot(v, x) / d
-        b_dot = (wp.dot(v_dot, x) + wp.dot(v, x_dot) - real(2.0) * b * wp.dot(x, x_dot)) / d
-        return b_dot * gradient(x, s) + b * hessian_product(x, x_dot, s)
-
-    @wp.func
-    def adjoint_x(x: vector, v: vector, w: vector, s: surroundings) -> vector:
-        d = size(x, s)
-        b = wp.dot(v, x) / d
-        return b * hessian_product(x, w, s) + (wp.dot(gradient(x, s), w) / d) * (v - real(2.0) * b * x)
-
-    @wp.func
-    def adjoint_v(x: vector, v: vector, w: vector, s: surroundings) -> vector:
-        return (wp.dot(gradient(x, s), w) / size(x, s)) * x
-
-    return SimpleNamespace(force=force, tangent=tangent, adjoint_x=adjoint_x, adjoint_v=adjoint_v)
-
-
-@cache
-def laminar_functions(discretisation: Discretisation) -> SimpleNamespace:
-    """phi of the laminar form, as `pairwise_functions`."""
-    vector = discretisation.precision.vector
-    surroundings = surroundings_type(discretisation.precision)
-    pair = pair_functions(discretisation)
-    factor, factor_gradient = pair.factor, pair.factor_gradient
-
-    @wp.func
-    def force(x: vector, v: vector, s: surroundings) -> vector:
-        return factor(x, s) * v
-
-    @wp.func
-    def tangent(x: vector, v: vector, x_dot: vector, v_dot: vector, s: surroundings) -> vector:
-        return factor(x, s) * v_dot + wp.dot(factor_gradient(x, s), x_dot) * v
-
-    @wp.func
-    def adjoint_x(x: vector, v: vector, w: vector, s: surroundings) -> vector:
-        return wp.dot(v, w) * factor_gradient(x, s)
-
-    @wp.func
-    def adjoint_v(x: vector, v: vector, w: vector, s: surroundings) -> vector:
-        return factor(x, s) * w
-
-    return SimpleNamespace(force=force, tangent=tangent, adjoint_x=adjoint_x, adjoint_v=adjoint_v)
-
-
-PairFunctions = Callable[[Discretisation], SimpleNamespace]
-
-
-@cache
-def viscosity_kernels(discretisation: Discretisation, form: PairFunctions) -> SimpleNamespace:
+def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels:
     """Kernels ``forward``, ``tangent`` and ``adjoint`` of the viscous acceleration with a given pair force phi."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     surroundings = surroundings_type(discretisation.precision)
@@ -91,7 +32,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairFunctions) -> Si
     separation, vectors, numbers = pair.separation, pair.vectors, pair.numbers
     phi = form(discretisation)
     phi_force, phi_tangent, phi_adjoint_x, phi_adjoint_v = phi.force, phi.tangent, phi.adjoint_x, phi.adjoint_v
-    name = form.__name__.removesuffix("_functions")  # a module for each form: their functions share names
+    name = form.__name__  # a module for each form: their functions share names
 
     @wp.func
     def shared(a: real, b: real) -> real:
@@ -293,4 +234,35 @@ def viscosity_kernels(discretisation: Discretisation, form: PairFunctions) -> Si
         m_bar[i] = m_bar[i] - factor / m[i] * own_work
         mu_bar[i] = mu_bar[i] + factor * mu_work
 
-    return SimpleNamespace(forward=viscosity, tangent=viscosity_tangent, adjoint=viscosity_adjoint)
+    return Kernels(viscosity, viscosity_tangent, viscosity_adjoint)
+
+
+class Viscosity:
+    """A viscous force between neighbours, and with walls."""
+
+    shares: tuple[str, ...] = ()  # viscosities reach particles through the mixture, which has the phases' adjoints
+
+    def __init__(self, discretisation: Discretisation, form: PairForm, kappa: float, friction: float):
+        """``friction`` 0 lets walls slip freely."""
+        self._kernels, self.friction = viscosity_kernels(discretisation, form), friction
+        self._constants: dict[str, Any] = {"kappa": kappa, "friction": friction}
+
+    def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
+        step.launch(self._kernels.forward, **self._constants, acceleration_in=before, acceleration=after)
+
+    def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
+        accelerations = {"acceleration_in_dot": before, "acceleration_dot": after}
+        step.launch(self._kernels.tangent, *dot.named, **self._constants, **accelerations)
+
+    def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
+        step.launch(self._kernels.adjoint, *bar.named, **self._constants, acceleration_bar=acceleration_bar)
+
+
+def pairwise_viscosity(discretisation: Discretisation, dimension: int, wall: WallLayers | None) -> Viscosity:
+    """The form of Monaghan (2005), which keeps linear and angular momentum. ``wall`` None: free slip."""
+    return Viscosity(discretisation, pairwise, 2.0 * (dimension + 2), friction=1.0 if wall else 0.0)
+
+
+def laminar_viscosity(discretisation: Discretisation, dimension: int, wall: WallLayers | None) -> Viscosity:
+    """The form of Morris, Fox and Zhu (1997), which carries shear to a wall. ``wall`` None: free slip."""
+    return Viscosity(discretisation, laminar, 2.0, friction=wall.friction if wall else 0.0)

@@ -7,7 +7,8 @@ import numpy as np
 
 from cortado.arrays import as_numbers
 from cortado.errors import InputError, shown
-from cortado.parameter_values import POSITIVE, Arrays
+from cortado.parameters.registry import BY_NAME, Range
+from cortado.parameters.values import Arrays
 from cortado.precision import Precision
 from cortado.region import TOLERANCE
 from cortado.restart import RestartState
@@ -21,7 +22,7 @@ def check_sizes(values: Arrays, precision: Precision) -> None:
         if size.max(initial=0.0) > precision.greatest:
             wanted = f"at most {precision.greatest:g} in {precision.name}"
             raise InputError(f"parameter {name} has a value of size {size.max():g}, but must be {wanted}.")
-        if name in POSITIVE and size.min(initial=1.0) < 1.0 / precision.greatest:
+        if BY_NAME[name].range is Range.POSITIVE and size.min(initial=1.0) < 1.0 / precision.greatest:
             wanted = f"at least {1.0 / precision.greatest:g} in {precision.name}"
             raise InputError(f"parameter {name} is {size.min():g}, but must be {wanted}.")
 

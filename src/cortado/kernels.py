@@ -1,0 +1,15 @@
+"""Families of kernels and of the functions that they are made of, typed."""
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """A Warp kernel with its derivatives, or a Warp function with its."""
+
+    forward: Any
+    tangent: Any
+    """Forward mode: from the tangents of the inputs, ``x_dot`` of an argument ``x``, to those of the outputs."""
+    adjoint: Any
+    """Reverse mode: adds to the adjoints of the inputs, ``x_bar``, what those of the outputs ask for."""

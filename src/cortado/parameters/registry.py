@@ -1,0 +1,214 @@
+"""The one list of parameters: what each is called, its unit, shape and range, what it is in a scene, and what a
+meaningful change of it is. Without Warp.
+
+Shapes on a device, checks of what users write, scales of the certificate and tables of the documents follow from it.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Axis(Enum):
+    """What a parameter has a value for."""
+
+    SCALAR = "one number"
+    PHASE = "each phase"
+    STEP = "each step, or all of them"
+    PARTICLE = "each particle"
+
+
+class Role(Enum):
+    """What a parameter is to a run."""
+
+    RUN = "what steps depend on"
+    STATE = "part of the first state"
+    VIEW = "another way to write a parameter"
+    LOSS = "what only losses depend on"
+
+
+class Range(Enum):
+    """Which numbers a parameter may be."""
+
+    ANY = "any"
+    POSITIVE = "greater than 0"
+    NOT_NEGATIVE = "at least 0"
+    FRACTIONS = "adding up to 1 for each particle"
+
+
+class Source(Protocol):
+    """A simulation as the registry sees it: a scene, cut into particles."""
+
+    scene: Any
+    positions: NDArray
+    velocities: NDArray
+    mass_fractions: NDArray
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Something that a run, or a loss of it, depends on."""
+
+    name: str
+    unit: str
+    """In SI; empty for a plain number."""
+    axis: Axis
+    value: Callable[[Source], Any]
+    """What it is in a scene that has it."""
+    components: Callable[[int, int], int] | None = None
+    """Of a vector, in so many dimensions and with so many phases; None for a number."""
+    role: Role = Role.RUN
+    range: Range = Range.ANY
+    change: Callable[[Source, NDArray], Any] = lambda source, value: np.abs(value)
+    """What an optimiser would take for a large change, for one at a value: by default the value itself."""
+    acts: Callable[[Source, Mapping[str, NDArray]], bool] = lambda source, values: True
+    """Whether it can make a difference in a scene, with values of parameters by name."""
+    present: Callable[[Any], bool] = lambda scene: True
+    """Whether a scene has it."""
+    absent: str = ""
+    """What to say of a scene that does not: "has no emitter"."""
+    part: str | None = None
+    """The module of the force that it belongs to, where no other module makes it: see `cortado.solvers.parts`."""
+
+    def shapes(self, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:
+        """The shapes that its values may have, () for a number, where positions are (n, d)."""
+        particles, dimension = positions
+        own = () if self.components is None else (self.components(dimension, phases),)
+        if self.axis is Axis.STEP:
+            return [own, (steps, *own)] if steps > 0 else [own]
+        if self.axis is Axis.PARTICLE:
+            return [(particles, *own)]
+        several = self.axis is Axis.PHASE and (phases > 1 or own)
+        return [(phases, *own) if several else own]
+
+
+def _vector(dimension: int, phases: int) -> int:
+    return dimension
+
+
+def _spacing(source: Source, value: Any = None) -> float:
+    return source.scene.discretisation.spacing
+
+
+def _size_of_gravity(source: Source, value: Any = None) -> float:
+    return float(np.linalg.norm(source.scene.forces.gravity)) or 1.0
+
+
+def _speed_of_fall(source: Source, value: Any) -> float:
+    height = float(np.ptp(source.positions, axis=0).max()) + _spacing(source)
+    return float(np.sqrt(_size_of_gravity(source) * height))
+
+
+def _several_phases(source: Source, values: Mapping[str, NDArray]) -> bool:
+    return len(source.scene.phase) > 1
+
+
+def _diffuses(source: Source, values: Mapping[str, NDArray]) -> bool:
+    return _several_phases(source, values) and bool(values["mobility"] > 0.0)
+
+
+def _of_phases(name: str) -> Callable[[Source], list[Any]]:
+    return lambda source: [getattr(phase, name) for phase in source.scene.phase]
+
+
+def _has_emitter(scene: Any) -> bool:
+    return scene.emitter is not None
+
+
+PARAMETERS = (
+    Parameter(
+        "gravity", "m/s²", Axis.STEP, lambda s: s.scene.forces.gravity, components=_vector, change=_size_of_gravity
+    ),
+    Parameter(
+        "tilt",
+        "°",
+        Axis.STEP,
+        lambda s: np.zeros(s.scene.dimension - 1),
+        components=lambda dimension, phases: dimension - 1,
+        role=Role.VIEW,
+        change=lambda source, value: np.degrees(1.0),
+        present=lambda scene: any(scene.forces.gravity),
+        absent="has no gravity to lean",
+    ),
+    Parameter(
+        "initial_positions",
+        "m",
+        Axis.PARTICLE,
+        lambda s: s.positions,
+        components=_vector,
+        role=Role.STATE,
+        change=_spacing,
+    ),
+    Parameter(
+        "initial_velocities",
+        "m/s",
+        Axis.PARTICLE,
+        lambda s: s.velocities,
+        components=_vector,
+        role=Role.STATE,
+        change=_speed_of_fall,
+    ),
+    Parameter(
+        "mass_fractions",
+        "",
+        Axis.PARTICLE,
+        lambda s: s.mass_fractions,
+        components=lambda dimension, phases: phases,
+        role=Role.STATE,
+        range=Range.FRACTIONS,
+        change=lambda source, value: 0.02,
+        acts=_several_phases,
+    ),
+    Parameter("rest_density", "kg/m³", Axis.PHASE, _of_phases("rest_density"), range=Range.POSITIVE),
+    Parameter("viscosity", "Pa s", Axis.PHASE, _of_phases("viscosity"), range=Range.NOT_NEGATIVE),
+    Parameter("time_step", "s", Axis.SCALAR, lambda s: s.scene.solver.time_step, range=Range.POSITIVE),
+    Parameter(
+        "mobility", "m²/s", Axis.SCALAR, lambda s: s.scene.mixture.mobility, range=Range.NOT_NEGATIVE, acts=_diffuses
+    ),
+    Parameter(
+        "interface_width",
+        "m",
+        Axis.SCALAR,
+        lambda s: s.scene.mixture.width(s.scene.discretisation.spacing),
+        range=Range.POSITIVE,
+        acts=_diffuses,
+    ),
+    Parameter(
+        "nozzle_path",
+        "m",
+        Axis.STEP,
+        lambda s: s.scene.emitter.outlet,
+        components=_vector,
+        change=_spacing,
+        present=_has_emitter,
+        absent="has no emitter",
+    ),
+    Parameter(
+        "flow_rate",
+        "m³/s",
+        Axis.SCALAR,
+        lambda s: s.scene.emitter.flow_rate,
+        range=Range.POSITIVE,
+        present=_has_emitter,
+        absent="has no emitter",
+    ),
+    Parameter(
+        "colours",
+        "",
+        Axis.PHASE,
+        _of_phases("colour"),
+        components=lambda dimension, phases: 3,
+        role=Role.LOSS,
+        change=lambda source, value: 1.0,
+    ),
+)
+BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
+
+
+def names(role: Role | None = None, axis: Axis | None = None) -> tuple[str, ...]:
+    """The names of parameters of a role and with an axis, of any where none is given, in the order of the list."""
+    return tuple(p.name for p in PARAMETERS if role in (None, p.role) and axis in (None, p.axis))

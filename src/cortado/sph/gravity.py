@@ -1,0 +1,61 @@
+"""Gravity: the same acceleration everywhere, one for each step."""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.kernels import Kernels
+from cortado.launching import sum_of
+from cortado.physics.integration import integration_module
+from cortado.precision import Precision
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+
+
+@cache
+def gravity_kernels(precision: Precision) -> Kernels:
+    """The kernels; the tangent is the acceleration itself, of another table."""
+    vector = precision.vector
+
+    @wp.kernel(module=integration_module(precision, True))
+    def accelerate(
+        gravity: wp.array(dtype=vector),
+        step: wp.array(dtype=wp.int32),
+        acceleration_in: wp.array(dtype=vector),
+        # out
+        acceleration: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        acceleration[i] = acceleration_in[i] + gravity[step[0]]
+
+    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
+    def adjoint(
+        total: wp.array(dtype=vector),
+        step: wp.array(dtype=wp.int32),
+        # in and out
+        gravity_bar: wp.array(dtype=vector),
+    ):
+        gravity_bar[step[0]] = gravity_bar[step[0]] + total[0]
+
+    return Kernels(accelerate, accelerate, adjoint)
+
+
+class Gravity:
+    """The force of gravity on a number of particles."""
+
+    shares: tuple[str, ...] = ()
+
+    def __init__(self, precision: Precision, particles: int, device: Any):
+        self._kernels = gravity_kernels(precision)
+        self._sum = sum_of(precision.vector, particles, device)
+
+    def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
+        step.launch(self._kernels.forward, acceleration_in=before, acceleration=after)
+
+    def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
+        gravity_dot = dot.parameters["gravity"]
+        step.launch(self._kernels.tangent, gravity=gravity_dot, acceleration_in=before, acceleration=after)
+
+    def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
+        total = self._sum(acceleration_bar)
+        step.launch(self._kernels.adjoint, *bar.named, total=total, threads=1)

@@ -1,0 +1,132 @@
+"""The mixture step: phases diffuse into one another, and each particle gets the material of what it is made of.
+
+It comes first in a step, on the particles at rest at x(t); what it makes of a particle holds for the rest of the step.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from cortado.physics.diffusion import Diffusion, diffusion_kernels
+from cortado.physics.mixture import mixture_kernels
+from cortado.precision import Precision
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+
+
+@dataclass(frozen=True)
+class Phases:
+    """How many phases there are, and how they diffuse into one another."""
+
+    count: int
+    diffusion: Diffusion | None
+    """None: not at all."""
+    strength: float
+    """alpha of the free energy [-]."""
+
+
+class Mixture:
+    """The composition of the particles of one solver; its arrays are reused by every step."""
+
+    def __init__(self, phases: Phases, precision: Precision, particles: int, device: Any, requires_grad: bool = False):
+        self.phases = phases
+        self.kernels = mixture_kernels(precision, phases.count)
+        self.diffusion = diffusion_kernels(phases.diffusion) if phases.diffusion else None
+        self.shares = ("rest_density", "viscosity", *(("mobility", "interface_width") if phases.diffusion else ()))
+        """Parameters, numbers or those of phases, in whose adjoints every particle has a share."""
+        self.substeps = 0
+        """Explicit steps of diffusion within a time step."""
+        self._precision, self._particles = precision, particles
+        self._options = {"device": device, "requires_grad": requires_grad}
+        self.c: list[wp.array] = [self.fractions()]
+        """Sorted fractions (n,) before each substep, and after the last."""
+        self.chi: list[wp.array] = []
+        """Chemical potentials (n,) of each substep [-]."""
+        self.w: list[wp.array] = []
+        """m M (n,) of each substep [kg / (m s)]."""
+
+    def fractions(self) -> wp.array:
+        """(n,) of one number for each phase, all 0."""
+        return wp.zeros(self._particles, dtype=self._precision.fractions(self.phases.count), **self._options)
+
+    def numbers(self) -> wp.array:
+        """(n,) numbers, all 0."""
+        return wp.zeros(self._particles, dtype=self._precision.real, **self._options)
+
+    def reserve(self, substeps: int) -> None:
+        """Take so many substeps from now on, and make room for them."""
+        self.substeps = substeps
+        while len(self.chi) < substeps:
+            self.c.append(self.fractions())
+            self.chi.append(self.fractions())
+            self.w.append(self.numbers())
+
+    def diffuse(self, step: StepContext, mass_fractions: wp.array) -> None:
+        """From ``mass_fractions`` in the scene's order, and write rest densities and viscosities."""
+        step.launch(self.kernels.sort, c_scene=mass_fractions, c=self.c[0])
+        for k in range(self.substeps):
+            assert self.diffusion is not None
+            now = {"c": self.c[k], "chi": self.chi[k], "w": self.w[k]}
+            step.launch(self.diffusion.potential.forward, strength=self.phases.strength, **now)
+            step.launch(self.diffusion.flux.forward, substeps=self.substeps, c_new=self.c[k + 1], **now)
+        step.launch(self.kernels.blend.forward, c=self.c[self.substeps])
+
+    def result(self, step: StepContext, mass_fractions: wp.array) -> None:
+        """Write the fractions after the last substep, in the scene's order."""
+        step.launch(self.kernels.unsort, c=self.c[self.substeps], c_scene=mass_fractions)
+
+
+class MixtureAdjoint:
+    """Reverse mode of a mixture step, by gathers."""
+
+    def __init__(self, mixture: Mixture):
+        self._mixture = mixture
+        self._c_bar, self._y, self._z = (mixture.fractions() for _ in range(3))
+
+    def step(self, step: StepContext, bar: Adjoints, new_fractions_bar: wp.array, fractions_bar: wp.array) -> None:
+        """From the adjoints of the materials and of the new fractions to that of the old ones, in scene order."""
+        mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, bar.named
+        substeps, strength, c_bar, y, z = mixture.substeps, mixture.phases.strength, self._c_bar, self._y, self._z
+        step.launch(kernels.blend.adjoint, *known, c=mixture.c[substeps], c_scene_bar=new_fractions_bar, c_bar=c_bar)
+        for k in reversed(range(substeps)):
+            assert diffusion is not None
+            c, chi, w = mixture.c[k], mixture.chi[k], mixture.w[k]
+            step.launch(diffusion.scale_adjoint, substeps=substeps, c_bar=c_bar, y=y)
+            step.launch(diffusion.flux.adjoint, *known, strength=strength, c=c, chi=chi, w=w, y=y, c_bar=c_bar, z=z)
+            step.launch(diffusion.potential.adjoint, *known, c=c, z=z, c_bar=c_bar)
+        step.launch(kernels.unsort, c=c_bar, c_scene=fractions_bar)
+
+
+class MixtureTangent:
+    """Forward mode of a mixture step."""
+
+    def __init__(self, mixture: Mixture):
+        self._mixture = mixture
+        self._c_dot = [mixture.fractions() for _ in range(2)]
+        self._chi_dot = mixture.fractions()
+        self._w_dot = mixture.numbers()
+
+    def step(self, step: StepContext, dot: Tangents, fractions_dot: wp.array) -> None:
+        """From the tangent of the old fractions, in scene order, to those of the materials; `result` writes the new."""
+        mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, dot.named
+        substeps, now = mixture.substeps, {"chi_dot": self._chi_dot, "w_dot": self._w_dot}
+        step.launch(kernels.sort, c_scene=fractions_dot, c=self._c_dot[0])
+        for k in range(substeps):
+            assert diffusion is not None
+            c_dot, c_new_dot = self._c_dot[k % 2], self._c_dot[(k + 1) % 2]
+            step.launch(
+                diffusion.potential.tangent,
+                *known,
+                strength=mixture.phases.strength,
+                c=mixture.c[k],
+                c_dot=c_dot,
+                **now,
+            )
+            flux = {"chi": mixture.chi[k], "w": mixture.w[k], "c_dot": c_dot, "c_new_dot": c_new_dot}
+            step.launch(diffusion.flux.tangent, *known, substeps=substeps, **flux, **now)
+        step.launch(kernels.blend.tangent, *known, c=mixture.c[substeps], c_dot=self._c_dot[substeps % 2])
+
+    def result(self, step: StepContext, new_fractions_dot: wp.array) -> None:
+        """Write the tangent of the new fractions, in the scene's order."""
+        last = self._c_dot[self._mixture.substeps % 2]
+        step.launch(self._mixture.kernels.unsort, c=last, c_scene=new_fractions_dot)

@@ -1,0 +1,88 @@
+"""Forms of the viscous force phi(x, v) between a pair, as functions of Warp.
+
+pairwise:  phi = B G,  B = v . x / (|x|^2 + 0.01 h^2)     (Monaghan 2005)
+laminar:   phi = F v,  F = x . G / (|x|^2 + 0.01 h^2)     (Morris, Fox and Zhu 1997)
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
+
+
+@dataclass(frozen=True)
+class PairForce:
+    """phi(x, v) of one form with its derivatives, functions of Warp."""
+
+    force: Any
+    tangent: Any
+    adjoint_x: Any
+    """The transposed derivative with respect to x, applied to a vector."""
+    adjoint_v: Any
+    """The same with respect to v."""
+
+
+PairForm = Callable[[Discretisation], PairForce]
+
+
+@cache
+def pairwise(discretisation: Discretisation) -> PairForce:
+    """phi of the pairwise form: ``force``, ``tangent``, and the transposed derivatives ``adjoint_x``, ``adjoint_v``."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    surroundings = surroundings_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    gradient, hessian_product, size = pair.gradient, pair.hessian_product, pair.size
+
+    @wp.func
+    def force(x: vector, v: vector, s: surroundings) -> vector:
+        return (wp.dot(v, x) / size(x, s)) * gradient(x, s)
+
+    @wp.func
+    def tangent(x: vector, v: vector, x_dot: vector, v_dot: vector, s: surroundings) -> vector:
+        d = size(x, s)
+        b = wp.dot(v, x) / d
+        b_dot = (wp.dot(v_dot, x) + wp.dot(v, x_dot) - real(2.0) * b * wp.dot(x, x_dot)) / d
+        return b_dot * gradient(x, s) + b * hessian_product(x, x_dot, s)
+
+    @wp.func
+    def adjoint_x(x: vector, v: vector, w: vector, s: surroundings) -> vector:
+        d = size(x, s)
+        b = wp.dot(v, x) / d
+        return b * hessian_product(x, w, s) + (wp.dot(gradient(x, s), w) / d) * (v - real(2.0) * b * x)
+
+    @wp.func
+    def adjoint_v(x: vector, v: vector, w: vector, s: surroundings) -> vector:
+        return (wp.dot(gradient(x, s), w) / size(x, s)) * x
+
+    return PairForce(force, tangent, adjoint_x, adjoint_v)
+
+
+@cache
+def laminar(discretisation: Discretisation) -> PairForce:
+    """phi of the laminar form, as `pairwise`."""
+    vector = discretisation.precision.vector
+    surroundings = surroundings_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    factor, factor_gradient = pair.factor, pair.factor_gradient
+
+    @wp.func
+    def force(x: vector, v: vector, s: surroundings) -> vector:
+        return factor(x, s) * v
+
+    @wp.func
+    def tangent(x: vector, v: vector, x_dot: vector, v_dot: vector, s: surroundings) -> vector:
+        return factor(x, s) * v_dot + wp.dot(factor_gradient(x, s), x_dot) * v
+
+    @wp.func
+    def adjoint_x(x: vector, v: vector, w: vector, s: surroundings) -> vector:
+        return wp.dot(v, w) * factor_gradient(x, s)
+
+    @wp.func
+    def adjoint_v(x: vector, v: vector, w: vector, s: surroundings) -> vector:
+        return factor(x, s) * w
+
+    return PairForce(force, tangent, adjoint_x, adjoint_v)

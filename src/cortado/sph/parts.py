@@ -1,0 +1,106 @@
+"""What a part of a step is given, and what it gives: forces, the mixture, the nozzle.
+
+A part reads the sorted particles and the parameters, and adds to adjoints: nothing that it is given is overwritten.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import warp as wp
+
+from cortado.launching import Launcher, Named, add, sum_of
+from cortado.parameters.registry import BY_NAME, Axis
+from cortado.particles import Arrays, Fields, Parameters, zeros
+from cortado.precision import Precision
+
+
+@dataclass(frozen=True)
+class StepContext:
+    """A step as its parts see it. Kernels find in it, by name, the fields of the particles, the parameters, ``s`` (what
+    lies around each particle), ``order`` (sorted -> scene) and ``step`` (1,), the number of the step."""
+
+    launcher: Launcher
+    surroundings: Any
+    order: wp.array
+    step: wp.array
+    fields: Fields
+    parameters: Parameters
+
+    @cached_property
+    def _known(self) -> tuple[Named, ...]:
+        own = {"s": self.surroundings, "order": self.order, "step": self.step}
+        return own, self.fields.named(), self.parameters.named()
+
+    def launch(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
+        """Launch a kernel over the particles; what is not among ``arguments`` and ``groups`` is the step's."""
+        self.launcher(kernel, *groups, *self._known, threads=threads, **arguments)
+
+
+@dataclass(frozen=True)
+class Tangents:
+    """Tangents of the sorted particles and of the parameters."""
+
+    fields: Fields
+    parameters: Parameters
+
+    @cached_property
+    def named(self) -> tuple[Named, ...]:
+        """For kernels: ``x_dot``, ``viscosity_dot`` and so on."""
+        return self.fields.named("_dot"), self.parameters.named("_dot")
+
+
+class Shares(Arrays):
+    """The adjoints of parameters in which every particle has a share, kept particle by particle until they are added
+    up: (n,) numbers, of a parameter of phases (n,) of one for each phase."""
+
+    def __init__(self, names: Iterable[str], particles: int, phases: int, precision: Precision, device: Any):
+        """Of the parameters of these names, all 0."""
+        kinds = {
+            name: (particles, precision.fractions(phases) if BY_NAME[name].axis is Axis.PHASE else precision.real)
+            for name in dict.fromkeys(names)
+        }
+        super().__init__(zeros(kinds, device))
+        self._sums = {name: sum_of(dtype, size, device) for name, (size, dtype) in kinds.items()}
+
+    def collect(self, bar: Parameters) -> None:
+        """Add them up into ``bar``, and begin anew."""
+        for name, total in self._sums.items():
+            add(total(self[name]).view(bar[name].dtype).flatten(), bar[name])
+        self.clear()
+
+
+@dataclass(frozen=True)
+class Adjoints:
+    """Where parts add adjoints: of the sorted particles, of the parameters, and particles' shares of the latter."""
+
+    fields: Fields
+    parameters: Parameters
+    shares: Shares
+
+    @cached_property
+    def named(self) -> tuple[Named, ...]:
+        """For kernels: ``x_bar`` and so on; ``viscosity_bar`` is that of the shares where these have it."""
+        whole = {
+            name: array
+            for name, array in self.parameters.named("_bar").items()
+            if name.removesuffix("_bar") not in self.shares.names
+        }
+        return self.fields.named("_bar"), self.shares.named("_bar"), whole
+
+
+class Force(Protocol):
+    """An explicit force. A step adds up the accelerations [m / s2] of its forces, one after the other."""
+
+    shares: tuple[str, ...]
+    """Parameters, numbers or those of phases, in whose adjoints every particle has a share."""
+
+    def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
+        """``after`` = ``before`` + this force's acceleration, both (n,) vectors."""
+
+    def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
+        """The same for the tangents of the accelerations, along ``dot``."""
+
+    def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
+        """Add to ``bar`` what the adjoint of the acceleration, (n,) vectors, asks for."""
