@@ -25,12 +25,12 @@ LAYERS = """
     physics.tint physics.colour_field physics.interpolation physics.rays physics.absorption
     shapes region pairs walls.points walls.places walls.layers walls.weights walls
     restart neighbours particles
-    sph.parts sph.gravity sph.pair_forces sph.viscosity sph.mixture sph.nozzle sph
     render.cameras render.views render.fields render.marching render.renderer
     vtkhdf_layout vtkhdf
     scene_kinds scene_tables scene_toml point_reader scene_points
     scene_fluids scene_emitter scene_mixture scene_render scene_containers scene_stability scene_checks scene sampling
     discrete_scene
+    sph.parts sph.pair_forces sph.gravity sph.viscosity sph.mixture sph.nozzle sph
     reference.digits reference.engine reference.losses reference.histories reference.simulation reference
     trajectory
     solvers.containment

@@ -10,9 +10,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, create_model, field_validator, model_validator
 
 from cortado.errors import CortadoWarning, SceneError
+from cortado.parameters.registry import PARAMETERS
 from cortado.scene_checks import check_scene
 from cortado.scene_containers import AnyContainer, BoxContainer, CylinderContainer, NoContainer
 from cortado.scene_emitter import Emitter
@@ -79,8 +80,8 @@ class Phase(Table):
     """(3,) red, green and blue, each from 0 to 1."""
 
 
-class Forces(Table):
-    """Which forces act."""
+class FixedForces(Table):
+    """The forces that every scene has."""
 
     gravity: Annotated[tuple[float, ...], Components(Quantity("m/s2"), default=(0.0, -9.81, 0.0))] = ()
     """(d,) [m/s2]"""
@@ -88,6 +89,15 @@ class Forces(Table):
     """"pairwise": the report's equation 10; "laminar": Morris et al. (1997)."""
     pressure: Annotated[bool, Flag()] = True
     """Whether the fluid resists compression."""
+
+
+_OPTIONAL: dict[str, Any] = {
+    parameter.name: (Annotated[float, Quantity(parameter.unit, least=0.0)] | None, None)
+    for parameter in PARAMETERS
+    if parameter.is_optional
+}
+Forces: Any = create_model("Forces", __base__=FixedForces, __module__=__name__, **_OPTIONAL)
+"""Which forces act: `FixedForces`, and the optional ones of the registry of parameters."""
 
 
 class Solver(Table):

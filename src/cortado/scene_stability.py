@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cortado.parameters.registry import PARAMETERS
 from cortado.parameters.values import Arrays
 from cortado.shapes import Points
 
@@ -13,13 +14,15 @@ if TYPE_CHECKING:
 
 
 def stability_limit(scene: "Scene", values: Arrays | None = None) -> float:
-    """The smallest of three limits [s], infinite if nothing moves; h is the support radius.
+    """The smallest of several limits [s], infinite if nothing moves; h is the support radius.
 
     Courant: 0.4 h / v, where v is the largest initial speed and that of a free fall through the container, or through
     the extent of the fluid if there is none (Monaghan 1992); an emitter has its speed, and fluid falls from its outlet.
     Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity: 0.06 h^2 rho / mu of the most viscous and the lightest phase
     in use, as they may meet: the least that a lattice bears of explicit steps with any kernel here (Wendland C4 in 3-D;
     the form is that of Morris et al. 1997, whose 0.125 is for an h of half the support).
+
+    Optional forces have limits of their own, in the registry of parameters.
 
     ``values``: parameters by name that replace the scene's; of a gravity for each step the strongest counts.
     """
@@ -30,7 +33,8 @@ def stability_limit(scene: "Scene", values: Arrays | None = None) -> float:
     speed = _first_speed(scene, values) + sqrt(2.0 * float((np.abs(gravity) @ (upper - lower)).max()))
     courant = 0.4 * support / speed if speed > 0.0 else inf
     force = 0.25 * sqrt(support / strength) if strength > 0.0 else inf
-    return min(courant, force, _viscous_limit(scene, values))
+    optional = [p.longest_step(scene, values) for p in PARAMETERS if p.is_optional and p.present(scene)]
+    return min(courant, force, _viscous_limit(scene, values), *optional)
 
 
 def _first_speed(scene: "Scene", values: Arrays) -> float:

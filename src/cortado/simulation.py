@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from hashlib import sha256
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from cortado.errors import CortadoWarning, InputError, shown
 from cortado.memory import frame_parts, require, simulation_parts
 from cortado.neighbours import Grid, NeighbourSearch
 from cortado.parameters.checks import check_sizes
+from cortado.parameters.registry import PARAMETERS
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import scene_values
 from cortado.particles import State, padded
@@ -29,20 +31,16 @@ from cortado.scene_containers import NoContainer
 from cortado.solvers.containment import Walled
 from cortado.solvers.pcisph import Pcisph
 from cortado.solvers.pcisph_parts import PressureSolve
-from cortado.sph.gravity import Gravity
 from cortado.sph.mixture import Phases
 from cortado.sph.nozzle import Nozzle
-from cortado.sph.parts import Force
-from cortado.sph.viscosity import laminar_viscosity, pairwise_viscosity
+from cortado.sph.parts import Force, Setting
 from cortado.threads import WARP, Turn, in_turn
 from cortado.trajectory import Trajectory
-from cortado.walls.layers import WallLayers
 
 MOST_SUBSTEPS = 10_000
 """Explicit steps of diffusion in a time step; beyond it the mobility is taken for a mistake."""
 GREATEST_NUMBER = 10**18
 """Of steps: within a 64-bit number."""
-VISCOSITIES = {"pairwise": pairwise_viscosity, "laminar": laminar_viscosity}
 
 
 class Simulation:
@@ -249,7 +247,7 @@ class Simulation:
             discretisation,
             discrete.lattice,
             search,
-            self._forces(discretisation, discrete.wall_layers),
+            self._forces(discretisation, discrete),
             self._pressure(),
             [*discrete.periods, *np.zeros(3 - self.dimension)],
             self._phases(discretisation),
@@ -282,12 +280,13 @@ class Simulation:
         diffusion = Diffusion(discretisation, count, self.free_energy, MOBILITIES[mixture.mobility_form])
         return Phases(count, diffusion, mixture.strength)
 
-    def _forces(self, discretisation: Discretisation, layers: WallLayers) -> list[Force]:
-        forces: list[Force] = [Gravity(self.precision, self.particles, self.device)]
-        if self.scene.forces.viscosity in VISCOSITIES:
-            wall = layers if getattr(self.scene.container, "slip", "free") == "no" else None
-            forces.append(VISCOSITIES[self.scene.forces.viscosity](discretisation, self.dimension, wall))
-        return forces
+    def _forces(self, discretisation: Discretisation, discrete: DiscreteScene) -> list[Force]:
+        """Those of the parameters that the scene has, in the order of the registry."""
+        layers, particles, device = discrete.wall_layers, self.particles, self.device
+        setting = Setting(self.scene, discretisation, discrete.lattice, layers, particles, device)
+        modules = [p.force for p in PARAMETERS if p.force is not None and p.present(self.scene)]
+        found = [import_module(name).force(setting) for name in modules]
+        return [force for force in found if force is not None]
 
     def _pressure(self) -> PressureSolve | None:
         solver = self.scene.solver

@@ -7,6 +7,7 @@ Shapes on a device, checks of what users write, scales of the certificate and ta
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from math import inf
 from typing import Any, Protocol
 
 import numpy as np
@@ -49,6 +50,10 @@ class Source(Protocol):
     mass_fractions: NDArray
 
 
+Limit = Callable[[Any, Mapping[str, Any]], float]
+"""A time step [s] of a scene, with values of parameters that replace the scene's."""
+
+
 @dataclass(frozen=True)
 class Parameter:
     """Something that a run, or a loss of it, depends on."""
@@ -71,8 +76,12 @@ class Parameter:
     """Whether a scene has it."""
     absent: str = ""
     """What to say of a scene that does not: "has no emitter"."""
-    part: str | None = None
-    """The module of the force that it belongs to, where no other module makes it: see `cortado.solvers.parts`."""
+    force: str | None = None
+    """The module whose ``force`` makes the force that reads it, in scenes that have it: see `cortado.sph.parts`."""
+    is_optional: bool = False
+    """Whether it is a key of [forces] that scenes may leave out, and its force with it."""
+    longest_step: Limit = lambda scene, values: inf
+    """The largest at which an optional force is likely to be stable."""
 
     def shapes(self, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:
         """The shapes that its values may have, () for a number, where positions are (n, d)."""
@@ -119,9 +128,31 @@ def _has_emitter(scene: Any) -> bool:
     return scene.emitter is not None
 
 
+def _optional(name: str, unit: str, force: str, longest_step: Limit = lambda scene, values: inf) -> Parameter:
+    """A number of at least 0 that stands in the table [forces] of a scene, and switches a force on."""
+    return Parameter(
+        name,
+        unit,
+        Axis.SCALAR,
+        lambda source: getattr(source.scene.forces, name),
+        range=Range.NOT_NEGATIVE,
+        present=lambda scene: getattr(scene.forces, name) is not None,
+        absent=f"has no {name.replace('_', ' ')} in [forces]",
+        force=force,
+        is_optional=True,
+        longest_step=longest_step,
+    )
+
+
 PARAMETERS = (
     Parameter(
-        "gravity", "m/s²", Axis.STEP, lambda s: s.scene.forces.gravity, components=_vector, change=_size_of_gravity
+        "gravity",
+        "m/s²",
+        Axis.STEP,
+        lambda s: s.scene.forces.gravity,
+        components=_vector,
+        change=_size_of_gravity,
+        force="cortado.sph.gravity",
     ),
     Parameter(
         "tilt",
@@ -164,7 +195,14 @@ PARAMETERS = (
         acts=_several_phases,
     ),
     Parameter("rest_density", "kg/m³", Axis.PHASE, _of_phases("rest_density"), range=Range.POSITIVE),
-    Parameter("viscosity", "Pa s", Axis.PHASE, _of_phases("viscosity"), range=Range.NOT_NEGATIVE),
+    Parameter(
+        "viscosity",
+        "Pa s",
+        Axis.PHASE,
+        _of_phases("viscosity"),
+        range=Range.NOT_NEGATIVE,
+        force="cortado.sph.viscosity",
+    ),
     Parameter("time_step", "s", Axis.SCALAR, lambda s: s.scene.solver.time_step, range=Range.POSITIVE),
     Parameter(
         "mobility", "m²/s", Axis.SCALAR, lambda s: s.scene.mixture.mobility, range=Range.NOT_NEGATIVE, acts=_diffuses

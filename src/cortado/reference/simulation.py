@@ -64,6 +64,9 @@ class Simulation:
             raise InputError(f"scene is {shown(scene)}, but must be a cortado.Scene, such as load_scene gives.")
         if len(scene.phase) > 1 or scene.emitter is not None:
             raise InputError("scene has several phases or an emitter, but must have neither for the reference engine.")
+        unknown = [p.name for p in BY_NAME.values() if p.is_optional and p.present(scene)]
+        if unknown:
+            raise InputError(f"scene has forces.{unknown[0]}, but must leave it out for the reference engine.")
         if precision not in precisions():
             raise InputError(f"precision is {shown(precision)}, but must be one of {', '.join(precisions())}.")
         self.scene, self.precision = scene, precision

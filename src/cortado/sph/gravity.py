@@ -9,7 +9,7 @@ from cortado.kernels import Kernels
 from cortado.launching import sum_of
 from cortado.physics.integration import integration_module
 from cortado.precision import Precision
-from cortado.sph.parts import Adjoints, StepContext, Tangents
+from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 
 
 @cache
@@ -59,3 +59,8 @@ class Gravity:
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
         total = self._sum(acceleration_bar)
         step.launch(self._kernels.adjoint, *bar.named, total=total, threads=1)
+
+
+def force(setting: Setting) -> Gravity:
+    """Gravity in every scene."""
+    return Gravity(setting.discretisation.precision, setting.particles, setting.device)

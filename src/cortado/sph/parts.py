@@ -10,10 +10,14 @@ from typing import Any, Protocol
 
 import warp as wp
 
+from cortado.discrete_scene import Lattice
 from cortado.launching import Launcher, Named, add, sum_of
 from cortado.parameters.registry import BY_NAME, Axis
 from cortado.particles import Arrays, Fields, Parameters, zeros
+from cortado.physics.surroundings import Discretisation
 from cortado.precision import Precision
+from cortado.scene import Scene
+from cortado.walls.layers import WallLayers
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,19 @@ class Adjoints:
             if name.removesuffix("_bar") not in self.shares.names
         }
         return self.fields.named("_bar"), self.shares.named("_bar"), whole
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a force is made for: the ``force(setting)`` of a module that the registry of parameters names makes it, or
+    returns None where nothing acts."""
+
+    scene: Scene
+    discretisation: Discretisation
+    lattice: Lattice
+    walls: WallLayers
+    particles: int
+    device: Any
 
 
 class Force(Protocol):

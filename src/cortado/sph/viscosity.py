@@ -19,8 +19,7 @@ import warp as wp
 from cortado.kernels import Kernels
 from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
 from cortado.sph.pair_forces import PairForm, laminar, pairwise
-from cortado.sph.parts import Adjoints, StepContext, Tangents
-from cortado.walls.layers import WallLayers
+from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 
 
 @cache
@@ -258,11 +257,13 @@ class Viscosity:
         step.launch(self._kernels.adjoint, *bar.named, **self._constants, acceleration_bar=acceleration_bar)
 
 
-def pairwise_viscosity(discretisation: Discretisation, dimension: int, wall: WallLayers | None) -> Viscosity:
-    """The form of Monaghan (2005), which keeps linear and angular momentum. ``wall`` None: free slip."""
-    return Viscosity(discretisation, pairwise, 2.0 * (dimension + 2), friction=1.0 if wall else 0.0)
-
-
-def laminar_viscosity(discretisation: Discretisation, dimension: int, wall: WallLayers | None) -> Viscosity:
-    """The form of Morris, Fox and Zhu (1997), which carries shear to a wall. ``wall`` None: free slip."""
-    return Viscosity(discretisation, laminar, 2.0, friction=wall.friction if wall else 0.0)
+def force(setting: Setting) -> Viscosity | None:
+    """The form that a scene names: that of Monaghan (2005), which keeps linear and angular momentum, or that of Morris,
+    Fox and Zhu (1997), which carries shear to a wall. None for a scene without."""
+    scene, walls = setting.scene, setting.walls
+    sticks = getattr(scene.container, "slip", "free") == "no"
+    if scene.forces.viscosity == "pairwise":
+        return Viscosity(setting.discretisation, pairwise, 2.0 * (scene.dimension + 2), friction=float(sticks))
+    if scene.forces.viscosity == "laminar":
+        return Viscosity(setting.discretisation, laminar, 2.0, friction=walls.friction if sticks else 0.0)
+    return None
