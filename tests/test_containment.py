@@ -125,7 +125,7 @@ def test_fluid_that_leaves_the_container_ends_the_run(make, precision):
     assert len(frames) == caught.value.step - 1  # those before are good
     tolerance = 0.5 * made.discretisation.spacing
     assert made.container.contains(np.concatenate(frames).astype(np.float64), tolerance).all()
-    assert len(rollout.iterations) == caught.value.step
+    assert len(rollout.diagnostics["iterations"]) == caught.value.step
 
 
 def test_without_pressure_walls_hold_nothing():

@@ -5,7 +5,7 @@ import warp as wp
 
 from cortado import Simulation
 from cortado.particles import Fields
-from cortado.solvers.pcisph_derivatives import PcisphAdjoint
+from cortado.solvers.pcisph.derivatives import PcisphAdjoint
 from cortado.sph.gravity import Gravity
 from cortado.sph.parts import Adjoints, Shares
 from scenes import plane_of_three, splash

@@ -60,6 +60,6 @@ def test_short_lists_grow():
     simulation = Simulation(splash(), "cuda:0", "float64")
     wanted = simulation.run(40).positions
     simulation.solver.search.forget_needed()
-    simulation.solver.grow(8)
+    simulation.solver.resize(8)
     np.testing.assert_array_equal(simulation.run(40).positions, wanted)
     assert simulation.solver.search.capacity > 8

@@ -22,18 +22,18 @@ from cortado.parameters.reference_density import (
     reference_density_adjoint,
     reference_density_tangent,
 )
-from cortado.physics.contrast import contrast_kernels
-from cortado.physics.density import density_kernels
 from cortado.physics.diffusion import Diffusion, diffusion_kernels
 from cortado.physics.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
-from cortado.physics.integration import integration_kernels
 from cortado.physics.mixture import mixture_kernels
-from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
 from cortado.physics.surroundings import Discretisation, surroundings_type
-from cortado.physics.walls import wall_kernels
 from cortado.precision import FLOAT32, FLOAT64, Precision
 from cortado.smoothing import CUBIC_SPLINE
+from cortado.solvers.pcisph.density_ratio_relaxation import contrast_kernels
+from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
+from cortado.solvers.pcisph.wall_relaxation import wall_kernels
+from cortado.sph.density import density_kernels
 from cortado.sph.gravity import gravity_kernels
+from cortado.sph.integration import integration_kernels
 from cortado.sph.pair_forces import laminar, pairwise
 from cortado.sph.viscosity import viscosity_kernels
 

@@ -21,13 +21,16 @@ from scenes import HONEY, MIXING, OIL, plane, scene
 ROOT = Path(cortado.__file__).parent
 
 ADJOINTS = {
-    "physics.density": {
+    "sph.density": {
         "density_sums.weights_adjoint": 5,
         "density_kernels.density_adjoint": 1,
     },
-    "physics.walls": {"wall_kernels.wall_yield_adjoint": 1},
-    "physics.contrast": {"contrast_kernels.factor_adjoint": 2, "contrast_kernels.contrast_adjoint": 10},
-    "physics.pressure": {
+    "solvers.pcisph.wall_relaxation": {"wall_kernels.wall_yield_adjoint": 1},
+    "solvers.pcisph.density_ratio_relaxation": {
+        "contrast_kernels.factor_adjoint": 2,
+        "contrast_kernels.contrast_adjoint": 10,
+    },
+    "solvers.pcisph.pressure": {
         "pressure_kernels.pressure_adjoint": 4,
         "pressure_force_kernels.pressure_force_adjoint": 28,
     },
@@ -38,7 +41,7 @@ ADJOINTS = {
         "laminar.adjoint_v": 1,
     },
     "sph.viscosity": {"viscosity_kernels.viscosity_adjoint": 19},
-    "physics.integration": {
+    "sph.integration": {
         "prediction_share.adjoint": 4,
         "integration_kernels.begin_adjoint": 6,
         "integration_kernels.acceleration_adjoint": 1,
@@ -59,7 +62,7 @@ ADJOINTS = {
 SHARED = {
     "physics.smoothing_functions": {"_cubic_spline.bend": 5, "smoothing_functions.hessian_product": 3},
     "physics.surroundings": {"pair_functions.factor_gradient": 4},
-    "physics.contrast": {"contrast_kernels.excess_slope": 3},
+    "solvers.pcisph.density_ratio_relaxation": {"contrast_kernels.excess_slope": 3},
     "sph.viscosity": {"viscosity_kernels.share": 1},
     "physics.free_energy": {"_double_well.bend": 3, "_miscible.bend": 1, "_degenerate.slope": 4},
     "physics.matching": {"matching_kernels.difference": 3},
@@ -162,12 +165,17 @@ def qualified(node: ast.AST, outer: str = ""):
             yield from qualified(child, outer)
 
 
-KERNELS = sorted(path for package in ("physics", "sph") for path in (ROOT / package).glob("*.py"))
+KERNELS = sorted(path for package in ("physics", "sph", "solvers/pcisph") for path in (ROOT / package).glob("*.py"))
 
 
-@pytest.mark.parametrize("path", KERNELS, ids=lambda path: f"{path.parent.name}.{path.stem}")
+def name_of(path: Path) -> str:
+    """Of a module within the package."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts)
+
+
+@pytest.mark.parametrize("path", KERNELS, ids=name_of)
 def test_every_adjoint_is_planted(path):
-    module = f"{path.parent.name}.{path.stem}"
+    module = name_of(path)
     if module not in ELSEWHERE:
         names = {name for name in qualified(ast.parse(path.read_text())) if "adjoint" in name.split(".")[-1]}
         assert names <= PLANTED.get(module, {}).keys()

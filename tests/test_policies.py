@@ -253,9 +253,9 @@ def averaged(simulation, strength, fields=("positions", "velocities")):
     """An adjoint before and after, with the positions (n, d) it belongs to."""
     solver, point = simulation.solver, point_of(simulation)
     rollout = simulation.rollout(1, point)
-    solver.diffuse(rollout.substeps)
+    solver.begin(rollout.elapsed, rollout.substeps)
     solver.step_number.zero_()
-    solver.record(rollout.initial, rollout.parameters, 2)
+    solver.replay(rollout.initial, rollout.parameters, (2,))
     bar, values = random_bar(simulation)
     average = Average(solver, fields)
     average.set_strength(strength)

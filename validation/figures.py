@@ -144,7 +144,8 @@ def contain(particles: int = 8000, steps: int = 2000) -> None:
     started = time.perf_counter()
     rollout.forward(observe, keep=False)
     seconds = time.perf_counter() - started
-    average, greatest = rollout.errors[10:].max(axis=0)
+    errors = rollout.diagnostics
+    average, greatest = errors["density_errors"][10:].max(), errors["greatest_density_errors"][10:].max()
     print(
         f"{simulation.particles} particles, {steps} steps, {seconds:.0f} s: {outside} times outside, "
         f"nearest {nearest / scene.discretisation.spacing:.3f} spacings from a wall; "

@@ -53,7 +53,7 @@ class Lattice:
     stiffness: float
     """k [m2]: delta = k / dt^2 [Pa m3 / kg] (report eq. 7, put right) for a filled neighbourhood."""
     rigidity: float
-    """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of the yield, see `cortado.physics.walls`."""
+    """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of the yield, see `cortado.solvers.pcisph.wall_relaxation`."""
     evenness: float
     """[-], see `cortado.calibration.laplacian_evenness`."""
 

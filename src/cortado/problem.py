@@ -11,7 +11,7 @@ import numpy as np
 from cortado.checked_loss import as_loss
 from cortado.errors import CortadoWarning, InputError
 from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd, fingerprint
-from cortado.memory import gradient_parts, require
+from cortado.memory import require
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import NAMES, UNITS, Arrays, Values
 from cortado.particles import State
@@ -164,7 +164,7 @@ class Problem:
 
     def iterations(self) -> np.ndarray:
         """(steps,) pressure iterations of the last evaluation."""
-        return self._rollout.iterations
+        return self._rollout.diagnostics["iterations"]
 
     def _ends(
         self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()
@@ -222,9 +222,9 @@ class Passage:
     def derivative(self, policy: AdjointPolicy) -> StepDerivative:
         """The policy's backward step, made once for each problem."""
         if policy not in self._derivatives:
-            search, iterations = self.rollout.solver.search, int(self.rollout.iterations.max(initial=0))
-            parts = gradient_parts(search.particles, iterations, self.rollout.solver.discretisation.precision.bytes)
-            require(parts, "take a larger spacing or fewer pressure iterations", search.device)
+            solver = self.rollout.solver
+            parts = solver.gradient_memory(self.rollout.log)
+            require(parts, "take a larger spacing or fewer pressure iterations", solver.device)
             self._derivatives[policy] = policy.derivative(self.rollout)
         return self._derivatives[policy]
 

@@ -11,16 +11,14 @@ from math import isqrt
 from typing import Protocol
 
 import numpy as np
-import warp as wp
 
-from cortado.errors import DivergedError
+from cortado.errors import DivergedError, InputError
 from cortado.launching import Replayed, add
 from cortado.memory import require, step_parts, within
 from cortado.particles import Parameters, State
 from cortado.restart import Elapsed
 from cortado.solvers.containment import Lost
-from cortado.solvers.pcisph import Pcisph
-from cortado.solvers.pcisph_derivatives import PcisphTangent
+from cortado.solvers.solver import Counts, Solver
 from cortado.threads import WARP, Turn, in_turn
 
 CHUNK = 16
@@ -36,13 +34,13 @@ class StepDerivative(Protocol):
 
     capturable: bool
     """Whether a step may be captured as a graph."""
-    solver: Pcisph
-    """Whose fields hold the recorded step after `step`."""
+    solver: Solver
+    """Whose fields hold the replayed step after `step`."""
 
     def begin(self) -> None:
         """Forget the parameters' adjoints of an earlier way back."""
 
-    def step(self, state: State, iterations: int, bar: State) -> None:
+    def step(self, state: State, counts: Counts, bar: State) -> None:
         """Replace ``bar``, the adjoint of the step's result, by that of its first state."""
 
     def parameters(self) -> Parameters:
@@ -62,9 +60,9 @@ class Rollout:
     """A number of steps of a solver from a first state, which can be repeated and differentiated."""
 
     @WARP
-    def __init__(self, solver: Pcisph, steps: int, memory_budget: int = MEMORY_BUDGET):
+    def __init__(self, solver: Solver, steps: int, memory_budget: int = MEMORY_BUDGET):
         self.solver, self.steps = solver, steps
-        self._device = solver.search.device
+        self._device = solver.device
         require(step_parts(steps, solver.discretisation.precision.bytes), "take fewer steps", self._device)
         self.initial = solver.new_state()
         self.parameters = solver.new_parameters(steps)
@@ -74,22 +72,22 @@ class Rollout:
         """[s] and [m3/s], in 2-D [m2/s], as they were given: the device rounds them."""
         self.elapsed = Elapsed()
         """What went before the first state."""
-        self._records = (
-            wp.zeros(max(steps, 1), dtype=wp.int32, device=self._device),
-            wp.zeros(max(steps, 1), dtype=solver.discretisation.precision.pair, device=self._device),
-        )
+        self.log = solver.new_log(steps)
+        """What the solver noted of the steps of the last forward run."""
         state_bytes = sum(array.capacity for array in self.initial.arrays())
         self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
         self._states: dict[int, State] = {}
         self._buffer, self._bar = self.initial.like(), self.initial.like()
-        self._growth = -1
+        self._generation = -1
         self._forget_stale_graphs()
         self.evaluation = 0
         """How often the first state and the parameters were replaced: a way back belongs to one evaluation."""
-        self.iterations = np.zeros(0, dtype=int)
-        """(steps,) pressure iterations of the last forward run."""
-        self.errors = np.zeros((0, 2))
-        """(steps, 2) average and greatest compression (rho* - rho_0)+ / rho_0 at each step."""
+        self._kept = -1
+
+    @property
+    def diagnostics(self) -> Mapping[str, np.ndarray]:
+        """(steps,) by name, of the steps of the last forward run: see `StepLog`."""
+        return self.log.diagnostics
 
     @property
     def turn(self) -> Turn:
@@ -102,16 +100,18 @@ class Rollout:
     def forward(self, observe: Observer | None = None, keep: bool = True) -> State:
         """Run all steps and return the last state. ``observe`` is given every state; ``keep`` checkpoints for a way
         back. Raises `DivergedError` after the good states were observed."""
-        self._states = {0: self.initial}
+        self._states, self._kept = {0: self.initial}, -1
         state, step = self.initial, 0
-        self._set_solver()
+        self.solver.begin(self.elapsed, self.substeps)
         self._forget_stale_graphs()
         self.solver.reset()
         try:
             while step < self.steps:
                 last = min(step + (1 if self._device.is_cpu else CHUNK), self.steps)
                 chunk = self._advance(state, step, last)
-                if self._grow_lists():
+                if self.solver.make_room():
+                    self._forget_stale_graphs()
+                    self.solver.reset()
                     continue
                 lost = self.solver.containment.lost()
                 good = chunk if lost is None else chunk[: lost.step - step]
@@ -125,14 +125,10 @@ class Rollout:
                     raise self._diverged(lost, bad)
                 state, step = chunk[-1], last
         finally:
-            self._read_records(step)
+            self.log.read(step)
+        if keep:
+            self._kept = self.evaluation
         return state
-
-    def _set_solver(self) -> None:
-        """What the solver must know of this rollout before any of its steps, as rollouts share it."""
-        self.solver.diffuse(self.substeps)
-        if self.solver.emitter:
-            self.solver.emitter.go_on(self.elapsed)
 
     def _advance(self, state: State, first: int, last: int) -> list[State]:
         self.solver.step_number.fill_(first)
@@ -144,25 +140,14 @@ class Rollout:
             chunk[-1].assign(self._buffer)
         return chunk
 
-    def _grow_lists(self) -> bool:
-        """Whether the neighbour lists were too short; they are longer now, and what used them must be repeated."""
-        needed = self.solver.search.needed
-        if needed <= self.solver.search.capacity:
-            return False
-        self.solver.grow(min(needed + needed // 8 + 1, 2 * self.solver.search.capacity))
-        self.solver.search.forget_needed()
-        self._forget_stale_graphs()
-        self.solver.reset()
-        return True
-
     def _forget_stale_graphs(self) -> None:
         """Begin anew with graphs where arrays of the solver were replaced, by this rollout or by another."""
-        if self._growth == self.solver.growth:
+        if self._generation == self.solver.generation:
             return
-        self._growth = self.solver.growth
-        step = partial(self.solver.step, self._buffer, self._buffer, self.parameters, self._records)
+        self._generation = self.solver.generation
+        step = partial(self.solver.step, self._buffer, self._buffer, self.parameters, self.log)
         self._step = Replayed(step, self.solver.launch)
-        self._steps_back: dict[tuple[StepDerivative, int], Replayed] = {}
+        self._steps_back: dict[tuple[StepDerivative, Counts], Replayed] = {}
 
     def _diverged(self, lost: Lost, state: State) -> DivergedError:
         containment = self.solver.containment
@@ -176,19 +161,18 @@ class Rollout:
             others=lost.others,
         )
 
-    def _read_records(self, steps: int) -> None:
-        self.iterations = self._records[0].numpy()[:steps].astype(int)
-        self.errors = self._records[1].numpy()[:steps].astype(np.float64)
-
     # ---- derivatives ---------------------------------------------------------------------------------------------
 
     @in_turn
     def backward(self, derivative: StepDerivative, bars: Mapping[int, State], observe: Observer | None = None) -> State:
-        """The adjoint of the first state, for ``bars``, adjoints of states by their number; `forward` has run.
+        """The adjoint of the first state, for ``bars``, adjoints of states by their number.
 
-        ``observe`` is given the adjoint of every state, from the last to the first; the next step overwrites it.
+        ``observe`` is given the adjoint of every state, from the last to the first; the next step overwrites it. Raises
+        `InputError` unless `forward` has run to its end since the first state or the parameters were replaced, and has
+        kept states.
         """
-        self._set_solver()
+        self._require_states("backward")
+        self.solver.begin(self.elapsed, self.substeps)
         derivative.begin()
         self._forget_stale_graphs()
         self._bar.clear()
@@ -201,46 +185,55 @@ class Rollout:
             if n > 0:
                 self._buffer.assign(self._restore(n - 1))
                 self.solver.step_number.fill_(n - 1)
-                self._step_back(derivative, int(self.iterations[n - 1]))
+                self._step_back(derivative, self.log.counts(n - 1))
         return self._bar
 
-    def _step_back(self, derivative: StepDerivative, iterations: int) -> None:
-        work = partial(derivative.step, self._buffer, iterations, self._bar)
+    def _step_back(self, derivative: StepDerivative, counts: Counts) -> None:
+        work = partial(derivative.step, self._buffer, counts, self._bar)
         if not derivative.capturable:
             work()
             return
-        key = (derivative, iterations)
+        key = (derivative, counts)
         if key not in self._steps_back:
-            self.solver.iterates.reserve(iterations)
+            self.solver.reserve(counts)
             self._steps_back[key] = Replayed(work, self.solver.launch)
         self._steps_back[key]()
 
     @in_turn
     def tangent(self, dot: State, parameters_dot: Parameters, observe: Observer) -> None:
         """From ``dot``, the tangent of the first state, to that of every state, given to ``observe``; `forward` has
-        run."""
-        self._set_solver()
-        derivative = PcisphTangent(self.solver, parameters_dot)
+        run with these parameters."""
+        solver = self.solver
+        solver.begin(self.elapsed, self.substeps)
+        derivative = solver.tangent(parameters_dot)
         state = self.initial.like()
         state.assign(self.initial)
         observe(0, dot)
         for n in range(self.steps):
-            iterations = int(self.iterations[n])
-            self.solver.step_number.fill_(n)
-            self.solver.record(state, self.parameters, iterations)
-            derivative.step(iterations, dot, dot, self.parameters)
-            self.solver.recorded(iterations, self.parameters, state)
+            counts = self.log.counts(n)
+            solver.step_number.fill_(n)
+            solver.replay(state, self.parameters, counts)
+            derivative.step(counts, dot, dot, self.parameters)
+            solver.write_state(counts, self.parameters, state)
             observe(n + 1, dot)
+
+    def _require_states(self, what: str) -> None:
+        if self._kept != self.evaluation:
+            raise InputError(
+                f"The rollout cannot go {what}, as its states are of other parameters, or were not kept: run forward "
+                "first, with keep=True."
+            )
 
     def _restore(self, n: int) -> State:
         """State n: a checkpoint, or recomputed from the one before, with the states in between."""
         if n not in self._states:
             start = n - n % self._interval
             for m in range(start, n):
+                counts = self.log.counts(m)
                 self.solver.step_number.fill_(m)
-                self.solver.record(self._states[m], self.parameters, int(self.iterations[m]))
+                self.solver.replay(self._states[m], self.parameters, counts)
                 self._states[m + 1] = self.initial.like()
-                self.solver.recorded(int(self.iterations[m]), self.parameters, self._states[m + 1])
+                self.solver.write_state(counts, self.parameters, self._states[m + 1])
         if (n + 1) % self._interval:
             self._states.pop(n + 1, None)
         return self._states[n]

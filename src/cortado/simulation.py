@@ -29,8 +29,8 @@ from cortado.sampling import FluidSample
 from cortado.scene import Scene
 from cortado.scene_containers import NoContainer
 from cortado.solvers.containment import Walled
-from cortado.solvers.pcisph import Pcisph
-from cortado.solvers.pcisph_parts import PressureSolve
+from cortado.solvers.pcisph.parts import PressureSolve
+from cortado.solvers.pcisph.solver import Pcisph
 from cortado.sph.mixture import Phases
 from cortado.sph.nozzle import Nozzle
 from cortado.sph.parts import Force, Setting
@@ -145,7 +145,7 @@ class Simulation:
                 frames.append((step, *state.numpy(self.dimension)))
 
         rollout.forward(keep, keep=False)
-        converged = self.converged(rollout)
+        converged = rollout.diagnostics["converged"]
         if not converged.all():
             warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=5)
         numbers, positions, velocities, fractions = (np.array(column) for column in zip(*frames, strict=True))
@@ -155,8 +155,8 @@ class Simulation:
             positions=positions,
             velocities=velocities,
             mass_fractions=fractions if len(self.scene.phase) > 1 else None,
-            iterations=rollout.iterations,
-            density_errors=rollout.errors[:, 0],
+            iterations=rollout.diagnostics["iterations"],
+            density_errors=rollout.diagnostics["density_errors"],
             converged=converged,
             substeps=rollout.substeps,
             constants=self.constants(rollout, numbers),
@@ -216,14 +216,6 @@ class Simulation:
                 f"time step, but must not take more than {MOST_SUBSTEPS}: lower it, interface_width or time_step."
             )
         return int(number)
-
-    def converged(self, rollout: Rollout) -> np.ndarray:
-        """(steps,) whether the density error came below the tolerances; always, with a fixed number of iterations."""
-        solve = self.solver.pressure
-        if solve is None or solve.minimum_iterations == solve.maximum_iterations:
-            return np.ones(len(rollout.errors), dtype=bool)
-        average, greatest = rollout.errors.T
-        return (average <= solve.tolerance) & (greatest <= solve.greatest_tolerance)
 
     def _solver(self, discrete: DiscreteScene) -> Pcisph:
         discretisation, support = Discretisation(discrete.kernel, self.precision), discrete.lattice.support

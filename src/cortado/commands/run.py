@@ -45,7 +45,7 @@ def run_scene(
         folder = RunFolder.create(out, scene.to_json(), command, device=str(simulation.device), overwrite=overwrite)
         with keeping(lambda: f"the frames so far are in {folder.trajectory}" if folder.trajectory.exists() else ""):
             _compute(simulation, rollout, folder, record_every)
-    converged = simulation.converged(rollout)
+    converged = rollout.diagnostics["converged"]
     warning = "" if converged.all() else f"Mind that {not_converged_sentence(converged)} "
     return f"{warning}The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
 
@@ -92,11 +92,12 @@ def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolde
         try:
             rollout.forward(observe, keep=False)
         finally:
-            writer.append_steps(rollout.iterations, rollout.errors[:, 0], simulation.converged(rollout))
-            for step, (iterations, error) in enumerate(zip(rollout.iterations, rollout.errors, strict=True), 1):
-                folder.append_metrics(
-                    step=step, iterations=iterations, density_error=error[0], greatest_density_error=error[1]
-                )
+            found = rollout.diagnostics
+            iterations, errors = found["iterations"], found["density_errors"]
+            writer.append_steps(iterations, errors, found["converged"])
+            rows = zip(iterations, errors, found["greatest_density_errors"], strict=True)
+            for step, (count, error, greatest) in enumerate(rows, 1):
+                folder.append_metrics(step=step, iterations=count, density_error=error, greatest_density_error=greatest)
 
 
 def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], folder: Path) -> Figures:

@@ -17,8 +17,8 @@ from typing import Any
 import warp as wp
 
 from cortado.kernels import Kernels
-from cortado.physics.integration import integration_module
 from cortado.precision import Precision
+from cortado.sph.integration import integration_module
 
 
 @dataclass(frozen=True)

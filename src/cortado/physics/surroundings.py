@@ -61,7 +61,7 @@ def surroundings_type(precision: Precision) -> Any:
         self_weight: real
         """W(0) [1 / m^d]."""
         pliancy: real
-        """(sum_j G_j . G_j)^(-1/2) of a filled neighbourhood [m^(d + 1)], see `cortado.physics.walls`."""
+        """(sum_j G_j . G_j)^(-1/2) of a filled neighbourhood [m^(d + 1)], for the relaxation beside walls."""
         evenness: real
         """What second derivatives are multiplied with [-], see `cortado.calibration.laplacian_evenness`."""
         volume: real

@@ -8,7 +8,7 @@ import warp as wp
 from cortado.particles import Parameters, State
 from cortado.policies.policy import AdjointPolicy
 from cortado.rollout import Rollout, StepDerivative
-from cortado.solvers.pcisph_derivatives import PcisphAdjoint
+from cortado.solvers.solver import Counts
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Exact(AdjointPolicy):
     """
 
     def derivative(self, rollout: Rollout) -> StepDerivative:
-        return _AdjointStep(rollout, frozen_positions=False)
+        return _AdjointStep(rollout, frozen_geometry=False)
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class VelocityOnly(AdjointPolicy):
     """
 
     def derivative(self, rollout: Rollout) -> StepDerivative:
-        return _AdjointStep(rollout, frozen_positions=True)
+        return _AdjointStep(rollout, frozen_geometry=True)
 
 
 @dataclass(frozen=True)
@@ -58,17 +58,17 @@ class Tape(AdjointPolicy):
 class _AdjointStep:
     capturable = True
 
-    def __init__(self, rollout: Rollout, frozen_positions: bool):
+    def __init__(self, rollout: Rollout, frozen_geometry: bool):
         solver = rollout.solver
         self.solver, self._parameters = solver, rollout.parameters
-        self._adjoint = PcisphAdjoint(solver, rollout.steps, frozen_positions)
+        self._adjoint = solver.adjoint(rollout.steps, frozen_geometry)
 
     def begin(self) -> None:
         self._adjoint.begin()
 
-    def step(self, state: State, iterations: int, bar: State) -> None:
-        self.solver.record(state, self._parameters, iterations)
-        self._adjoint.step(iterations, bar, bar, self._parameters)
+    def step(self, state: State, counts: Counts, bar: State) -> None:
+        self.solver.replay(state, self._parameters, counts)
+        self._adjoint.step(counts, bar, bar, self._parameters)
 
     def parameters(self) -> Parameters:
         return self._adjoint.collect()
@@ -85,25 +85,24 @@ class _TapeStep:
         self._own = self.solver.new_parameters(rollout.steps, requires_grad=True)
 
     def begin(self) -> None:
-        self.solver.grow(self._given.search.capacity)
-        self.solver.diffuse(self._given.mixture.substeps)
+        self.solver.match(self._given)
         self._own.assign(self._parameters)
         for array in self._own.arrays():
             array.grad.zero_()
 
-    def step(self, state: State, iterations: int, bar: State) -> None:
+    def step(self, state: State, counts: Counts, bar: State) -> None:
         self._before.assign(state)
         wp.copy(self.solver.step_number, self._given.step_number)
         tape = wp.Tape()
         try:
-            self._back(tape, iterations, bar)
+            self._back(tape, counts, bar)
         finally:
             self._forget(tape)
 
-    def _back(self, tape: wp.Tape, iterations: int, bar: State) -> None:
+    def _back(self, tape: wp.Tape, counts: Counts, bar: State) -> None:
         with tape:
-            self.solver.record(self._before, self._own, iterations)
-            self.solver.recorded(iterations, self._own, self._after)
+            self.solver.replay(self._before, self._own, counts)
+            self.solver.write_state(counts, self._own, self._after)
         tape.backward(grads=dict(zip(self._after.arrays(), bar.arrays(), strict=True)))
         for own, total in zip(self._before.arrays(), bar.arrays(), strict=True):
             wp.copy(total, own.grad)

@@ -8,6 +8,7 @@ from cortado.errors import InputError
 from cortado.parameters.values import Arrays, Values
 from cortado.particles import Parameters, State
 from cortado.rollout import Observer, Rollout, StepDerivative
+from cortado.solvers.solver import Counts
 
 
 @dataclass(frozen=True)
@@ -103,8 +104,8 @@ class Filtered:
     def begin(self) -> None:
         self._base.begin()
 
-    def step(self, state: State, iterations: int, bar: State) -> None:
-        self._base.step(state, iterations, bar)
+    def step(self, state: State, counts: Counts, bar: State) -> None:
+        self._base.step(state, counts, bar)
         self.filter(bar)
 
     def parameters(self) -> Parameters:

@@ -8,7 +8,7 @@ import warp as wp
 from cortado.launching import sum_of
 from cortado.particles import Parameters, State
 from cortado.physics.adjoint_filters import adjoint_filter_kernels
-from cortado.solvers.pcisph import Pcisph
+from cortado.solvers.solver import Solver
 
 FIELDS = ("positions", "velocities")
 """Fields of a `State` that can be filtered."""
@@ -17,13 +17,13 @@ FIELDS = ("positions", "velocities")
 class Average:
     """Blends fields of an adjoint with their average over the neighbours that the solver holds."""
 
-    def __init__(self, solver: Pcisph, fields: Iterable[str]):
+    def __init__(self, solver: Solver, fields: Iterable[str]):
         self._solver, self._fields = solver, tuple(fields)
         self._kernels = adjoint_filter_kernels(solver.discretisation)
         self._before = solver.new_state()
-        real, device = solver.discretisation.precision.real, solver.search.device
+        real, device = solver.discretisation.precision.real, solver.device
         self._strength = wp.zeros(1, dtype=real, device=device)
-        self._most = wp.zeros(solver.search.particles, dtype=real, device=device)
+        self._most = wp.zeros(solver.particles, dtype=real, device=device)
 
     def set_strength(self, strength: float) -> None:
         """From now on; from 0, which leaves everything as it is, to 1."""
@@ -42,8 +42,8 @@ class Average:
 class Limit:
     """Cuts fields of an adjoint, particle by particle, to so many root mean squares over all particles."""
 
-    def __init__(self, solver: Pcisph, fields: Iterable[str]):
-        particles, device = solver.search.particles, solver.search.device
+    def __init__(self, solver: Solver, fields: Iterable[str]):
+        particles, device = solver.particles, solver.device
         self._launch, self._particles, self._fields = solver.launch, particles, tuple(fields)
         self._kernels = adjoint_filter_kernels(solver.discretisation)
         self._squares = wp.zeros(particles, dtype=wp.vec2d, device=device)
@@ -66,7 +66,7 @@ class Limit:
 class Drag:
     """Multiplies the adjoint of velocities by exp(-rate dt)."""
 
-    def __init__(self, solver: Pcisph, rate: float):
+    def __init__(self, solver: Solver, rate: float):
         self._launch, self._rate = solver.launch, rate
         self._kernel = adjoint_filter_kernels(solver.discretisation).drag
 
@@ -77,8 +77,8 @@ class Drag:
 class AdjointNorms:
     """An observer of a way back that keeps the norms of adjoints, on the device until they are asked for."""
 
-    def __init__(self, solver: Pcisph, steps: int):
-        particles, device = solver.search.particles, solver.search.device
+    def __init__(self, solver: Solver, steps: int):
+        particles, device = solver.particles, solver.device
         self._launch = solver.launch
         self._kernel = adjoint_filter_kernels(solver.discretisation).squares
         self._squares = wp.zeros(particles, dtype=wp.vec2d, device=device)

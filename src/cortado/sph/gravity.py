@@ -7,8 +7,8 @@ import warp as wp
 
 from cortado.kernels import Kernels
 from cortado.launching import sum_of
-from cortado.physics.integration import integration_module
 from cortado.precision import Precision
+from cortado.sph.integration import integration_module
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 
 

@@ -1,6 +1,6 @@
-"""The adjoint of the pressure force (`cortado.physics.pressure`) with respect to pressures alone, at frozen positions.
+"""The adjoint of the pressure force with respect to pressures alone, at frozen positions.
 
-Without the Hessian of the smoothing kernel, which is most of the exact adjoint's work.
+It is that of `cortado.solvers.pcisph.pressure` without the Hessian of the smoothing kernel, which is most of the work.
 """
 
 from functools import cache

@@ -5,11 +5,11 @@
     ap_i = -(V / m_i) (sum_j (c_i + c_j) G_ij + sum_b w_b c_i G_ib)
     v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
 
-n is the number density (`cortado.physics.density`; for fluids of different masses: Solenthaler and Pajarola 2008),
-y the yield beside walls (`cortado.physics.walls`). G is taken at x(t), n* at the predicted positions over the
-neighbours of x(t). The force is the transpose of the derivative of n with respect to positions, that of walls
-included: moving particles against it takes the work V sum_i c_i dn_i. After the last iteration (x*, v*) is the new
-state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
+n is the number density (`cortado.sph.density`; for fluids of different masses: Solenthaler and Pajarola 2008),
+y the relaxation beside walls (`cortado.solvers.pcisph.wall_relaxation`). G is taken at x(t), n* at the predicted
+positions over the neighbours of x(t). The force is the transpose of the derivative of n with respect to positions,
+that of walls included: moving particles against it takes the work V sum_i c_i dn_i. After the last iteration (x*, v*)
+is the new state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
 """
 
 from functools import cache
@@ -17,9 +17,9 @@ from functools import cache
 import warp as wp
 
 from cortado.kernels import Kernels
-from cortado.physics.density import density_sums
-from cortado.physics.integration import prediction_share
 from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.sph.density import density_sums
+from cortado.sph.integration import prediction_share
 
 
 @cache

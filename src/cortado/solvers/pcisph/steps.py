@@ -1,7 +1,7 @@
 """Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009; the report's Algorithms 1 and 3, put right).
 
-`Pcisph.step` goes on until the density error is small; `Pcisph.record` repeats a step with a known number of iterations
-and keeps every intermediate value, for `cortado.solvers.pcisph_derivatives`. Nothing here reads from the device.
+`PcisphSteps.step` goes on until the density error is small; `PcisphSteps.replay` repeats a step with a known number of
+iterations and keeps every intermediate value, for `cortado.solvers.pcisph.derivatives`.
 """
 
 from collections.abc import Sequence
@@ -15,16 +15,22 @@ from cortado.launching import Launcher, sum_and_maximum
 from cortado.neighbours import NeighbourSearch
 from cortado.particles import Fields, Parameters, State
 from cortado.physics.surroundings import Discretisation, surroundings_type
+from cortado.restart import Elapsed
 from cortado.solvers.containment import Containment, Walled
-from cortado.solvers.pcisph_parts import Iterates, PcisphKernels, PressureSolve
+from cortado.solvers.pcisph.log import IterationLog
+from cortado.solvers.pcisph.parts import Iterates, PcisphKernels, PressureSolve
+from cortado.solvers.solver import Counts
 from cortado.sph.mixture import Mixture, Phases
 from cortado.sph.nozzle import Emitter, Nozzle
 from cortado.sph.parts import Force, StepContext
 from cortado.threads import Turn
 
 
-class Pcisph:
-    """The solver of one set of particles on one device; its arrays are reused by every step."""
+class PcisphSteps:
+    """The steps of one set of particles on one device, forward; their arrays are reused by every step.
+
+    The methods that `Solver` has are explained there.
+    """
 
     def __init__(
         self,
@@ -42,6 +48,7 @@ class Pcisph:
         """``pressure`` None leaves the pressure out; ``periods`` (3,) [m], 0 along an axis that is not periodic."""
         precision, particles, device = discretisation.precision, search.particles, search.device
         self.discretisation, self.lattice, self.search = discretisation, lattice, search
+        self.particles, self.device = particles, device
         self.forces, self.pressure, self.periods = tuple(forces), pressure, tuple(periods)
         self.launch = Launcher(particles, device, record_tape=requires_grad)
         self.turn = Turn(device)
@@ -75,15 +82,15 @@ class Pcisph:
         self.containment = Containment(walled, precision, self.launch, nozzle.first if nozzle else particles)
         self._surroundings: Any = None
         self._context: StepContext | None = None
-        self.growth = 0
+        self.generation = 0
         """How often arrays, or the work of a step, were replaced; what was captured before is stale."""
-        self.grow(search.capacity)
+        self.resize(search.capacity)
 
-    def grow(self, capacity: int) -> None:
+    def resize(self, capacity: int) -> None:
         """Make room for neighbour lists of that length."""
         if capacity != self.search.capacity:
             self.search.allocate(capacity)
-            self.growth += 1
+            self.generation += 1
         search, lattice, precision = self.search, self.lattice, self.discretisation.precision
         s = surroundings_type(precision)()
         s.neighbours, s.fluid_count, s.filling, s.count = (
@@ -102,21 +109,6 @@ class Pcisph:
         s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in self.periods))
         self._surroundings, self._context = s, None
 
-    def differentiable(self) -> "Pcisph":
-        """The same solver, over the same neighbour search, with arrays that Warp's tape can differentiate."""
-        return Pcisph(
-            self.discretisation,
-            self.lattice,
-            self.search,
-            self.forces,
-            self.pressure,
-            self.periods,
-            self.mixture.phases,
-            self.emitter.nozzle if self.emitter else None,
-            self.containment.walled,
-            requires_grad=True,
-        )
-
     def new_state(self, requires_grad: bool = False) -> State:
         """A state of this solver's particles, all 0."""
         phases, search = self.mixture.phases.count, self.search
@@ -128,29 +120,38 @@ class Pcisph:
         precision, device = self.discretisation.precision, search.device
         return Parameters.zeros(steps, search.particles, phases, precision, device, requires_grad)
 
-    def diffuse(self, substeps: int) -> None:
-        """Take so many substeps of diffusion within each time step from now on."""
+    def new_log(self, steps: int) -> IterationLog:
+        return IterationLog(steps, self.pressure, self.discretisation.precision, self.device)
+
+    def begin(self, elapsed: Elapsed, substeps: int) -> None:
         if substeps != self.mixture.substeps:
             self.mixture.reserve(substeps)
-            self.growth += 1
+            self.generation += 1
+        if self.emitter:
+            self.emitter.go_on(elapsed)
+
+    def make_room(self) -> bool:
+        needed, capacity = self.search.needed, self.search.capacity
+        if needed <= capacity:
+            return False
+        self.resize(min(needed + needed // 8 + 1, 2 * capacity))
+        self.search.forget_needed()
+        return True
 
     def reset(self) -> None:
-        """Forget the counts and flags of an earlier run, also of one that was interrupted."""
         self._iteration.zero_()
         self.step_number.zero_()
         self.containment.reset()
 
     # ---- forward -------------------------------------------------------------------------------------------------
 
-    def step(self, state: State, new_state: State, parameters: Parameters, records: tuple[wp.array, wp.array]) -> None:
-        """One step; ``records`` take its number of iterations and its (average, greatest) density error."""
+    def step(self, state: State, new_state: State, parameters: Parameters, log: IterationLog) -> None:
         context = self._begin(state, parameters)
         if self.pressure is not None:
             self._solve_pressure(self.pressure, context)
-        self.recorded(0, parameters, new_state)
+        self.write_state((0,), parameters, new_state)
         f, it, containment = self.fields, self.iterates, self.containment
         containment.look(self.search.order, f["x"], f["rho_0"], it.x_star[0], it.v_star[0], new_state)
-        iterations, errors = records
         self.launch(
             self.kernels.convergence.finish,
             particles=self.search.particles,
@@ -159,21 +160,23 @@ class Pcisph:
             step=self.step_number,
             iteration=self._iteration,
             bad_step=containment.bad_step,
-            iterations=iterations,
-            errors=errors,
+            iterations=log.iterations,
+            errors=log.errors,
             threads=1,
         )
 
-    def record(self, state: State, parameters: Parameters, iterations: int) -> None:
-        """The same step again, bit for bit, with every intermediate value kept (and the new state: `recorded`)."""
-        self.iterates.reserve(iterations)
+    def reserve(self, counts: Counts) -> None:
+        self.iterates.reserve(*counts)
+
+    def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
+        self.reserve(counts)
         context = self._begin(state, parameters)
-        for k in range(iterations):
+        for k in range(*counts):
             self._iterate(k, k + 1, context)
 
-    def recorded(self, iterations: int, parameters: Parameters, new_state: State) -> None:
-        """The new state of the step that was recorded: its last prediction, in the scene's order, but for particles
-        that a nozzle leads."""
+    def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
+        """The last prediction, in the scene's order, but for particles that a nozzle leads."""
+        (iterations,) = counts
         it, context = self.iterates, self.context(parameters)
         free = self.emitter.free if self.emitter else new_state
         self.launch(

@@ -6,13 +6,13 @@ from typing import Any
 import warp as wp
 
 from cortado.kernels import Kernels
-from cortado.physics.contrast import ContrastKernels, contrast_kernels
-from cortado.physics.convergence import ConvergenceKernels, convergence_kernels
-from cortado.physics.density import density_kernels
-from cortado.physics.integration import IntegrationKernels, integration_kernels
-from cortado.physics.pressure import pressure_force_kernels, pressure_kernels
 from cortado.physics.surroundings import Discretisation
-from cortado.physics.walls import wall_kernels
+from cortado.solvers.pcisph.convergence import ConvergenceKernels, convergence_kernels
+from cortado.solvers.pcisph.density_ratio_relaxation import ContrastKernels, contrast_kernels
+from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
+from cortado.solvers.pcisph.wall_relaxation import wall_kernels
+from cortado.sph.density import density_kernels
+from cortado.sph.integration import IntegrationKernels, integration_kernels
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,15 @@ import warp as wp
 
 from cortado.launching import Named
 from cortado.particles import Fields, Parameters, State
-from cortado.physics.frozen_pressure import frozen_force_adjoint
-from cortado.solvers.pcisph import Pcisph
+from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
+from cortado.solvers.pcisph.steps import PcisphSteps
+from cortado.solvers.solver import Counts
 from cortado.sph.mixture import MixtureAdjoint, MixtureTangent
 from cortado.sph.nozzle import EmitterAdjoint
 from cortado.sph.parts import Adjoints, Shares, StepContext, Tangents
 
 
-def _scratch(solver: Pcisph, vectors: int, scalars: int) -> tuple[list[wp.array], list[wp.array]]:
+def _scratch(solver: PcisphSteps, vectors: int, scalars: int) -> tuple[list[wp.array], list[wp.array]]:
     """Arrays (n,) of vectors and of scalars that a derivative works in, all 0."""
     precision, particles = solver.discretisation.precision, solver.search.particles
     device = solver.search.device
@@ -25,14 +26,14 @@ class PcisphAdjoint:
     """Reverse mode, one step at a time, of a run with some parameters; every neighbour sum is a gather, so that no
     atomics are needed.
 
-    With frozen positions accelerations do not depend on x(t): v' does on v alone, x' = x + dt v' on both.
+    With a frozen geometry accelerations do not depend on x(t): v' does on v alone, x' = x + dt v' on both.
     """
 
-    def __init__(self, solver: Pcisph, steps: int, frozen_positions: bool = False):
+    def __init__(self, solver: PcisphSteps, steps: int, frozen_geometry: bool = False):
         precision, particles, device = solver.discretisation.precision, solver.search.particles, solver.search.device
-        self._solver, self._frozen = solver, frozen_positions
+        self._solver, self._frozen = solver, frozen_geometry
         kernels, mixture = solver.kernels, solver.mixture
-        self._force = frozen_force_adjoint(solver.discretisation) if frozen_positions else kernels.force.adjoint
+        self._force = frozen_force_adjoint(solver.discretisation) if frozen_geometry else kernels.force.adjoint
         names = ["time_step", *mixture.shares, *(name for force in solver.forces for name in force.shares)]
         self.bar = Adjoints(
             Fields.zeros(particles, precision, device),
@@ -56,9 +57,10 @@ class PcisphAdjoint:
         self.bar.shares.collect(self.bar.parameters)
         return self.bar.parameters
 
-    def step(self, iterations: int, new_state_bar: State, state_bar: State, parameters: Parameters) -> None:
-        """From the adjoint of the recorded step's result to that of its state, which may be the same arrays; adjoints
+    def step(self, counts: Counts, new_state_bar: State, state_bar: State, parameters: Parameters) -> None:
+        """From the adjoint of the replayed step's result to that of its state, which may be the same arrays; adjoints
         of the parameters are added to ``bar``."""
+        (iterations,) = counts
         solver, b, it, kernels, bar = (
             self._solver,
             self.bar.fields,
@@ -123,7 +125,7 @@ class PcisphAdjoint:
 class PcisphTangent:
     """Forward mode, one step at a time, of a run along tangents of its parameters."""
 
-    def __init__(self, solver: Pcisph, parameters_dot: Parameters):
+    def __init__(self, solver: PcisphSteps, parameters_dot: Parameters):
         precision, particles, device = solver.discretisation.precision, solver.search.particles, solver.search.device
         self._solver = solver
         self._dot = Tangents(Fields.zeros(particles, precision, device), parameters_dot)
@@ -132,8 +134,9 @@ class PcisphTangent:
         self._zero_pressure, *self._p_dot, self._c_dot, self._y_dot, self._wall_y_dot = scalars
         self._mixture = MixtureTangent(solver.mixture)
 
-    def step(self, iterations: int, state_dot: State, new_state_dot: State, parameters: Parameters) -> None:
-        """From the tangent of the recorded step's state to that of its result; may be the same arrays."""
+    def step(self, counts: Counts, state_dot: State, new_state_dot: State, parameters: Parameters) -> None:
+        """From the tangent of the replayed step's state to that of its result; may be the same arrays."""
+        (iterations,) = counts
         solver, dot, it, kernels = self._solver, self._dot, self._solver.iterates, self._solver.kernels
         context, known, order, d = solver.context(parameters), self._dot.named, solver.search.order, self._dot.fields
         solver.launch(

@@ -1,0 +1,1 @@
+"""Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009)."""

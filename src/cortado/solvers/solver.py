@@ -1,0 +1,122 @@
+"""What a solver is: an algorithm that takes steps, and can take one again, along tangents, and back.
+
+Rollouts, gradients and the certificate know a solver by this protocol; `cortado.solvers.pcisph` is one.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Protocol, Self
+
+import warp as wp
+from numpy.typing import NDArray
+
+from cortado.launching import Launcher
+from cortado.particles import Parameters, State
+from cortado.physics.surroundings import Discretisation
+from cortado.restart import Elapsed
+from cortado.solvers.containment import Containment
+from cortado.sph.parts import StepContext
+from cortado.threads import Turn
+
+Counts = tuple[int, ...]
+"""How often each loop of a step went round: with it the step can be taken again, bit for bit."""
+
+
+class StepLog(Protocol):
+    """What a solver notes of each step of a run, on the device until it is read."""
+
+    @property
+    def diagnostics(self) -> Mapping[str, NDArray]:
+        """(steps,) by name, of the steps that were read. Every solver has ``converged``; PCISPH also ``iterations``,
+        ``density_errors``, the average of the compressions (rho* - rho_0)+ / rho_0, and ``greatest_density_errors``.
+        """
+
+    def read(self, steps: int) -> None:
+        """Read so many steps from the device."""
+
+    def counts(self, step: int) -> Counts:
+        """Of a step that was read, from 0."""
+
+
+class StepTangent(Protocol):
+    """Forward mode of a step that a solver has replayed, along tangents of the parameters."""
+
+    def step(self, counts: Counts, state_dot: State, new_state_dot: State, parameters: Parameters) -> None:
+        """From the tangent of the step's state to that of its result, which may be the same arrays."""
+
+
+class StepAdjoint(Protocol):
+    """Reverse mode of steps that a solver has replayed."""
+
+    def begin(self) -> None:
+        """Forget the adjoints of the parameters of an earlier way back."""
+
+    def step(self, counts: Counts, new_state_bar: State, state_bar: State, parameters: Parameters) -> None:
+        """From the adjoint of the step's result to that of its state, which may be the same arrays."""
+
+    def collect(self) -> Parameters:
+        """The adjoints of the parameters, of all steps since `begin`."""
+
+
+class Solver(Protocol):
+    """The solver of one set of particles on one device. Rollouts share it; nothing here reads from the device, but for
+    `make_room`."""
+
+    discretisation: Discretisation
+    particles: int
+    device: Any
+    launch: Launcher
+    turn: Turn
+    containment: Containment
+    step_number: wp.array
+    """(1,) of the step to take, which `step` counts."""
+    generation: int
+    """How often arrays, or the work of a step, were replaced; what was captured before is stale."""
+
+    def new_state(self, requires_grad: bool = False) -> State:
+        """A state of this solver's particles, all 0."""
+
+    def new_parameters(self, steps: int, requires_grad: bool = False) -> Parameters:
+        """Parameters of a run of so many steps, all 0."""
+
+    def new_log(self, steps: int) -> StepLog:
+        """Room for what is noted of so many steps."""
+
+    def begin(self, elapsed: Elapsed, substeps: int) -> None:
+        """What to know of a run before any of its steps: what went before it, and how many explicit substeps of
+        diffusion each step has."""
+
+    def reset(self) -> None:
+        """Forget the counts and flags of an earlier run, also of one that was interrupted."""
+
+    def make_room(self) -> bool:
+        """Whether the lists of neighbours were too short; they are longer now, and what used them must be repeated."""
+
+    def step(self, state: State, new_state: State, parameters: Parameters, log: Any) -> None:
+        """One step, noted in a log of `new_log`."""
+
+    def reserve(self, counts: Counts) -> None:
+        """Make room for all intermediate values of a step."""
+
+    def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
+        """The same step again, bit for bit, with every intermediate value kept."""
+
+    def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
+        """The result of the step that was replayed."""
+
+    def context(self, parameters: Parameters) -> StepContext:
+        """The present step as its parts see it."""
+
+    def tangent(self, parameters_dot: Parameters) -> StepTangent:
+        """Forward mode along tangents of the parameters."""
+
+    def adjoint(self, steps: int, frozen_geometry: bool = False) -> StepAdjoint:
+        """Reverse mode of a run of so many steps; with a frozen geometry no force depends on positions."""
+
+    def differentiable(self) -> Self:
+        """The same solver, with arrays that Warp's tape can differentiate."""
+
+    def match(self, other: Self) -> None:
+        """Have the room and the substeps of another that is the same but for its arrays."""
+
+    def gradient_memory(self, log: Any) -> Mapping[str, float]:
+        """[bytes] by what they are for, that going back through the steps of a log takes."""
