@@ -36,8 +36,8 @@ LAYERS = """
     solvers.pcisph_parts solvers.pcisph solvers.pcisph_derivatives solvers.adjoint_filters
     rollout
     policies.policy policies.exact policies.strength policies.filters policies.cloud policies.ensemble policies
-    losses checked_loss parameter_checks controls simulation problem
-    render.scene_renderer reparametrisation
+    losses checked_loss parameter_checks controls render.scene_renderer simulation problem
+    reparametrisation
     evaluations optimisers optimisation
     folder_lock run_environment run_folder progress pictures video
     figures.canvas figures.curves figures.particle_sets figures.side_by_side figures report

@@ -21,6 +21,8 @@ from cortado.physics.diffusion import Diffusion
 from cortado.physics.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
 from cortado.physics.surroundings import Discretisation
 from cortado.precision import Precision, precision_named
+from cortado.render.renderer import Renderer
+from cortado.render.scene_renderer import scene_renderer
 from cortado.restart import RestartState, RunConstants
 from cortado.rollout import Rollout
 from cortado.sampling import FluidSample
@@ -186,6 +188,15 @@ class Simulation:
             space.check_restart(state, values)
         space.begin(rollout, values, state=state)
         return rollout
+
+    def renderer(self, **settings: Any) -> Renderer:
+        """What takes pictures of the simulation, ``renderer.render(trajectory[k])``, and differentiates them: as the
+        table ``[render]`` of its scene says, or from above, in 2-D as the plane is.
+
+        ``settings`` replace keys of that table: ``resolution=(320, 240)``, or ``view="volume", position=(1, 1, 2),
+        look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for settings that do not fit.
+        """
+        return scene_renderer(self, **settings)
 
     def parameters(self) -> dict[str, np.ndarray]:
         """Every parameter of `Problem` as the scene has it."""

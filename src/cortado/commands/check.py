@@ -54,10 +54,8 @@ def _loss(name: str, simulation: Simulation) -> Loss:
         return FinalPositions(simulation.positions)
     if name == "centre-of-mass":
         return CentreOfMass(simulation.positions.mean(axis=0))
-    from cortado.render.scene_renderer import scene_renderer
-
-    renderer, state = scene_renderer(simulation), simulation.state
-    return Image(renderer, renderer.render(state.positions, state.mass_fractions, simulation.parameters()["colours"]))
+    renderer = simulation.renderer()
+    return Image(renderer, renderer.render(simulation.state))
 
 
 def _make(folder: Path) -> None:
