@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from hashlib import sha256
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from cortado.render.scene_renderer import scene_renderer
 from cortado.restart import RestartState, RunConstants
 from cortado.rollout import Rollout
 from cortado.sampling import FluidSample
-from cortado.scene import Scene
+from cortado.scene import Scene, as_scene
 from cortado.scene_containers import NoContainer
 from cortado.solvers.containment import Walled
 from cortado.solvers.emitter import Nozzle
@@ -54,15 +55,14 @@ class Simulation:
     @WARP
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | str | PathLike[str],
         device: str = "cpu",
         precision: str = "float32",
         free_energy: FreeEnergy | None = None,
     ):
-        """``device`` as Warp names it ("cpu", "cuda:0"), ``precision`` "float32" or "float64"; ``free_energy``
-        replaces the one that the scene names."""
-        if not isinstance(scene, Scene):
-            raise InputError(f"scene is {shown(scene)}, but must be a cortado.Scene, such as load_scene gives.")
+        """``scene``: one, or the path of its file; ``device`` as Warp names it ("cpu", "cuda:0"), ``precision``
+        "float32" or "float64"; ``free_energy`` replaces the one that the scene names."""
+        scene = as_scene(scene)
         if free_energy is not None and not isinstance(free_energy, FreeEnergy):
             wanted = "a FreeEnergy, of cortado.physics.free_energy"
             raise InputError(f"free_energy is {shown(free_energy)}, but must be {wanted}.")
