@@ -25,6 +25,7 @@ from cortado.folder_lock import locked
 from cortado.pictures import heart, rosetta, write_picture
 from cortado.run_folder import FIGURES, RunFolder
 from test_files import largest_file
+from test_silence import with_kernels
 
 RUN_FILES = {"scene.json", "environment.json", "metrics.jsonl", "trajectory.vtkhdf", "figures", "report.html"}
 OPTIMISE_FILES = {"scene.json", "environment.json", "metrics.jsonl", "checkpoint", "figures", "report.html"}
@@ -50,7 +51,8 @@ def cortado_command(capfd):
             code = 0
         except SystemExit as end:
             code = end.code
-        return code, *capfd.readouterr()
+        out, err = capfd.readouterr()
+        return code, out, with_kernels(err)
 
     return run
 

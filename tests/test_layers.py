@@ -12,7 +12,7 @@ import cortado
 ROOT = Path(cortado.__file__).parent
 
 LAYERS = """
-    errors threads files memory input_files arrays interruption terminal kernel_cache
+    errors threads files memory input_files arrays interruption terminal silence kernel_cache
     image_losses srgb masses
     smoothing calibration parameter_values tilt
     precision cells

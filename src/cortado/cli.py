@@ -5,6 +5,7 @@ user's, or of the machine, is one sentence on stderr, never a traceback.
 """
 
 import io
+import logging
 import os
 import sys
 import warnings
@@ -206,6 +207,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # type: ignore[assignment]
             work = _understood(arguments)
+            logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where its folder cannot be written it goes on
             start_warp()
             tell(work())
     except ComputationError as error:

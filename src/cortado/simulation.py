@@ -13,6 +13,7 @@ from cortado.calibration import SKIN, diffusion_limit
 from cortado.controls import Controls
 from cortado.discrete_scene import DiscreteScene, discretise
 from cortado.errors import CortadoWarning, InputError, shown
+from cortado.kernel_cache import start_warp
 from cortado.memory import frame_parts, require, simulation_parts
 from cortado.neighbours import Grid, NeighbourSearch
 from cortado.parameter_checks import check_sizes
@@ -63,6 +64,7 @@ class Simulation:
         """``scene``: one, or the path of its file; ``device`` as Warp names it ("cpu", "cuda:0"), ``precision``
         "float32" or "float64"; ``free_energy`` replaces the one that the scene names."""
         scene = as_scene(scene)
+        start_warp()
         if free_energy is not None and not isinstance(free_energy, FreeEnergy):
             wanted = "a FreeEnergy, of cortado.physics.free_energy"
             raise InputError(f"free_energy is {shown(free_energy)}, but must be {wanted}.")

@@ -9,6 +9,7 @@ import warp as wp
 
 from cortado.arrays import as_numbers
 from cortado.errors import InputError, shown
+from cortado.kernel_cache import start_warp
 from cortado.particles import padded
 from cortado.precision import Precision
 from cortado.render.cameras import positive, vector
@@ -71,6 +72,7 @@ class Renderer:
         ``volume`` is the rest volume of a particle [m^d], ``cell`` the distance of nodes [m], by default half the
         support radius. ``colours`` (phases, 3) are those of the phases where a picture is asked for without any.
         """
+        start_warp()
         for name, size in (("support", support), ("volume", volume), ("cell", 1.0 if cell is None else cell)):
             positive(name, size)
         cell = 0.5 * support if cell is None else cell
