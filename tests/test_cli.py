@@ -259,6 +259,10 @@ def test_every_command_has_help(cortado_command, command):
     assert (code, err) == (0, "") and out.startswith(" ".join(["usage: cortado", *command]))
 
 
+def test_the_version_is_printed(cortado_command):
+    assert cortado_command("--version") == (0, f"cortado {cortado.__version__}\n", "")
+
+
 def test_a_process_of_its_own_says_no_more_than_the_sentence(folder):
     process = start("run", "scene.toml", "--steps", "0", "--out", "dam")
     out, err = process.communicate(timeout=60)

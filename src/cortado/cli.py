@@ -20,6 +20,7 @@ import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
+from cortado import __version__
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
 from cortado.interruption import Interrupted
 from cortado.kernel_cache import complaint, start_warp
@@ -228,13 +229,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _understood(arguments: Sequence[str]) -> Work:
-    """The command that the arguments name; prints help and exits where they ask for it."""
+    """The command that the arguments name; prints help or the version and exits where they ask for it."""
     box = io.StringIO()
     try:
         with redirect_stderr(box), to_stdout():
+            if list(arguments) == ["--version"]:
+                print(f"cortado {__version__}")
+                sys.exit(0)
             return app.cli(
                 prog="cortado",
-                description="A differentiable SPH fluid simulator.",
+                description="A differentiable SPH fluid simulator. --version prints which one.",
                 args=arguments,
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
             )

@@ -18,6 +18,18 @@ from cortado.physics.matching import matching_kernels
 from cortado.precision import FLOAT32, FLOAT64, Precision
 from cortado.threads import WARP
 
+__all__ = [
+    "CentreOfMass",
+    "CentreOfMassAlong",
+    "EndAdjoint",
+    "FinalPositions",
+    "Frames",
+    "Image",
+    "Loss",
+    "Recorded",
+    "TrajectoryEnd",
+]
+
 
 @dataclass(frozen=True)
 class TrajectoryEnd:
@@ -297,3 +309,7 @@ class Recorded:
         loss = wp.zeros(1, dtype=end.precision.real, device=copies[0].device, requires_grad=True)
         self.function(copies[0], copies[1], loss)
         return loss, copies[0], copies[1]
+
+
+def __dir__() -> list[str]:
+    return __all__

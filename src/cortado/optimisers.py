@@ -15,6 +15,8 @@ from cortado.errors import InputError, shown
 from cortado.evaluations import Packing, Vector
 from cortado.scene_kinds import as_number
 
+__all__ = ["LBFGS", "Adam", "GradientDescent", "Optimiser", "Outcome", "Search"]
+
 PerParameter = float | Mapping[str, float]
 
 
@@ -306,3 +308,7 @@ def _require_names(name: str, values: PerParameter, packing: Packing) -> None:
 def _listed(names: Iterable[str]) -> str:
     """Names as a message shows them."""
     return ", ".join(f"'{name}'" for name in names) or "none"
+
+
+def __dir__() -> list[str]:
+    return __all__
