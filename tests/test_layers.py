@@ -12,7 +12,7 @@ import cortado
 ROOT = Path(cortado.__file__).parent
 
 LAYERS = """
-    errors threads files memory input_files arrays interruption terminal silence kernel_cache
+    errors words notebook threads files memory input_files arrays interruption terminal silence kernel_cache
     image_losses srgb masses
     smoothing calibration parameter_values tilt
     precision cells
@@ -31,7 +31,7 @@ LAYERS = """
     scene_fluids scene_emitter scene_mixture scene_render scene_containers scene_stability scene_checks scene sampling
     discrete_scene
     reference.digits reference.engine reference.losses reference.histories reference.simulation reference
-    trajectory
+    figures.canvas figures.particle_sets trajectory figures.curves
     solvers.forces solvers.mixture solvers.containment solvers.emitter
     solvers.pcisph_parts solvers.pcisph solvers.pcisph_derivatives solvers.adjoint_filters
     rollout
@@ -40,10 +40,10 @@ LAYERS = """
     reparametrisation
     evaluations optimisers differentiable optimisation_result optimisation
     folder_lock run_environment run_folder progress pictures video
-    figures.canvas figures.curves figures.particle_sets figures.side_by_side figures report
+    figures.side_by_side figures report
     task_tables task assignment task_figures
     certificate.twin certificate.course certificate.changes certificate.rightness certificate.horizon
-    certificate.agreement certificate.certificate certificate figures.gradient_check
+    certificate.agreement certificate.text certificate.certificate certificate figures.gradient_check
     study.tables study.scenes study.experiment study.canvas study.comparison study.reference_losses study.sources
     study.gravity_tangents study.term_sizes
     study.estimates study.shades study.starts study.spatial_scales study.lyapunov_spectrum study.lyapunov_exponents

@@ -17,6 +17,7 @@ from cortado.particles import State, to_device
 from cortado.physics.matching import matching_kernels
 from cortado.precision import FLOAT32, FLOAT64, Precision
 from cortado.threads import WARP
+from cortado.words import counted
 
 __all__ = [
     "CentreOfMass",
@@ -41,6 +42,9 @@ class TrajectoryEnd:
     colours: np.ndarray
     """(phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
 
+    def __repr__(self) -> str:
+        return f"TrajectoryEnd({counted(len(self.state.positions), 'particle')}, {self.precision.name})"
+
     @property
     def precision(self) -> Precision:
         """Of the Warp arrays."""
@@ -62,7 +66,7 @@ class TrajectoryEnd:
         return self.state.mass_fractions.numpy().astype(np.float64)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class EndAdjoint:
     """Derivatives of a loss that also looks at the colours."""
 

@@ -3,6 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
+from cortado.notebook import with_picture
+from cortado.words import counted, sized
+
 Parameters = dict[str, Any]
 # by name: a float where the user gave a number, otherwise a float64 array of the shape that the user gave
 
@@ -20,6 +23,9 @@ class Record:
     # at which the loss was evaluated
     replayed: bool
     # whether it was read from the checkpoint
+
+    def __repr__(self) -> str:
+        return f"Record(iteration {self.iteration}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,3 +46,13 @@ class Result:
     # how it ended, a sentence
     converged: bool
     # whether the optimiser's own test was met; Adam and gradient descent have none
+
+    def __repr__(self) -> str:
+        found = f"loss {self.loss:.6g} after {counted(self.evaluations, 'evaluation')}"
+        return f"Result({sized(self.parameters)}: {found}; {self.message.rstrip('.')})"
+
+    def _repr_html_(self) -> str:
+        """With the losses of all evaluations."""
+        from cortado.figures.curves import loss_curve
+
+        return with_picture(self, lambda path: loss_curve([record.loss for record in self.history], path))

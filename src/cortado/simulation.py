@@ -39,6 +39,7 @@ from cortado.solvers.pcisph_parts import PressureSolve
 from cortado.threads import WARP, Turn, in_turn
 from cortado.trajectory import Trajectory
 from cortado.walls.layers import WallLayers
+from cortado.words import counted
 
 MOST_SUBSTEPS = 10_000
 """Explicit steps of diffusion in a time step; beyond it the mobility is taken for a mistake."""
@@ -102,6 +103,10 @@ class Simulation:
         """Pickled and copied as what it is made from."""
         energy = self.free_energy if len(self.scene.phase) > 1 else None
         return _made_again, (self.scene, self.device.alias, self.precision.name, energy, self._points)
+
+    def __repr__(self) -> str:
+        sizes = f"{counted(self.particles, 'particle')}, {counted(len(self.scene.phase), 'phase')}"
+        return f"Simulation({sizes}, {self.device.alias}, {self.precision.name})"
 
     @property
     def dimension(self) -> int:

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from cortado import vtkhdf
 from cortado.errors import InputError, shown
+from cortado.notebook import as_text, with_picture
 from cortado.restart import Elapsed, RestartState, RunConstants
+from cortado.words import counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +30,9 @@ class Frame:
     """(n, phases) [-]; None with one phase"""
     time: float
     """[s]"""
+
+    def __repr__(self) -> str:
+        return f"Frame({counted(len(self.positions), 'particle')}, t = {self.time:.4g} s)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +80,22 @@ class Trajectory:
             raise InputError(
                 f"Iterations, density errors and converged must be of one length, but have {sorted(steps)}."
             )
+
+    def __repr__(self) -> str:
+        times = f", {self.times[0]:.4g} to {self.times[-1]:.4g} s" if len(self) else ""
+        return f"Trajectory({counted(len(self), 'frame')} of {counted(self.particles, 'particle')}{times})"
+
+    def _repr_html_(self) -> str:
+        """Its first, middle and last frame, coloured by speed."""
+        from cortado.figures.particle_sets import particles
+
+        if not len(self):
+            return as_text(repr(self))
+        shown = [self[k] for k in sorted({0, len(self) // 2, len(self) - 1})]
+        titles = [f"t = {frame.time:.4g} s" for frame in shown]
+        speeds = [np.linalg.norm(frame.velocities, axis=1) for frame in shown]
+        sets, label = [frame.positions for frame in shown], "speed [m/s]"
+        return with_picture(self, lambda path: particles(sets, titles, path, colours=speeds, colour_label=label))
 
     def __len__(self) -> int:
         """Number of frames."""

@@ -12,15 +12,18 @@ from cortado.certificate.changes import CHANGE, coherent_directions, directions,
 from cortado.certificate.course import Course
 from cortado.certificate.horizon import Horizon, horizon
 from cortado.certificate.rightness import Comparison, balanced, compare
+from cortado.certificate.text import agreement_words, horizon_table, parameter_table, policy_table
 from cortado.certificate.twin import in_float64
 from cortado.errors import InputError, shown
 from cortado.losses import FinalPositions
+from cortado.notebook import as_text
 from cortado.parameter_values import Arrays, Values
 from cortado.policies import AdjointNorms
 from cortado.policies.strength import growth
 from cortado.problem import Problem
 from cortado.scene import Scene
 from cortado.simulation import Simulation
+from cortado.words import counted
 
 ROUGHLY = 0.1
 """How far the adjoint of a loss in float32 may be from differences of it, relative."""
@@ -47,6 +50,30 @@ class Certificate:
     """For every parameter that was asked for; none where the adjoint is wrong."""
     agreement: Agreement | None
     """Of all of these together with the smoothed gradient."""
+
+    def __repr__(self) -> str:
+        verdict = f"right, horizon {self.horizon}" if self.right else f"WRONG for {', '.join(self.wrong)}"
+        size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}"
+        return f"Certificate({size}, {verdict}, use policies.{self.policy})"
+
+    def __str__(self) -> str:
+        """As tables and sentences."""
+        size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}, float64"
+        lines = [size, parameter_table(self.shares, self.wrong)]
+        if not self.right:
+            return "\n".join([*lines, f"The adjoint is WRONG: {agreement_words(self.comparison)}."])
+        lines += [
+            f"The adjoint is right: {agreement_words(self.comparison)}.",
+            f"The adjoint of a state grows by e^{self.growth:.4f} a step.",
+            horizon_table(self.horizons),
+            *([] if self.agreement is None else [policy_table(self.agreement)]),
+            f"Up to step {self.horizon} of {self.steps} the exact gradient means something. For {self.steps} steps use "
+            f"policies.{self.policy}.",
+        ]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return as_text(self)
 
     @property
     def right(self) -> bool:

@@ -18,6 +18,7 @@ from cortado.render.marching import RayMarcher
 from cortado.render.views import View
 from cortado.smoothing import SmoothingKernel
 from cortado.threads import WARP
+from cortado.words import counted
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,11 @@ class Renderer:
         )
         self._rays = RayMarcher(view, self._field.nodes, precision, self._device)
         self._rendered = False
+
+    def __repr__(self) -> str:
+        rows, columns, _ = self.shape
+        view = type(self.view).__name__
+        return f"Renderer({view}, {columns} x {rows} pixels, {counted(self._particles, 'particle')})"
 
     def __reduce__(self) -> tuple[Any, ...]:
         raise InputError("A Renderer cannot be pickled or copied; make another one where it is needed.")
