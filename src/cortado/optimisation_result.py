@@ -1,5 +1,6 @@
 """What an optimisation leaves: its best parameters, and every evaluation on the way."""
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,7 +50,8 @@ class Result:
 
     def __repr__(self) -> str:
         found = f"loss {self.loss:.6g} after {counted(self.evaluations, 'evaluation')}"
-        return f"Result({sized(self.parameters)}: {found}; {self.message.rstrip('.')})"
+        end = re.split("[,:;.]", self.message)[0]
+        return f"Result({sized(self.parameters)}: {found}; {end})"
 
     def _repr_html_(self) -> str:
         """With the losses of all evaluations."""
