@@ -46,7 +46,7 @@ def milk_at(picture):
 density = trajectory.constants.reference_density.astype(float)  # (n,), in proportion to the mass of each particle
 milk = np.array([density @ frame.mass_fractions[:, 1] for frame in trajectory])
 coffee_in_milk = trajectory[-1].mass_fractions[trajectory[0].mass_fractions[:, 1] > 0.5, 0].mean()
-print(f"milk is kept to {np.ptp(milk) / milk[0]:.1g}; its centre goes from {milk_at(before):.2f} to {milk_at(after):.2f}")
+print(f"milk is kept to {np.ptp(milk) / milk[0]:.1g}, and goes from {milk_at(before):.2f} to {milk_at(after):.2f}")
 print(f"{coffee_in_milk:.1%} of what was milk is coffee now")
 assert np.ptp(milk) < 1e-4 * milk[0], "milk was lost or made"
 assert 0.01 < coffee_in_milk < 0.5, "the fluids have not mixed a little"

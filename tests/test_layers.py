@@ -38,7 +38,7 @@ LAYERS = """
     policies.policy policies.exact policies.strength policies.filters policies.cloud policies.ensemble policies
     losses checked_loss parameter_checks controls render.scene_renderer simulation problem
     reparametrisation
-    evaluations optimisers differentiable optimisation_result optimisation
+    evaluations optimisers named_optimisers differentiable optimisation_result optimisation
     folder_lock run_environment run_folder progress pictures video
     figures.side_by_side figures report
     task_tables task assignment task_figures

@@ -13,8 +13,9 @@ import pytest
 import cortado
 from cortado.errors import ComputationError, InputError
 from cortado.evaluations import FILE_NAME
+from cortado.named_optimisers import BY_NAME
 from cortado.optimisation import Record, Result, optimise
-from cortado.optimisers import BY_NAME, LBFGS, Adam, GradientDescent
+from cortado.optimisers import LBFGS, Adam, GradientDescent
 
 OPTIMISERS = [Adam(learning_rate=0.05), GradientDescent(learning_rate=1e-3, momentum=0.5), LBFGS()]
 

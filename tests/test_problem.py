@@ -132,7 +132,7 @@ MISTAKES = {
     "steps 1.5": lambda p: Problem(p.simulation, 1.5, p.loss),
     "steps None": lambda p: Problem(p.simulation, None, p.loss),
     "simulation is a file": lambda p: Problem("scene.toml", 10, p.loss),
-    "scene is a file": lambda p: Simulation("scene.toml"),
+    "scene is a number": lambda p: Simulation(3),
     "device": lambda p: Simulation(p.simulation.scene, device="gpu7"),
     "precision": lambda p: Simulation(p.simulation.scene, precision="float16"),
     "target's shape": lambda p: Problem(p.simulation, 2, losses.FinalPositions(np.zeros((7, 3)))).value(GRAVITY),

@@ -18,8 +18,9 @@ from cortado.arrays import as_numbers, as_one_number
 from cortado.differentiable import Differentiable, LossFunction, as_differentiable, loss_and_gradient
 from cortado.errors import ComputationError, InputError, shown
 from cortado.evaluations import Evaluation, EvaluationLog, Log, MemoryLog, Packing, Vector
+from cortado.named_optimisers import as_optimiser
 from cortado.optimisation_result import Parameters, Record, Result
-from cortado.optimisers import Optimiser, Search, as_optimiser
+from cortado.optimisers import Optimiser, Search
 
 GREATEST_GRADIENT = 1e150
 # Components beyond it are refused like infinite ones: their squares, which optimisers take, overflow.

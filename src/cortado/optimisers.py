@@ -5,15 +5,16 @@ on nothing else. Resuming (`cortado.optimisation`) rests on this; an optimiser w
 them from a seed of its own.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import MISSING, dataclass, fields
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from cortado.errors import InputError, shown
+from cortado.errors import InputError
 from cortado.evaluations import Packing, Vector
 from cortado.scene_kinds import as_number
+from cortado.words import quoted
 
 __all__ = ["LBFGS", "Adam", "GradientDescent", "Optimiser", "Outcome", "Search"]
 
@@ -221,41 +222,6 @@ _LBFGS_MESSAGES = {
 }
 
 
-BY_NAME: dict[str, Any] = {"adam": Adam, "gradient_descent": GradientDescent, "lbfgs": LBFGS}
-"""The optimisers by the names that `cortado.optimise` takes."""
-
-
-def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
-    """An optimiser from its name and its settings, or the object itself; raises `InputError` for anything else."""
-    if isinstance(optimiser, str):
-        return _named(optimiser, settings)
-    if isinstance(optimiser, type) or not isinstance(optimiser, Optimiser):
-        raise InputError(
-            f"The optimiser must be an object such as cortado.optimisers.Adam(learning_rate=0.1), or one of "
-            f"{_listed(BY_NAME)}, not {shown(optimiser)}."
-        )
-    if settings:
-        raise InputError(
-            f"optimise was given {_listed(settings)}, but takes settings only of an optimiser that is given by its "
-            "name: an object has its own."
-        )
-    return optimiser
-
-
-def _named(name: str, settings: Mapping[str, Any]) -> Optimiser:
-    """The optimiser of a name, with settings that must be its own and complete."""
-    if name not in BY_NAME:
-        raise InputError(f"The optimiser is {shown(name)}, but must be one of {_listed(BY_NAME)}, or an object.")
-    known = {field.name: field.default is MISSING for field in fields(BY_NAME[name])}
-    unknown = sorted(set(settings) - set(known))
-    if unknown:
-        raise InputError(f"{_listed(unknown)} is no setting of '{name}', whose settings are {_listed(known)}.")
-    missing = [setting for setting, needed in known.items() if needed and setting not in settings]
-    if missing:
-        raise InputError(f"'{name}' needs {_listed(missing)}; its settings are {_listed(known)}.")
-    return BY_NAME[name](**settings)
-
-
 def _scaled_bounds(search: Search, scale: Vector) -> list[tuple[float, float]] | None:
     """The bounds on (x - start) / scale, as scipy takes them; None if there are none at all."""
     if np.isinf(search.lower).all() and np.isinf(search.upper).all():
@@ -300,14 +266,9 @@ def _require_names(name: str, values: PerParameter, packing: Packing) -> None:
     """Raise InputError if a setting is given per parameter for others than these parameters."""
     if isinstance(values, Mapping) and set(values) != set(packing.names):
         raise InputError(
-            f"{name} is given for {_listed(values)}, but the optimised parameters are "
-            f"{_listed(packing.names)}; give it for each of these, or one number for all."
+            f"{name} is given for {quoted(values)}, but the optimised parameters are "
+            f"{quoted(packing.names)}; give it for each of these, or one number for all."
         )
-
-
-def _listed(names: Iterable[str]) -> str:
-    """Names as a message shows them."""
-    return ", ".join(f"'{name}'" for name in names) or "none"
 
 
 def __dir__() -> list[str]:

@@ -1,6 +1,6 @@
-"""Objects in a few words, for their ``repr``: how many, how large, never the numbers of an array."""
+"""Objects in a few words, for their ``repr`` and for sentences: how many, how large, never the numbers of an array."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -8,6 +8,11 @@ from typing import Any
 def counted(number: int, noun: str) -> str:
     """``1 phase``, ``2 phases``"""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def quoted(names: Iterable[str]) -> str:
+    """Names as a sentence shows them: ``'gravity', 'viscosity'``."""
+    return ", ".join(f"'{name}'" for name in names) or "none"
 
 
 def sized(arrays: Mapping[str, Any]) -> str:
