@@ -1,7 +1,8 @@
 """What Warp says of itself is kept back, unless it is asked for; that kernels are compiled is said in one line.
 
 Who sets the environment variable CORTADO_VERBOSE to 1 hears all of it: the greeting, a line for every module that is
-loaded, warnings about drivers. Who sets ``warp.config.log_level`` before the first simulation is made keeps that level.
+loaded, warnings about drivers. Who sets ``warp.config.log_level`` before the first simulation is made keeps that level,
+if it is another one than Warp's own.
 """
 
 import os
