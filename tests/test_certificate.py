@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from cortado.certificate.twin import in_float64
 from cortado.physics.free_energy import FREE_ENERGIES
 from cortado.problem import Passage
 from cortado.render.scene_renderer import scene_renderer
+from cortado.scene import load_scene
 from scenes import plane, plane_of_three, scene, splash, two_layers
 from test_emitter import jet, pour
 
@@ -217,6 +219,16 @@ def test_frames_are_judged_where_they_are():
     assert slope == pytest.approx(gradient[1])
 
 
+def test_a_scene_needs_only_a_number_of_steps():
+    path = Path(__file__).parents[1] / "docs/figures/dam_break_plane.toml"
+    dam = load_scene(path)
+    whole = certify(problem_of(dam, 6, lambda simulation: losses.FinalPositions(simulation.positions)))
+    for subject in (path, str(path), dam, Simulation(dam)):
+        assert certify(subject, steps=6).as_dict() == whole.as_dict()
+    with pytest.raises(InputError, match=r"^steps is left out, but must be given where .* no Problem but a Scene\.$"):
+        certify(dam)
+
+
 def test_without_steps_nothing_is_claimed():
     found = certify(problem_of(plane(), 0, lambda simulation: losses.FinalPositions(0.9 * simulation.positions)))
     assert found.right and found.agreement is None and found.comparison.moments.tolist() == [0]
@@ -233,6 +245,7 @@ def test_it_is_part_of_the_public_face():
         ({"parameters": []}, "parameters is empty, but must have at least one of gravity, "),
         ({"parameters": ["nozzle_path"]}, "parameter 'nozzle_path' is unknown"),
         ({"parameters": {"gravity": [1.0, 2.0, 3.0]}}, r"parameter gravity has shape \(3,\), but must be"),
+        ({"steps": 4}, "steps is 4, but must be left out, as the problem has 3 steps."),
         ({"change": 0.0}, "change is 0.0, but must be greater than 0 and less than 1."),
     ],
 )

@@ -25,6 +25,7 @@ from cortado.folder_lock import locked
 from cortado.pictures import heart, rosetta, write_picture
 from cortado.run_folder import FIGURES, RunFolder
 from test_files import largest_file
+from test_silence import with_kernels
 
 RUN_FILES = {"scene.json", "environment.json", "metrics.jsonl", "trajectory.vtkhdf", "figures", "report.html"}
 OPTIMISE_FILES = {"scene.json", "environment.json", "metrics.jsonl", "checkpoint", "figures", "report.html"}
@@ -50,7 +51,8 @@ def cortado_command(capfd):
             code = 0
         except SystemExit as end:
             code = end.code
-        return code, *capfd.readouterr()
+        out, err = capfd.readouterr()
+        return code, out, with_kernels(err)
 
     return run
 
@@ -255,6 +257,10 @@ def test_wrong_usage_is_refused(cortado_command, folder, arguments, words):
 def test_every_command_has_help(cortado_command, command):
     code, out, err = cortado_command(*command, "--help")
     assert (code, err) == (0, "") and out.startswith(" ".join(["usage: cortado", *command]))
+
+
+def test_the_version_is_printed(cortado_command):
+    assert cortado_command("--version") == (0, f"cortado {cortado.__version__}\n", "")
 
 
 def test_a_process_of_its_own_says_no_more_than_the_sentence(folder):

@@ -12,7 +12,7 @@ import cortado
 ROOT = Path(cortado.__file__).parent
 
 LAYERS = """
-    errors threads files memory input_files arrays interruption terminal kernel_cache
+    errors words notebook threads files memory input_files arrays interruption terminal silence kernel_cache
     image_losses srgb
     smoothing calibration parameters.registry parameters.values parameters.tilt parameters.reference_density
     precision kernels physics.reduction launching cells
@@ -30,21 +30,21 @@ LAYERS = """
     discrete_scene
     sph.parts sph.pair_forces sph.gravity sph.viscosity sph.mixture sph.nozzle sph
     reference.digits reference.engine reference.losses reference.histories reference.simulation reference
-    trajectory
+    figures.canvas figures.particle_sets trajectory figures.curves
     solvers.containment solvers.solver
     solvers.pcisph.wall_relaxation solvers.pcisph.density_ratio_relaxation solvers.pcisph.pressure
     solvers.pcisph.frozen_pressure solvers.pcisph.convergence solvers.pcisph.parts solvers.pcisph.log
     solvers.pcisph.steps solvers.pcisph.derivatives solvers.pcisph.solver solvers.adjoint_filters
     rollout
     policies.policy policies.exact policies.strength policies.filters policies.cloud policies.ensemble policies
-    losses checked_loss parameters.checks parameters.space parameters simulation problem
-    render.scene_renderer reparametrisation
-    evaluations optimisers optimisation
+    losses checked_loss parameters.checks parameters.space parameters render.scene_renderer simulation problem
+    reparametrisation
+    evaluations optimisers named_optimisers differentiable optimisation_result optimisation
     folder_lock run_environment run_folder progress pictures video
-    figures.canvas figures.curves figures.particle_sets figures.side_by_side figures report
+    figures.side_by_side figures report
     task_tables task assignment task_figures
     certificate.twin certificate.course certificate.changes certificate.rightness certificate.horizon
-    certificate.agreement certificate.certificate certificate figures.gradient_check
+    certificate.agreement certificate.text certificate.certificate certificate figures.gradient_check
     study.tables study.scenes study.experiment study.canvas study.comparison study.reference_losses study.sources
     study.gravity_tangents study.term_sizes
     study.estimates study.shades study.starts study.spatial_scales study.lyapunov_spectrum study.lyapunov_exponents

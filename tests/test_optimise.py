@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import cortado
 from cortado.errors import ComputationError, InputError
 from cortado.evaluations import FILE_NAME
+from cortado.named_optimisers import BY_NAME
 from cortado.optimisation import Record, Result, optimise
 from cortado.optimisers import LBFGS, Adam, GradientDescent
 
@@ -468,7 +470,22 @@ def test_wrong_settings_are_refused(make):
         ({"bounds": {"x": (None, "2")}}, "upper bound of 'x' is '2'"),
         ({"start": {"x": np.zeros((0, 3))}}, r"'x' has shape \(0, 3\), but must have at least one"),
         ({"start": {"x": [[1.0], [1.0, 2.0]]}}, r"'x' is \[\[1.0\], \[1.0, 2.0\]\], but must be a number or an array"),
-        ({"optimiser": "adam"}, "optimiser must be an object"),
+        ({"start": np.ones(2)}, r"^The start is array\(\[1., 1.\]\), but must name its parameters"),
+        ({"optimiser": Adam}, "^The optimiser must be an object such as"),
+        (
+            {"optimiser": "adm"},
+            "^The optimiser is 'adm', but must be one of 'adam', 'gradient_descent', 'lbfgs', or an object.$",
+        ),
+        (
+            {"optimiser": "gradient_descent"},
+            "^'gradient_descent' needs 'learning_rate'; its settings are 'learning_rate', 'momentum'.$",
+        ),
+        (
+            {"optimiser": "lbfgs", "learning_rate": 0.1},
+            "^'learning_rate' is no setting of 'lbfgs', whose settings are 'memory', 'tolerance', 'scale'.$",
+        ),
+        ({"optimiser": "adam", "learning_rate": -1.0}, "^learning_rate must be a positive, finite number"),
+        ({"learning_rate": 0.1}, "^optimise was given 'learning_rate', but takes settings only of an optimiser that"),
         (
             {"optimiser": Adam({"y": 0.1})},
             "learning_rate is given for 'y', but the optimised parameters are 'x'",
@@ -529,3 +546,65 @@ def test_the_history_is_safe_from_a_problem_that_overwrites_its_arguments():
     careful = optimise(Quadratic({"x": np.zeros(2)}), {"x": start}, LBFGS(), 5)
     assert bits(optimise(Careless({"x": np.zeros(2)}), {"x": start}, LBFGS(), 5)) == bits(careful)
     np.testing.assert_array_equal(start, np.ones(2))
+
+
+# Names and functions
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "optimiser"),
+    [
+        ("adam", {"learning_rate": 0.05, "beta1": 0.8}, Adam(0.05, beta1=0.8)),
+        ("gradient_descent", {"learning_rate": {"a": 1e-3, "b": 2e-3}}, GradientDescent({"a": 1e-3, "b": 2e-3})),
+        ("lbfgs", {}, LBFGS()),
+    ],
+)
+def test_an_optimiser_may_be_given_by_its_name(name, settings, optimiser):
+    assert bits(rosenbrock(name, **settings)) == bits(rosenbrock(optimiser))
+
+
+def test_every_optimiser_has_a_name():
+    assert {type(optimiser) for optimiser in OPTIMISERS} == set(BY_NAME.values())
+
+
+def test_both_spellings_are_the_same():
+    assert cortado.optimize is cortado.optimise
+
+
+def test_a_plain_function_is_optimised(tmp_path):
+    """Bit for bit as an object is; and its name is kept in the checkpoint."""
+
+    def valley(parameters):
+        return Rosenbrock().value_and_gradient(parameters)
+
+    def other(parameters):
+        return valley(parameters)
+
+    found = rosenbrock(LBFGS(), problem=valley, checkpoint=tmp_path)
+    assert bits(found) == bits(rosenbrock(LBFGS()))
+    with pytest.raises(InputError, match="problem"):
+        rosenbrock(LBFGS(), problem=other, checkpoint=tmp_path, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("returned", "found"),
+    [
+        (1.5, "1.5"),
+        (None, "None"),
+        ((1.0, {"a": 0.0}, 2), "a tuple of 3"),
+        ((1.0, np.zeros(2)), "a loss and a gradient of type ndarray"),
+    ],
+)
+def test_a_function_that_returns_something_else_is_refused(returned, found):
+    wanted = "two things: the loss, a number, and its gradient, a dictionary with an array for each parameter"
+    with pytest.raises(InputError, match=f"^What is optimised returned {found}, but must return {wanted} by its name"):
+        rosenbrock(LBFGS(), problem=lambda parameters: returned)
+
+
+def test_what_cannot_be_optimised_is_refused():
+    with pytest.raises(InputError, match=r"^What is optimised is 3, but must be a cortado\.Problem, an object with"):
+        rosenbrock(LBFGS(), problem=3)
+    with pytest.raises(InputError, match=r"^What is optimised is the class Rosenbrock, but must be an object"):
+        rosenbrock(LBFGS(), problem=Rosenbrock)
+    with pytest.raises(InputError, match=r"^A policy is given, but must be left out"):
+        rosenbrock(LBFGS(), problem=lambda parameters: (0.0, {}), policy=object())

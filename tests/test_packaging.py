@@ -16,6 +16,7 @@ import cortado
 
 ROOT = Path(__file__).parent.parent
 
+PACKAGE = ("src/cortado/__init__.py", "src/cortado/py.typed")
 needs_cmake = pytest.mark.skipif(shutil.which("cmake") is None, reason="CMake is not installed")
 
 
@@ -29,12 +30,11 @@ def build(hook: str, source: Path, out: Path, **environment: str) -> subprocess.
 
 @pytest.fixture
 def small(tmp_path):
-    """A project of one module that is built as Cortado is."""
+    """A project of one module, with a marker that it has types, that is built as Cortado is."""
     source = tmp_path / "source"
     (source / "src/cortado").mkdir(parents=True)
-    (source / "src/cortado/__init__.py").touch()
     (source / "cpp").mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE", "cpp/CMakeLists.txt"):
+    for name in ("pyproject.toml", "README.md", "LICENSE", "cpp/CMakeLists.txt", *PACKAGE):
         shutil.copy(ROOT / name, source / name)
     return source
 
@@ -46,8 +46,9 @@ def test_without_a_compiler_the_wheel_is_pure_python(small, tmp_path, hook):
     assert built.returncode == 0, built.stdout + built.stderr
     assert "retrying due to override" in built.stdout
     (wheel,) = (tmp_path / "dist").glob("*.whl")
-    assert wheel.name.startswith("cortado_sph-") and wheel.name.endswith("-py3-none-any.whl")
-    assert ("cortado/__init__.py" in zipfile.ZipFile(wheel).namelist()) == (hook == "build_wheel")
+    assert wheel.name == f"cortado_sph-{cortado.__version__}-py3-none-any.whl"
+    held = set(zipfile.ZipFile(wheel).namelist())
+    assert ({"cortado/__init__.py", "cortado/py.typed"} <= held) == (hook == "build_wheel")
 
 
 @needs_cmake
@@ -71,7 +72,7 @@ def test_the_source_distribution_holds_every_source(tmp_path):
 def test_one_name_stands_wherever_cortado_is_installed():
     """Another project has the name cortado on the package index."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert (project["name"], project["version"]) == ("cortado-sph", cortado.__version__)
+    assert project["name"] == "cortado-sph"
     files = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "src").rglob("*.py"), ROOT / "pyproject.toml"]
     named = {name for file in files for name in re.findall(r"([\w-]+)\[(?:video|test)\]", file.read_text())}
     assert named == {"cortado-sph"}

@@ -78,7 +78,7 @@ SHARED = {
 }
 """Derivatives that forward mode uses too, the adjoints of pictures among them, so that only differences can tell."""
 ELSEWHERE = {
-    "physics.frozen_pressure": "a policy that is not exact: tests/test_policies.py",
+    "solvers.pcisph.frozen_pressure": "a policy that is not exact: tests/test_policies.py",
     "physics.adjoint_filters": "policies that are not exact: tests/test_policies.py",
 }
 """Modules with adjoints that no plant is in, and why."""

@@ -44,7 +44,7 @@ def test_an_interruption_leaves_nothing_behind(simulation, policy, monkeypatch):
     _, wanted = problem.value_and_gradient(point, policy)
     fresh = Problem(simulation, 30, losses.FinalPositions(np.zeros_like(simulation.positions)))
     solver = simulation.solver
-    recorded = type(solver).recorded
+    recorded = type(solver).write_state
     calls = []
 
     def interrupted(self, *rest):
@@ -53,7 +53,7 @@ def test_an_interruption_leaves_nothing_behind(simulation, policy, monkeypatch):
             raise KeyboardInterrupt
         recorded(self, *rest)
 
-    monkeypatch.setattr(type(solver), "recorded", interrupted)
+    monkeypatch.setattr(type(solver), "write_state", interrupted)
     with pytest.raises(KeyboardInterrupt):
         for _ in range(3):
             fresh.value_and_gradient(point, policy)
@@ -132,7 +132,7 @@ MISTAKES = {
     "steps 1.5": lambda p: Problem(p.simulation, 1.5, p.loss),
     "steps None": lambda p: Problem(p.simulation, None, p.loss),
     "simulation is a file": lambda p: Problem("scene.toml", 10, p.loss),
-    "scene is a file": lambda p: Simulation("scene.toml"),
+    "scene is a number": lambda p: Simulation(3),
     "device": lambda p: Simulation(p.simulation.scene, device="gpu7"),
     "precision": lambda p: Simulation(p.simulation.scene, precision="float16"),
     "target's shape": lambda p: Problem(p.simulation, 2, losses.FinalPositions(np.zeros((7, 3)))).value(GRAVITY),

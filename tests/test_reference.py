@@ -343,7 +343,7 @@ def test_an_observer_may_stop_a_run():
         (lambda s: s.gradient({}, 5, reference.FinalPositions(np.zeros((2, 3)))), r"target has shape \(2, 3\)"),
         (lambda s: reference.Simulation(splash(), "float16"), "precision is 'float16', but must be one of float32"),
         (lambda s: reference.Simulation(splash(), threads=0), "threads is 0"),
-        (lambda s: reference.Simulation("splash"), "must be a cortado.Scene"),
+        (lambda s: reference.Simulation(3), "must be a cortado.Scene or the path of a scene file"),
         (lambda s: reference.Simulation(two_layers()), "several phases or an emitter"),
         (
             lambda s: reference.Simulation(SCENES["laminar, no slip"]).tangent({}, {}, 5, method="as_printed"),

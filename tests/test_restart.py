@@ -62,3 +62,14 @@ def test_states_that_do_not_fit_are_refused():
     ]:
         with pytest.raises(InputError, match=what):
             simulation.run(3, **arguments)
+
+
+def test_a_run_goes_on_from_a_frame_on_the_way():
+    """Also where a nozzle is moved, whose outlets are kept frame by frame."""
+    simulation = Simulation(jet())
+    path = simulation.parameters()["nozzle_path"] + np.linspace(0.0, 0.02, 6)[:, None]
+    whole = simulation.run(6, {"nozzle_path": path})
+    again = simulation.run(3, {"nozzle_path": path[3:]}, state=whole[:4].last_state)
+    np.testing.assert_array_equal(again.positions, whole[3:].positions)
+    with pytest.raises(InputError, match=r"^The trajectory has no frame"):
+        _ = whole[7:].last_state

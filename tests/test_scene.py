@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bad_scenes import BAD_SCENES, EMITTER, GOOD_SCENE, MIXTURE, RENDER, assert_one_sentence, plane
-from cortado.errors import CortadoWarning, DivergedError, SceneError
+from cortado.errors import CortadoWarning, DivergedError, InputError, SceneError
 from cortado.scene import (
     BoxFluid,
     Discretisation,
@@ -23,6 +23,7 @@ from cortado.scene import (
     scene_from_dict,
     stability_limit,
 )
+from cortado.simulation import Simulation
 
 
 @pytest.fixture
@@ -242,6 +243,14 @@ def test_any_change_loads_or_is_a_sentence(draw):
             assert str(error).startswith("scene.toml: ")
         else:
             assert Scene.from_json(scene.to_json()) == scene
+
+
+def test_a_scene_may_be_given_by_its_path(scene_file):
+    assert Simulation(str(scene_file)).scene == Simulation(scene_file).scene == load_scene(scene_file)
+    with pytest.raises(SceneError, match=r"^absent\.toml: the scene cannot be read"):
+        Simulation("absent.toml")
+    with pytest.raises(InputError, match=r"^scene is 3, but must be a cortado\.Scene or the path of a scene file\.$"):
+        Simulation(3)
 
 
 # ---- stability ---------------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from cortado.study.task import TASK, TaskSettings
 from cortado.study.term_sizes import term_sizes
 from cortado.task import load_task
 from scenes import scene
+from test_silence import with_kernels
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 FIGURES = ["figure_1", "figure_2_small", "figure_3_small", "figure_4", "figure_5", "figure_6", "figure_7"]
@@ -44,7 +45,8 @@ def command(capfd):
             code = 0
         except SystemExit as end:
             code = end.code
-        return code, *capfd.readouterr()
+        out, err = capfd.readouterr()
+        return code, out, with_kernels(err)
 
     return run
 

@@ -287,3 +287,32 @@ def test_writer_refuses_what_was_not_announced(tmp_path):
     with TrajectoryWriter(tmp_path / "b", times=[0.0], particles=3, dimension=2):
         pass
     assert os.listdir(tmp_path) == ["a"]
+
+
+def test_a_frame_is_taken_by_its_number():
+    trajectory = example(2)
+    assert len(trajectory) == 4
+    for k in range(-4, 4):
+        frame = trajectory[k]
+        np.testing.assert_array_equal(frame.positions, trajectory.positions[k])
+        np.testing.assert_array_equal(frame.velocities, trajectory.velocities[k])
+        assert (frame.mass_fractions, frame.time) == (None, trajectory.times[k])
+    assert trajectory[np.int64(2)].time == 0.2
+    assert [frame.time for frame in trajectory] == [*trajectory.times]
+    assert [frame.time for frame in reversed(trajectory)] == [*trajectory.times[::-1]]
+    with pytest.raises(IndexError, match=r"^frame 4 is asked for, but there are 4 frames\.$"):
+        trajectory[4]
+    with pytest.raises(InputError, match=r"^a frame is asked for by 0.5, but must be by a whole number or a slice\.$"):
+        trajectory[0.5]
+
+
+@pytest.mark.parametrize("chosen", [slice(1, 3), slice(None, None, 2), slice(-1, None), slice(None, None, -1)])
+def test_some_frames_are_a_trajectory(chosen, tmp_path):
+    trajectory = example(3)
+    some = trajectory[chosen]
+    for name in ("times", "steps", "positions", "velocities"):
+        np.testing.assert_array_equal(getattr(some, name), getattr(trajectory, name)[chosen])
+    assert some.iterations is trajectory.iterations
+    if chosen.step != -1:  # as files go forwards in time
+        some.save(tmp_path / "some.vtkhdf")
+        np.testing.assert_array_equal(Trajectory.load(tmp_path / "some.vtkhdf").positions, some.positions)

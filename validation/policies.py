@@ -20,7 +20,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from cortado import Problem, Scene, Simulation, losses, policies
 from cortado.figures.canvas import INK, PALETTE, drawing
@@ -293,7 +292,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     known = {(int(line["seed"]), int(line["steps"])) for line in kept}
     rows: list[Row] = []
     with (
-        ProcessPoolExecutor(given.processes, get_context("spawn"), initializer=quiet) as pool,
+        ProcessPoolExecutor(given.processes, get_context("spawn")) as pool,
         track(sum(len(LOSSES) + (case not in known) for case in cases), "cases") as advance,
     ):
         wanted = {
@@ -312,11 +311,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     report(found)
     draw(found, given.out / f"policies_{given.blocks}.png")
     print(f"\nwritten: {given.out / f'policies_{given.blocks}.csv'}")
-
-
-def quiet() -> None:
-    """No lines of Warp's."""
-    wp.config.quiet = True
 
 
 if __name__ == "__main__":

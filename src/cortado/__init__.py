@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from cortado.errors import InputError as InputError
     from cortado.errors import SceneError as SceneError
     from cortado.optimisation import optimise as optimise
+    from cortado.optimisation import optimize as optimize
     from cortado.problem import Problem as Problem
     from cortado.scene import Scene as Scene
     from cortado.scene import load_scene as load_scene
@@ -46,6 +47,7 @@ _HOMES = {
     "certify": "certificate",
     "load_scene": "scene",
     "optimise": "optimisation",
+    "optimize": "optimisation",
 }
 __all__ = [*_MODULES, *_HOMES]
 
@@ -59,4 +61,4 @@ def __getattr__(name: str) -> "Any":
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return [*__all__, "__version__"]

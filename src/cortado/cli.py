@@ -5,6 +5,7 @@ user's, or of the machine, is one sentence on stderr, never a traceback.
 """
 
 import io
+import logging
 import os
 import sys
 import warnings
@@ -19,6 +20,7 @@ import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
+from cortado import __version__
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
 from cortado.interruption import Interrupted
 from cortado.kernel_cache import complaint, start_warp
@@ -206,6 +208,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # type: ignore[assignment]
             work = _understood(arguments)
+            logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where its folder cannot be written it goes on
             start_warp()
             tell(work())
     except ComputationError as error:
@@ -226,13 +229,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _understood(arguments: Sequence[str]) -> Work:
-    """The command that the arguments name; prints help and exits where they ask for it."""
+    """The command that the arguments name; prints help or the version and exits where they ask for it."""
     box = io.StringIO()
     try:
         with redirect_stderr(box), to_stdout():
+            if list(arguments) == ["--version"]:
+                print(f"cortado {__version__}")
+                sys.exit(0)
             return app.cli(
                 prog="cortado",
-                description="A differentiable SPH fluid simulator.",
+                description="A differentiable SPH fluid simulator. --version prints which one.",
                 args=arguments,
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
             )

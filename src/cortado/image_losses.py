@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from cortado.arrays import as_numbers
 from cortado.errors import InputError
 
+__all__ = ["ImageLoss", "Pyramid", "SquaredDifference", "psnr"]
+
 Image = NDArray[np.float64]
 """(rows, columns, 3) red, green and blue, linear"""
 SMALLEST = 2
@@ -162,3 +164,7 @@ def _difference(image: ArrayLike, target: ArrayLike) -> Image:
     if image.shape != target.shape:
         raise InputError(f"The image has shape {image.shape}, but its target {target.shape}: they must be the same.")
     return image - target
+
+
+def __dir__() -> list[str]:
+    return __all__

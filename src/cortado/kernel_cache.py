@@ -4,17 +4,17 @@ Containers and clusters often have a home that is read-only or full.
 """
 
 import atexit
-import logging
-import os
 import shutil
 import struct
 import sys
 import tempfile
 import traceback
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 from cortado.errors import ComputationError
+from cortado.silence import announce_compilation, silenced
 from cortado.terminal import say
 
 VARIABLE = "WARP_CACHE_PATH"
@@ -22,13 +22,14 @@ ROOM = 16 * 2**20
 """[bytes] that must be free for kernels; those of one run take a few MiB."""
 
 
+@cache
 def start_warp() -> None:
-    """Start Warp without its greeting. Where its cache cannot be written, a warning says so, and kernels that are not
-    in it are compiled in a temporary folder; raises `ComputationError` where there is none either."""
+    """Start Warp, once a process, without its greeting (`cortado.silence`). Where its cache cannot be written, a
+    warning says so, and kernels that are not in it are compiled in a temporary folder; raises `ComputationError` where
+    there is none either."""
     import warp as wp
 
-    wp.config.log_level = wp.LOG_ERROR
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it has a folder of its own, and goes on without it
+    announce_compilation()
     reason = _start()
     folder = wp.config.kernel_cache_dir
     reason = reason or _trouble(folder)
@@ -67,20 +68,14 @@ def complaint(error: Exception) -> str | None:
 
 
 def _start() -> str | None:
-    """Start Warp, unless it has started, without the line that its C code prints where there is no CUDA driver; why
-    its cache cannot be made, None if it can."""
+    """Start Warp, unless it has started; why its cache cannot be made, None if it can."""
     import warp as wp
 
-    stderr, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(nothing, 2)
-        wp.init()
+        with silenced():
+            wp.init()
     except OSError as problem:
         return problem.strerror or str(problem)
-    finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
-        os.close(nothing)
     return None
 
 

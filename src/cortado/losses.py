@@ -17,6 +17,19 @@ from cortado.particles import State, to_device
 from cortado.physics.matching import matching_kernels
 from cortado.precision import FLOAT32, FLOAT64, Precision
 from cortado.threads import WARP
+from cortado.words import counted
+
+__all__ = [
+    "CentreOfMass",
+    "CentreOfMassAlong",
+    "EndAdjoint",
+    "FinalPositions",
+    "Frames",
+    "Image",
+    "Loss",
+    "Recorded",
+    "TrajectoryEnd",
+]
 
 
 @dataclass(frozen=True)
@@ -28,6 +41,9 @@ class TrajectoryEnd:
     dimension: int
     colours: np.ndarray
     """(phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
+
+    def __repr__(self) -> str:
+        return f"TrajectoryEnd({counted(len(self.state.positions), 'particle')}, {self.precision.name})"
 
     @property
     def precision(self) -> Precision:
@@ -50,7 +66,7 @@ class TrajectoryEnd:
         return self.state.mass_fractions.numpy().astype(np.float64)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class EndAdjoint:
     """Derivatives of a loss that also looks at the colours."""
 
@@ -297,3 +313,7 @@ class Recorded:
         loss = wp.zeros(1, dtype=end.precision.real, device=copies[0].device, requires_grad=True)
         self.function(copies[0], copies[1], loss)
         return loss, copies[0], copies[1]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -10,85 +10,42 @@ import re
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number
-from cortado.errors import ComputationError, InputError
+from cortado.differentiable import Differentiable, LossFunction, as_differentiable, loss_and_gradient
+from cortado.errors import ComputationError, InputError, shown
 from cortado.evaluations import Evaluation, EvaluationLog, Log, MemoryLog, Packing, Vector
+from cortado.named_optimisers import as_optimiser
+from cortado.optimisation_result import Parameters, Record, Result
 from cortado.optimisers import Optimiser, Search
-
-Parameters = dict[str, Any]
-# by name: a float where the user gave a number, otherwise a float64 array of the shape that the user gave
-
 
 GREATEST_GRADIENT = 1e150
 # Components beyond it are refused like infinite ones: their squares, which optimisers take, overflow.
 
 
-class Differentiable(Protocol):
-    """What is optimised. It may have an attribute `fingerprint`, a text that says which problem it is.
-
-    The fingerprint is kept in the checkpoint, so that the run of one problem is not resumed with another.
-    """
-
-    def value_and_gradient(self, parameters: dict[str, Vector], policy: Any = None) -> tuple[float, dict[str, Vector]]:
-        """The loss, and its gradient by the names and in the shapes of the parameters."""
-
-
-@dataclass(frozen=True, eq=False)
-class Record:
-    """One evaluation in the history of an optimisation."""
-
-    iteration: int
-    # index of the evaluation, from 0; with Adam and gradient descent also the number of updates before it
-    loss: float
-    gradient_norm: float
-    # Euclidean, over all the parameters
-    parameters: Parameters
-    # at which the loss was evaluated
-    replayed: bool
-    # whether it was read from the checkpoint
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """What an optimisation found."""
-
-    parameters: Parameters
-    # with the lowest loss seen
-    loss: float
-    # the lowest seen
-    last_parameters: Parameters
-    # the optimiser's last iterate
-    history: tuple[Record, ...]
-    # one per evaluation, in order
-    evaluations: int
-    # how many the optimiser asked for, with those replayed from the checkpoint
-    message: str
-    # how it ended, a sentence
-    converged: bool
-    # whether the optimiser's own test was met; Adam and gradient descent have none
-
-
 def optimise(
-    problem: Differentiable,
+    problem: Differentiable | LossFunction,
     start: Mapping[str, Any],
-    optimiser: Optimiser,
+    optimiser: Optimiser | str,
     iterations: int,
     bounds: Mapping[str, tuple[Any, Any]] | None = None,
     policy: Any = None,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
     on_iteration: Callable[[Record], None] | None = None,
+    **settings: Any,
 ) -> Result:
-    """Lower the loss of a problem, from a start.
+    """Lower the loss of a problem, from a start; `cortado.optimize` is the same.
 
     Parameters:
-        problem: gives the loss and its gradient, see `Differentiable`.
+        problem: a `Problem`, or any object with `value_and_gradient`, or a function that takes the parameters by name
+            and returns the loss and its gradient, `{"gravity": array of the parameter's shape}`.
         start: numbers or arrays of any shape by name; they are optimised together, in float64.
-        optimiser: such as `cortado.optimisers.Adam(learning_rate=0.1)`.
+        optimiser: such as `cortado.optimisers.Adam(learning_rate=0.1)`; or "adam", "gradient_descent" or "lbfgs",
+            with its settings as keywords: `optimise(problem, start, "adam", learning_rate=0.1, iterations=50)`.
         iterations: greatest number of updates. Adam and gradient descent evaluate once more, to judge the
             last iterate.
         bounds: by name, (lower, upper), each a number, an array of the parameter's shape, or None.
@@ -102,25 +59,22 @@ def optimise(
     Raises InputError for a start, bounds or settings that do not fit, and for a checkpoint of another run;
     ComputationError if the loss or its gradient is not finite; what came before is in the checkpoint.
     """
-    if not isinstance(optimiser, Optimiser):
-        raise InputError(
-            f"The optimiser must be an object such as cortado.optimisers.Adam(learning_rate=0.1), not {optimiser!r}."
-        )
+    algorithm, differentiable = as_optimiser(optimiser, settings), as_differentiable(problem)
     values = _checked_start(start)
     packing = Packing.of(values)
     vector = packing.pack(values)
     lower, upper = _checked_bounds(bounds or {}, packing)
     _require_within(vector, lower, upper, packing)
-    optimiser.check(packing)
+    algorithm.check(packing)
     _require_count(iterations)
-    settings = {
-        "optimiser": _description(optimiser),
+    identity = {
+        "optimiser": _description(algorithm),
         "policy": _description(policy),
-        "problem": str(getattr(problem, "fingerprint", "")),
+        "problem": str(getattr(differentiable, "fingerprint", "")),
     }
-    with closing(_open_log(checkpoint, resume, packing, settings)) as log:
-        evaluator = _Evaluator(problem, policy, packing, start, log, on_iteration)
-        outcome = optimiser.minimise(Search(evaluator, packing, vector, lower, upper, iterations))
+    with closing(_open_log(checkpoint, resume, packing, identity)) as log:
+        evaluator = _Evaluator(differentiable, policy, packing, start, log, on_iteration)
+        outcome = algorithm.minimise(Search(evaluator, packing, vector, lower, upper, iterations))
     best = min(evaluator.history, key=lambda record: record.loss)
     return Result(
         parameters=_copied(best.parameters),
@@ -131,6 +85,10 @@ def optimise(
         message=outcome.message,
         converged=outcome.converged,
     )
+
+
+optimize = optimise
+"""The same, for those who spell it so."""
 
 
 @dataclass
@@ -180,7 +138,7 @@ class _Evaluator:
         A first evaluation that is refused has a wrong start; later ones, parameters to which the search has come.
         """
         try:
-            loss, gradients = self.problem.value_and_gradient(self.packing.unpack(vector), policy=self.policy)
+            found = self.problem.value_and_gradient(self.packing.unpack(vector), policy=self.policy)
         except InputError as error:
             if not self.history:
                 raise
@@ -189,6 +147,7 @@ class _Evaluator:
                 f"learning rate, or bounds on the parameters. The {len(self.history)} evaluations before "
                 f"{self.log.fate}."
             ) from error
+        loss, gradients = loss_and_gradient(found)
         evaluation = Evaluation(vector.copy(), as_one_number("The problem's loss", loss), self._packed(gradients))
         self._require_finite(evaluation)
         self.log.append(evaluation)
@@ -246,6 +205,8 @@ def _description(setting: object) -> str:
 
 def _checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
     """The start as float64 arrays, or InputError if there is a parameter that cannot be optimised."""
+    if not isinstance(start, Mapping):
+        raise InputError(f"The start is {shown(start)}, but must name its parameters, as {{'gravity': value}} does.")
     if not start:
         raise InputError("The start names no parameter to optimise; give one or more, as {'gravity': value}.")
     return {name: _checked_value(f"The start of '{name}'", value) for name, value in start.items()}

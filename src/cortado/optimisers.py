@@ -14,6 +14,9 @@ import numpy as np
 from cortado.errors import InputError
 from cortado.evaluations import Packing, Vector
 from cortado.scene_kinds import as_number
+from cortado.words import quoted
+
+__all__ = ["LBFGS", "Adam", "GradientDescent", "Optimiser", "Outcome", "Search"]
 
 PerParameter = float | Mapping[str, float]
 
@@ -263,11 +266,10 @@ def _require_names(name: str, values: PerParameter, packing: Packing) -> None:
     """Raise InputError if a setting is given per parameter for others than these parameters."""
     if isinstance(values, Mapping) and set(values) != set(packing.names):
         raise InputError(
-            f"{name} is given for {_listed(values)}, but the optimised parameters are "
-            f"{_listed(packing.names)}; give it for each of these, or one number for all."
+            f"{name} is given for {quoted(values)}, but the optimised parameters are "
+            f"{quoted(packing.names)}; give it for each of these, or one number for all."
         )
 
 
-def _listed(names: Mapping[str, float] | tuple[str, ...]) -> str:
-    """Names as a message shows them."""
-    return ", ".join(f"'{name}'" for name in names) or "none"
+def __dir__() -> list[str]:
+    return __all__

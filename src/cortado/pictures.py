@@ -21,6 +21,8 @@ from cortado.input_files import reason, regular_file
 from cortado.render.cameras import check_resolution, positive, vector
 from cortado.srgb import from_srgb, to_srgb
 
+__all__ = ["COFFEE", "MILK", "WHITE", "heart", "read_picture", "rosetta", "write_picture"]
+
 Picture = NDArray[np.float64]
 Resolution = int | tuple[int, int]
 Colour = tuple[float, float, float]
@@ -232,3 +234,7 @@ def _resampled(picture: Any, columns: int, rows: int) -> Picture:
             channel.paste(Image.fromarray(light[np.asarray(band.getchannel(k))]), (0, first))
         small[..., k] = np.asarray(channel.resize((columns, rows), Image.Resampling.BILINEAR, box=box))
     return small
+
+
+def __dir__() -> list[str]:
+    return __all__

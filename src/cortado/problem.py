@@ -20,6 +20,7 @@ from cortado.rollout import MEMORY_BUDGET, Observer, Rollout, StepDerivative
 from cortado.simulation import Simulation, check_steps
 from cortado.threads import Turn, in_turn
 from cortado.trajectory import Trajectory
+from cortado.words import counted
 
 __all__ = ["NAMES", "UNITS", "Problem"]
 
@@ -71,6 +72,10 @@ class Problem:
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled and copied as what it is made from."""
         return Problem, (self.simulation, self.steps, self.loss, self.memory_budget)
+
+    def __repr__(self) -> str:
+        loss = getattr(self.loss, "__name__", type(self.loss).__name__)
+        return f"Problem({counted(self.steps, 'step')} of {self.simulation!r}, judged by {loss})"
 
     @property
     def turn(self) -> Turn:

@@ -7,6 +7,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.words import Brief
+
 
 @dataclass(frozen=True)
 class Elapsed:
@@ -25,8 +27,8 @@ class Elapsed:
         return (self.time - self.steps * time_step) + (self.steps + steps) * time_step
 
 
-@dataclass(frozen=True, eq=False)
-class RunConstants:
+@dataclass(frozen=True, eq=False, repr=False)
+class RunConstants(Brief):
     """What a restart needs of a run besides its frames."""
 
     reference_density: NDArray
@@ -53,8 +55,8 @@ class RunConstants:
         return cls(reference_density=arrays["reference_density"], outlets=outlets, **numbers)
 
 
-@dataclass(frozen=True, eq=False)
-class RestartState:
+@dataclass(frozen=True, eq=False, repr=False)
+class RestartState(Brief):
     """The state at the end of a step, whole: `Trajectory.last_state` gives it and `Simulation.run` takes it."""
 
     positions: NDArray

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, ValidationInfo, create_model, field_validator, model_validator
 
-from cortado.errors import CortadoWarning, SceneError
+from cortado.errors import CortadoWarning, InputError, SceneError, shown
 from cortado.parameters.registry import PARAMETERS
 from cortado.scene_checks import check_scene
 from cortado.scene_containers import AnyContainer, BoxContainer, CylinderContainer, NoContainer
@@ -41,6 +41,7 @@ __all__ = [
     "Scene",
     "Solver",
     "SphereFluid",
+    "as_scene",
     "load_scene",
     "read_toml",
     "scene_from_dict",
@@ -198,6 +199,15 @@ def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> S
         SceneError: in one sentence, with the file, the field, what was found and what was wanted.
     """
     return scene_from_dict(read_toml(path, overrides), os.fspath(path))
+
+
+def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
+    """The scene itself, or the one in the file at a path; raises `InputError` for anything else, and `SceneError`."""
+    if isinstance(scene, Scene):
+        return scene
+    if isinstance(scene, (str, os.PathLike)):
+        return load_scene(scene)
+    raise InputError(f"scene is {shown(scene)}, but must be a cortado.Scene or the path of a scene file.")
 
 
 def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Mapping
 from hashlib import sha256
 from importlib import import_module
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import warp as wp
 from cortado.calibration import SKIN, diffusion_limit
 from cortado.discrete_scene import DiscreteScene, discretise
 from cortado.errors import CortadoWarning, InputError, shown
+from cortado.kernel_cache import start_warp
 from cortado.memory import frame_parts, require, simulation_parts
 from cortado.neighbours import Grid, NeighbourSearch
 from cortado.parameters.checks import check_sizes
@@ -23,10 +25,12 @@ from cortado.physics.diffusion import Diffusion
 from cortado.physics.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
 from cortado.physics.surroundings import Discretisation
 from cortado.precision import Precision, precision_named
+from cortado.render.renderer import Renderer
+from cortado.render.scene_renderer import scene_renderer
 from cortado.restart import RestartState, RunConstants
 from cortado.rollout import Rollout
 from cortado.sampling import FluidSample
-from cortado.scene import Scene
+from cortado.scene import Scene, as_scene
 from cortado.scene_containers import NoContainer
 from cortado.solvers.containment import Walled
 from cortado.solvers.pcisph.parts import PressureSolve
@@ -36,6 +40,7 @@ from cortado.sph.nozzle import Nozzle
 from cortado.sph.parts import Force, Setting
 from cortado.threads import WARP, Turn, in_turn
 from cortado.trajectory import Trajectory
+from cortado.words import counted
 
 MOST_SUBSTEPS = 10_000
 """Explicit steps of diffusion in a time step; beyond it the mobility is taken for a mistake."""
@@ -52,15 +57,15 @@ class Simulation:
     @WARP
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | str | PathLike[str],
         device: str = "cpu",
         precision: str = "float32",
         free_energy: FreeEnergy | None = None,
     ):
-        """``device`` as Warp names it ("cpu", "cuda:0"), ``precision`` "float32" or "float64"; ``free_energy``
-        replaces the one that the scene names."""
-        if not isinstance(scene, Scene):
-            raise InputError(f"scene is {shown(scene)}, but must be a cortado.Scene, such as load_scene gives.")
+        """``scene``: one, or the path of its file; ``device`` as Warp names it ("cpu", "cuda:0"), ``precision``
+        "float32" or "float64"; ``free_energy`` replaces the one that the scene names."""
+        scene = as_scene(scene)
+        start_warp()
         if free_energy is not None and not isinstance(free_energy, FreeEnergy):
             wanted = "a FreeEnergy, of cortado.physics.free_energy"
             raise InputError(f"free_energy is {shown(free_energy)}, but must be {wanted}.")
@@ -98,6 +103,10 @@ class Simulation:
         """Pickled and copied as what it is made from."""
         energy = self.free_energy if len(self.scene.phase) > 1 else None
         return _made_again, (self.scene, self.device.alias, self.precision.name, energy, self._points)
+
+    def __repr__(self) -> str:
+        sizes = f"{counted(self.particles, 'particle')}, {counted(len(self.scene.phase), 'phase')}"
+        return f"Simulation({sizes}, {self.device.alias}, {self.precision.name})"
 
     @property
     def dimension(self) -> int:
@@ -186,6 +195,15 @@ class Simulation:
             space.check_restart(state, values)
         space.begin(rollout, values, state=state)
         return rollout
+
+    def renderer(self, **settings: Any) -> Renderer:
+        """What takes pictures of the simulation, ``renderer.render(trajectory[k])``, and differentiates them: as the
+        table ``[render]`` of its scene says, or from above, in 2-D as the plane is.
+
+        ``settings`` replace keys of that table: ``resolution=(320, 240)``, or ``view="volume", position=(1, 1, 2),
+        look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for settings that do not fit.
+        """
+        return scene_renderer(self, **settings)
 
     def parameters(self) -> dict[str, np.ndarray]:
         """Every parameter of `Problem` as the scene has it."""

@@ -2,21 +2,45 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from operator import index
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cortado import vtkhdf
-from cortado.errors import InputError
+from cortado.errors import InputError, shown
+from cortado.notebook import as_text, with_picture
 from cortado.restart import Elapsed, RestartState, RunConstants
+from cortado.words import counted
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One recorded state of a run, ``trajectory[k]``; n particles in d dimensions."""
+
+    positions: NDArray[Any]
+    """(n, d) [m]"""
+    velocities: NDArray[Any]
+    """(n, d) [m/s]"""
+    mass_fractions: NDArray[Any] | None
+    """(n, phases) [-]; None with one phase"""
+    time: float
+    """[s]"""
+
+    def __repr__(self) -> str:
+        return f"Frame({counted(len(self.positions), 'particle')}, t = {self.time:.4g} s)"
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """What a run leaves: recorded frames, and what the pressure solver did at every step.
+
+    ``trajectory[k]`` is the `Frame` k, counted from the end where k is negative; ``trajectory[2:5]`` and
+    ``trajectory[::10]`` are trajectories of these frames alone; ``len``, ``for`` and ``reversed`` go over the frames.
 
     Raises:
         InputError: arrays whose shapes do not belong together.
@@ -57,6 +81,63 @@ class Trajectory:
                 f"Iterations, density errors and converged must be of one length, but have {sorted(steps)}."
             )
 
+    def __repr__(self) -> str:
+        times = f", {self.times[0]:.4g} to {self.times[-1]:.4g} s" if len(self) else ""
+        return f"Trajectory({counted(len(self), 'frame')} of {counted(self.particles, 'particle')}{times})"
+
+    def _repr_html_(self) -> str:
+        """Its first, middle and last frame, coloured by speed."""
+        from cortado.figures.particle_sets import particles
+
+        if not len(self):
+            return as_text(repr(self))
+        shown = [self[k] for k in sorted({0, len(self) // 2, len(self) - 1})]
+        titles = [f"t = {frame.time:.4g} s" for frame in shown]
+        speeds = [np.linalg.norm(frame.velocities, axis=1) for frame in shown]
+        sets, label = [frame.positions for frame in shown], "speed [m/s]"
+        return with_picture(self, lambda path: particles(sets, titles, path, colours=speeds, colour_label=label))
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.times)
+
+    @overload
+    def __getitem__(self, k: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, k: slice) -> Trajectory: ...
+
+    def __getitem__(self, k: int | slice) -> Frame | Trajectory:
+        """A frame, or a trajectory of some; what the pressure solver did stays that of the whole run.
+
+        Raises:
+            IndexError: there is no such frame.
+            InputError: k is neither a whole number nor a slice.
+        """
+        if isinstance(k, slice):
+            return self._chosen(k)
+        try:
+            place = index(k)
+        except TypeError:
+            raise InputError(f"a frame is asked for by {shown(k)}, but must be by a whole number or a slice.") from None
+        if place not in range(-len(self), len(self)):
+            raise IndexError(f"frame {place} is asked for, but there are {len(self)} frames.")
+        fractions = None if self.mass_fractions is None else self.mass_fractions[place]
+        return Frame(self.positions[place], self.velocities[place], fractions, float(self.times[place]))
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[k] for k in range(len(self)))
+
+    def _chosen(self, frames: slice) -> Trajectory:
+        """The trajectory of some frames."""
+        constants = self.constants
+        if constants is not None and constants.outlets is not None:
+            constants = replace(constants, outlets=constants.outlets[frames])
+        names = ("times", "steps", "positions", "velocities", "mass_fractions")
+        arrays = {name: getattr(self, name) for name in names}
+        chosen: dict[str, Any] = {name: None if array is None else array[frames] for name, array in arrays.items()}
+        return replace(self, **chosen, constants=constants)
+
     @property
     def dimension(self) -> int:
         """2 or 3."""
@@ -77,8 +158,10 @@ class Trajectory:
         """The state of the last frame, from which `Simulation.run` goes on bit for bit.
 
         Raises:
-            InputError: the trajectory is from a file that does not hold all of it.
+            InputError: there is no frame, or the trajectory is from a file that does not hold all of it.
         """
+        if not len(self):
+            raise InputError("The trajectory has no frame, but must have one to go on from.")
         if self.constants is None:
             raise InputError("The trajectory is from an earlier version of Cortado, without what a restart needs.")
         outlets = self.constants.outlets

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,18 @@ from cortado.certificate.changes import CHANGE, coherent_directions, directions,
 from cortado.certificate.course import Course
 from cortado.certificate.horizon import Horizon, horizon
 from cortado.certificate.rightness import Comparison, balanced, compare
+from cortado.certificate.text import agreement_words, horizon_table, parameter_table, policy_table
 from cortado.certificate.twin import in_float64
 from cortado.errors import InputError, shown
+from cortado.losses import FinalPositions
+from cortado.notebook import as_text
 from cortado.parameters.values import Arrays, Values
 from cortado.policies import AdjointNorms
 from cortado.policies.strength import growth
 from cortado.problem import Problem
+from cortado.scene import Scene
+from cortado.simulation import Simulation
+from cortado.words import counted
 
 ROUGHLY = 0.1
 """How far the adjoint of a loss in float32 may be from differences of it, relative."""
@@ -43,6 +50,30 @@ class Certificate:
     """For every parameter that was asked for; none where the adjoint is wrong."""
     agreement: Agreement | None
     """Of all of these together with the smoothed gradient."""
+
+    def __repr__(self) -> str:
+        verdict = f"right, horizon {self.horizon}" if self.right else f"WRONG for {', '.join(self.wrong)}"
+        size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}"
+        return f"Certificate({size}, {verdict}, use policies.{self.policy})"
+
+    def __str__(self) -> str:
+        """As tables and sentences."""
+        size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}, float64"
+        lines = [size, parameter_table(self.shares, self.wrong)]
+        if not self.right:
+            return "\n".join([*lines, f"The adjoint is WRONG: {agreement_words(self.comparison)}."])
+        lines += [
+            f"The adjoint is right: {agreement_words(self.comparison)}.",
+            f"The adjoint of a state grows by e^{self.growth:.4f} a step.",
+            horizon_table(self.horizons),
+            *([] if self.agreement is None else [policy_table(self.agreement)]),
+            f"Up to step {self.horizon} of {self.steps} the exact gradient means something. For {self.steps} steps use "
+            f"policies.{self.policy}.",
+        ]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return as_text(self)
 
     @property
     def right(self) -> bool:
@@ -77,9 +108,13 @@ class Certificate:
 
 
 def certify(
-    problem: Problem, parameters: Values | Sequence[str] = ("gravity",), change: float = CHANGE, seed: int = 0
+    problem: Problem | Simulation | Scene | str | PathLike[str],
+    parameters: Values | Sequence[str] = ("gravity",),
+    change: float = CHANGE,
+    seed: int = 0,
+    steps: int | None = None,
 ) -> Certificate:
-    """Check the gradients of a problem, always in float64.
+    """Check the gradients of a problem, always in float64; ``certify("scene.toml", steps=50)`` those of a scene.
 
     A problem in float32 is made once more in float64, on the same device, to be checked: the code is the same, and
     round-off does not hide what is wrong. A loss of your own goes on being asked in float32 then; its adjoint is held
@@ -89,13 +124,18 @@ def certify(
     policy to use beyond, of ``parameters``: values, or names of the scene's.
 
     Args:
+        problem: one; or, with a number of ``steps``, a simulation, a scene or the path of its file: the loss is then
+            how far the particles have come, their mean squared distance from where they start.
         change: what a meaningful change of a parameter is, in its own size; of positions in spacings, of velocities in
             those of a fall over the height of the fluid.
         seed: of the random directions.
+        steps: left out where a problem is given, which has a number of its own.
+
+    Raises `InputError` for arguments that do not fit, `DivergedError` where the problem itself diverges.
     """
     if not 0.0 < change < 1.0:
         raise InputError(f"change is {shown(change)}, but must be greater than 0 and less than 1.")
-    problem = in_float64(problem)
+    problem = in_float64(_problem(problem, steps))
     chosen, random = point(problem, parameters), np.random.default_rng(seed)
     course, values = Course(problem), everything(problem, chosen)
     norms = AdjointNorms(problem.simulation.solver, problem.steps)
@@ -119,6 +159,20 @@ def certify(
         horizons=tuple(horizon(course, chosen, name, changes[name]) for name in asked),
         agreement=agreement(problem, asked, sizes, _of(chosen, exact.gradient)) if asked else None,
     )
+
+
+def _problem(subject: Any, steps: int | None) -> Problem:
+    """A problem as it is, or that of how far a scene comes in a number of steps."""
+    if isinstance(subject, Problem):
+        if steps is not None:
+            own = f"as the problem has {subject.steps} steps"
+            raise InputError(f"steps is {shown(steps)}, but must be left out, {own}.")
+        return subject
+    if steps is None:
+        found = type(subject).__name__
+        raise InputError(f"steps is left out, but must be given where what is certified is no Problem but a {found}.")
+    simulation = subject if isinstance(subject, Simulation) else Simulation(subject, precision="float64")
+    return Problem(simulation, steps, FinalPositions(simulation.positions))
 
 
 def _of(chosen: Arrays, gradient: Arrays) -> Arrays:

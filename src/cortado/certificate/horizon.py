@@ -6,6 +6,7 @@ import numpy as np
 
 from cortado.certificate.course import Course
 from cortado.parameters.values import Arrays
+from cortado.words import Brief
 
 WITHIN = 0.25
 """The exact derivative means something where it is this near to the change of the loss, relative."""
@@ -13,8 +14,8 @@ LINEAR = 0.3
 """How far a change may part neighbours for their forces to answer linearly [spacings]."""
 
 
-@dataclass(frozen=True)
-class Horizon:
+@dataclass(frozen=True, repr=False)
+class Horizon(Brief):
     """The loss's derivative along a meaningful change of one parameter, exact and as that change finds it."""
 
     parameter: str

@@ -6,6 +6,7 @@ import numpy as np
 
 from cortado.certificate.course import Course
 from cortado.parameters.values import Arrays
+from cortado.words import Brief
 
 STEPS = tuple(10.0**-k for k in range(3, 9))
 """Steps of the central differences, in units of the direction; they are tried until they stop getting better, and
@@ -26,8 +27,8 @@ DIFFERENCE_ROUND_OFF = 1e-15
 """Round-off of a central difference of step h is taken as this part of the loss, over h."""
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Brief):
     """Derivatives of the loss along one direction, three times."""
 
     moments: np.ndarray

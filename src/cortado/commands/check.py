@@ -2,10 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from io import StringIO
-from math import log10
 from pathlib import Path
-from typing import Any
 
 from cortado.certificate import Certificate, certify
 from cortado.errors import ComputationError, InputError, shown
@@ -39,7 +36,7 @@ def check_scene(
         _make(out)
     certificate = certify(problem, parameters, change, seed)
     found = json.dumps(certificate.as_dict(), indent=2)
-    text = found if as_json else "\n".join(_lines(certificate, loss))
+    text = found if as_json else f"Loss: {loss}.\n{certificate}"
     if out is not None:
         text += _written(certificate, found, out, as_json)
     if not certificate.right:
@@ -54,10 +51,8 @@ def _loss(name: str, simulation: Simulation) -> Loss:
         return FinalPositions(simulation.positions)
     if name == "centre-of-mass":
         return CentreOfMass(simulation.positions.mean(axis=0))
-    from cortado.render.scene_renderer import scene_renderer
-
-    renderer, state = scene_renderer(simulation), simulation.state
-    return Image(renderer, renderer.render(state.positions, state.mass_fractions, simulation.parameters()["colours"]))
+    renderer = simulation.renderer()
+    return Image(renderer, renderer.render(simulation.state))
 
 
 def _make(folder: Path) -> None:
@@ -74,73 +69,3 @@ def _written(certificate: Certificate, found: str, out: Path, as_json: bool) -> 
     gradient_check(certificate, out / "certificate.png")
     write_atomically(out / "certificate.json", found.encode())
     return "" if as_json else f"\nThe results are in {out.resolve()}"
-
-
-def _lines(certificate: Certificate, loss: str) -> list[str]:
-    comparison, steps = certificate.comparison, certificate.steps
-    lines = [
-        f"{certificate.particles} particles, {steps} steps, float64, {loss}",
-        _table(["parameter", "a change of it changes the loss by", "adjoint"], _parameters(certificate)),
-    ]
-    digits = f"reverse and forward mode agree to {_digits(comparison.disagreement)} digits"
-    if comparison.miss is None:
-        differences = "no difference is reliable here"
-    else:
-        differences = f"with differences to {_digits(comparison.miss)}, up to step {comparison.last_believed}"
-    if not certificate.right:
-        return [*lines, f"The adjoint is WRONG: {digits}, {differences}."]
-    return [
-        *lines,
-        f"The adjoint is right: {digits}, {differences}.",
-        f"The adjoint of a state grows by e^{certificate.growth:.4f} a step.",
-        _table(["parameter", "predicted horizon", "measured horizon"], _horizons(certificate)),
-        *_policies(certificate),
-        f"Up to step {certificate.horizon} of {steps} the exact gradient means something. For {steps} steps use "
-        f"policies.{certificate.policy}.",
-    ]
-
-
-def _parameters(certificate: Certificate) -> list[list[str]]:
-    verdicts = {name: "WRONG" if name in certificate.wrong else "right" for name in certificate.shares}
-    return [
-        [name, f"{share:.3e}", verdicts[name] if share or name in certificate.wrong else "not felt by this loss"]
-        for name, share in certificate.shares.items()
-    ]
-
-
-def _horizons(certificate: Certificate) -> list[list[str]]:
-    return [
-        [
-            horizon.parameter,
-            "later" if horizon.predicted is None else f"step {horizon.predicted}",
-            f"step {horizon.measured}" + (", the last" if horizon.lasts else ""),
-        ]
-        for horizon in certificate.horizons
-    ]
-
-
-def _policies(certificate: Certificate) -> list[str]:
-    agreement = certificate.agreement
-    if agreement is None:
-        return []
-    rows = [[judged.policy, f"{judged.cosine:.3f}", f"{judged.size:.3g}"] for judged in agreement.policies]
-    return [
-        _table(["policy", "cosine", "size"], rows)
-        + f"\nto the gradient of the smoothed loss, whose own error is {agreement.noise:.0%}"
-    ]
-
-
-def _digits(distance: float) -> str:
-    return f"{min(max(-log10(distance), 0.0), 16.0):.0f}" if distance > 0.0 else "16"
-
-
-def _table(columns: list[str], rows: list[list[str]]) -> str:
-    from rich.console import Console
-    from rich.table import Table
-
-    table: Any = Table(*columns)
-    for row in rows:
-        table.add_row(*row)
-    text = StringIO()
-    Console(file=text, width=110).print(table)
-    return text.getvalue().rstrip()

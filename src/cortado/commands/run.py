@@ -12,7 +12,6 @@ from cortado.interruption import keeping
 from cortado.memory import frame_parts, require
 from cortado.particles import State
 from cortado.progress import track
-from cortado.render.scene_renderer import scene_renderer
 from cortado.report import Figures, write_report
 from cortado.rollout import Rollout
 from cortado.run_folder import RunFolder
@@ -102,14 +101,10 @@ def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolde
 
 def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], folder: Path) -> Figures:
     """Pictures of a scene that says how it is rendered, and a video where it can be written."""
-    renderer, state = scene_renderer(simulation), simulation.solver.new_state()
-    colours = simulation.parameters()["colours"]
+    renderer = simulation.renderer()
 
     def image(frame: int) -> np.ndarray:
-        fractions = trajectory.mass_fractions
-        composition = simulation.mass_fractions if fractions is None else fractions[frame]
-        state.set(trajectory.positions[frame], trajectory.velocities[frame], composition)
-        return renderer.render(state.positions, state.mass_fractions, colours)
+        return renderer.render(trajectory[frame])
 
     titles = [f"t = {trajectory.times[frame]:.3f} s" for frame in shown]
     path = images(map(image, shown), titles, folder / "rendered.png")

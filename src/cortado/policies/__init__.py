@@ -32,6 +32,10 @@ __all__ = [
 ]
 
 
+def __dir__() -> list[str]:
+    return __all__
+
+
 def estimate(
     problem: Differentiable, parameters: Values, policy: Policy | None = None, observe: Observer | None = None
 ) -> Estimate:

@@ -9,6 +9,7 @@ from cortado.parameters.values import Arrays, Values
 from cortado.particles import Parameters, State
 from cortado.rollout import Observer, Rollout, StepDerivative
 from cortado.solvers.solver import Counts
+from cortado.words import sized
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,11 @@ class Estimate:
     """Of the smoothing that `AdjointSmoothing` applied, the weakest of those that were extrapolated."""
     standard_error: Arrays | None = None
     """Of every number of the gradient, where it is an average (`Smoothed`, `Averaged`)."""
+
+    def __repr__(self) -> str:
+        strength = "" if self.strength is None else f", strength {self.strength:.4g}"
+        error = "" if self.standard_error is None else ", with its standard error"
+        return f"Estimate(loss {self.loss:.6g}, gradient of {sized(self.gradient)}{strength}{error})"
 
 
 class Passage(Protocol):

@@ -17,7 +17,7 @@ from cortado.reference.engine import extension, precisions
 from cortado.reference.histories import Gradient, History
 from cortado.reference.losses import Loss
 from cortado.region import TOLERANCE
-from cortado.scene import Scene
+from cortado.scene import Scene, as_scene
 
 METHODS = (
     "analytic",
@@ -57,11 +57,11 @@ class Simulation:
     is not enough. Every method takes an ``observe`` that is called with the number of every step.
     """
 
-    def __init__(self, scene: Scene, precision: str = "float64", threads: int | None = None):
-        """``precision``: one of `cortado.reference.precisions`; ``threads``: all cores unless said, or one where there
-        are too few particles. The bits of the results do not depend on them."""
-        if not isinstance(scene, Scene):
-            raise InputError(f"scene is {shown(scene)}, but must be a cortado.Scene, such as load_scene gives.")
+    def __init__(self, scene: Scene | str | os.PathLike[str], precision: str = "float64", threads: int | None = None):
+        """``scene``: one, or the path of its file; ``precision``: one of `cortado.reference.precisions`; ``threads``:
+        all cores unless said, or one where there are too few particles. The bits of the results do not depend on them.
+        """
+        scene = as_scene(scene)
         if len(scene.phase) > 1 or scene.emitter is not None:
             raise InputError("scene has several phases or an emitter, but must have neither for the reference engine.")
         unknown = [p.name for p in BY_NAME.values() if p.is_optional and p.present(scene)]

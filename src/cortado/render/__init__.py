@@ -19,3 +19,7 @@ def __getattr__(name: str) -> Any:
     if name in __all__:
         return importlib.import_module(f"cortado.render.{name}")
     raise AttributeError(f"module 'cortado.render' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -9,6 +9,7 @@ import warp as wp
 
 from cortado.arrays import as_numbers
 from cortado.errors import InputError, shown
+from cortado.kernel_cache import start_warp
 from cortado.particles import padded
 from cortado.precision import Precision
 from cortado.render.cameras import positive, vector
@@ -17,6 +18,7 @@ from cortado.render.marching import RayMarcher
 from cortado.render.views import View
 from cortado.smoothing import SmoothingKernel
 from cortado.threads import WARP
+from cortado.words import counted
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Renderer:
         dimension: int = 3,
         cell: float | None = None,
         periods: Sequence[float] | np.ndarray | None = None,
+        colours: np.ndarray | None = None,
     ):
         """Fluid is seen from ``lower`` to ``upper`` (d,) [m], and by the support radius [m] beyond.
 
@@ -68,8 +71,9 @@ class Renderer:
         between ``lower`` and ``upper``.
 
         ``volume`` is the rest volume of a particle [m^d], ``cell`` the distance of nodes [m], by default half the
-        support radius.
+        support radius. ``colours`` (phases, 3) are those of the phases where a picture is asked for without any.
         """
+        start_warp()
         for name, size in (("support", support), ("volume", volume), ("cell", 1.0 if cell is None else cell)):
             positive(name, size)
         cell = 0.5 * support if cell is None else cell
@@ -98,14 +102,21 @@ class Renderer:
             "dimension": dimension,
             "cell": cell,
             "periods": periods,
+            "colours": colours,
         }
         self._particles, self._phases, self._precision = particles, phases, precision
         self._dimension, self._device = dimension, wp.get_device(device)
+        self._colours = None if colours is None else _of_shape("colours", colours, (phases, 3))
         self._field = ColourField(
             low, high, turns, cell, smoothing, support, volume, particles, phases, precision, self._device
         )
         self._rays = RayMarcher(view, self._field.nodes, precision, self._device)
         self._rendered = False
+
+    def __repr__(self) -> str:
+        rows, columns, _ = self.shape
+        view = type(self.view).__name__
+        return f"Renderer({view}, {columns} x {rows} pixels, {counted(self._particles, 'particle')})"
 
     def __reduce__(self) -> tuple[Any, ...]:
         raise InputError("A Renderer cannot be pickled or copied; make another one where it is needed.")
@@ -127,14 +138,17 @@ class Renderer:
         return rows, columns, 3
 
     @WARP
-    def render(self, positions: Any, fractions: Any, colours: Any) -> np.ndarray:
-        """The picture (rows, columns, 3), in float64, row 0 at the top.
+    def render(self, positions: Any, fractions: Any = None, colours: Any = None) -> np.ndarray:
+        """The picture (rows, columns, 3), in float64, row 0 at the top: ``render(trajectory[-1])``.
 
         Args:
-            positions: (n, d) [m], or a Warp array (n,) of vectors in the renderer's precision, on its device.
-            fractions: (n, phases) mass fractions [-], or such a Warp array.
-            colours: (phases, 3) of the phases.
+            positions: a frame, such as ``trajectory[k]`` or ``problem.end(parameters)``, which brings its own mass
+                fractions, and colours if it has any; or (n, d) [m], or a Warp array (n,) of vectors in the renderer's
+                precision, on its device.
+            fractions: (n, phases) mass fractions [-], or such a Warp array; may be left out with one phase.
+            colours: (phases, 3) of the phases; those that the renderer was made with if left out.
         """
+        positions, fractions, colours = self._completed(positions, fractions, colours)
         x = self._on_device("positions", positions, self._dimension, self._precision.vector)
         c = self._on_device("fractions", fractions, self._phases, self._precision.fractions(self._phases))
         colours = _of_shape("colours", colours, (self._phases, 3))
@@ -164,6 +178,21 @@ class Renderer:
         nodes = self._field.nodes
         indices = np.moveaxis(np.indices(tuple(nodes.shape)), 0, -1)
         return np.array(nodes.origin, dtype=np.float64) + nodes.cell * indices
+
+    def _completed(self, positions: Any, fractions: Any, colours: Any) -> tuple[Any, Any, Any]:
+        """What `render` was given, a frame taken apart, and what was left out filled in."""
+        if hasattr(positions, "positions"):
+            frame, positions = positions, positions.positions
+            fractions = frame.mass_fractions if fractions is None else fractions
+            colours = getattr(frame, "colours", None) if colours is None else colours
+        if fractions is None:
+            if self._phases > 1:
+                wanted = f"mass fractions ({self._particles}, {self._phases})"
+                raise InputError(f"fractions is left out, but must be {wanted}, as there are {self._phases} phases.")
+            fractions = np.ones((self._particles, 1))
+        if colours is None and self._colours is None:
+            raise InputError("colours is left out, but must be given, as the renderer was made without any.")
+        return positions, fractions, self._colours if colours is None else colours
 
     def _on_device(self, name: str, values: Any, components: int, dtype: Any) -> wp.array:
         """A Warp array (n,) of vectors as it is, or one of an array (n, components)."""

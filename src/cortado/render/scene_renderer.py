@@ -1,14 +1,18 @@
 """The pictures that a scene asks for."""
 
-from typing import Any
+from typing import Annotated, Any, Protocol
 
 import numpy as np
+from pydantic import AfterValidator, TypeAdapter
 
+from cortado.precision import Precision
 from cortado.render.cameras import Perspective
 from cortado.render.renderer import Renderer
 from cortado.render.views import TopView, View, Volume
+from cortado.scene import Scene
 from cortado.scene_render import Render
-from cortado.simulation import Simulation
+from cortado.scene_tables import sentences
+from cortado.smoothing import SmoothingKernel
 
 UP = {2: 2, 3: 1}
 """The axis that points upwards, by dimension; in 2-D the one that the plane lacks."""
@@ -17,16 +21,34 @@ FINENESS = {2: 0.5, 3: 1.0}
 between them, which catches single particles; in 2-D finer nodes cost next to nothing."""
 CLEARNESS = 8.0
 """A volume is seen into as far as the scene is wide over this, unless the scene says more."""
+CAMERA = ("position", "look_at", "field_of_view", "extinction")
+"""Keys of the table [render] that belong to one view."""
 
 
-def scene_renderer(simulation: Simulation, share: float = 1.0) -> Renderer:
+class Pictured(Protocol):
+    """What is asked of a `cortado.Simulation`."""
+
+    scene: Scene
+    positions: np.ndarray
+    particles: int
+    precision: Precision
+    device: Any
+    smoothing: SmoothingKernel
+    solver: Any
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+
+
+def scene_renderer(simulation: Pictured, share: float = 1.0, **settings: Any) -> Renderer:
     """A renderer for the particles of a simulation, as the table [render] of its scene wants it, or from above; with
-    that share of the extinction."""
+    that share of the extinction. ``settings`` replace keys of the table; see `Simulation.renderer`."""
     scene = simulation.scene
     lower, upper = _extent(simulation)
     dimension = simulation.dimension
     cell = scene.discretisation.spacing * FINENESS[dimension]
-    table = scene.render if scene.render is not None else Render().in_dimension(dimension)
+    table = _table(scene, settings)
     return Renderer(
         _view(table, lower, upper, scene.discretisation.spacing, cell, share),
         lower,
@@ -41,7 +63,18 @@ def scene_renderer(simulation: Simulation, share: float = 1.0) -> Renderer:
         dimension=dimension,
         cell=cell,
         periods=scene.container.periods(dimension)[1],
+        colours=np.array([phase.colour for phase in scene.phase]),
     )
+
+
+def _table(scene: Scene, settings: dict[str, Any]) -> Render:
+    """The table [render] of a scene with some of its keys replaced; a camera stays with its view."""
+    given = {} if scene.render is None else scene.render.model_dump(exclude_unset=True)
+    if settings.get("view", given.get("view")) != given.get("view"):
+        given = {name: value for name, value in given.items() if name not in CAMERA}
+    resolved = Annotated[Render, AfterValidator(lambda table: table.in_dimension(scene.dimension))]
+    with sentences():
+        return TypeAdapter(dict[str, resolved]).validate_python({"render": {**given, **settings}})["render"]
 
 
 def _view(table: Render, lower: np.ndarray, upper: np.ndarray, spacing: float, cell: float, share: float) -> View:
@@ -61,7 +94,7 @@ def _view(table: Render, lower: np.ndarray, upper: np.ndarray, spacing: float, c
     return Volume(camera, share * extinction, **options)
 
 
-def _extent(simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
+def _extent(simulation: Pictured) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper corner (d,) of the container, or of the fluid's first positions [m]."""
     ends = simulation.scene.container.extent()
     x = simulation.positions

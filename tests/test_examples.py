@@ -1,0 +1,51 @@
+"""The examples in Python run without a screen, end in a check, and the check can fail."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cortado.pictures import read_picture
+
+FOLDER = Path(__file__).parents[1] / "examples"
+MISTAKES = {
+    "first_gradient.py": ("iterations=12", "iterations=2", "gravity is"),
+    "custom_loss.py": ("2.0 * (share - self.wanted)", "(share - self.wanted)", "the adjoint is not the derivative"),
+    "two_fluids.py": ('"tilt": [20.0, 10.0]', '"tilt": [-20.0, 10.0]', "the milk is not where the tilt sends it"),
+}
+"""A mistake in each, and what its check says of it."""
+
+
+def run(path: Path, folder: Path) -> subprocess.CompletedProcess:
+    environment = {name: value for name, value in os.environ.items() if name != "DISPLAY"}
+    command = [sys.executable, str(path)]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
+
+
+def test_there_are_three_short_ones():
+    paths = list(FOLDER.glob("*.py"))
+    assert {path.name for path in paths} == MISTAKES.keys() and len(paths) == 3
+    assert all(len(path.read_text().splitlines()) <= 60 for path in paths)
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_an_example_ends_well(name, tmp_path):
+    done = run(FOLDER / name, tmp_path)
+    assert done.returncode == 0, done.stderr
+    written = sorted(path.name for path in tmp_path.iterdir())
+    assert written == (["two_fluids.png"] if name == "two_fluids.py" else [])
+    for file in written:
+        assert np.ptp(read_picture(tmp_path / file)) > 0.5
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_its_check_can_fail(name, tmp_path):
+    right, wrong, said = MISTAKES[name]
+    source = (FOLDER / name).read_text()
+    assert source.count(right) == 1
+    (tmp_path / name).write_text(source.replace(right, wrong))
+    done = run(tmp_path / name, tmp_path)
+    assert done.returncode == 1 and f"AssertionError: {said}" in done.stderr

@@ -1,0 +1,104 @@
+"""What is shown of results: a few words, never the numbers of an array; in notebooks a picture or a table too."""
+
+import re
+from base64 import b64decode
+from io import BytesIO
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import cortado
+from cortado import Problem, Simulation, losses, policies
+from scenes import plane, plane_of_three
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return Simulation(plane())
+
+
+@pytest.fixture(scope="module")
+def trajectory(simulation):
+    return simulation.run(4)
+
+
+@pytest.fixture(scope="module")
+def problem(simulation):
+    return Problem(simulation, 4, losses.FinalPositions(0.9 * simulation.positions))
+
+
+@pytest.fixture(scope="module")
+def result(problem):
+    start = {"gravity": np.array([0.0, -9.0]), "viscosity": 0.05}
+    return cortado.optimise(problem, start, "adam", learning_rate=0.01, iterations=2)
+
+
+@pytest.fixture(scope="module")
+def certificate(problem):
+    return cortado.certify(problem)
+
+
+def test_what_runs(simulation, problem):
+    assert repr(simulation) == "Simulation(64 particles, 1 phase, cpu, float32)"
+    three = Simulation(plane_of_three(), precision="float64")
+    assert repr(three) == "Simulation(64 particles, 3 phases, cpu, float64)"
+    assert repr(problem) == f"Problem(4 steps of {simulation!r}, judged by FinalPositions)"
+
+    def height(positions, velocities, loss):
+        """Never called."""
+
+    assert repr(Problem(simulation, 1, height)) == f"Problem(1 step of {simulation!r}, judged by height)"
+    assert repr(simulation.renderer(resolution=(20, 10))) == "Renderer(TopView, 20 x 10 pixels, 64 particles)"
+
+
+def test_what_a_run_leaves(trajectory, problem):
+    assert repr(trajectory) == "Trajectory(5 frames of 64 particles, 0 to 0.0084 s)"
+    assert repr(trajectory[:0]) == "Trajectory(0 frames of 64 particles)"
+    assert repr(trajectory[-1]) == "Frame(64 particles, t = 0.0084 s)"
+    assert repr(problem.end({})) == "TrajectoryEnd(64 particles, float32)"
+    restart = repr(trajectory.last_state)
+    assert restart.startswith("RestartState(positions=array (64, 2), velocities=array (64, 2), mass_fractions=None, ")
+    assert "RunConstants(reference_density=array (64,), time_step=0.0021" in restart
+
+
+def test_what_a_search_finds(result):
+    words = r"Result\(gravity \(2,\), viscosity: loss [\d.e-]+ after 3 evaluations; Adam made all its 2 updates\)"
+    assert re.fullmatch(words, repr(result))
+    assert re.fullmatch(r"Record\(iteration 0: loss [\d.e-]+, gradient norm [\d.e-]+\)", repr(result.history[0]))
+
+
+def test_what_a_policy_says(problem):
+    at = {"gravity": np.array([0.0, -9.0]), "viscosity": 0.05}
+    exact = repr(problem.estimate(at))
+    assert re.fullmatch(r"Estimate\(loss [\d.e-]+, gradient of gravity \(2,\), viscosity\)", exact)
+    smoothed = repr(problem.estimate({"gravity": at["gravity"]}, policies.Smoothed({"gravity": 0.1}, 2)))
+    assert smoothed.endswith(", gradient of gravity (2,), with its standard error)")
+
+
+def test_a_certificate_is_a_table(certificate):
+    assert repr(certificate) == "Certificate(64 particles, 4 steps, right, horizon 4, use policies.Exact())"
+    assert re.search(r"│ gravity +│ \d\.\d{3}e-\d\d +│ right +│", str(certificate))
+    assert "array(" not in repr(certificate.comparison) and "array(" not in repr(certificate.horizons)
+    html = certificate._repr_html_()
+    assert html.startswith("<pre>") and html.endswith("</pre>") and "│ gravity" in html
+
+
+@pytest.mark.parametrize("name", ["trajectory", "result"])
+def test_a_notebook_shows_a_picture(name, request):
+    found = request.getfixturevalue(name)
+    html = found._repr_html_()
+    (picture,) = re.findall(r'src="data:image/png;base64,([^"]*)"', html)
+    pixels = np.asarray(Image.open(BytesIO(b64decode(picture))).convert("L"))
+    assert pixels.shape[1] >= 1000 and 0.001 < np.mean(pixels < 200) < 0.9
+    assert html.startswith(f"<p>{repr(found)[:10]}")
+
+
+def test_a_trajectory_of_nothing_has_no_picture(trajectory):
+    assert trajectory[:0]._repr_html_() == "<pre>Trajectory(0 frames of 64 particles)</pre>"
+
+
+def test_no_repr_is_long(simulation, trajectory, problem, result, certificate):
+    """Whatever the number of particles, parameters and steps."""
+    shown = [simulation, trajectory, trajectory[0], problem, result, result.history[0], certificate, problem.end({})]
+    assert all(len(repr(one)) < 200 and "\n" not in repr(one) and "[" not in repr(one) for one in shown)

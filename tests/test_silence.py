@@ -1,0 +1,80 @@
+"""What Warp says of itself, and what is said instead: processes of their own, as Warp starts once in each."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+FIRST = """
+import warp as wp
+BEFORE
+import cortado
+simulation = cortado.Simulation("docs/figures/dam_break_plane.toml")
+simulation.run(2)
+print("level", wp.config.log_level)
+"""
+COMPILING = "Compiling kernels for the first time, which may take half a minute; they are kept in "
+
+
+def with_kernels(err):
+    """What stderr would have if all kernels came from the cache, for tests that may be the first to need one."""
+    return "".join(line for line in err.splitlines(keepends=True) if not line.startswith(COMPILING))
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """A cache that a first run has filled, and what that run said."""
+    folder = tmp_path_factory.mktemp("kernels")
+    return folder, said(folder)
+
+
+def said(cache, before="", **environment):
+    """Lines on stdout, and stderr, of a run in a process."""
+    environment = {**os.environ, "WARP_CACHE_PATH": str(cache), **environment}
+    done = subprocess.run(
+        [sys.executable, "-c", FIRST.replace("BEFORE", before)], capture_output=True, env=environment, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines(), done.stderr
+
+
+def test_one_line_says_that_kernels_are_compiled(compiled):
+    folder, (out, err) = compiled
+    assert out == ["level 30"]
+    assert err.startswith(f"{COMPILING}{folder}") and err.count("\n") == 1
+
+
+def test_nothing_is_said_where_they_come_from_the_cache(compiled):
+    """Neither a greeting nor a warning that there is no driver of a GPU."""
+    folder, _ = compiled
+    assert said(folder) == (["level 30"], "")
+
+
+def test_whoever_wants_to_hear_warp_does(compiled):
+    folder, _ = compiled
+    out, _ = said(folder, CORTADO_VERBOSE="1")
+    assert out[0].startswith("Warp ") and out[-1] == "level 20"
+    assert any(line.startswith("Module cortado_") and line.endswith("(cached)") for line in out)
+    assert said(folder, CORTADO_VERBOSE="0") == (["level 30"], "")
+
+
+@pytest.mark.parametrize(("level", "greets"), [("DEBUG", True), ("WARNING", False), ("ERROR", False)])
+def test_a_level_that_was_chosen_is_kept(compiled, level, greets):
+    folder, _ = compiled
+    out, _ = said(folder, before=f"wp.config.log_level = wp.LOG_{level}; print('level', wp.LOG_{level})")
+    assert out[0] == out[-1] and out[1].startswith("Warp ") == greets
+
+
+def test_the_command_line_says_the_same(compiled, tmp_path):
+    """Other kernels are among those that it needs, at first."""
+    folder, _ = compiled
+    scene = "docs/figures/dam_break_plane.toml"
+    command = [sys.executable, "-m", "cortado", "run", scene, "--steps", "2", "--out", str(tmp_path), "--overwrite"]
+    errors = []
+    for _ in range(2):
+        environment = {**os.environ, "WARP_CACHE_PATH": str(folder)}
+        done = subprocess.run(command, capture_output=True, env=environment, text=True)
+        assert done.returncode == 0, done.stderr
+        errors.append(done.stderr)
+    assert errors[0].startswith(COMPILING) and errors[0].count("\n") == 1 and errors[1] == ""
