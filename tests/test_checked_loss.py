@@ -33,6 +33,11 @@ class Given:
         return self._adjoint
 
 
+def adjoint_of(given):
+    """What becomes of the adjoint that a loss returns."""
+    return as_loss(Given(adjoint=given)).value_and_adjoint(END)[1]
+
+
 class Narrow(Given):
     def adjoint(self):
         return None
@@ -47,15 +52,15 @@ def test_a_value_is_a_number(value):
 def test_adjoints_of_every_form_come_through():
     arrays = (np.ones((N, 2)), np.zeros((N, 2)), np.ones((N, PHASES)))
     for given in (arrays, arrays[:2], [array.tolist() for array in arrays]):
-        found = as_loss(Given(adjoint=given)).adjoint(END)
+        found = adjoint_of(given)
         assert len(found) == len(given)
         for one, wanted in zip(found, arrays, strict=False):
             assert one.dtype == np.float64
             np.testing.assert_array_equal(one, wanted)
     bar = state()
-    assert as_loss(Given(adjoint=bar)).adjoint(END) is bar
+    assert adjoint_of(bar) is bar
     found = as_loss(Given(adjoint=EndAdjoint(bar, np.ones((PHASES, 3)))))
-    assert found.adjoint(END).state is bar
+    assert found.value_and_adjoint(END)[1].state is bar
 
 
 def a_pair(positions, velocities=None):
@@ -66,32 +71,46 @@ MISTAKES = {
     "no value": (lambda: as_loss(Given(None)).value(END), "the loss's value is None"),
     "an array as value": (lambda: as_loss(Given(np.ones(3))).value(END), r"shape \(3,\), but must be one number"),
     "a complex value": (lambda: as_loss(Given(1j)).value(END), "the loss's value is 1j"),
-    "no adjoint": (lambda: as_loss(Given()).adjoint(END), "is a NoneType"),
-    "one array": (lambda: as_loss(Given(adjoint=np.ones((N, 2)))).adjoint(END), "is a ndarray"),
-    "one array in a tuple": (lambda: as_loss(Given(adjoint=(np.ones((N, 2)),))).adjoint(END), "is a tuple of 1"),
+    "no adjoint": (lambda: adjoint_of(None), "is a NoneType"),
+    "one array": (lambda: adjoint_of(np.ones((N, 2))), "is a ndarray"),
+    "one array in a tuple": (
+        lambda: adjoint_of((np.ones((N, 2)),)),
+        "is a tuple of 1",
+    ),
     "a wrong shape": (
-        lambda: as_loss(Given(adjoint=a_pair(np.ones((N, 3))))).adjoint(END),
+        lambda: adjoint_of(a_pair(np.ones((N, 3)))),
         r"of positions has shape \(5, 3\), but must be \(5, 2\)",
     ),
     "complex numbers": (
-        lambda: as_loss(Given(adjoint=a_pair(np.ones((N, 2)), np.ones((N, 2), complex)))).adjoint(END),
+        lambda: adjoint_of(a_pair(np.ones((N, 2)), np.ones((N, 2), complex))),
         "of velocities is made of complex numbers",
     ),
     "a mask": (
-        lambda: as_loss(Given(adjoint=a_pair(np.ma.masked_equal(np.zeros((N, 2)), 0.0)))).adjoint(END),
+        lambda: adjoint_of(a_pair(np.ma.masked_equal(np.zeros((N, 2)), 0.0))),
         "of positions is partly masked",
     ),
     "another number of particles": (
-        lambda: as_loss(Given(adjoint=state(N + 1))).adjoint(END),
+        lambda: adjoint_of(state(N + 1)),
         r"of positions is a Warp array of vec3d of shape \(6,\) on cpu, but must be .* \(5,\)",
     ),
-    "another precision": (lambda: as_loss(Given(adjoint=state(precision=FLOAT32))).adjoint(END), "of vec3f"),
+    "another precision": (
+        lambda: adjoint_of(state(precision=FLOAT32)),
+        "of vec3f",
+    ),
     "NumPy arrays in a state": (
-        lambda: as_loss(Given(adjoint=State({**state().named(), "velocities": np.zeros((N, 3))}))).adjoint(END),
+        lambda: as_loss(Given(adjoint=State({**state().named(), "velocities": np.zeros((N, 3))}))).value_and_adjoint(
+            END
+        )[1],
         "of velocities is a ndarray",
     ),
-    "colours": (lambda: as_loss(Given(adjoint=EndAdjoint(state(), np.ones(3)))).adjoint(END), "of colours has shape"),
-    "no state": (lambda: as_loss(Given(adjoint=EndAdjoint(None, np.ones((2, 3))))).adjoint(END), "a NoneType as its"),
+    "colours": (
+        lambda: adjoint_of(EndAdjoint(state(), np.ones(3))),
+        "of colours has shape",
+    ),
+    "no state": (
+        lambda: adjoint_of(EndAdjoint(None, np.ones((2, 3)))),
+        "a NoneType as its",
+    ),
     "a class": (lambda: as_loss(FinalPositions), "loss is the class FinalPositions"),
     "an array": (lambda: as_loss(np.zeros((N, 2))), "loss is a ndarray"),
     "too few arguments": (lambda: as_loss(lambda x, v: None), r"takes the arguments '\(x, v\)', but must take 3"),

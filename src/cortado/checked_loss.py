@@ -9,7 +9,7 @@ import warp as wp
 
 from cortado.arrays import as_numbers, as_one_number
 from cortado.errors import InputError, shown
-from cortado.losses import EndAdjoint, Loss, Recorded, TrajectoryEnd
+from cortado.losses import Adjoint, EndAdjoint, Loss, Recorded, TrajectoryEnd
 from cortado.particles import State
 
 FORMS = ("positions", "velocities", "mass fractions")
@@ -19,15 +19,21 @@ FORMS = ("positions", "velocities", "mass fractions")
 class CheckedLoss:
     """A loss whose value is a number, and whose adjoint fits the state."""
 
-    def __init__(self, loss: Loss):
+    def __init__(self, loss: Any):
+        """A `Loss`; an ``adjoint`` of its own takes the place of ``value_and_adjoint``."""
         self._loss = loss
 
     def value(self, end: TrajectoryEnd) -> float:
         return as_one_number("the loss's value", self._loss.value(end))
 
-    def adjoint(self, end: TrajectoryEnd) -> State | EndAdjoint | tuple[np.ndarray, ...]:
+    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
         """As that of `Loss`; arrays come in float64."""
-        bar = self._loss.adjoint(end)
+        if hasattr(self._loss, "adjoint"):
+            return self.value(end), self._checked(self._loss.adjoint(end), end)
+        value, bar = self._loss.value_and_adjoint(end)
+        return as_one_number("the loss's value", value), self._checked(bar, end)
+
+    def _checked(self, bar: Any, end: TrajectoryEnd) -> Adjoint:
         if isinstance(bar, State):
             return _checked_state(bar, end)
         if isinstance(bar, EndAdjoint):
@@ -47,8 +53,9 @@ def as_loss(loss: Any) -> Loss:
     """A loss with its results checked; a function of Warp arrays is made into one. Raises `InputError`."""
     if isinstance(loss, type):
         raise InputError(f"loss is the class {loss.__name__}, but must be an object that is made of it.")
-    if hasattr(loss, "adjoint") and hasattr(loss, "value"):
-        for name in ("value", "adjoint"):
+    derivative = next((name for name in ("adjoint", "value_and_adjoint") if hasattr(loss, name)), None)
+    if derivative is not None and hasattr(loss, "value"):
+        for name in ("value", derivative):
             _require_arguments(f"the loss's {name}", getattr(loss, name), ("the end of a trajectory",))
         return CheckedLoss(loss)
     if not callable(loss):

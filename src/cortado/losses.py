@@ -76,15 +76,22 @@ class EndAdjoint:
     """(phases, 3)"""
 
 
+Adjoint = State | EndAdjoint | tuple[np.ndarray, ...]
+"""Derivatives of a loss with respect to positions and velocities, (n, d) each, and, if there is a third array, mass
+fractions (n, phases); or as Warp arrays."""
+
+
 class Loss(Protocol):
-    """A differentiable number of the end of a trajectory."""
+    """A differentiable number of the end of a trajectory.
+
+    A loss of your own may have a method ``adjoint(end)`` in the place of `value_and_adjoint`.
+    """
 
     def value(self, end: TrajectoryEnd) -> float:
         """The loss."""
 
-    def adjoint(self, end: TrajectoryEnd) -> State | EndAdjoint | tuple[np.ndarray, ...]:
-        """Derivatives of the loss with respect to positions and velocities, (n, d) each, and, if there is a third
-        array, mass fractions (n, phases); or as Warp arrays."""
+    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
+        """The loss and its derivatives, which share what both need."""
 
 
 class Frames:
@@ -127,21 +134,22 @@ class FinalPositions:
     @WARP
     def value(self, end: TrajectoryEnd) -> float:
         x, target, device = self._positions_and_target(end)
-        squares = wp.empty(len(x), dtype=wp.float64, device=device)
-        kernels = matching_kernels(end.precision)
-        launch(kernels.squared_distance, len(x), device, x=x, target=target, squares=squares)
-        total = sum_of(wp.float64, len(x), device)(squares)
-        return float(total.numpy()[0]) / len(x)
+        return self._mean_square(x, target, device, end.precision)
 
     @WARP
-    def adjoint(self, end: TrajectoryEnd) -> State:
+    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, State]:
         x, target, device = self._positions_and_target(end)
         bar = end.state.like()
         bar.clear()
-        kernels = matching_kernels(end.precision)
-        factor = 2.0 / len(x)
-        launch(kernels.difference, len(x), device, factor=factor, x=x, target=target, bar=bar.positions)
-        return bar
+        factor, kernel = 2.0 / len(x), matching_kernels(end.precision).difference
+        launch(kernel, len(x), device, factor=factor, x=x, target=target, bar=bar.positions)
+        return self._mean_square(x, target, device, end.precision), bar
+
+    def _mean_square(self, x: wp.array, target: wp.array, device: Any, precision: Precision) -> float:
+        squares = wp.empty(len(x), dtype=wp.float64, device=device)
+        launch(matching_kernels(precision).squared_distance, len(x), device, x=x, target=target, squares=squares)
+        total = sum_of(wp.float64, len(x), device)(squares)
+        return float(total.numpy()[0]) / len(x)
 
     def _positions_and_target(self, end: TrajectoryEnd) -> tuple[wp.array, wp.array, Any]:
         x = end.state.positions
@@ -165,8 +173,9 @@ class CentreOfMass:
     def value(self, end: TrajectoryEnd) -> float:
         return float((self._miss(end) ** 2).sum())
 
-    def adjoint(self, end: TrajectoryEnd) -> tuple[np.ndarray, ...]:
-        return (2.0 * _shares(self._weights, end)[:, None] * self._miss(end), np.zeros_like(end.velocities))
+    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
+        bar = 2.0 * _shares(self._weights, end)[:, None] * self._miss(end)
+        return self.value(end), (bar, np.zeros_like(end.velocities))
 
     def _miss(self, end: TrajectoryEnd) -> np.ndarray:
         if self.target.shape != (end.dimension,):
@@ -184,12 +193,15 @@ class CentreOfMassAlong:
         """Tells one direction from another, for checkpoints."""
 
     def value(self, end: TrajectoryEnd) -> float:
-        return float((self.adjoint(end)[0] * end.positions).sum())
+        return float((self._slopes(end) * end.positions).sum())
 
-    def adjoint(self, end: TrajectoryEnd) -> tuple[np.ndarray, ...]:
+    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
+        return self.value(end), (self._slopes(end), np.zeros_like(end.velocities))
+
+    def _slopes(self, end: TrajectoryEnd) -> np.ndarray:
         if self.direction.shape != (end.dimension,):
             raise InputError(f"direction has shape {self.direction.shape}, but must be {(end.dimension,)}.")
-        return (_shares(self._weights, end)[:, None] * self.direction, np.zeros_like(end.velocities))
+        return _shares(self._weights, end)[:, None] * self.direction
 
 
 def _finite(what: str, value: Any, dimensions: int) -> np.ndarray:
@@ -246,7 +258,6 @@ class Image:
         parts = (self.distance.fingerprint, sha256(self.target.tobytes()).hexdigest())
         self.fingerprint = " ".join((*parts, getattr(renderer, "fingerprint", "")))
         """Tells one target, or one view of it, from another, for checkpoints."""
-        self._seen: tuple[TrajectoryEnd, float] | None = None
 
     def image(self, end: TrajectoryEnd) -> np.ndarray:
         """The picture (rows, columns, 3) of a state."""
@@ -254,20 +265,17 @@ class Image:
 
     @WARP
     def value(self, end: TrajectoryEnd) -> float:
-        if self._seen is not None and self._seen[0] is end:
-            return self._seen[1]
         return self.distance.value(self.image(end), self.target)
 
     @WARP
-    def adjoint(self, end: TrajectoryEnd) -> EndAdjoint:
+    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, EndAdjoint]:
         image = self.image(end)
-        self._seen = (end, self.distance.value(image, self.target))
         found = self.renderer.adjoint(self.distance.adjoint(image, self.target))
         bar = end.state.like()
         bar.velocities.zero_()
         wp.copy(bar.positions, found.positions)
         wp.copy(bar.mass_fractions, found.fractions)
-        return EndAdjoint(bar, found.colours)
+        return self.distance.value(image, self.target), EndAdjoint(bar, found.colours)
 
 
 def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:
@@ -302,11 +310,12 @@ class Recorded:
         return float(loss.numpy()[0])
 
     @WARP
-    def adjoint(self, end: TrajectoryEnd) -> tuple[np.ndarray, np.ndarray]:
+    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
         with wp.Tape() as tape:
             loss, positions, velocities = self._run(end)
         tape.backward(loss)
-        return tuple(array.grad.numpy()[:, : end.dimension].astype(np.float64) for array in (positions, velocities))
+        bars = tuple(array.grad.numpy()[:, : end.dimension].astype(np.float64) for array in (positions, velocities))
+        return float(loss.numpy()[0]), bars
 
     def _run(self, end: TrajectoryEnd) -> tuple[wp.array, wp.array, wp.array]:
         copies = [wp.clone(a, requires_grad=True) for a in (end.state.positions, end.state.velocities)]

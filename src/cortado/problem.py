@@ -10,7 +10,7 @@ import numpy as np
 
 from cortado.checked_loss import as_loss
 from cortado.errors import CortadoWarning, InputError
-from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd, fingerprint
+from cortado.losses import Adjoint, EndAdjoint, Frames, Loss, TrajectoryEnd, fingerprint
 from cortado.memory import require
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import NAMES, UNITS, Arrays, Values
@@ -131,8 +131,8 @@ class Problem:
         values = self._space.checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         evaluation = self._rollout.evaluation  # before the loss, which may evaluate the problem itself
-        bars = {step: self._adjoint(step, end) for step, end in ends.items()}
-        return Passage(self._total(ends), self._rollout, values, bars, self._space, self._derivatives, evaluation)
+        loss, bars = self._judged(ends)
+        return Passage(loss, self._rollout, values, bars, self._space, self._derivatives, evaluation)
 
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> float:
@@ -140,7 +140,7 @@ class Problem:
         values = self._space.checked(parameters)
         along = self._space.checked(directions, "direction")
         ends = self._ends(values, self._losses, keep=False, varied=along)
-        bars = {step: self._adjoint(step, end) for step, end in ends.items()}
+        _, bars = self._judged(ends)
         dot, parameters_dot = self._space.direction(self._rollout, values, along)
         terms = [np.sum(bar.colours * along["colours"]) for bar in bars.values()] if "colours" in along else []
 
@@ -193,8 +193,13 @@ class Problem:
     def _total(self, ends: dict[int, TrajectoryEnd]) -> float:
         return sum(loss.value(ends[step]) for step, loss in self._losses.items())
 
-    def _adjoint(self, step: int, end: TrajectoryEnd) -> EndAdjoint:
-        bar = self._losses[step].adjoint(end)
+    def _judged(self, ends: dict[int, TrajectoryEnd]) -> tuple[float, dict[int, EndAdjoint]]:
+        """The loss of a run, and its adjoints of states by the number of steps before them."""
+        found = {step: loss.value_and_adjoint(ends[step]) for step, loss in self._losses.items()}
+        bars = {step: self._on_device(bar, ends[step]) for step, (_, bar) in found.items()}
+        return sum(value for value, _ in found.values()), bars
+
+    def _on_device(self, bar: Adjoint, end: TrajectoryEnd) -> EndAdjoint:
         if isinstance(bar, EndAdjoint):
             return bar
         no_colours = np.zeros_like(end.colours)

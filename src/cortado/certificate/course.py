@@ -108,7 +108,8 @@ class Course:
 
         def project(step: int, dot: State) -> None:
             if step in self._losses:
-                bar, arrays = self._losses[step].adjoint(ends[step]), dot.numpy(simulation.dimension)
+                _, bar = self._losses[step].value_and_adjoint(ends[step])
+                arrays = dot.numpy(simulation.dimension)
                 slopes.append(_product(bar, arrays) + _of_colours(bar, directions))
                 strain.append(_strain(ends[step].positions, arrays[0]))
 
@@ -133,7 +134,7 @@ def _change(loss: Loss, before: TrajectoryEnd, after: TrajectoryEnd) -> float:
     ends = (before, after)
     old, new = (end.state.numpy(end.dimension) for end in ends)
     distance, colours = tuple(b - a for a, b in zip(old, new, strict=True)), {"colours": after.colours - before.colours}
-    bars = [loss.adjoint(end) for end in ends]
+    bars = [loss.value_and_adjoint(end)[1] for end in ends]
     return 0.5 * sum(_product(bar, distance) + _of_colours(bar, colours) for bar in bars)
 
 

@@ -2,10 +2,17 @@
 
 from typing import Any
 
-import numpy as np
-
 from cortado.checked_loss import as_loss
-from cortado.losses import CentreOfMass, CentreOfMassAlong, EndAdjoint, FinalPositions, Frames, Image, TrajectoryEnd
+from cortado.losses import (
+    Adjoint,
+    CentreOfMass,
+    CentreOfMassAlong,
+    EndAdjoint,
+    FinalPositions,
+    Frames,
+    Image,
+    TrajectoryEnd,
+)
 from cortado.particles import State
 from cortado.precision import FLOAT64
 from cortado.problem import Problem
@@ -53,15 +60,15 @@ class Rounded:
     def value(self, end: TrajectoryEnd) -> float:
         return self._loss.value(self._rounded(end))
 
-    def adjoint(self, end: TrajectoryEnd) -> EndAdjoint | tuple[np.ndarray, ...]:
-        bar = self._loss.adjoint(self._rounded(end))
+    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
+        value, bar = self._loss.value_and_adjoint(self._rounded(end))
         if isinstance(bar, State):
-            return bar.numpy(end.dimension)
+            return value, bar.numpy(end.dimension)
         if isinstance(bar, EndAdjoint):
             state = end.state.like()
             state.set(*bar.state.numpy(end.dimension))
-            return EndAdjoint(state, bar.colours)
-        return bar
+            return value, EndAdjoint(state, bar.colours)
+        return value, bar
 
     def _rounded(self, end: TrajectoryEnd) -> TrajectoryEnd:
         state = self._single.solver.new_state()

@@ -31,7 +31,7 @@ class _OnDevice:
         return float(self._loss.value(self._end(positions, velocities)))
 
     def adjoint(self, positions: Digits, velocities: Digits) -> tuple[NDArray[Any], NDArray[Any]]:
-        bar = self._loss.adjoint(self._end(positions, velocities))
+        _, bar = self._loss.value_and_adjoint(self._end(positions, velocities))
         state = bar.state if isinstance(bar, EndAdjoint) else bar
         found = state.numpy(self._simulation.dimension) if isinstance(state, State) else state
         return np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.float64)
