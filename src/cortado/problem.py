@@ -137,20 +137,34 @@ class Problem:
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> float:
         """The derivative of the loss along ``directions`` (any of the parameters), by forward mode."""
-        values = self._space.checked(parameters)
-        along = self._space.checked(directions, "direction")
-        ends = self._ends(values, self._losses, keep=False, varied=along)
-        _, bars = self._judged(ends)
-        dot, parameters_dot = self._space.direction(self._rollout, values, along)
-        terms = [np.sum(bar.colours * along["colours"]) for bar in bars.values()] if "colours" in along else []
+        dots: dict[int, tuple[np.ndarray, ...]] = {}
 
         def observe(step: int, dot: State) -> None:
-            if step in bars:
-                pairs = zip(bars[step].state.numpy(3), dot.numpy(3), strict=True)
-                terms.extend((bar.astype(np.float64) * d).sum() for bar, d in pairs)
+            if step in self._losses:
+                dots[step] = dot.numpy(3)
 
-        self._rollout.tangent(dot, parameters_dot, observe)
+        ends = self.tangents(parameters, directions, observe, self._losses)
+        _, bars = self._judged(ends)
+        terms = []
+        if "colours" in directions:
+            colours_dot = np.asarray(directions["colours"], dtype=np.float64)
+            terms = [np.sum(bar.colours * colours_dot) for bar in bars.values()]
+        for step in sorted(dots):
+            pairs = zip(bars[step].state.numpy(3), dots[step], strict=True)
+            terms += [(bar.astype(np.float64) * d).sum() for bar, d in pairs]
         return float(sum(terms))
+
+    @in_turn
+    def tangents(
+        self, parameters: Values, directions: Values, observe: Observer, steps: Iterable[int] = ()
+    ) -> dict[int, TrajectoryEnd]:
+        """Forward mode: run, and give ``observe`` the number of every state and its tangent along ``directions`` (any
+        of the parameters), which the next step overwrites. Returns the states after ``steps`` steps, by these."""
+        values = self._space.checked(parameters)
+        along = self._space.checked(directions, "direction")
+        ends = self._ends(values, steps, keep=False, varied=along)
+        self._rollout.tangent(*self._space.direction(self._rollout, values, along), observe)
+        return ends
 
     @property
     def fingerprint(self) -> str:

@@ -10,11 +10,9 @@ from cortado.certificate.twin import Rounded
 from cortado.checked_loss import as_loss
 from cortado.errors import DivergedError
 from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd
-from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import Arrays
 from cortado.particles import State
 from cortado.problem import Problem
-from cortado.rollout import Rollout
 
 MOMENTS = 25
 """Steps at most at which a run is judged, where its loss is one of the last state."""
@@ -96,27 +94,18 @@ class Course:
 
     def tangent(self, parameters: Arrays, along: Arrays) -> Tangent:
         """Derivatives along a direction, which names all or some of the parameters."""
-        simulation, controls = self.problem.simulation, ParameterSpace(self.problem.simulation, self.problem.steps)
-        values, directions = controls.checked(parameters), controls.checked(along, "direction")
-        rollout, colours = Rollout(simulation.solver, self.problem.steps), controls.colours(values)
-        ends: dict[int, TrajectoryEnd] = {}
+        dots: dict[int, tuple[np.ndarray, ...]] = {}
+
+        def observe(step: int, dot: State) -> None:
+            if step in self._losses:
+                dots[step] = dot.numpy(self.problem.simulation.dimension)
+
+        ends = self.problem.tangents(parameters, along, observe, self._losses)
         slopes, strain = [], []
-
-        def keep(step: int, state: State) -> None:
-            if step in self._losses:
-                ends[step] = TrajectoryEnd(state, simulation.dimension, colours)
-
-        def project(step: int, dot: State) -> None:
-            if step in self._losses:
-                _, bar = self._losses[step].value_and_adjoint(ends[step])
-                arrays = dot.numpy(simulation.dimension)
-                slopes.append(_product(bar, arrays) + _of_colours(bar, directions))
-                strain.append(_strain(ends[step].positions, arrays[0]))
-
-        controls.begin(rollout, values, directions)
-        keep(0, rollout.initial)
-        rollout.forward(keep, keep=False)
-        rollout.tangent(*controls.direction(rollout, values, directions), project)
+        for step, loss in self._losses.items():
+            _, bar = loss.value_and_adjoint(ends[step])
+            slopes.append(_product(bar, dots[step]) + _of_colours(bar, along))
+            strain.append(_strain(ends[step].positions, dots[step][0]))
         return Tangent(self._judged(ends), self._total(slopes), np.array(strain))
 
     def _judged(self, ends: dict[int, TrajectoryEnd]) -> np.ndarray:

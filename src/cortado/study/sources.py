@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from cortado import reference
 from cortado.checked_loss import as_loss
 from cortado.losses import Frames
-from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import Arrays, Values
 from cortado.particles import State
 from cortado.policies import AdjointNorms, AdjointPolicy, Policy
 from cortado.problem import Problem
-from cortado.rollout import Rollout
 from cortado.scene import Scene
 from cortado.study.reference_losses import reference_loss
 
@@ -124,17 +122,12 @@ class WarpTangent(Forward):
     """Forward mode of the Warp engine."""
 
     def along(self, problem: Problem, parameters: Values, directions: Values) -> Along:
-        controls = ParameterSpace(problem.simulation, problem.steps)
-        values, along = controls.checked(parameters), controls.checked(directions, "direction")
-        rollout = Rollout(problem.simulation.solver, problem.steps)
-        controls.begin(rollout, values, along)
-        rollout.forward(keep=False)
         norms = np.zeros((2, problem.steps + 1))
 
         def observe(step: int, dot: State) -> None:
             norms[:, step] = [np.linalg.norm(array) for array in dot.numpy(problem.simulation.dimension)[:2]]
 
-        rollout.tangent(*controls.direction(rollout, values, along), observe)
+        problem.tangents(parameters, directions, observe)
         return Along(problem.value(parameters), problem.tangent(parameters, directions), Norms(*norms))
 
 
