@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from cortado.errors import CortadoError, CortadoWarning
-from cortado.scene import Scene
-from cortado.trajectory import Trajectory
+from cortado.io.trajectory import Trajectory
+from cortado.scene.scene import Scene
 
 TOLERANCE = 0.5
 """How far outside of its container a particle may be, in spacings: up to there it has not passed the wall particles."""

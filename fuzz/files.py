@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from cortado.io.trajectory import Trajectory
 from cortado.study.experiment_files import load_experiment
-from cortado.trajectory import Trajectory
 from fuzz import bases
 from fuzz.answers import run_complaints, same_frames, search_complaints
 from fuzz.cases import Case

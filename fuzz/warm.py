@@ -2,7 +2,7 @@
 
 import importlib
 
-from cortado.silence import silenced
+from cortado.device.silence import silenced
 
 MODULES = (
     "av",

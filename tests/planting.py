@@ -138,7 +138,7 @@ def plant_all(package: Path, copy: Path, functions: dict[str, set[str]]) -> list
         planter = Planter(names, len(plants))
         tree = planter.visit(tree)
         future = sum(isinstance(node, ast.ImportFrom) and node.module == "__future__" for node in tree.body)
-        tree.body.insert(1 + future, ast.parse(IMPORTS[module.split(".")[0] in ("physics", "sph", "solvers")]).body[0])
+        tree.body.insert(1 + future, ast.parse(IMPORTS["import warp as wp" in path.read_text()]).body[0])
         path.write_text(ast.unparse(ast.fix_missing_locations(tree)))
         plants += [(module, *one) for one in planter.found]
     return plants
@@ -184,7 +184,7 @@ def case(scene, loss: str, precision: str = "float64"):
     import numpy as np
 
     from cortado import Problem, Simulation, losses
-    from cortado.image_losses import Pyramid, SquaredDifference
+    from cortado.losses.image_losses import Pyramid, SquaredDifference
     from cortado.render.scene_renderer import scene_renderer
 
     simulation, random = Simulation(scene, precision=precision), np.random.default_rng(1)

@@ -6,13 +6,13 @@ import pytest
 from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, LATTE_PARTICLES, PARTICLES, PLANE_PICTURE, TINY_LATTE
 from cortado import InputError, optimise
-from cortado.assignment import assignment
-from cortado.image_losses import Pyramid, SquaredDifference
-from cortado.optimisers import LBFGS, Adam
+from cortado.inverse.setup import assignment
+from cortado.inverse.task import load_task
+from cortado.io.pictures import heart, rosetta, write_picture
+from cortado.losses.image_losses import Pyramid, SquaredDifference
+from cortado.optimisation.optimisers import LBFGS, Adam
+from cortado.optimisation.reparametrisation import Knots, Logarithm, Softmax
 from cortado.parameters.tilt import Tilt
-from cortado.pictures import heart, rosetta, write_picture
-from cortado.reparametrisation import Knots, Logarithm, Softmax
-from cortado.task import load_task
 
 
 @pytest.fixture

@@ -15,10 +15,10 @@ from cortado.certificate import Comparison, certify
 from cortado.certificate.agreement import Agreement, Judged
 from cortado.certificate.horizon import Horizon
 from cortado.certificate.twin import in_float64
-from cortado.physics.free_energy import FREE_ENERGIES
 from cortado.problem import Passage
 from cortado.render.scene_renderer import scene_renderer
-from cortado.scene import load_scene
+from cortado.scene.scene import load_scene
+from cortado.sph.free_energy import FREE_ENERGIES
 from scenes import plane, plane_of_three, scene, splash, two_layers
 from test_emitter import jet, pour
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado.checked_loss import as_loss
+from cortado.device.precision import FLOAT32, FLOAT64
+from cortado.device.state import State
 from cortado.errors import InputError
 from cortado.losses import EndAdjoint, FinalPositions, Frames, TrajectoryEnd
-from cortado.particles import State
-from cortado.precision import FLOAT32, FLOAT64
+from cortado.losses.checked import as_loss
 
 N, PHASES = 5, 2
 

@@ -21,9 +21,9 @@ from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
 from cortado import Problem, Scene, Trajectory
 from cortado.cli import main
-from cortado.folder_lock import locked
-from cortado.pictures import heart, rosetta, write_picture
-from cortado.run_folder import FIGURES, RunFolder
+from cortado.io.folder_lock import locked
+from cortado.io.pictures import heart, rosetta, write_picture
+from cortado.io.run_folder import FIGURES, RunFolder
 from test_files import largest_file
 from test_silence import with_kernels
 
@@ -472,7 +472,7 @@ def test_frames_stay_when_a_disk_fills_up(cortado_command, monkeypatch, full):
         return refuse() if next(left, None) is None else write(*arguments)
 
     if full == "trajectory.vtkhdf":
-        monkeypatch.setattr(cortado.vtkhdf, "write_fully", until_full)
+        monkeypatch.setattr(cortado.io.vtkhdf, "write_fully", until_full)
     elif full == "metrics.jsonl":
         monkeypatch.setattr(RunFolder, "metrics", Path("/dev/full"))
     else:
@@ -644,7 +644,7 @@ def test_a_right_gradient_passes_the_check(cortado_command):
     rows = [line for line in out.splitlines() if line.rstrip(" │").endswith("right")]
     assert len(rows) == 6 and "WRONG" not in out
     assert "The adjoint is right: reverse and forward mode agree to 1" in out
-    assert out.endswith("For 3 steps use policies.Exact().\n")
+    assert out.endswith("For 3 steps use gradients.Exact().\n")
 
 
 def test_the_check_speaks_json(cortado_command):

@@ -9,12 +9,12 @@ import warp as wp
 
 from cortado import CortadoWarning, DivergedError, InputError, Problem, Scene, Simulation, Trajectory, losses
 from cortado.commands.bench import dam_break
-from cortado.launching import Launcher
-from cortado.particles import State, to_device
-from cortado.precision import precision_named
-from cortado.region import Region
-from cortado.scene_containers import CylinderContainer
-from cortado.shapes import corners
+from cortado.device.launching import Launcher
+from cortado.device.precision import precision_named
+from cortado.device.state import State, to_device
+from cortado.lattice.region import Region
+from cortado.lattice.shapes import corners
+from cortado.scene.containers import CylinderContainer
 from cortado.solvers.containment import Containment, Walled
 from scenes import plane, scene
 from test_emitter import jet

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from cortado import InputError, Problem, Scene, Simulation, losses, policies
+from cortado import InputError, Problem, Scene, Simulation, gradients, losses
 from scenes import MIXING, OIL, plane, scene
 
 STEPS = 30
@@ -137,7 +137,7 @@ def test_gradient_equals_warps_tape(name, over_time):
     problem = problem_of(name)
     point = point_of(problem, over_time)
     (loss, gathered), (taped_loss, taped) = (
-        problem.value_and_gradient(point, policy) for policy in (policies.Exact(), policies.Tape())
+        problem.value_and_gradient(point, policy) for policy in (gradients.Exact(), gradients.Tape())
     )
     assert loss == taped_loss
     for key, gradient in gathered.items():

@@ -9,12 +9,12 @@ import pytest
 import cortado.render.scene_renderer
 from bad_tasks import GOOD_TASK, PLANE_PICTURE, TINY_LATTE
 from cortado import optimise
-from cortado.assignment import assignment
 from cortado.cli import main
 from cortado.errors import SceneError
-from cortado.image_losses import psnr
-from cortado.optimisers import Adam
-from cortado.task import load_task
+from cortado.inverse.setup import assignment
+from cortado.inverse.task import load_task
+from cortado.losses.image_losses import psnr
+from cortado.optimisation.optimisers import Adam
 
 STAGED = "optimise.extinctions=[0.25, 1.0]"
 

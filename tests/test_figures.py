@@ -6,8 +6,8 @@ from PIL import Image
 
 from cortado import figures
 from cortado.errors import InputError
-from cortado.srgb import to_srgb
-from cortado.trajectory import Trajectory
+from cortado.io.srgb import to_srgb
+from cortado.io.trajectory import Trajectory
 
 
 def pixels(path) -> np.ndarray:

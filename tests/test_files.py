@@ -8,9 +8,9 @@ from contextlib import contextmanager
 
 import pytest
 
-import cortado.files
+import cortado.io.files
 from cortado.errors import ComputationError, InputError
-from cortado.files import unfinished, write_atomically
+from cortado.io.files import unfinished, write_atomically
 
 
 @contextmanager

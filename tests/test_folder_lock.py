@@ -10,12 +10,12 @@ import sys
 import pytest
 
 from cortado.errors import InputError
-from cortado.folder_lock import LOCK, locked
+from cortado.io.folder_lock import LOCK, locked
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from cortado.folder_lock import locked
+from cortado.io.folder_lock import locked
 
 with locked(Path(sys.argv[1])):
     print("locked", flush=True)

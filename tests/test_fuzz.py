@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from cortado.errors import InputError
-from cortado.scene import scene_from_dict
-from cortado.task import load_task
-from cortado.trajectory import Trajectory
+from cortado.inverse.task import load_task
+from cortado.io.trajectory import Trajectory
+from cortado.scene.scene import scene_from_dict
 from fuzz import answers, bases, judge, oddities
 from fuzz.campaign import Campaign
 from fuzz.cases import Case, Family

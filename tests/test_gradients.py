@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado import Problem, Simulation, losses, policies
+from cortado import Problem, Simulation, gradients, losses
 from scenes import plane, scene, splash
 
 SCALES = {
@@ -98,8 +98,8 @@ SHAPES = {
 def test_gather_adjoint_equals_warps_tape(made):
     problem = problem_of(made, 30)
     point = dict(point_and_direction(problem, what)[:2] for what in SCALES if what != "gravity")
-    loss, gathered = problem.value_and_gradient(point, policies.Exact())
-    taped_loss, taped = problem.value_and_gradient(point, policies.Tape())
+    loss, gathered = problem.value_and_gradient(point, gradients.Exact())
+    taped_loss, taped = problem.value_and_gradient(point, gradients.Tape())
     assert loss == taped_loss
     for name, gradient in gathered.items():
         # One fluid hardly feels its density: there what a change of its size does to the loss is below round-off.

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from cortado import InputError, Problem, Scene, Simulation, losses
-from cortado.image_losses import Pyramid, SquaredDifference
-from cortado.precision import FLOAT64
+from cortado.device.precision import FLOAT64
+from cortado.lattice.smoothing import CUBIC_SPLINE
+from cortado.losses.image_losses import Pyramid, SquaredDifference
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
 from cortado.render.views import TopView
-from cortado.smoothing import CUBIC_SPLINE
 from scenes import plane_of_three, two_layers
 
 RESOLUTION = [20, 16]

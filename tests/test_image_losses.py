@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cortado.errors import InputError
-from cortado.image_losses import Pyramid, SquaredDifference, psnr, reduce, reduce_transposed
+from cortado.losses.image_losses import Pyramid, SquaredDifference, psnr, reduce, reduce_transposed
 
 SIZES = [(7, 10), (1, 9), (16, 5), (1, 1)]
 LOSSES = [SquaredDifference(), Pyramid(), Pyramid(levels=3), Pyramid(weights=(0.0, 1.5, 4.0))]

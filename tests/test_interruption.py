@@ -9,7 +9,7 @@ import pytest
 
 STOPPED = "print('here', flush=True); time.sleep(60)"
 SLOW_IMPORT = f"import time; {STOPPED}"
-START = "import time; from cortado import interruption; interruption.leave_at_once(); "
+START = "import time; from cortado.io import interruption; interruption.leave_at_once(); "
 KEEPING = f"""{START}
 class Late:
     def __del__(self):

@@ -9,7 +9,7 @@ import pytest
 KERNEL = """
 import sys
 import warp as wp
-from cortado.kernel_cache import complaint, start_warp
+from cortado.device.kernel_cache import complaint, start_warp
 
 @wp.kernel(module="unique")
 def twice(x: wp.array(dtype=float)):
@@ -73,6 +73,6 @@ def test_a_cache_that_cannot_be_written_is_replaced(twice, tmp_path):
 
 
 def test_other_errors_are_no_complaint_of_the_cache():
-    from cortado.kernel_cache import complaint
+    from cortado.device.kernel_cache import complaint
 
     assert complaint(ValueError("steps")) is None and complaint(OSError(28, "No space left on device")) is None

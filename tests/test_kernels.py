@@ -14,26 +14,26 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado.cells import Grid
-from cortado.launching import TreeSum, add, sum_and_maximum, sum_of
-from cortado.neighbours import NeighbourSearch
+from cortado.device.cells import Grid
+from cortado.device.launching import TreeSum, add, sum_and_maximum, sum_of
+from cortado.device.neighbourhood import Discretisation, surroundings_type
+from cortado.device.neighbours import NeighbourSearch
+from cortado.device.precision import FLOAT32, FLOAT64, Precision
+from cortado.lattice.smoothing import CUBIC_SPLINE
 from cortado.parameters.reference_density import (
     reference_density,
     reference_density_adjoint,
     reference_density_tangent,
 )
-from cortado.physics.diffusion import Diffusion, diffusion_kernels
-from cortado.physics.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
-from cortado.physics.mixture import mixture_kernels
-from cortado.physics.surroundings import Discretisation, surroundings_type
-from cortado.precision import FLOAT32, FLOAT64, Precision
-from cortado.smoothing import CUBIC_SPLINE
 from cortado.solvers.pcisph.density_ratio_relaxation import contrast_kernels
 from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
 from cortado.solvers.pcisph.wall_relaxation import wall_kernels
 from cortado.sph.density import density_kernels
+from cortado.sph.diffusion import Diffusion, diffusion_kernels
+from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
 from cortado.sph.gravity import gravity_kernels
 from cortado.sph.integration import integration_kernels
+from cortado.sph.materials import mixture_kernels
 from cortado.sph.pair_forces import laminar, pairwise
 from cortado.sph.viscosity import viscosity_kernels
 

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from bad_scenes import plane
-from cortado import InputError, Problem, SceneError, Simulation, losses, memory
+from cortado import InputError, Problem, SceneError, Simulation, losses
+from cortado.device import memory
 from cortado.render.scene_renderer import scene_renderer
-from cortado.scene import scene_from_dict
+from cortado.scene.scene import scene_from_dict
 
 MEASURE = """
 import sys
 import numpy as np
-from cortado import Problem, Simulation, losses, memory
+from cortado import Problem, Simulation, losses
+from cortado.device import memory
 from cortado.commands.bench import dam_break
 
 def run(particles):
@@ -97,7 +99,7 @@ def test_more_steps_than_any_machine_has_room_for():
 
 
 def test_the_limit_of_a_process_counts():
-    program = "from cortado import memory; print(memory.available())"
+    program = "from cortado.device import memory; print(memory.available())"
     line = f'ulimit -v 2000000; "{sys.executable}" -c "{program}"'
     free = float(subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True).stdout)
     assert 1e8 < free < 2.05e9

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado import InputError, Problem, Simulation, Trajectory, losses, policies
+from cortado import InputError, Problem, Simulation, Trajectory, gradients, losses
 from cortado.parameters.reference_density import reference_density
-from cortado.physics.free_energy import FreeEnergy
+from cortado.sph.free_energy import FreeEnergy
 from scenes import MIXING, OIL, plane, plane_of_three, scene, two_layers
 
 MAKERS = {"two layers": two_layers, "plane of three": plane_of_three}
@@ -120,7 +120,7 @@ def test_a_parameter_alone_has_the_gradient_that_it_has_among_all(name, what):
 @scenes
 def test_gradient_equals_warps_tape(name):
     problem, point, _, (loss, gradient) = case(name)
-    taped_loss, taped = problem.value_and_gradient(point, policies.Tape())
+    taped_loss, taped = problem.value_and_gradient(point, gradients.Tape())
     assert loss == taped_loss
     for key in SIZES:
         assert np.linalg.norm(gradient[key] - taped[key]) <= 1e-9 * np.linalg.norm(gradient[key]), key
@@ -210,7 +210,7 @@ def test_problems_with_different_substeps_share_a_simulation():
     problem, point, _, (loss, gradient) = case("two layers")
     other = Problem(problem.simulation, 5, problem.loss)
     for mobility in (0.0, 0.5):
-        other.value_and_gradient({"mobility": mobility}, policies.Tape())
+        other.value_and_gradient({"mobility": mobility}, gradients.Tape())
     found, bits = problem.value_and_gradient(point)
     assert found == loss and all(bits[key].tobytes() == gradient[key].tobytes() for key in SIZES)
 

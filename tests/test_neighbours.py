@@ -9,12 +9,12 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cortado.calibration import SKIN
-from cortado.cells import Grid
-from cortado.neighbours import NeighbourSearch
-from cortado.physics.surroundings import UNROLL, Discretisation, surroundings_type
-from cortado.precision import FLOAT32, FLOAT64, Precision
-from cortado.smoothing import CUBIC_SPLINE
+from cortado.device.cells import Grid
+from cortado.device.neighbourhood import UNROLL, Discretisation, surroundings_type
+from cortado.device.neighbours import NeighbourSearch
+from cortado.device.precision import FLOAT32, FLOAT64, Precision
+from cortado.lattice.calibration import SKIN
+from cortado.lattice.smoothing import CUBIC_SPLINE
 
 SUPPORT = 0.1
 REACH = (1 + SKIN) * SUPPORT

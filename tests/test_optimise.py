@@ -12,10 +12,10 @@ import pytest
 
 import cortado
 from cortado.errors import ComputationError, InputError
-from cortado.evaluations import FILE_NAME
-from cortado.named_optimisers import BY_NAME
-from cortado.optimisation import Record, Result, optimise
-from cortado.optimisers import LBFGS, Adam, GradientDescent
+from cortado.optimisation.named_optimisers import BY_NAME
+from cortado.optimisation.optimise import Record, Result, optimise
+from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent
+from cortado.optimisation.replay_log import FILE_NAME
 
 OPTIMISERS = [Adam(learning_rate=0.05), GradientDescent(learning_rate=1e-3, momentum=0.5), LBFGS()]
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from cortado import DivergedError, Problem, Scene, Simulation, launching, losses
+from cortado import DivergedError, Problem, Scene, Simulation, losses
 from cortado.commands.bench import dam_break
+from cortado.device import launching
 from cortado.errors import CortadoWarning
 from scenes import plane, scene, splash
 

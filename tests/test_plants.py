@@ -13,7 +13,7 @@ import pytest
 
 import cortado
 from cortado import Problem, Simulation
-from cortado.launching import Launcher
+from cortado.device.launching import Launcher
 from cortado.rollout import Rollout
 from planting import case, plant_all
 from scenes import HONEY, MIXING, OIL, plane, scene
@@ -48,38 +48,38 @@ ADJOINTS = {
         "integration_kernels.collect_masses": 1,
     },
     "sph.gravity": {"gravity_kernels.adjoint": 1},
-    "physics.mixture": {"mixture_kernels.blend_adjoint": 7},
-    "physics.spreading": {"spreading_functions.spread_adjoint": 12},
-    "physics.diffusion": {
+    "sph.materials": {"mixture_kernels.blend_adjoint": 7},
+    "sph.pairwise_laplacian": {"spreading_functions.spread_adjoint": 12},
+    "sph.diffusion": {
         "diffusion_kernels.scale_adjoint": 1,
         "diffusion_kernels.flux_adjoint": 9,
         "diffusion_kernels.potential_adjoint": 6,
     },
-    "physics.nozzle": {"nozzle_kernels.lead_adjoint": 4, "nozzle_kernels.collect": 7},
+    "sph.nozzle_kernels": {"nozzle_kernels.lead_adjoint": 4, "nozzle_kernels.collect": 7},
     "parameters.reference_density": {"reference_density_adjoint": 2},
 }
 """Functions of adjoints by module, and how many terms each has: what is planted."""
 SHARED = {
-    "physics.smoothing_functions": {"_cubic_spline.bend": 5, "smoothing_functions.hessian_product": 3},
-    "physics.surroundings": {"pair_functions.factor_gradient": 4},
+    "device.smoothing": {"_cubic_spline.bend": 5, "smoothing_functions.hessian_product": 3},
+    "device.neighbourhood": {"pair_functions.factor_gradient": 4},
     "solvers.pcisph.density_ratio_relaxation": {"contrast_kernels.excess_slope": 3},
     "sph.viscosity": {"viscosity_kernels.share": 1},
-    "physics.free_energy": {"_double_well.bend": 3, "_miscible.bend": 1, "_degenerate.slope": 4},
-    "physics.matching": {"matching_kernels.difference": 3},
-    "physics.colour_field": {"colour_field_kernels.colour_field_adjoint": 11},
-    "physics.tint": {"tint_kernels.tint_adjoint": 2},
-    "physics.absorption": {
+    "sph.free_energy": {"_double_well.bend": 3, "_miscible.bend": 1, "_degenerate.slope": 4},
+    "losses.matching": {"matching_kernels.difference": 3},
+    "render.colour_field": {"colour_field_kernels.colour_field_adjoint": 11},
+    "render.phase_colours": {"tint_kernels.tint_adjoint": 2},
+    "render.absorption": {
         "brightness_functions.brightness_slope": 5,
         "absorption_kernels.march_adjoint": 9,
         "absorption_kernels.gather": 8,
     },
-    "physics.interpolation": {"interpolation_functions.share": 6},
-    "image_losses": {"adjoint": 3, "reduce_transposed": 1},
+    "render.interpolation": {"interpolation_functions.share": 6},
+    "losses.image_losses": {"adjoint": 3, "reduce_transposed": 1},
 }
 """Derivatives that forward mode uses too, the adjoints of pictures among them, so that only differences can tell."""
 ELSEWHERE = {
     "solvers.pcisph.frozen_pressure": "a policy that is not exact: tests/test_policies.py",
-    "physics.adjoint_filters": "policies that are not exact: tests/test_policies.py",
+    "gradients.filter_kernels": "policies that are not exact: tests/test_policies.py",
 }
 """Modules with adjoints that no plant is in, and why."""
 
@@ -165,7 +165,11 @@ def qualified(node: ast.AST, outer: str = ""):
             yield from qualified(child, outer)
 
 
-KERNELS = sorted(path for package in ("physics", "sph", "solvers/pcisph") for path in (ROOT / package).glob("*.py"))
+KERNELS = sorted(
+    path
+    for package in ("sph", "solvers/pcisph", "gradients", "losses", "render")
+    for path in (ROOT / package).glob("*.py")
+)
 
 
 def name_of(path: Path) -> str:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado import InputError, Problem, Simulation, losses, policies
-from cortado.policies.strength import LADDER, MOST_GROWTH, growth, sufficient
-from cortado.solvers.adjoint_filters import Average
+from cortado import InputError, Problem, Simulation, gradients, losses
+from cortado.gradients.adjoint_filters import Average
+from cortado.gradients.strength import LADDER, MOST_GROWTH, growth, sufficient
 from reference import complex_step
 from scenes import plane, plane_of_three, scene, splash
 from test_emitter import jet, pour
@@ -138,7 +138,7 @@ class Twin:
         chain = [policy]
         while hasattr(chain[0], "base"):
             chain.insert(0, chain[0].base)
-        frozen = isinstance(chain[0], policies.VelocityOnly)
+        frozen = isinstance(chain[0], gradients.VelocityOnly)
         for state, jacobian in zip(reversed(self.states[:-1]), reversed(self.jacobians), strict=True):
             bar = (self.detached(jacobian) if frozen else jacobian).T @ bar
             for each in chain[1:]:
@@ -148,9 +148,9 @@ class Twin:
     def filtered(self, bar, state, policy):
         """What a policy does to the adjoint of a state."""
         x_bar, v_bar = bar.reshape(2, *self.shape)
-        if isinstance(policy, policies.Damped):
+        if isinstance(policy, gradients.Damped):
             v_bar = np.exp(-policy.rate * DT) * v_bar
-        if isinstance(policy, policies.AdjointSmoothing):
+        if isinstance(policy, gradients.AdjointSmoothing):
             averaging = self.averaging(state, policy.strength)
             x_bar = limited(averaging @ x_bar, policy.limit) if "positions" in policy.fields else x_bar
             v_bar = limited(averaging @ v_bar, policy.limit) if "velocities" in policy.fields else v_bar
@@ -165,17 +165,17 @@ def limited(vectors, times):
 
 twin_of = cache(Twin)
 POLICIES = (
-    policies.Exact(),
-    policies.VelocityOnly(),
-    policies.AdjointSmoothing(0.3),
-    policies.AdjointSmoothing(0.3, limit=1.2, order=2),
-    policies.AdjointSmoothing(0.7, fields=["velocities"], limit=1.1),
-    policies.AdjointSmoothing(0.7, fields=["positions"]),
-    policies.AdjointSmoothing(0.3, order=2),
-    policies.AdjointSmoothing(0.3, base=policies.VelocityOnly()),
-    policies.AdjointSmoothing(0.3, base=policies.Tape()),
-    policies.Damped(100.0),
-    policies.Damped(100.0, base=policies.AdjointSmoothing(0.3)),
+    gradients.Exact(),
+    gradients.VelocityOnly(),
+    gradients.AdjointSmoothing(0.3),
+    gradients.AdjointSmoothing(0.3, limit=1.2, order=2),
+    gradients.AdjointSmoothing(0.7, fields=["velocities"], limit=1.1),
+    gradients.AdjointSmoothing(0.7, fields=["positions"]),
+    gradients.AdjointSmoothing(0.3, order=2),
+    gradients.AdjointSmoothing(0.3, base=gradients.VelocityOnly()),
+    gradients.AdjointSmoothing(0.3, base=gradients.Tape()),
+    gradients.Damped(100.0),
+    gradients.Damped(100.0, base=gradients.AdjointSmoothing(0.3)),
 )
 
 
@@ -186,10 +186,10 @@ def test_gradients_equal_those_of_the_twin(policy, dimension):
     loss = Mixed(slow.simulation)
     _, found = Problem(slow.simulation, STEPS, loss).value_and_gradient(slow.point, policy)
     last = np.concatenate([w.ravel() for w in loss.weights[:2]])
-    wanted, exact = slow.adjoint(last, policy), slow.adjoint(last, policies.Exact())
+    wanted, exact = slow.adjoint(last, policy), slow.adjoint(last, gradients.Exact())
     gradient = np.concatenate([found[name].ravel() for name in slow.point])
     np.testing.assert_allclose(gradient, wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())
-    assert (np.linalg.norm(wanted - exact) > 0.01 * np.linalg.norm(exact)) == (policy != policies.Exact())
+    assert (np.linalg.norm(wanted - exact) > 0.01 * np.linalg.norm(exact)) == (policy != gradients.Exact())
 
 
 # ---- velocities only ------------------------------------------------------------------------------------------------
@@ -201,7 +201,7 @@ def test_velocity_only_leaves_out_positions_and_nothing_else(kind):
     simulation = simulation_of(kind)
     problem, point = Problem(simulation, 1, Mixed(simulation)), point_of(simulation)
     _, exact = problem.value_and_gradient(point)
-    _, found = problem.value_and_gradient(point, policies.VelocityOnly())
+    _, found = problem.value_and_gradient(point, gradients.VelocityOnly())
     first = exact.pop("initial_positions")
     for name, wanted in exact.items():
         np.testing.assert_allclose(found[name], wanted, rtol=0, atol=1e-12 * np.abs(wanted).max(), err_msg=name)
@@ -224,16 +224,16 @@ def test_velocity_only_grows_at_most_linearly(make):
     steps = 300
     problem, dt = Problem(simulation, steps, losses.FinalPositions(simulation.positions + 0.1)), 0.0021
     point = {"initial_positions": point_of(simulation)["initial_positions"]}
-    norms = norms_of(problem, point, policies.VelocityOnly())
+    norms = norms_of(problem, point, gradients.VelocityOnly())
     np.testing.assert_allclose(norms[:, 0], norms[-1, 0], rtol=1e-13)
     back = steps - np.arange(steps + 1)
     assert (norms[:, 1] <= 1.05 * back * dt * norms[:, 0]).all()
-    exact = norms_of(problem, point, policies.Exact())
+    exact = norms_of(problem, point, gradients.Exact())
     assert exact[0, 1] > 10.0 * steps * dt * exact[-1, 0]
 
 
 def norms_of(problem, point, policy):
-    norms = policies.AdjointNorms(problem.simulation.solver, problem.steps)
+    norms = gradients.AdjointNorms(problem.simulation.solver, problem.steps)
     problem.estimate(point, policy, norms)
     return norms.numpy()
 
@@ -294,7 +294,7 @@ def test_an_average_leaves_other_fields_alone():
 
 @kinds
 @pytest.mark.parametrize(
-    "policy", [policies.AdjointSmoothing(0), policies.AdjointSmoothing("auto"), policies.Damped(0.0)], ids=repr
+    "policy", [gradients.AdjointSmoothing(0), gradients.AdjointSmoothing("auto"), gradients.Damped(0.0)], ids=repr
 )
 def test_without_strength_a_policy_is_exact_bit_for_bit(kind, policy):
     """Also with "auto" over a few steps, in which nothing grows."""
@@ -308,7 +308,7 @@ def test_without_strength_a_policy_is_exact_bit_for_bit(kind, policy):
 
 
 @kinds
-@pytest.mark.parametrize("policy", [policies.AdjointSmoothing(0.2), policies.VelocityOnly()], ids=repr)
+@pytest.mark.parametrize("policy", [gradients.AdjointSmoothing(0.2), gradients.VelocityOnly()], ids=repr)
 def test_the_same_bits_twice_and_float32_is_near(kind, policy):
     gradients = []
     for precision in ("float64", "float64", "float32"):
@@ -334,16 +334,16 @@ def chaotic():
 @pytest.mark.parametrize("order", [1, 2])
 def test_auto_takes_so_many_times_the_smallest_sufficient_strength(chaotic, order):
     point = {"gravity": np.array([0.5, -9.81, 0.0])}
-    auto = chaotic.estimate(point, policies.AdjointSmoothing(order=order))
+    auto = chaotic.estimate(point, gradients.AdjointSmoothing(order=order))
     least = auto.strength / (order + 1)
     chosen = int(np.argmin(np.abs(np.array(LADDER) - least)))
     assert LADDER[chosen] == pytest.approx(least, rel=1e-15)
     _, exact = chaotic.value_and_gradient(point)
     assert np.linalg.norm(exact["gravity"]) > 30 * np.linalg.norm(auto.gradient["gravity"])
-    fixed = chaotic.estimate(point, policies.AdjointSmoothing(order=order).tuned(chaotic, point))
+    fixed = chaotic.estimate(point, gradients.AdjointSmoothing(order=order).tuned(chaotic, point))
     assert auto.gradient["gravity"].tobytes() == fixed.gradient["gravity"].tobytes()
     for k, strength in enumerate(LADDER[: chosen + 1]):
-        history = norms_of(chaotic, point, policies.AdjointSmoothing(strength))
+        history = norms_of(chaotic, point, gradients.AdjointSmoothing(strength))
         assert (growth(history, DT) <= MOST_GROWTH) == (k == chosen)
 
 
@@ -378,13 +378,13 @@ def test_every_adjoint_of_a_state_can_be_observed():
     simulation = simulation_of("2-D")
     problem, point = Problem(simulation, 7, Mixed(simulation)), point_of(simulation)
     seen = {}
-    norms = policies.AdjointNorms(simulation.solver, 7)
+    norms = gradients.AdjointNorms(simulation.solver, 7)
 
     def observe(step, bar):
         seen[step] = bar.numpy(2)
         norms(step, bar)
 
-    found = problem.estimate(point, policies.AdjointSmoothing(0.1), observe)
+    found = problem.estimate(point, gradients.AdjointSmoothing(0.1), observe)
     assert list(seen) == [7, 6, 5, 4, 3, 2, 1, 0]
     for k, name in enumerate(("initial_positions", "initial_velocities")):
         np.testing.assert_array_equal(seen[7][k], problem.loss.weights[k])
@@ -417,7 +417,7 @@ def quadratic(p):
 
 def test_smoothed_differences_of_a_quadratic_are_exact():
     stub = Stub(quadratic, simulation_of("2-D"))
-    found = policies.Smoothed({"gravity": 0.5, "viscosity": 0.1}, samples=3).estimate(stub, POINT)
+    found = gradients.Smoothed({"gravity": 0.5, "viscosity": 0.1}, samples=3).estimate(stub, POINT)
     assert found.loss == quadratic(POINT)
     np.testing.assert_allclose(found.gradient["gravity"], [[6.0, -0.5], [2.0, 1.4]], rtol=1e-12)
     np.testing.assert_allclose(found.gradient["viscosity"], 7.4, rtol=1e-12)
@@ -428,7 +428,7 @@ def test_smoothed_differences_of_a_quadratic_are_exact():
 def test_smoothing_takes_waves_off_that_are_narrower_than_the_spread():
     """L = u + sin(k u) / k: its gradient at 0 is 2, that of its average 1 + sin(k r) / (k r)."""
     stub = Stub(lambda p: p["viscosity"] + np.sin(40.0 * p["viscosity"]) / 40.0, simulation_of("2-D"))
-    found = policies.Smoothed(0.3).estimate(stub, {"viscosity": 0.0})
+    found = gradients.Smoothed(0.3).estimate(stub, {"viscosity": 0.0})
     assert found.gradient["viscosity"] == pytest.approx(1.0 + np.sin(12.0) / 12.0)
 
 
@@ -440,12 +440,12 @@ def test_standard_errors_tell_how_gradients_scatter():
         return quadratic(p) + 1e4 * p["gravity"][0, 0] * (x[3, 0] - first[3, 0])
 
     stub = Stub(noisy, simulation_of("2-D"))
-    runs = [policies.Smoothed(0.5, samples=20, seed=seed).estimate(stub, POINT) for seed in range(40)]
+    runs = [gradients.Smoothed(0.5, samples=20, seed=seed).estimate(stub, POINT) for seed in range(40)]
     scatter = np.std([run.gradient["gravity"] for run in runs], axis=0, ddof=1)
     believed = np.sqrt(np.mean([run.standard_error["gravity"] ** 2 for run in runs], axis=0))
     np.testing.assert_allclose(believed, scatter, rtol=0.4)
     assert runs[0].gradient["gravity"].tobytes() != runs[1].gradient["gravity"].tobytes()
-    again = policies.Smoothed(0.5, samples=20, seed=0).estimate(stub, POINT)
+    again = gradients.Smoothed(0.5, samples=20, seed=0).estimate(stub, POINT)
     assert runs[0].gradient["gravity"].tobytes() == again.gradient["gravity"].tobytes()
 
 
@@ -454,7 +454,7 @@ def test_before_chaos_smoothed_and_exact_agree():
     problem = Problem(simulation, 60, losses.CentreOfMass([0.1, 0.1, 0.1]))
     point = {"gravity": np.array([0.5, -9.81, 0.0])}
     _, exact = problem.value_and_gradient(point)
-    found = problem.estimate(point, policies.Smoothed(0.1, samples=4, disorder=0.001))
+    found = problem.estimate(point, gradients.Smoothed(0.1, samples=4, disorder=0.001))
     assert np.linalg.norm(found.gradient["gravity"] - exact["gravity"]) < 0.02 * np.linalg.norm(exact["gravity"])
 
 
@@ -468,7 +468,7 @@ class Slopes:
         self.asked.append(parameters)
         g, mu = parameters["gravity"], parameters["viscosity"]
         gradient = {"gravity": np.array(self.gravity(g, mu)), "viscosity": np.array(self.viscosity(g, mu))}
-        return policies.Estimate(7.0, gradient, strength=0.5)
+        return gradients.Estimate(7.0, gradient, strength=0.5)
 
 
 def slopes_of_quadratic():
@@ -479,7 +479,7 @@ def slopes_of_quadratic():
 
 def test_averaged_gradients_of_a_quadratic_are_exact():
     stub, inner = Stub(quadratic, simulation_of("2-D")), slopes_of_quadratic()
-    found = policies.Averaged({"gravity": 0.5, "viscosity": 0.1}, samples=4, policy=inner).estimate(stub, POINT)
+    found = gradients.Averaged({"gravity": 0.5, "viscosity": 0.1}, samples=4, policy=inner).estimate(stub, POINT)
     assert (found.loss, found.strength, len(inner.asked)) == (quadratic(POINT), 0.5, 4)
     np.testing.assert_allclose(found.gradient["gravity"], [[6.0, -0.5], [2.0, 1.4]], rtol=1e-12)
     np.testing.assert_allclose(found.gradient["viscosity"], 7.4, rtol=1e-12)
@@ -488,7 +488,7 @@ def test_averaged_gradients_of_a_quadratic_are_exact():
 
 def test_a_cloud_is_a_ball_and_perturbs_positions():
     stub, inner = Stub(quadratic, simulation_of("2-D")), slopes_of_quadratic()
-    policies.Averaged(0.3, samples=4000, policy=inner).estimate(stub, POINT)
+    gradients.Averaged(0.3, samples=4000, policy=inner).estimate(stub, POINT)
     moved = np.array([np.append(p["gravity"] - POINT["gravity"], p["viscosity"] - 0.7) for p in inner.asked]) / 0.3
     assert (np.linalg.norm(moved, axis=1) <= np.sqrt(5.0) + 1e-12).all()
     np.testing.assert_allclose(moved.std(axis=0), np.sqrt(5.0 / 7.0), rtol=0.05)
@@ -501,21 +501,21 @@ def test_averaged_and_smoothed_differentiate_the_same_loss():
     stub = Stub(lambda p: (p["gravity"] ** 3).sum() + p["viscosity"] ** 3, simulation_of("2-D"))
     cubes = Slopes(lambda g, mu: 3.0 * g**2, lambda g, mu: 3.0 * mu**2)
     origin = {"gravity": np.zeros((2, 2)), "viscosity": 0.0}
-    for policy in (policies.Smoothed(0.3, 400), policies.Averaged(0.3, 4000, policy=cubes)):
+    for policy in (gradients.Smoothed(0.3, 400), gradients.Averaged(0.3, 4000, policy=cubes)):
         found = policy.estimate(stub, origin)
         for name, gradient in found.gradient.items():
             assert (np.abs(gradient - 3.0 * 0.3**2 * 5.0 / 7.0) < 4.0 * found.standard_error[name]).all()
             assert (found.standard_error[name] < 0.05 * gradient).all()
-    again = policies.Averaged(0.3, 4000, policy=cubes).estimate(stub, origin)
+    again = gradients.Averaged(0.3, 4000, policy=cubes).estimate(stub, origin)
     assert found.gradient["gravity"].tobytes() == again.gradient["gravity"].tobytes()
 
 
 def test_an_average_finds_its_strength_once(chaotic):
     point, cloud = {"gravity": np.array([0.5, -9.81, 0.0])}, {"spread": 0.1, "samples": 4}
-    found = chaotic.estimate(point, policies.Averaged(**cloud))
-    smoothing = policies.AdjointSmoothing(order=2).tuned(chaotic, point)
+    found = chaotic.estimate(point, gradients.Averaged(**cloud))
+    smoothing = gradients.AdjointSmoothing(order=2).tuned(chaotic, point)
     assert found.strength == smoothing.strength > 0.0
-    again = chaotic.estimate(point, policies.Averaged(**cloud, policy=smoothing))
+    again = chaotic.estimate(point, gradients.Averaged(**cloud, policy=smoothing))
     assert found.gradient["gravity"].tobytes() == again.gradient["gravity"].tobytes()
 
 
@@ -524,7 +524,7 @@ def test_before_chaos_an_average_and_the_exact_gradient_agree():
     problem = Problem(simulation, 60, losses.CentreOfMass([0.1, 0.1, 0.1]))
     point = {"gravity": np.array([0.5, -9.81, 0.0]), "initial_positions": simulation.positions}
     _, exact = problem.value_and_gradient(point)
-    policy = policies.Averaged({"gravity": 0.1, "initial_positions": 1e-6}, disorder=0.001, policy=policies.Exact())
+    policy = gradients.Averaged({"gravity": 0.1, "initial_positions": 1e-6}, disorder=0.001, policy=gradients.Exact())
     found = problem.estimate(point, policy)
     assert found.strength is None and found.gradient["initial_positions"].shape == simulation.positions.shape
     assert np.linalg.norm(found.gradient["gravity"] - exact["gravity"]) < 0.02 * np.linalg.norm(exact["gravity"])
@@ -554,36 +554,40 @@ def test_centres_of_mass_and_their_gradients(make, masses):
 # ---- mistakes -------------------------------------------------------------------------------------------------------
 
 MISTAKES = {
-    "strength above 1": lambda p: policies.AdjointSmoothing(1.5),
-    "strength twice 0.6": lambda p: policies.AdjointSmoothing(0.6, order=2),
-    "order 0": lambda p: policies.AdjointSmoothing(order=0),
-    "order in words": lambda p: policies.AdjointSmoothing(order="two"),
-    "order with a point": lambda p: policies.AdjointSmoothing(order=2.0),
-    "order 3": lambda p: policies.AdjointSmoothing(order=3),
-    "samples in words": lambda p: policies.Averaged(samples="4"),
-    "odd samples": lambda p: policies.Averaged(samples=5),
-    "half a sample": lambda p: policies.Smoothed(samples=2.5),
-    "no disorder": lambda p: policies.Smoothed(disorder=None),
-    "endless disorder": lambda p: policies.Averaged(disorder=np.inf),
-    "negative seed": lambda p: policies.Smoothed(seed=-1),
-    "a sample out of range": lambda p: p.estimate({"viscosity": 0.1}, policies.Averaged(1.0, policy=policies.Exact())),
-    "spread in words": lambda p: p.estimate({"viscosity": 0.1}, policies.Averaged("wide")),
-    "a class is tuned": lambda p: policies.tuned(policies.AdjointSmoothing, p, {}),
-    "auto as a base": lambda p: p.estimate({"viscosity": 1.0}, policies.Damped(1.0, base=policies.AdjointSmoothing())),
-    "strength NaN": lambda p: policies.AdjointSmoothing(float("nan")),
-    "strength in words": lambda p: policies.AdjointSmoothing("strong"),
-    "limit below 1": lambda p: policies.AdjointSmoothing(limit=0.5),
-    "no fields": lambda p: policies.AdjointSmoothing(fields=()),
-    "a field that is none": lambda p: policies.AdjointSmoothing(fields=("densities",)),
-    "rate below 0": lambda p: policies.Damped(-1.0),
-    "one sample": lambda p: policies.Smoothed(samples=1),
-    "an average of one": lambda p: policies.Averaged(samples=1),
-    "an average over no spread": lambda p: p.estimate({"viscosity": 1.0}, policies.Averaged(0.0)),
-    "an average of no policy": lambda p: policies.Averaged(policy=policies.Exact),
-    "disorder below 0": lambda p: policies.Smoothed(disorder=-0.1),
-    "spread 0": lambda p: p.estimate({"viscosity": 1.0}, policies.Smoothed(0.0)),
-    "spread without a name": lambda p: p.estimate({"viscosity": 1.0}, policies.Smoothed({"gravity": 1.0})),
-    "too many numbers": lambda p: p.estimate({"initial_positions": p.simulation.positions}, policies.Smoothed()),
+    "strength above 1": lambda p: gradients.AdjointSmoothing(1.5),
+    "strength twice 0.6": lambda p: gradients.AdjointSmoothing(0.6, order=2),
+    "order 0": lambda p: gradients.AdjointSmoothing(order=0),
+    "order in words": lambda p: gradients.AdjointSmoothing(order="two"),
+    "order with a point": lambda p: gradients.AdjointSmoothing(order=2.0),
+    "order 3": lambda p: gradients.AdjointSmoothing(order=3),
+    "samples in words": lambda p: gradients.Averaged(samples="4"),
+    "odd samples": lambda p: gradients.Averaged(samples=5),
+    "half a sample": lambda p: gradients.Smoothed(samples=2.5),
+    "no disorder": lambda p: gradients.Smoothed(disorder=None),
+    "endless disorder": lambda p: gradients.Averaged(disorder=np.inf),
+    "negative seed": lambda p: gradients.Smoothed(seed=-1),
+    "a sample out of range": lambda p: p.estimate(
+        {"viscosity": 0.1}, gradients.Averaged(1.0, policy=gradients.Exact())
+    ),
+    "spread in words": lambda p: p.estimate({"viscosity": 0.1}, gradients.Averaged("wide")),
+    "a class is tuned": lambda p: gradients.tuned(gradients.AdjointSmoothing, p, {}),
+    "auto as a base": lambda p: p.estimate(
+        {"viscosity": 1.0}, gradients.Damped(1.0, base=gradients.AdjointSmoothing())
+    ),
+    "strength NaN": lambda p: gradients.AdjointSmoothing(float("nan")),
+    "strength in words": lambda p: gradients.AdjointSmoothing("strong"),
+    "limit below 1": lambda p: gradients.AdjointSmoothing(limit=0.5),
+    "no fields": lambda p: gradients.AdjointSmoothing(fields=()),
+    "a field that is none": lambda p: gradients.AdjointSmoothing(fields=("densities",)),
+    "rate below 0": lambda p: gradients.Damped(-1.0),
+    "one sample": lambda p: gradients.Smoothed(samples=1),
+    "an average of one": lambda p: gradients.Averaged(samples=1),
+    "an average over no spread": lambda p: p.estimate({"viscosity": 1.0}, gradients.Averaged(0.0)),
+    "an average of no policy": lambda p: gradients.Averaged(policy=gradients.Exact),
+    "disorder below 0": lambda p: gradients.Smoothed(disorder=-0.1),
+    "spread 0": lambda p: p.estimate({"viscosity": 1.0}, gradients.Smoothed(0.0)),
+    "spread without a name": lambda p: p.estimate({"viscosity": 1.0}, gradients.Smoothed({"gravity": 1.0})),
+    "too many numbers": lambda p: p.estimate({"initial_positions": p.simulation.positions}, gradients.Smoothed()),
     "masses of others": lambda p: Problem(p.simulation, 1, losses.CentreOfMass([0.0] * 3, np.ones(7))).value({}),
     "no masses": lambda p: losses.CentreOfMass([0.0] * 3, np.zeros(7)),
     "target's shape": lambda p: Problem(p.simulation, 1, losses.CentreOfMass([0.0] * 2)).value({}),
@@ -604,7 +608,7 @@ def test_a_filter_stays_off_a_users_tape():
     simulation = simulation_of("2-D")
     problem = Problem(simulation, 2, losses.FinalPositions(simulation.positions))
     recorded = []
-    for policy in (policies.Exact(), policies.AdjointSmoothing(0.1)):
+    for policy in (gradients.Exact(), gradients.AdjointSmoothing(0.1)):
         with wp.Tape() as tape:
             problem.estimate({"gravity": [0.0, -9.81]}, policy)
         recorded.append(len(tape.launches))

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cortado import CortadoWarning, InputError, Problem, Simulation, losses, policies
-from cortado.particles import State
-from cortado.physics.free_energy import MISCIBLE
+from cortado import CortadoWarning, InputError, Problem, Simulation, gradients, losses
+from cortado.device.state import State
 from cortado.rollout import checkpoint_interval
+from cortado.sph.free_energy import MISCIBLE
 from scenes import plane_of_three, splash
 
 GRAVITY = {"gravity": np.array([0.0, -9.81, 0.0])}
@@ -28,7 +28,7 @@ def test_problems_and_runs_share_a_simulation(simulation, problem):
     point = {**GRAVITY, "initial_velocities": simulation.velocities}
     wanted = problem.value_and_gradient(point)
     other = Problem(simulation, 25, losses.FinalPositions(np.zeros_like(simulation.positions)))
-    other.value_and_gradient({"gravity": np.tile([3.0, -5.0, 1.0], (25, 1)), "viscosity": 0.5}, policies.Tape())
+    other.value_and_gradient({"gravity": np.tile([3.0, -5.0, 1.0], (25, 1)), "viscosity": 0.5}, gradients.Tape())
     simulation.run(10)
     problem.tangent({"viscosity": 0.3}, {"viscosity": 1.0})
     found = problem.value_and_gradient(point)
@@ -37,7 +37,7 @@ def test_problems_and_runs_share_a_simulation(simulation, problem):
         assert gradient.tobytes() == found[1][name].tobytes()
 
 
-@pytest.mark.parametrize("policy", [policies.Exact(), policies.Tape()], ids=repr)
+@pytest.mark.parametrize("policy", [gradients.Exact(), gradients.Tape()], ids=repr)
 def test_an_interruption_leaves_nothing_behind(simulation, policy, monkeypatch):
     problem = Problem(simulation, 30, losses.FinalPositions(np.zeros_like(simulation.positions)))
     point = {**GRAVITY, "initial_positions": simulation.positions}
@@ -125,7 +125,7 @@ MISTAKES = {
     "array for a number": lambda p: p.value({"viscosity": [0.1, 0.2]}),
     "unknown direction": lambda p: p.tangent(GRAVITY, {"speed": 1.0}),
     "policy by name": lambda p: p.value_and_gradient(GRAVITY, policy="exact"),
-    "policy class": lambda p: p.value_and_gradient(GRAVITY, policy=policies.Exact),
+    "policy class": lambda p: p.value_and_gradient(GRAVITY, policy=gradients.Exact),
     "loss is an array": lambda p: Problem(p.simulation, 10, np.zeros((125, 3))),
     "steps 0 of a run": lambda p: p.simulation.run(0),
     "steps -1": lambda p: Problem(p.simulation, -1, p.loss),
@@ -207,11 +207,11 @@ def test_a_passage_ends_with_the_next_evaluation(problem, simulation):
     _, wanted = problem.value_and_gradient(point)
     passage = problem.passage(point)
     for _ in range(2):
-        found = passage.back(passage.derivative(policies.Exact()))
+        found = passage.back(passage.derivative(gradients.Exact()))
         assert found["gravity"].tobytes() == wanted["gravity"].tobytes()
     problem.value({"gravity": [1.0, -5.0, 0.0]})
     with pytest.raises(InputError, match="evaluated again"):
-        passage.back(passage.derivative(policies.Exact()))
+        passage.back(passage.derivative(gradients.Exact()))
 
 
 class Overflowing:

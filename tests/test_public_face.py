@@ -7,7 +7,7 @@ import pytest
 
 import cortado
 
-MODULES = ("image_losses", "losses", "optimisers", "pictures", "policies", "render")
+MODULES = ("gradients", "image_losses", "losses", "optimisers", "pictures", "render")
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -41,6 +41,6 @@ def test_types_are_checked_where_cortado_is_used(tmp_path):
     )
     command = [sys.executable, "-m", "mypy", "--config-file=", "--follow-imports=silent", "use.py"]
     found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stdout
-    assert 'Revealed type is "cortado.trajectory.Frame"' in found
-    assert 'Revealed type is "cortado.trajectory.Trajectory"' in found
+    assert 'Revealed type is "cortado.io.trajectory.Frame"' in found
+    assert 'Revealed type is "cortado.io.trajectory.Trajectory"' in found
     assert '"Simulation" has incompatible type "int"' in found

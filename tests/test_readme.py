@@ -13,9 +13,9 @@ import cortado.commands.figure
 import cortado.commands.optimise
 import cortado.commands.run
 from cortado.cli import main
-from cortado.scene import load_scene
+from cortado.inverse.task import load_task
+from cortado.scene.scene import load_scene
 from cortado.study.experiment_files import load_experiment
-from cortado.task import load_task
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import warp as wp
 
+from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.errors import InputError
-from cortado.precision import FLOAT32, FLOAT64, Precision
+from cortado.lattice.smoothing import CUBIC_SPLINE, KERNELS, WENDLAND_C2, SmoothingKernel
 from cortado.render.cameras import Camera, Orthographic, Perspective
 from cortado.render.renderer import RenderAdjoint, Renderer
 from cortado.render.views import TopView, View, Volume
-from cortado.smoothing import CUBIC_SPLINE, KERNELS, WENDLAND_C2, SmoothingKernel
 
 SPACING, SUPPORT, N, PHASES = 0.1, 0.2, 200, 3
 LOWER, UPPER = np.array([-0.31, 0.02, -0.23]), np.array([0.3, 0.47, 0.27])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cortado import InputError, Problem, Simulation, losses, policies
-from cortado.reparametrisation import SMALLEST, Knots, Logarithm, Reparametrised, Softmax
+from cortado import InputError, Problem, Simulation, gradients, losses
+from cortado.optimisation.reparametrisation import SMALLEST, Knots, Logarithm, Reparametrised, Softmax
 from scenes import plane, plane_of_three
 
 STEPS = 6
@@ -158,7 +158,7 @@ def test_without_coordinates_it_is_the_problem_itself(problem):
     assert loss == wanted and all(gradient[name].tobytes() == exact[name].tobytes() for name in point)
 
 
-@pytest.mark.parametrize("policy", [policies.VelocityOnly(), policies.AdjointSmoothing(0.2, order=2)], ids=repr)
+@pytest.mark.parametrize("policy", [gradients.VelocityOnly(), gradients.AdjointSmoothing(0.2, order=2)], ids=repr)
 def test_policies_go_back_to_coordinates(problem, policy):
     search = Reparametrised(problem, COORDINATES)
     u = search.coordinate(start_of(problem))
@@ -175,8 +175,8 @@ def test_a_cloud_is_one_of_coordinates(problem):
     u = {"gravity": search.coordinate(start_of(problem))["gravity"]}
     _, exact = search.value_and_gradient(u)
     for policy in (
-        policies.Smoothed(0.01, disorder=0.0),
-        policies.Averaged(0.01, disorder=0.0, policy=policies.Exact()),
+        gradients.Smoothed(0.01, disorder=0.0),
+        gradients.Averaged(0.01, disorder=0.0, policy=gradients.Exact()),
     ):
         found = search.estimate(u, policy).gradient["gravity"]
         assert found.shape == (3, 2)

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import cortado
-from cortado import Problem, Simulation, losses, policies
+from cortado import Problem, Simulation, gradients, losses
 from scenes import plane, plane_of_three
 
 
@@ -72,12 +72,12 @@ def test_what_a_policy_says(problem):
     at = {"gravity": np.array([0.0, -9.0]), "viscosity": 0.05}
     exact = repr(problem.estimate(at))
     assert re.fullmatch(r"Estimate\(loss [\d.e-]+, gradient of gravity \(2,\), viscosity\)", exact)
-    smoothed = repr(problem.estimate({"gravity": at["gravity"]}, policies.Smoothed({"gravity": 0.1}, 2)))
+    smoothed = repr(problem.estimate({"gravity": at["gravity"]}, gradients.Smoothed({"gravity": 0.1}, 2)))
     assert smoothed.endswith(", gradient of gravity (2,), with its standard error)")
 
 
 def test_a_certificate_is_a_table(certificate):
-    assert repr(certificate) == "Certificate(64 particles, 4 steps, right, horizon 4, use policies.Exact())"
+    assert repr(certificate) == "Certificate(64 particles, 4 steps, right, horizon 4, use gradients.Exact())"
     assert re.search(r"│ gravity +│ \d\.\d{3}e-\d\d +│ right +│", str(certificate))
     assert "array(" not in repr(certificate.comparison) and "array(" not in repr(certificate.horizons)
     html = certificate._repr_html_()

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import cortado.run_folder
+import cortado.io.run_folder
 from cortado.errors import InputError
-from cortado.files import unfinished
-from cortado.progress import track
-from cortado.report import write_report
-from cortado.run_folder import RunFolder
+from cortado.io.files import unfinished
+from cortado.io.progress import track
+from cortado.io.report import write_report
+from cortado.io.run_folder import RunFolder
 
 SCENE = '{"name": "drop", "dimension": 2}'
 COMMAND = ["cortado", "run", "drop.toml"]
@@ -142,7 +142,7 @@ class Killed(BaseException):
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_a_kill_while_a_folder_is_made_leaves_one_to_overwrite_or_resume(tmp_path, monkeypatch, overwrite):
     """Killed at every file that is written, made or removed."""
-    events = [(Path, "unlink"), (Path, "mkdir"), (Path, "rmdir"), (cortado.run_folder, "write_atomically")]
+    events = [(Path, "unlink"), (Path, "mkdir"), (Path, "rmdir"), (cortado.io.run_folder, "write_atomically")]
     finished = False
     for moment in range(100):
         path = tmp_path / str(moment)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from cortado.discretise.sampling import fluid_particles, period, wall_particles
 from cortado.errors import InputError
-from cortado.sampling import fluid_particles, period, wall_particles
-from cortado.scene import Scene
+from cortado.scene.scene import Scene
 
 SPACING = 0.05
 

@@ -13,16 +13,12 @@ from hypothesis import strategies as st
 
 from bad_scenes import BAD_SCENES, EMITTER, GOOD_SCENE, MIXTURE, RENDER, assert_one_sentence, plane
 from cortado.errors import CortadoWarning, DivergedError, InputError, SceneError
-from cortado.scene import (
-    BoxFluid,
-    Discretisation,
-    Mixture,
-    Scene,
-    load_scene,
-    read_toml,
-    scene_from_dict,
-    stability_limit,
-)
+from cortado.scene.fluids import BoxFluid
+from cortado.scene.mixture import Mixture
+from cortado.scene.model import Discretisation
+from cortado.scene.scene import Scene, load_scene, scene_from_dict
+from cortado.scene.stability import stability_limit
+from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 
 

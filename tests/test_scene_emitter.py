@@ -7,10 +7,12 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from bad_scenes import plane
+from cortado.discretise.sampling import fluid_particles
 from cortado.errors import CortadoWarning, SceneError
-from cortado.sampling import fluid_particles
-from cortado.scene import Emitter, Scene, stability_limit
-from cortado.shapes import across, disc
+from cortado.lattice.shapes import across, disc
+from cortado.scene.emitter import Emitter
+from cortado.scene.scene import Scene
+from cortado.scene.stability import stability_limit
 
 SPACING = 0.05
 NOZZLE = {"phase": "water", "outlet": [0.1, 0.6, 0.2], "radius": 0.12, "length": 0.3, "flow_rate": 2e-3}

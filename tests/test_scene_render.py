@@ -8,13 +8,14 @@ import pytest
 import cortado
 from bad_scenes import GOOD_SCENE, RENDER
 from bad_scenes import plane as plane_tables
+from cortado.device.precision import FLOAT64
+from cortado.device.state import to_device
 from cortado.errors import InputError, SceneError
-from cortado.particles import to_device
-from cortado.precision import FLOAT64
 from cortado.problem import Problem
 from cortado.render.scene_renderer import scene_renderer
 from cortado.render.views import TopView
-from cortado.scene import Render, Scene, scene_from_dict
+from cortado.scene.render import Render
+from cortado.scene.scene import Scene, scene_from_dict
 from cortado.simulation import Simulation
 from scenes import plane, plane_of_three, scene
 

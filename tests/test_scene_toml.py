@@ -7,7 +7,7 @@ import pytest
 
 from bad_scenes import assert_one_sentence
 from cortado.errors import SceneError
-from cortado.scene_toml import MOST_BYTES, read_toml
+from cortado.scene.toml import MOST_BYTES, read_toml
 
 DEEP = "a." * 30_000 + "b"
 

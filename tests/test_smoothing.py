@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado.calibration import (
+from cortado.device.precision import FLOAT32, FLOAT64
+from cortado.device.smoothing import smoothing_functions
+from cortado.errors import InputError
+from cortado.lattice.calibration import (
     RATE_LIMIT,
     SLACK,
     greatest_rate,
@@ -17,10 +20,7 @@ from cortado.calibration import (
     rest_volume,
     wall_rigidity,
 )
-from cortado.errors import InputError
-from cortado.physics.smoothing_functions import smoothing_functions
-from cortado.precision import FLOAT32, FLOAT64
-from cortado.smoothing import KERNELS, smoothing_kernel
+from cortado.lattice.smoothing import KERNELS, smoothing_kernel
 
 SUPPORT = 0.13
 SPACING = 0.05

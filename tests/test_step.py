@@ -6,9 +6,9 @@ import pytest
 import reference
 import reference_mixture
 from cortado import Simulation
+from cortado.gradients import Exact
+from cortado.lattice.smoothing import KERNELS
 from cortado.parameters.space import ParameterSpace
-from cortado.policies import Exact
-from cortado.smoothing import KERNELS
 from cortado.sph.viscosity import Viscosity
 from scenes import plane, plane_of_three, scene, two_layers
 

@@ -11,11 +11,12 @@ from PIL import Image
 
 from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_LATTE
-from cortado.assignment import assignment
 from cortado.cli import main
-from cortado.optimisation import optimise
-from cortado.optimisers import Adam
-from cortado.policies import Exact, VelocityOnly
+from cortado.gradients import Exact, VelocityOnly
+from cortado.inverse.setup import assignment
+from cortado.inverse.task import load_task
+from cortado.optimisation.optimise import optimise
+from cortado.optimisation.optimisers import Adam
 from cortado.reference import Simulation, Terms
 from cortado.study.experiment_files import load_experiment
 from cortado.study.forces import ABLATIONS, FULL
@@ -26,7 +27,6 @@ from cortado.study.scenes import varied
 from cortado.study.tables import Table
 from cortado.study.task import TASK, TaskSettings
 from cortado.study.term_sizes import term_sizes
-from cortado.task import load_task
 from scenes import scene
 from test_silence import with_kernels
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cortado.lattice.smoothing import CUBIC_SPLINE
 from cortado.reference import Simulation
-from cortado.scene import scene_from_dict
-from cortado.smoothing import CUBIC_SPLINE
+from cortado.scene.scene import scene_from_dict
 from cortado.study import spatial_scales
 from cortado.study.estimates import Estimate, Line, growth_rate, norms
 from cortado.study.experiment_files import load_experiment

@@ -8,12 +8,12 @@ import pytest
 
 from bad_scenes import assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK
-from cortado import policies
+from cortado import gradients
 from cortado.commands.optimise import judge
 from cortado.errors import SceneError
-from cortado.optimisation import Record, Result
-from cortado.optimisers import LBFGS, Adam, GradientDescent
-from cortado.task import load_task
+from cortado.inverse.task import load_task
+from cortado.optimisation.optimise import Record, Result
+from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent
 
 
 @pytest.fixture
@@ -129,16 +129,16 @@ def test_options_of_the_search(task_file):
 SMOOTHING = ['optimise.policy.name="adjoint_smoothing"']
 SEVERAL = ["optimise.policy.samples=4", "optimise.policy.spread.gravity=0.5"]
 POLICIES = {
-    "exact": ([], policies.Exact()),
-    "velocity only": (['optimise.policy.name="velocity_only"'], policies.VelocityOnly()),
-    "smoothing": (SMOOTHING, policies.AdjointSmoothing()),
-    "with a strength": ([*SMOOTHING, "optimise.policy.strength=0.3"], policies.AdjointSmoothing(0.3)),
-    "averaged": ([*SMOOTHING, *SEVERAL], policies.Averaged({"gravity": 0.5}, 4)),
+    "exact": ([], gradients.Exact()),
+    "velocity only": (['optimise.policy.name="velocity_only"'], gradients.VelocityOnly()),
+    "smoothing": (SMOOTHING, gradients.AdjointSmoothing()),
+    "with a strength": ([*SMOOTHING, "optimise.policy.strength=0.3"], gradients.AdjointSmoothing(0.3)),
+    "averaged": ([*SMOOTHING, *SEVERAL], gradients.Averaged({"gravity": 0.5}, 4)),
     "averaged without disorder": (
         [*SMOOTHING, *SEVERAL, "optimise.policy.disorder=0"],
-        policies.Averaged({"gravity": 0.5}, 4, 0.0),
+        gradients.Averaged({"gravity": 0.5}, 4, 0.0),
     ),
-    "averaged without smoothing": (SEVERAL, policies.Averaged({"gravity": 0.5}, 4, policy=policies.Exact())),
+    "averaged without smoothing": (SEVERAL, gradients.Averaged({"gravity": 0.5}, 4, policy=gradients.Exact())),
 }
 
 

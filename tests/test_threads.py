@@ -14,7 +14,7 @@ import pytest
 import warp as wp
 
 from cortado import ComputationError, InputError, Problem, Simulation, losses
-from cortado.threads import WARP, Turn
+from cortado.device.threads import WARP, Turn
 from scenes import plane, splash, two_layers
 
 DOWN = {"gravity": np.array([0.0, -9.81, 0.0])}

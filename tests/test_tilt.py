@@ -5,8 +5,8 @@ import pytest
 
 import cortado
 from cortado import InputError, Problem, Simulation, losses
+from cortado.optimisation.reparametrisation import Knots, Reparametrised
 from cortado.parameters.tilt import SMALL, Tilt
-from cortado.reparametrisation import Knots, Reparametrised
 from scenes import plane, scene, splash
 
 RESTS = {

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from cortado.errors import InputError
-from cortado.pictures import COFFEE, MILK, heart
-from cortado.srgb import to_srgb
-from cortado.video import write_video
+from cortado.io.pictures import COFFEE, MILK, heart
+from cortado.io.srgb import to_srgb
+from cortado.io.video import write_video
 
 
 def levels_of(frame: av.VideoFrame) -> np.ndarray:

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cortado.calibration import SLACK
-from cortado.discrete_scene import DiscreteScene, discretise
-from cortado.scene import Scene
-from cortado.smoothing import KERNELS
-from cortado.walls.layers import SHALLOW, wall_layers
+from cortado.discretise.discrete_scene import DiscreteScene, discretise
+from cortado.discretise.walls.layers import SHALLOW, wall_layers
+from cortado.lattice.calibration import SLACK
+from cortado.lattice.smoothing import KERNELS
+from cortado.scene.scene import Scene
 
 SPACING = 0.05
 kernels = pytest.mark.parametrize("name", KERNELS)

@@ -5,7 +5,7 @@ step, in float64. The parameter is gravity, constant or in equal blocks of time 
 positions by 1 % of the spacing, and draws the gravity of a run whose last state is the target of the losses: centre of
 mass, Gaussian density on a grid, picture with two distances, and positions particle by particle.
 
-The reference is `policies.Smoothed` with a spread of 0.5 m/s2. For each policy the script writes the cosine of its
+The reference is `gradients.Smoothed` with a spread of 0.5 m/s2. For each policy the script writes the cosine of its
 gradient to the reference, and its size over the reference's, into `policies_1.csv` (for 1 block) with a picture, and
 prints the medians over seeds.
 """
@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from cortado import Problem, Scene, Simulation, losses, policies
+from cortado import Problem, Scene, Simulation, gradients, losses
 from cortado.figures.canvas import INK, PALETTE, drawing
-from cortado.image_losses import Pyramid
-from cortado.progress import track
+from cortado.io.progress import track
+from cortado.losses.image_losses import Pyramid
 from cortado.render.scene_renderer import scene_renderer
 
 SPACING, GRAVITY = 0.025, (0.0, -9.81)
@@ -36,14 +36,14 @@ SPREAD = 0.5
 TILT, HIDDEN = 3.0, 1.0
 """How far the target's gravities lean to a side, and their standard deviation [m/s2]."""
 LOSSES = ("centre of mass", "density grid", "picture, pyramid", "picture", "particles")
-POLICIES: dict[str, policies.Policy] = {
-    "exact": policies.Exact(),
-    "velocity only": policies.VelocityOnly(),
-    "damped 20/s": policies.Damped(20.0),
-    "smoothing 0.1": policies.AdjointSmoothing(0.1),
-    "smoothing": policies.AdjointSmoothing(),
-    "smoothing, extrapolated": policies.AdjointSmoothing(order=2),
-    "averaged over 8": policies.Averaged(SPREAD, 8, DISORDER),
+POLICIES: dict[str, gradients.Policy] = {
+    "exact": gradients.Exact(),
+    "velocity only": gradients.VelocityOnly(),
+    "damped 20/s": gradients.Damped(20.0),
+    "smoothing 0.1": gradients.AdjointSmoothing(0.1),
+    "smoothing": gradients.AdjointSmoothing(),
+    "smoothing, extrapolated": gradients.AdjointSmoothing(order=2),
+    "averaged over 8": gradients.Averaged(SPREAD, 8, DISORDER),
 }
 DRAWN = ("exact", "velocity only", "smoothing", "averaged over 8")
 
@@ -130,7 +130,7 @@ class Case:
             self._seen[key] = {name: loss.value(end) for name, loss in self.losses.items()}
         return self._seen[key]
 
-    def estimate(self, loss: str, policy: policies.Policy) -> policies.Estimate:
+    def estimate(self, loss: str, policy: gradients.Policy) -> gradients.Estimate:
         """The gradient of a loss with respect to gravity in blocks."""
         return policy.estimate(One(self, loss), {"gravity": self.gravity})
 
@@ -171,7 +171,7 @@ def references(seed: int, steps: int, blocks: int, samples: int) -> list[Row]:
     case = Case(Simulation(dam_break(), precision="float64"), seed, steps, blocks)
     rows = []
     for half in (1, 2):
-        cloud = policies.Smoothed(SPREAD, samples // 2, DISORDER, 1000 * seed + half)
+        cloud = gradients.Smoothed(SPREAD, samples // 2, DISORDER, 1000 * seed + half)
         name = f"reference {half} of {samples}"
         rows += [row(seed, steps, loss, name, case.estimate(loss, cloud)) for loss in LOSSES]
     return rows
@@ -183,7 +183,7 @@ def policy_rows(seed: int, steps: int, blocks: int, loss: str) -> list[Row]:
     return [row(seed, steps, loss, name, case.estimate(loss, policy)) for name, policy in POLICIES.items()]
 
 
-def row(seed: int, steps: int, loss: str, policy: str, found: policies.Estimate) -> Row:
+def row(seed: int, steps: int, loss: str, policy: str, found: gradients.Estimate) -> Row:
     """One line of the file."""
     numbers = {f"g{k}": float(value) for k, value in enumerate(found.gradient["gravity"].ravel())}
     strength = "" if found.strength is None else found.strength
@@ -211,7 +211,7 @@ def compared(rows: list[Row], halves: list[Row]) -> list[Row]:
         g = gradient_of(line)
         found.append(line | {"cosine": cosine(g, whole), "size": float(np.linalg.norm(g) / np.linalg.norm(whole))})
     for (seed, steps, loss), (a, b) in pairs.items():
-        mean = policies.Estimate(0.0, {"gravity": (a + b) / 2})
+        mean = gradients.Estimate(0.0, {"gravity": (a + b) / 2})
         whole = row(seed, steps, loss, "one half of the reference to the other", mean)
         found.append(whole | {"cosine": cosine(a, b), "size": float(np.linalg.norm(a) / np.linalg.norm(b))})
     return found

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from cortado.calibration import lattice_offsets
-from cortado.scene import Scene
+from cortado.lattice.calibration import lattice_offsets
+from cortado.lattice.smoothing import smoothing_kernel
+from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
-from cortado.smoothing import smoothing_kernel
 
 GRAVITY = 9.81
 KERNELS = (("cubic_spline", 2.0), ("wendland_c2", 2.6), ("wendland_c4", 3.0))

@@ -9,11 +9,8 @@ TYPE_CHECKING = False  # that of typing, which takes as long to import as all el
 if TYPE_CHECKING:
     from typing import Any
 
-    from cortado import image_losses as image_losses
+    from cortado import gradients as gradients
     from cortado import losses as losses
-    from cortado import optimisers as optimisers
-    from cortado import pictures as pictures
-    from cortado import policies as policies
     from cortado import render as render
     from cortado.certificate import certify as certify
     from cortado.errors import ComputationError as ComputationError
@@ -22,17 +19,27 @@ if TYPE_CHECKING:
     from cortado.errors import DivergedError as DivergedError
     from cortado.errors import InputError as InputError
     from cortado.errors import SceneError as SceneError
-    from cortado.optimisation import optimise as optimise
-    from cortado.optimisation import optimize as optimize
+    from cortado.io import pictures as pictures
+    from cortado.io.trajectory import Trajectory as Trajectory
+    from cortado.losses import image_losses as image_losses
+    from cortado.optimisation import optimisers as optimisers
+    from cortado.optimisation.optimise import optimise as optimise
+    from cortado.optimisation.optimise import optimize as optimize
     from cortado.problem import Problem as Problem
-    from cortado.scene import Scene as Scene
-    from cortado.scene import load_scene as load_scene
+    from cortado.scene.scene import Scene as Scene
+    from cortado.scene.scene import load_scene as load_scene
     from cortado.simulation import Simulation as Simulation
-    from cortado.trajectory import Trajectory as Trajectory
 
 __version__ = "0.1.0"
 
-_MODULES = ("image_losses", "losses", "optimisers", "pictures", "policies", "render")
+_MODULES = {
+    "gradients": "gradients",
+    "image_losses": "losses.image_losses",
+    "losses": "losses",
+    "optimisers": "optimisation.optimisers",
+    "pictures": "io.pictures",
+    "render": "render",
+}
 _HOMES = {
     "ComputationError": "errors",
     "CortadoError": "errors",
@@ -40,21 +47,21 @@ _HOMES = {
     "DivergedError": "errors",
     "InputError": "errors",
     "Problem": "problem",
-    "Scene": "scene",
+    "Scene": "scene.scene",
     "SceneError": "errors",
     "Simulation": "simulation",
-    "Trajectory": "trajectory",
+    "Trajectory": "io.trajectory",
     "certify": "certificate",
-    "load_scene": "scene",
-    "optimise": "optimisation",
-    "optimize": "optimisation",
+    "load_scene": "scene.scene",
+    "optimise": "optimisation.optimise",
+    "optimize": "optimisation.optimise",
 }
 __all__ = [*_MODULES, *_HOMES]
 
 
 def __getattr__(name: str) -> "Any":
     if name in _MODULES:
-        return importlib.import_module(f"cortado.{name}")
+        return importlib.import_module(f"cortado.{_MODULES[name]}")
     if name in _HOMES:
         return getattr(importlib.import_module(f"cortado.{_HOMES[name]}"), name)
     raise AttributeError(f"module 'cortado' has no attribute {name!r}")

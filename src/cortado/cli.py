@@ -21,11 +21,11 @@ from tyro.conf import Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
 from cortado import __version__
+from cortado.device.kernel_cache import complaint, start_warp
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
-from cortado.interruption import Interrupted
-from cortado.kernel_cache import complaint, start_warp
-from cortado.terminal import say, tell, to_stdout
-from cortado.usage import usage_sentence
+from cortado.io.interruption import Interrupted
+from cortado.io.terminal import say, tell, to_stdout
+from cortado.io.usage import usage_sentence
 
 app = SubcommandApp()
 gradients = SubcommandApp()

@@ -8,18 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from cortado.checked_loss import as_loss
+from cortado.device.memory import require
+from cortado.device.state import State
+from cortado.device.threads import Turn, in_turn
 from cortado.errors import CortadoWarning, InputError
-from cortado.losses import Adjoint, EndAdjoint, Frames, Loss, TrajectoryEnd, fingerprint
-from cortado.memory import require
+from cortado.gradients import AdjointPolicy, Estimate, Policy, estimate
+from cortado.io.trajectory import Trajectory
+from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd, fingerprint
+from cortado.losses.checked import as_loss
+from cortado.losses.loss import Adjoint
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import NAMES, UNITS, Arrays, Values
-from cortado.particles import State
-from cortado.policies import AdjointPolicy, Estimate, Policy, estimate
 from cortado.rollout import MEMORY_BUDGET, Observer, Rollout, StepDerivative
 from cortado.simulation import Simulation, check_steps
-from cortado.threads import Turn, in_turn
-from cortado.trajectory import Trajectory
 from cortado.words import counted
 
 __all__ = ["NAMES", "UNITS", "Problem"]
@@ -109,10 +110,10 @@ class Problem:
 
     @in_turn
     def estimate(self, parameters: Values, policy: Policy | None = None, observe: Observer | None = None) -> Estimate:
-        """The same, with what the policy (`policies.Exact` by default) reports.
+        """The same, with what the policy (`gradients.Exact` by default) reports.
 
         ``observe`` is given the number and the adjoint of every state, from the last to the first, by policies that go
-        back through a run; `policies.AdjointNorms` is such an observer.
+        back through a run; `gradients.AdjointNorms` is such an observer.
         """
         found = estimate(self, parameters, policy, observe)
         broken = [name for name, value in found.gradient.items() if not np.isfinite(value).all()]

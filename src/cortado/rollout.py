@@ -12,14 +12,14 @@ from typing import Protocol
 
 import numpy as np
 
+from cortado.device.launching import Replayed, add
+from cortado.device.memory import require, step_parts, within
+from cortado.device.state import Parameters, State
+from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
-from cortado.launching import Replayed, add
-from cortado.memory import require, step_parts, within
-from cortado.particles import Parameters, State
 from cortado.restart import Elapsed
 from cortado.solvers.containment import Lost
 from cortado.solvers.solver import Counts, Solver
-from cortado.threads import WARP, Turn, in_turn
 
 CHUNK = 16
 """Steps between two looks of the host, on a GPU."""

@@ -10,36 +10,36 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.calibration import SKIN, diffusion_limit
-from cortado.discrete_scene import DiscreteScene, discretise
+from cortado.device.kernel_cache import start_warp
+from cortado.device.memory import frame_parts, require, simulation_parts
+from cortado.device.neighbourhood import Discretisation
+from cortado.device.neighbours import Grid, NeighbourSearch
+from cortado.device.precision import Precision, precision_named
+from cortado.device.state import State, padded
+from cortado.device.threads import WARP, Turn, in_turn
+from cortado.discretise.discrete_scene import DiscreteScene, discretise
+from cortado.discretise.sampling import FluidSample
 from cortado.errors import CortadoWarning, InputError, shown
-from cortado.kernel_cache import start_warp
-from cortado.memory import frame_parts, require, simulation_parts
-from cortado.neighbours import Grid, NeighbourSearch
+from cortado.io.trajectory import Trajectory
+from cortado.lattice.calibration import SKIN, diffusion_limit
 from cortado.parameters.checks import check_sizes
 from cortado.parameters.registry import PARAMETERS
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import scene_values
-from cortado.particles import State, padded
-from cortado.physics.diffusion import Diffusion
-from cortado.physics.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
-from cortado.physics.surroundings import Discretisation
-from cortado.precision import Precision, precision_named
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
 from cortado.restart import RestartState, RunConstants
 from cortado.rollout import Rollout
-from cortado.sampling import FluidSample
-from cortado.scene import Scene, as_scene
-from cortado.scene_containers import NoContainer
+from cortado.scene.containers import NoContainer
+from cortado.scene.scene import Scene, as_scene
 from cortado.solvers.containment import Walled
 from cortado.solvers.pcisph.parts import PressureSolve
 from cortado.solvers.pcisph.solver import Pcisph
+from cortado.sph.diffusion import Diffusion
+from cortado.sph.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
 from cortado.sph.mixture import Phases
 from cortado.sph.nozzle import Nozzle
 from cortado.sph.parts import Force, Setting
-from cortado.threads import WARP, Turn, in_turn
-from cortado.trajectory import Trajectory
 from cortado.words import counted
 
 MOST_SUBSTEPS = 10_000
@@ -67,7 +67,7 @@ class Simulation:
         scene = as_scene(scene)
         start_warp()
         if free_energy is not None and not isinstance(free_energy, FreeEnergy):
-            wanted = "a FreeEnergy, of cortado.physics.free_energy"
+            wanted = "a FreeEnergy, of cortado.sph.free_energy"
             raise InputError(f"free_energy is {shown(free_energy)}, but must be {wanted}.")
         if free_energy is not None and len(scene.phase) == 1:
             raise InputError("free_energy is given, but must be left out, as the scene has only one phase.")
@@ -112,6 +112,11 @@ class Simulation:
     def dimension(self) -> int:
         """2 or 3."""
         return self.scene.dimension
+
+    @property
+    def free_particles(self) -> int:
+        """How many particles, the first ones, do not wait in a nozzle."""
+        return self.solver.emitter.nozzle.first if self.solver.emitter else self.particles
 
     @property
     def _points(self) -> str:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cortado.errors import DivergedError
+from cortado.gradients import AdjointSmoothing, Estimate, Exact, Policy, Smoothed, VelocityOnly
 from cortado.parameters.values import Arrays
-from cortado.policies import AdjointSmoothing, Estimate, Exact, Policy, Smoothed, VelocityOnly
 from cortado.problem import Problem
 
 MOST_NUMBERS = 12

@@ -15,13 +15,13 @@ from cortado.certificate.rightness import Comparison, balanced, compare
 from cortado.certificate.text import agreement_words, horizon_table, parameter_table, policy_table
 from cortado.certificate.twin import in_float64
 from cortado.errors import InputError, shown
+from cortado.gradients import AdjointNorms
+from cortado.gradients.strength import growth
+from cortado.io.notebook import as_text
 from cortado.losses import FinalPositions
-from cortado.notebook import as_text
 from cortado.parameters.values import Arrays, Values
-from cortado.policies import AdjointNorms
-from cortado.policies.strength import growth
 from cortado.problem import Problem
-from cortado.scene import Scene
+from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 from cortado.words import counted
 

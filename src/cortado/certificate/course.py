@@ -7,11 +7,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cortado.certificate.twin import Rounded
-from cortado.checked_loss import as_loss
+from cortado.device.state import State
 from cortado.errors import DivergedError
 from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd
+from cortado.losses.checked import as_loss
 from cortado.parameters.values import Arrays
-from cortado.particles import State
 from cortado.problem import Problem
 
 MOMENTS = 25

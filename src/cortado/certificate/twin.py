@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from cortado.checked_loss import as_loss
+from cortado.device.precision import FLOAT64
+from cortado.device.state import State
 from cortado.losses import (
     Adjoint,
     CentreOfMass,
@@ -13,8 +14,7 @@ from cortado.losses import (
     Image,
     TrajectoryEnd,
 )
-from cortado.particles import State
-from cortado.precision import FLOAT64
+from cortado.losses.checked import as_loss
 from cortado.problem import Problem
 from cortado.render.renderer import Renderer
 from cortado.simulation import Simulation

@@ -12,7 +12,10 @@ import warp as wp
 from cortado import reference
 from cortado.losses import FinalPositions
 from cortado.problem import Problem
-from cortado.scene import BoxContainer, BoxFluid, Discretisation, Forces, Phase, Scene, Solver
+from cortado.scene.containers import BoxContainer
+from cortado.scene.fluids import BoxFluid
+from cortado.scene.model import Discretisation, Forces, Phase, Solver
+from cortado.scene.scene import Scene
 from cortado.simulation import Simulation, check_steps
 
 REPEATS = 3

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from cortado.certificate import Certificate, certify
 from cortado.errors import ComputationError, InputError, shown
+from cortado.io.terminal import tell
 from cortado.losses import CentreOfMass, FinalPositions, Image, Loss
 from cortado.problem import Problem
-from cortado.scene import load_scene
+from cortado.scene.scene import load_scene
 from cortado.simulation import Simulation, check_steps
-from cortado.terminal import tell
 
 LOSSES = ("positions", "centre-of-mass", "image")
 
@@ -63,8 +63,8 @@ def _make(folder: Path) -> None:
 
 
 def _written(certificate: Certificate, found: str, out: Path, as_json: bool) -> str:
-    from cortado.figures.gradient_check import gradient_check
-    from cortado.files import write_atomically
+    from cortado.certificate.figure import gradient_check
+    from cortado.io.files import write_atomically
 
     gradient_check(certificate, out / "certificate.png")
     write_atomically(out / "certificate.json", found.encode())

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cortado.assignment import Assignment, assignment
 from cortado.errors import ComputationError, DivergedError
-from cortado.folder_lock import locked
-from cortado.image_losses import psnr
-from cortado.interruption import keeping
-from cortado.optimisation import Record, Result, optimise
-from cortado.policies import Policy, tuned
-from cortado.progress import track
-from cortado.report import write_report
-from cortado.run_folder import RunFolder
-from cortado.task import Task, load_task
-from cortado.task_figures import task_figures
+from cortado.gradients import Policy, tuned
+from cortado.inverse.figures import task_figures
+from cortado.inverse.setup import Assignment, assignment
+from cortado.inverse.task import Task, load_task
+from cortado.io.folder_lock import locked
+from cortado.io.interruption import keeping
+from cortado.io.progress import track
+from cortado.io.report import write_report
+from cortado.io.run_folder import RunFolder
+from cortado.losses.image_losses import psnr
+from cortado.optimisation.optimise import Record, Result, optimise
 
 Rows = list[tuple[str, object]]
 

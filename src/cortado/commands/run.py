@@ -5,21 +5,21 @@ from pathlib import Path
 
 import numpy as np
 
+from cortado.device.memory import frame_parts, require
+from cortado.device.state import State
 from cortado.errors import DivergedError
 from cortado.figures import density_errors, images, particles
-from cortado.folder_lock import locked
-from cortado.interruption import keeping
-from cortado.memory import frame_parts, require
-from cortado.particles import State
-from cortado.progress import track
-from cortado.report import Figures, write_report
+from cortado.io.folder_lock import locked
+from cortado.io.interruption import keeping
+from cortado.io.progress import track
+from cortado.io.report import Figures, write_report
+from cortado.io.run_folder import RunFolder
+from cortado.io.trajectory import Trajectory, fraction_fields, fraction_names
+from cortado.io.video import MOST_FRAMES, write_video
+from cortado.io.vtkhdf import TrajectoryWriter
 from cortado.rollout import Rollout
-from cortado.run_folder import RunFolder
-from cortado.scene import Scene, load_scene
+from cortado.scene.scene import Scene, load_scene
 from cortado.simulation import Simulation, check_steps, not_converged_sentence
-from cortado.trajectory import Trajectory, fraction_fields, fraction_names
-from cortado.video import MOST_FRAMES, write_video
-from cortado.vtkhdf import TrajectoryWriter
 
 
 def run_scene(

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from cortado.errors import ComputationError, CortadoError, InputError
+from cortado.io.terminal import say, tell
 from cortado.study.experiment import DeviceSettings, Experiment
 from cortado.study.experiment_files import load_experiment
 from cortado.study.results import Results
-from cortado.terminal import say, tell
 
 
 def run_study(folder: Path, out: Path, reduced: bool, only: list[str]) -> str:

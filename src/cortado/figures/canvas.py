@@ -8,7 +8,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from cortado.files import write_atomically
+from cortado.io.files import write_atomically
 
 PALETTE = ("#3d6b8e", "#c0763b", "#5b8a5a", "#8c5f7d", "#a89a4b", "#6b7a80", "#a8504f", "#4f8f8b")
 """Muted colours that stay apart in print and for most eyes."""

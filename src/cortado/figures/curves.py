@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cortado.errors import InputError
 from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE, drawing, whole_numbers
-from cortado.trajectory import Trajectory
+from cortado.io.trajectory import Trajectory
 
 
 def loss_curve(losses: ArrayLike, path: str | Path, *, title: str = "Loss", label: str = "loss") -> Path:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from cortado.errors import InputError
 from cortado.figures.canvas import drawing
-from cortado.srgb import to_srgb
+from cortado.io.srgb import to_srgb
 
 _MOST_IN_A_ROW = 4
 

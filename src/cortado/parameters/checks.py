@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import as_numbers
+from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
+from cortado.lattice.region import TOLERANCE
 from cortado.parameters.registry import BY_NAME, Range
 from cortado.parameters.values import Arrays
-from cortado.precision import Precision
-from cortado.region import TOLERANCE
 from cortado.restart import RestartState
-from cortado.scene import Scene, stability_limit
+from cortado.scene.scene import Scene
+from cortado.scene.stability import stability_limit
 
 
 def check_sizes(values: Arrays, precision: Precision) -> None:

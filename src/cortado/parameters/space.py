@@ -5,10 +5,14 @@ n counts fluid particles in the order in which the scene lists them, d is the sc
 
 import warnings
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
+from cortado.device.precision import Precision
+from cortado.device.state import Parameters, State
+from cortado.device.threads import WARP
 from cortado.errors import CortadoWarning, InputError
 from cortado.parameters.checks import check_places, check_sizes, check_state, unstable_sentence
 from cortado.parameters.reference_density import (
@@ -16,26 +20,43 @@ from cortado.parameters.reference_density import (
     reference_density_adjoint,
     reference_density_tangent,
 )
-from cortado.parameters.registry import BY_NAME, Role, names
+from cortado.parameters.registry import BY_NAME, Role, Source, names
 from cortado.parameters.tilt import Tilt
 from cortado.parameters.values import OVER_TIME, Arrays, Values, check_known, checked_value, scene_values
-from cortado.particles import Parameters, State
 from cortado.restart import Elapsed, RestartState
 from cortado.rollout import Rollout
-from cortado.threads import WARP
-
-if TYPE_CHECKING:
-    from cortado.simulation import Simulation
 
 RUN, STATE = names(Role.RUN), names(Role.STATE)
 DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
 """Parameters that explicit steps of diffusion have to follow."""
 
 
+class Simulated(Source, Protocol):
+    """A simulation as its parameters see it."""
+
+    state: State
+    """The first, on the device."""
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+
+    @property
+    def precision(self) -> Precision:
+        """Of the device's arrays."""
+
+    @property
+    def free_particles(self) -> int:
+        """How many particles, the first ones, do not wait in a nozzle."""
+
+    def substeps(self, time_step: NDArray, mobility: NDArray, interface_width: NDArray, rest_density: NDArray) -> int:
+        """Explicit steps of diffusion within a time step that are stable with these parameters."""
+
+
 class ParameterSpace:
     """The parameters of one simulation over a number of steps."""
 
-    def __init__(self, simulation: "Simulation", steps: int):
+    def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._steps = simulation, steps
         self._phases = len(simulation.scene.phase)
         absent = {name: np.zeros(self.shapes(name)[0]) for name in RUN}
@@ -90,7 +111,7 @@ class ParameterSpace:
         for name in (*STATE, "rest_density"):
             if name in values:
                 raise InputError(f"control {name} is given, but must be left out with a state, which has its own.")
-        check_state(state, self._simulation.scene, self._simulation.positions.shape, self._free)
+        check_state(state, self._simulation.scene, self._simulation.positions.shape, self._simulation.free_particles)
         if self._simulation.scene.emitter is not None:
             for name in ("time_step", "flow_rate"):
                 before, now = getattr(state.constants, name), float(values.get(name, self._scene[name]))
@@ -144,17 +165,11 @@ class ParameterSpace:
         check_sizes(values, simulation.precision)
         if self._steps == 0:
             return
-        check_places(values, simulation.scene, self._free)
+        check_places(values, simulation.scene, self._simulation.free_particles)
         sentence = unstable_sentence(self._upright(values), simulation.scene) if values and not self._warned else None
         if sentence is not None:
             self._warned = True
             warnings.warn(sentence, CortadoWarning, stacklevel=4)
-
-    @property
-    def _free(self) -> int:
-        """How many particles, the first ones, do not wait in the nozzle."""
-        emitter = self._simulation.solver.emitter
-        return emitter.nozzle.first if emitter else self._simulation.particles
 
     @property
     def _tilt(self) -> Tilt:

@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from cortado.calibration import SKIN
-from cortado.discrete_scene import DiscreteScene, discretise
+from cortado.discretise.discrete_scene import DiscreteScene, discretise
 from cortado.errors import DivergedError, InputError, shown
+from cortado.lattice.calibration import SKIN
+from cortado.lattice.region import TOLERANCE
 from cortado.parameters.registry import BY_NAME
 from cortado.parameters.values import checked_value
 from cortado.reference.digits import Digits
 from cortado.reference.engine import extension, precisions
 from cortado.reference.histories import Gradient, History
 from cortado.reference.losses import Loss
-from cortado.region import TOLERANCE
-from cortado.scene import Scene, as_scene
+from cortado.scene.scene import Scene, as_scene
 
 METHODS = (
     "analytic",

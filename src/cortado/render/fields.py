@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.cells import CellSort, Grid
+from cortado.device.cells import CellSort, Grid
+from cortado.device.launching import launch, sum_of
+from cortado.device.memory import field_parts, require
+from cortado.device.neighbourhood import Discretisation
+from cortado.device.precision import Precision
 from cortado.errors import InputError
-from cortado.launching import launch, sum_of
-from cortado.memory import field_parts, require
-from cortado.physics.colour_field import colour_field_kernels, ink_type, nodes_type
-from cortado.physics.surroundings import Discretisation
-from cortado.physics.tint import colours_type, tint_kernels
-from cortado.precision import Precision
-from cortado.smoothing import SmoothingKernel
+from cortado.lattice.smoothing import SmoothingKernel
+from cortado.render.colour_field import colour_field_kernels, ink_type, nodes_type
+from cortado.render.phase_colours import colours_type, tint_kernels
 
 MOST_NODES = 2**27
 """Of a colour field: 2 GiB in float32."""

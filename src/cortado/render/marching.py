@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.launching import launch, sum_of
-from cortado.memory import field_parts, picture_parts, require, sample_parts
-from cortado.physics.absorption import absorption_kernels, pose_type
-from cortado.physics.colour_field import ink_type
-from cortado.physics.rays import camera_type
-from cortado.precision import Precision
+from cortado.device.launching import launch, sum_of
+from cortado.device.memory import field_parts, picture_parts, require, sample_parts
+from cortado.device.precision import Precision
+from cortado.render.absorption import absorption_kernels, pose_type
 from cortado.render.cameras import Camera
+from cortado.render.colour_field import ink_type
+from cortado.render.rays import camera_type
 from cortado.render.views import View
 
 SAMPLES_PER_CELL = 2

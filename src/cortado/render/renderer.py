@@ -8,16 +8,16 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import as_numbers
+from cortado.device.kernel_cache import start_warp
+from cortado.device.precision import Precision
+from cortado.device.state import padded
+from cortado.device.threads import WARP
 from cortado.errors import InputError, shown
-from cortado.kernel_cache import start_warp
-from cortado.particles import padded
-from cortado.precision import Precision
+from cortado.lattice.smoothing import SmoothingKernel
 from cortado.render.cameras import positive, vector
 from cortado.render.fields import ColourField
 from cortado.render.marching import RayMarcher
 from cortado.render.views import View
-from cortado.smoothing import SmoothingKernel
-from cortado.threads import WARP
 from cortado.words import counted
 
 

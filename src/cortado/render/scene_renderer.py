@@ -5,14 +5,14 @@ from typing import Annotated, Any, Protocol
 import numpy as np
 from pydantic import AfterValidator, TypeAdapter
 
-from cortado.precision import Precision
+from cortado.device.precision import Precision
+from cortado.lattice.smoothing import SmoothingKernel
 from cortado.render.cameras import Perspective
 from cortado.render.renderer import Renderer
 from cortado.render.views import TopView, View, Volume
-from cortado.scene import Scene
-from cortado.scene_render import Render
-from cortado.scene_tables import sentences
-from cortado.smoothing import SmoothingKernel
+from cortado.scene.render import Render
+from cortado.scene.scene import Scene
+from cortado.scene.tables import sentences
 
 UP = {2: 2, 3: 1}
 """The axis that points upwards, by dimension; in 2-D the one that the plane lacks."""

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.launching import Launcher
-from cortado.particles import State, padded
-from cortado.physics.containment import NO_PARTICLE, bounds_type, lost_kernel
-from cortado.precision import Precision
-from cortado.region import TOLERANCE, Region
+from cortado.device.launching import Launcher
+from cortado.device.precision import Precision
+from cortado.device.state import State, padded
+from cortado.lattice.region import TOLERANCE, Region
+from cortado.solvers.containment_kernels import NO_PARTICLE, bounds_type, lost_kernel
 
 FURTHEST = 1e6
 """In spacings from the region of the first particles and walls: particles beyond are lost."""

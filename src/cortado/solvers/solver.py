@@ -9,13 +9,13 @@ from typing import Any, Protocol, Self
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.launching import Launcher
-from cortado.particles import Parameters, State
-from cortado.physics.surroundings import Discretisation
+from cortado.device.launching import Launcher
+from cortado.device.neighbourhood import Discretisation
+from cortado.device.state import Parameters, State
+from cortado.device.threads import Turn
 from cortado.restart import Elapsed
 from cortado.solvers.containment import Containment
 from cortado.sph.parts import StepContext
-from cortado.threads import Turn
 
 Counts = tuple[int, ...]
 """How often each loop of a step went round: with it the step can be taken again, bit for bit."""

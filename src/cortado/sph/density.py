@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from cortado.kernels import Kernels
-from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.device.kernels import Kernels
+from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
 
 
 @cache

@@ -5,9 +5,9 @@ from typing import Any
 
 import warp as wp
 
-from cortado.kernels import Kernels
-from cortado.launching import sum_of
-from cortado.precision import Precision
+from cortado.device.kernels import Kernels
+from cortado.device.launching import sum_of
+from cortado.device.precision import Precision
 from cortado.sph.integration import integration_module
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 

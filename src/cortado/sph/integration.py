@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.precision import Precision
+from cortado.device.precision import Precision
 
 
 def integration_module(precision: Precision, differentiable: bool) -> Any:

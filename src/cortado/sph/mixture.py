@@ -8,9 +8,9 @@ from typing import Any
 
 import warp as wp
 
-from cortado.physics.diffusion import Diffusion, diffusion_kernels
-from cortado.physics.mixture import mixture_kernels
-from cortado.precision import Precision
+from cortado.device.precision import Precision
+from cortado.sph.diffusion import Diffusion, diffusion_kernels
+from cortado.sph.materials import mixture_kernels
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 

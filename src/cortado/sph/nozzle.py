@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.launching import sum_of
-from cortado.particles import Parameters, State, padded, to_device
-from cortado.physics.nozzle import nozzle_kernels
-from cortado.precision import Precision
+from cortado.device.launching import sum_of
+from cortado.device.precision import Precision
+from cortado.device.state import Parameters, State, padded, to_device
 from cortado.restart import Elapsed
+from cortado.sph.nozzle_kernels import nozzle_kernels
 from cortado.sph.parts import StepContext
 
 

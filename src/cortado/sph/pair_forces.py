@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
+from cortado.device.neighbourhood import Discretisation, pair_functions, surroundings_type
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,14 @@ from typing import Any, Protocol
 
 import warp as wp
 
-from cortado.discrete_scene import Lattice
-from cortado.launching import Launcher, Named, add, sum_of
+from cortado.device.launching import Launcher, Named, add, sum_of
+from cortado.device.neighbourhood import Discretisation
+from cortado.device.precision import Precision
+from cortado.device.state import Arrays, Fields, Parameters, zeros
+from cortado.discretise.discrete_scene import Lattice
+from cortado.discretise.walls.layers import WallLayers
 from cortado.parameters.registry import BY_NAME, Axis
-from cortado.particles import Arrays, Fields, Parameters, zeros
-from cortado.physics.surroundings import Discretisation
-from cortado.precision import Precision
-from cortado.scene import Scene
-from cortado.walls.layers import WallLayers
+from cortado.scene.scene import Scene
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.kernels import Kernels
-from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.device.kernels import Kernels
+from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
 from cortado.sph.pair_forces import PairForm, laminar, pairwise
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 

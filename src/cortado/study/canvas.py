@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cortado.figures.canvas import STYLE
-from cortado.files import write_atomically
+from cortado.io.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

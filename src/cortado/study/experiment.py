@@ -5,19 +5,19 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
-from cortado import scene_kinds, scene_tables
-from cortado.progress import Advance
-from cortado.scene import Scene
-from cortado.scene_kinds import Text, as_sequence, wrong
+from cortado.io.progress import Advance
+from cortado.scene import fields, tables
+from cortado.scene.fields import Text, as_sequence, wrong
+from cortado.scene.scene import Scene
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Settings(scene_tables.Table):
+class Settings(tables.Table):
     """What the file of an experiment holds beside its kind; each kind adds its own. The kinds of values of
-    `cortado.scene_kinds` make sentences of what is wrong."""
+    `cortado.scene.model.fields` make sentences of what is wrong."""
 
     title: Annotated[str, Text()]
     """Above the picture."""
@@ -43,10 +43,10 @@ class DeviceSettings(Settings):
 
 
 @dataclass(frozen=True)
-class Several(scene_kinds.Kind):
+class Several(fields.Kind):
     """At least one value of a kind, in a list: ``Annotated[tuple[float, ...], Several(Quantity("s", above=0.0))]``."""
 
-    kind: scene_kinds.Kind
+    kind: fields.Kind
 
     @property
     def wanted(self) -> str:
@@ -56,7 +56,7 @@ class Several(scene_kinds.Kind):
         entries = as_sequence(value)
         if not entries:
             raise wrong((), value, self.wanted)
-        return scene_kinds.Components(self.kind).check(entries)
+        return fields.Components(self.kind).check(entries)
 
 
 class Progress(Protocol):

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from cortado.errors import SceneError
-from cortado.scene import Scene, read_toml, scene_from_dict
-from cortado.scene_kinds import MISSING, Choice
-from cortado.scene_tables import sentences
+from cortado.scene.fields import MISSING, Choice
+from cortado.scene.scene import Scene, scene_from_dict
+from cortado.scene.tables import sentences
+from cortado.scene.toml import read_toml
 from cortado.study.experiment import Experiment
 from cortado.study.kinds import KINDS
 from cortado.study.scenes import merged

@@ -8,7 +8,7 @@ import numpy as np
 
 from cortado.figures.canvas import DASHED, PALETTE
 from cortado.reference import Terms
-from cortado.scene_kinds import Choice, Count, Quantity
+from cortado.scene.fields import Choice, Count, Quantity
 from cortado.study.canvas import blank
 from cortado.study.comparison import growth
 from cortado.study.experiment import Kind, Progress, SceneSettings, Several

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from cortado.figures.canvas import DASHED, FAINT, PALETTE
-from cortado.scene_kinds import Choice, Count, Quantity
+from cortado.scene.fields import Choice, Count, Quantity
 from cortado.study.canvas import blank
 from cortado.study.experiment import Kind, Progress, SceneSettings, Several
 from cortado.study.gravity_tangents import COST, LABEL, along_gravity

@@ -6,7 +6,7 @@ import numpy as np
 
 from cortado.errors import InputError
 from cortado.reference import History
-from cortado.scene import Scene
+from cortado.scene.scene import Scene
 from cortado.study.sources import ReferenceTangent
 
 COST = {"float32": 1, "float64": 1, "float80": 3, "float128": 60}

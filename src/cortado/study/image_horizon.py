@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from cortado.figures.canvas import PALETTE
+from cortado.gradients import Exact, Tape
 from cortado.losses import FinalPositions, Image
-from cortado.policies import Exact, Tape
 from cortado.problem import Problem
 from cortado.render.scene_renderer import scene_renderer
-from cortado.scene_kinds import Choice, Components, Count, Quantity
+from cortado.scene.fields import Choice, Components, Count, Quantity
 from cortado.simulation import Simulation
 from cortado.study.canvas import blank
 from cortado.study.comparison import growth

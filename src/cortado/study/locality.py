@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE
+from cortado.lattice.smoothing import smoothing_kernel
 from cortado.reference import History, Simulation
-from cortado.scene_kinds import Components, Count, Quantity
-from cortado.smoothing import smoothing_kernel
+from cortado.scene.fields import Components, Count, Quantity
 from cortado.study import spatial_scales
 from cortado.study.canvas import blank
 from cortado.study.estimates import Estimate, growth_rate

@@ -14,10 +14,10 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from cortado import scene_tables
 from cortado.reference import Simulation, Terms
-from cortado.scene import Scene
-from cortado.scene_kinds import Choice, Components, Count, Quantity, Tables, Text
+from cortado.scene import tables
+from cortado.scene.fields import Choice, Components, Count, Quantity, Tables, Text
+from cortado.scene.scene import Scene
 from cortado.study.estimates import growth_rate, norms
 from cortado.study.experiment import Progress, SceneSettings, Several
 from cortado.study.lyapunov_spectrum import growth_by_segment
@@ -28,7 +28,7 @@ from cortado.study.tables import Table
 Term = Choice(("viscosity", "pressure", "hessian", "density"))
 
 
-class Variant(scene_tables.Table):
+class Variant(tables.Table):
     """One thing changed in the scene, or in the derivative."""
 
     panel: Annotated[str, Text()]

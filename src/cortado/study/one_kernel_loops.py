@@ -13,9 +13,9 @@ from functools import cache
 
 import warp as wp
 
-from cortado.kernels import Kernels
-from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
-from cortado.policies import Tape
+from cortado.device.kernels import Kernels
+from cortado.device.neighbourhood import Discretisation, pair_functions, surroundings_type
+from cortado.gradients import Tape
 from cortado.rollout import Rollout, StepDerivative
 
 

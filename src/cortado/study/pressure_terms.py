@@ -9,7 +9,7 @@ import numpy as np
 
 from cortado.figures.canvas import PALETTE
 from cortado.reference import Terms
-from cortado.scene_kinds import Choice, Count
+from cortado.scene.fields import Choice, Count
 from cortado.study.canvas import blank
 from cortado.study.comparison import growth
 from cortado.study.experiment import Kind, Progress, SceneSettings, Several

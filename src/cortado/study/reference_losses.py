@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado import losses, reference
-from cortado.checked_loss import as_loss
+from cortado.device.state import State
 from cortado.errors import InputError
 from cortado.losses import EndAdjoint, TrajectoryEnd
-from cortado.particles import State
+from cortado.losses.checked import as_loss
 from cortado.problem import Problem
 from cortado.reference.digits import Digits
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from cortado.errors import InputError
-from cortado.files import write_atomically
-from cortado.progress import track
+from cortado.io.files import write_atomically
+from cortado.io.progress import track
 from cortado.study.canvas import save
 from cortado.study.experiment import Experiment
 from cortado.study.tables import Table

@@ -15,7 +15,7 @@ import numpy as np
 
 from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE
 from cortado.reference import Digits, History, Simulation
-from cortado.scene_kinds import Choice, Components, Count, Quantity
+from cortado.scene.fields import Choice, Components, Count, Quantity
 from cortado.study.canvas import blank
 from cortado.study.estimates import Estimate, Line, growth_rate, norms
 from cortado.study.experiment import Kind, Progress, SceneSettings, Several

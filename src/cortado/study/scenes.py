@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from cortado.scene import Scene, scene_from_dict
+from cortado.scene.scene import Scene, scene_from_dict
 
 
 def varied(scene: Scene, **changes: Any) -> Scene:

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado import reference
-from cortado.checked_loss import as_loss
+from cortado.device.state import State
+from cortado.gradients import AdjointNorms, AdjointPolicy, Policy
 from cortado.losses import Frames
+from cortado.losses.checked import as_loss
 from cortado.parameters.values import Arrays, Values
-from cortado.particles import State
-from cortado.policies import AdjointNorms, AdjointPolicy, Policy
 from cortado.problem import Problem
-from cortado.scene import Scene
+from cortado.scene.scene import Scene
 from cortado.study.reference_losses import reference_loss
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from cortado.figures.canvas import DASHED, FAINT, INK
 from cortado.reference import Simulation
-from cortado.scene_kinds import Components, Count, Quantity
+from cortado.scene.fields import Components, Count, Quantity
 from cortado.study.canvas import blank
 from cortado.study.estimates import Estimate, Line, norms
 from cortado.study.experiment import Kind, Progress, SceneSettings, Several

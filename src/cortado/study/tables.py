@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import InputError
-from cortado.files import write_atomically
+from cortado.io.files import write_atomically
 
 
 @dataclass(frozen=True, eq=False, init=False)

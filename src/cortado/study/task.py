@@ -6,18 +6,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import ValidationInfo, field_validator
 
-from cortado.assignment import Assignment, assignment
 from cortado.errors import InputError
 from cortado.figures.canvas import PALETTE, whole_numbers
-from cortado.image_losses import psnr
-from cortado.optimisation import Record, optimise
-from cortado.policies import tuned
-from cortado.scene_kinds import Choice, Text
-from cortado.srgb import to_srgb
+from cortado.gradients import tuned
+from cortado.inverse.setup import Assignment, assignment
+from cortado.inverse.task import load_task
+from cortado.io.srgb import to_srgb
+from cortado.losses.image_losses import psnr
+from cortado.optimisation.optimise import Record, optimise
+from cortado.scene.fields import Choice, Text
 from cortado.study.canvas import blank
 from cortado.study.experiment import DeviceSettings, Kind, Progress, Several
 from cortado.study.tables import Table
-from cortado.task import load_task
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

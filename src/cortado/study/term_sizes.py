@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.reference import Simulation, Terms
-from cortado.scene import Scene
+from cortado.scene.scene import Scene
 
 
 def term_sizes(scene: Scene, steps: int, precision: str, cases: Mapping[str, Terms]) -> dict[str, NDArray[np.float64]]:

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from cortado import losses, policies, reference
+from cortado import gradients, losses, reference
 from cortado.figures.canvas import DASHED, INK, PALETTE
 from cortado.problem import Problem
-from cortado.scene_kinds import Count, Quantity
+from cortado.scene.fields import Count, Quantity
 from cortado.simulation import Simulation
 from cortado.study.canvas import blank
 from cortado.study.estimates import Estimate, growth_rate
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RIGHT, LINEAR, CLAMP, WALLS = "sums in functions", "linear after the loop", "clamp after it", "wall yield after it"
-WAYS: dict[str, policies.Policy] = {
-    RIGHT: policies.Tape(),
+WAYS: dict[str, gradients.Policy] = {
+    RIGHT: gradients.Tape(),
     LINEAR: OneKernelTape(("density", "force")),
     CLAMP: OneKernelTape(("pressure",)),
     WALLS: OneKernelTape(("walls",)),

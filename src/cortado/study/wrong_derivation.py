@@ -13,7 +13,7 @@ import numpy as np
 
 from cortado.figures.canvas import DASHED, INK, PALETTE
 from cortado.reference import History, Simulation
-from cortado.scene_kinds import Components, Count, Quantity
+from cortado.scene.fields import Components, Count, Quantity
 from cortado.study.canvas import blank
 from cortado.study.estimates import Estimate, growth_rate, norms
 from cortado.study.experiment import Kind, Progress, SceneSettings

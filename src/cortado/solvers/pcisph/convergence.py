@@ -6,8 +6,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.physics.containment import NO_PARTICLE
-from cortado.precision import Precision
+from cortado.device.precision import Precision
+from cortado.solvers.containment_kernels import NO_PARTICLE
 
 
 @dataclass(frozen=True)

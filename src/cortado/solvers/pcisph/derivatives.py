@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from cortado.launching import Named
-from cortado.particles import Fields, Parameters, State
+from cortado.device.launching import Named
+from cortado.device.state import Fields, Parameters, State
 from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.pcisph.steps import PcisphSteps
 from cortado.solvers.solver import Counts

@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
 
 
 @cache

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.precision import Precision
+from cortado.device.precision import Precision
 from cortado.solvers.pcisph.parts import PressureSolve
 from cortado.solvers.solver import Counts
 

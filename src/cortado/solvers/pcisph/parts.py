@@ -5,8 +5,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.kernels import Kernels
-from cortado.physics.surroundings import Discretisation
+from cortado.device.kernels import Kernels
+from cortado.device.neighbourhood import Discretisation
 from cortado.solvers.pcisph.convergence import ConvergenceKernels, convergence_kernels
 from cortado.solvers.pcisph.density_ratio_relaxation import ContrastKernels, contrast_kernels
 from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels

@@ -16,8 +16,8 @@ from functools import cache
 
 import warp as wp
 
-from cortado.kernels import Kernels
-from cortado.physics.surroundings import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.device.kernels import Kernels
+from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
 from cortado.sph.density import density_sums
 from cortado.sph.integration import prediction_share
 

@@ -1,7 +1,7 @@
 """PCISPH as a `Solver`: its steps, forward, and their derivatives."""
 
-from cortado.memory import gradient_parts
-from cortado.particles import Parameters
+from cortado.device.memory import gradient_parts
+from cortado.device.state import Parameters
 from cortado.restart import Elapsed
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint, PcisphTangent
 from cortado.solvers.pcisph.log import IterationLog

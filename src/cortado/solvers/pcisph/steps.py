@@ -9,12 +9,13 @@ from typing import Any
 
 import warp as wp
 
-from cortado.calibration import SKIN
-from cortado.discrete_scene import Lattice
-from cortado.launching import Launcher, sum_and_maximum
-from cortado.neighbours import NeighbourSearch
-from cortado.particles import Fields, Parameters, State
-from cortado.physics.surroundings import Discretisation, surroundings_type
+from cortado.device.launching import Launcher, sum_and_maximum
+from cortado.device.neighbourhood import Discretisation, surroundings_type
+from cortado.device.neighbours import NeighbourSearch
+from cortado.device.state import Fields, Parameters, State
+from cortado.device.threads import Turn
+from cortado.discretise.discrete_scene import Lattice
+from cortado.lattice.calibration import SKIN
 from cortado.restart import Elapsed
 from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.pcisph.log import IterationLog
@@ -23,7 +24,6 @@ from cortado.solvers.solver import Counts
 from cortado.sph.mixture import Mixture, Phases
 from cortado.sph.nozzle import Emitter, Nozzle
 from cortado.sph.parts import Force, StepContext
-from cortado.threads import Turn
 
 
 class PcisphSteps:

@@ -16,8 +16,8 @@ from functools import cache
 
 import warp as wp
 
-from cortado.kernels import Kernels
-from cortado.physics.surroundings import Discretisation, pair_functions, surroundings_type
+from cortado.device.kernels import Kernels
+from cortado.device.neighbourhood import Discretisation, pair_functions, surroundings_type
 
 
 @cache

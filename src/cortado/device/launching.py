@@ -1,0 +1,188 @@
+"""Launches of kernels with arguments by name, and sums over particles in a fixed order."""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import wait
+from contextlib import nullcontext
+from typing import Any
+
+import warp as wp
+
+from cortado.device.precision import Precision
+from cortado.device.reduction import add_kernel, sum_and_maximum_kernel, sum_kernel
+from cortado.device.threads import MOST_CORES, WARP, helpers
+
+BRANCHES = 32
+"""Values that one thread of a tree sum adds up."""
+
+
+MOST_PARTS = 32
+"""Ranges of particles at most that a launch on a CPU is cut into."""
+LEAST_PART = 2000
+"""Particles at least in a range: below, starting it costs more than it saves."""
+PARTS_A_CORE = 4
+"""Ranges for each core at most: one that is busy elsewhere leaves some of its own to the others."""
+LEAST_SHARED_PART = 10_000
+"""Particles at least in a range where there is more than one for each core."""
+
+
+Named = Mapping[str, Any]
+"""Arguments of kernels by name, of which a launch takes those that its kernel has."""
+
+
+def bound(kernel: wp.Kernel, groups: Sequence[Named], given: Named) -> list[Any]:
+    """The arguments of a kernel in its order: out of ``given``, all of which it must have, and out of the first of the
+    ``groups`` that has them, which may hold more.
+
+    Kernels take many arrays of one type, and nothing else would notice a mistake: raises `TypeError` for an argument
+    that is missing or that the kernel does not have.
+    """
+    names = [argument.label for argument in kernel.adj.args]
+    surplus = [name for name in given if name not in names]
+    if surplus:
+        raise TypeError(f"kernel {kernel.key} has no argument {surplus[0]!r}; it has {', '.join(names)}.")
+    sources = (given, *groups)
+    arguments = []
+    for name in names:
+        for source in sources:
+            if name in source:
+                arguments.append(source[name])
+                break
+        else:
+            raise TypeError(f"argument {name!r} of kernel {kernel.key} is missing; it has {', '.join(names)}.")
+    return arguments
+
+
+def launch(kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, **arguments: Any) -> None:
+    """Launch a kernel, off any tape, with arguments by name; ``threads``: their number, or a shape."""
+    wp.launch(kernel, threads, inputs=bound(kernel, groups, arguments), device=device, record_tape=False)
+
+
+class Launcher:
+    """Launches kernels with one thread a particle on one device, with arguments by name (see `bound`).
+
+    On a CPU Warp launches in one thread; a kernel that sums over neighbours, which begins with its surroundings, is cut
+    into ranges of particles, several for each core where there are many, and a core that has done one takes the next.
+    The sums are gathers, so that the bits do not depend on the cut, or on who took what.
+    """
+
+    def __init__(self, particles: int, device: Any, record_tape: bool):
+        """``record_tape`` False keeps launches off a tape that a user may have open."""
+        self.particles, self.device, self._record_tape = particles, device, record_tape
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self._cores = min(cores, MOST_CORES) if device.is_cpu and not record_tape else 1
+        each = min(PARTS_A_CORE, MOST_PARTS // self._cores, particles // (self._cores * LEAST_SHARED_PART))
+        most = self._cores * max(each, 1) if self._cores > 1 else 1
+        self.parts = max(min(most, particles // LEAST_PART), 1)
+        """Ranges of particles that a sum over neighbours is cut into."""
+        self._bounds = [particles * part // self.parts for part in range(self.parts + 1)]
+        self._compiled: set[Any] = set()
+        self._whole: Any = None
+        self._parts: list[Any] = []
+
+    @property
+    def capturable(self) -> bool:
+        """Whether launches may be captured as a graph: those of one thread."""
+        return self.parts == 1
+
+    def __call__(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
+        inputs = bound(kernel, groups, arguments)
+        if not self.capturable and hasattr(inputs[0], "neighbours"):
+            if kernel in self._compiled:
+                self._launch_parts(kernel, inputs)
+                return
+            self._compiled.add(kernel)  # by the one launch that follows
+        threads = threads or self.particles
+        wp.launch(kernel, threads, inputs=inputs, device=self.device, record_tape=self._record_tape)
+
+    def _launch_parts(self, kernel: wp.Kernel, inputs: Sequence[Any]) -> None:
+        if self._whole is not inputs[0]:
+            self._whole, self._parts = inputs[0], [self._part(inputs[0], n) for n in range(self.parts)]
+
+        waiting = iter(range(self.parts))
+
+        def take() -> None:
+            for part in waiting:
+                wp.launch(
+                    kernel,
+                    self._bounds[part + 1] - self._bounds[part],
+                    inputs=[self._parts[part], *inputs[1:]],
+                    device=self.device,
+                    record_tape=False,
+                )
+
+        called = [helpers().submit(take) for _ in range(min(self._cores, self.parts) - 1)]
+        try:
+            take()
+        finally:
+            begun = [helper for helper in called if not helper.cancel()]
+            wait(begun)  # also after an interruption: nothing may go on writing behind the back of what comes next
+        for helper in begun:
+            helper.result()
+
+    def _part(self, surroundings: Any, number: int) -> Any:
+        """The surroundings as one range sees them."""
+        part = surroundings._cls()
+        for name in surroundings._cls.vars:
+            setattr(part, name, getattr(surroundings, name))
+        part.first, part.part = self._bounds[number], number
+        return part
+
+
+class Replayed:
+    """Work that is done over and over with the same arrays: a captured graph from the second time on.
+
+    The first time loads modules and allocates what a capture must not. On a CPU a graph saves the packing of arguments:
+    half of the time with a hundred particles.
+    """
+
+    def __init__(self, work: Callable[[], None], launch: Launcher):
+        self._work, self._launch = work, launch
+        self._warm, self._graph = False, None
+
+    def __call__(self) -> None:
+        if not self._warm or not self._launch.capturable:
+            self._work()
+            self._warm = True
+            return
+        if self._graph is None:
+            with wp.ScopedCapture(device=self._launch.device) as capture:
+                self._work()
+            self._graph = capture.graph
+        with WARP.lent() if self._launch.device.is_cpu else nullcontext():  # a GPU has one queue for all threads
+            wp.capture_launch(self._graph)
+
+
+class TreeSum:
+    """Adds one value of each particle on the device, in the same order every time."""
+
+    def __init__(self, kernel: Any, dtype: Any, particles: int, device: Any):
+        self._kernel, self._device = kernel, device
+        self._levels: list[wp.array] = []
+        size = particles
+        while size > 1 or not self._levels:
+            size = -(-size // BRANCHES)
+            self._levels.append(wp.zeros(size, dtype=dtype, device=device))
+
+    def __call__(self, values: wp.array) -> wp.array:
+        """The sum as an array (1,), which the next call overwrites."""
+        for partial in self._levels:
+            size = partial.shape[0]
+            launch(self._kernel, size, self._device, count=len(values), stride=size, values=values, partial=partial)
+            values = partial
+        return values
+
+
+def sum_of(dtype: Any, particles: int, device: Any) -> TreeSum:
+    """Sums of (n,) numbers, vectors or matrices of a Warp type."""
+    return TreeSum(sum_kernel(dtype), dtype, particles, device)
+
+
+def sum_and_maximum(particles: int, precision: Precision, device: Any) -> TreeSum:
+    """Sums of first and maxima of second components of pairs (n,)."""
+    return TreeSum(sum_and_maximum_kernel(precision), precision.pair, particles, device)
+
+
+def add(values: wp.array, total: wp.array) -> None:
+    """total += values, element by element."""
+    launch(add_kernel(values.dtype), len(values), values.device, value=values, total=total)

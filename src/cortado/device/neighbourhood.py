@@ -1,0 +1,159 @@
+"""What a particle sees: its neighbours and the walls, as one argument of every kernel that sums over them."""
+
+from dataclasses import dataclass
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from cortado.device.precision import Precision
+from cortado.device.smoothing import smoothing_functions
+from cortado.lattice.smoothing import SmoothingKernel
+
+UNROLL = 4
+"""Fluid neighbours that a loop takes at a time, so that their loads overlap; lists are filled up to a multiple of it
+with the particle itself, which adds nothing to a sum but W(0) to the density's."""
+
+
+@dataclass(frozen=True)
+class Discretisation:
+    """A smoothing kernel in a precision: what a kernel factory is asked for."""
+
+    smoothing: SmoothingKernel
+    precision: Precision
+
+    def module(self, differentiable: bool, topic: str = "pcisph") -> Any:
+        """The Warp module of these kernels; only the forward kernels get Warp's own adjoint (for `gradients.Tape`)."""
+        kind = "forward" if differentiable else "derivative"
+        module = wp.get_module(f"cortado_{topic}_{kind}_{self.smoothing.name}_{self.precision.name}")
+        module.options["enable_backward"] = differentiable
+        return module
+
+
+@cache
+def surroundings_type(precision: Precision) -> Any:
+    """The Warp struct of one precision; arrays are sorted by cell, lists are [neighbour, particle]."""
+    real, vector = precision.real, precision.vector
+
+    class Surroundings:
+        first: wp.int32
+        """Particle of a launch's first thread: a launch may be cut into ranges of particles."""
+        part: wp.int32
+        """Number of the range."""
+        neighbours: wp.array2d(dtype=wp.int32)
+        """First the fluid neighbours of a particle, filled up with itself, then its wall neighbours."""
+        fluid_count: wp.array(dtype=wp.int32)
+        """Of the filled list, a multiple of `UNROLL`."""
+        filling: wp.array(dtype=wp.int32)
+        """How many of them are the particle itself."""
+        count: wp.array(dtype=wp.int32)
+        wall_positions: wp.array(dtype=vector)
+        """[m]"""
+        wall_weights: wp.array(dtype=real)
+        """w_b [-]: what a wall particle counts for in the density, a fluid particle being 1."""
+        support: real
+        """Support radius h [m]."""
+        reach: real
+        """Neighbours are listed up to this distance [m], a little beyond the support."""
+        normalisation: real
+        """sigma of the kernel [1 / m^d]."""
+        self_weight: real
+        """W(0) [1 / m^d]."""
+        pliancy: real
+        """(sum_j G_j . G_j)^(-1/2) of a filled neighbourhood [m^(d + 1)], for the relaxation beside walls."""
+        evenness: real
+        """What second derivatives are multiplied with [-], see `cortado.lattice.calibration.laplacian_evenness`."""
+        volume: real
+        """Volume V of a particle on the rest lattice [m^d]: with it that lattice has the rest density."""
+        periodic: wp.int32
+        period: vector
+        """[m], 0 along an axis that is not periodic."""
+        frequency: vector
+        """1 / period [1 / m], or 0."""
+
+    Surroundings.__qualname__ = f"Surroundings_{precision.name}"
+    Surroundings.__name__ = Surroundings.__qualname__
+    return wp.struct(Surroundings)
+
+
+@cache
+def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
+    """Warp functions of a separation in given surroundings.
+
+    ``separation``, ``weight``, ``gradient``, ``hessian_product``; ``size`` (|x|^2 + 0.01 h^2, which covers coincident
+    particles), ``factor`` (F = evenness x . G / size, of second derivatives after Brookshaw 1985) and
+    ``factor_gradient``;
+    and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have before any of it is used, so that the
+    loads do not wait for one another (on a GPU a tenth of a whole step).
+    """
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    surroundings = surroundings_type(discretisation.precision)
+    smooth = smoothing_functions(discretisation.smoothing, discretisation.precision)
+    smooth_weight, smooth_gradient = smooth.weight, smooth.gradient
+    smooth_hessian_product = smooth.hessian_product
+    rows = wp.types.matrix(shape=(UNROLL, 3), dtype=real)
+    row = wp.types.vector(length=UNROLL, dtype=real)
+
+    @wp.func
+    def separation(x_i: vector, x_j: vector, s: surroundings) -> vector:
+        """x_i - x_j, of the nearest image."""
+        x_ij = x_i - x_j
+        if s.periodic != 0:
+            turns = vector(
+                wp.round(x_ij[0] * s.frequency[0]),
+                wp.round(x_ij[1] * s.frequency[1]),
+                wp.round(x_ij[2] * s.frequency[2]),
+            )
+            return x_ij - wp.cw_mul(turns, s.period)
+        return x_ij
+
+    @wp.func
+    def weight(x: vector, s: surroundings) -> real:
+        return smooth_weight(x, s.support, s.normalisation)
+
+    @wp.func
+    def gradient(x: vector, s: surroundings) -> vector:
+        return smooth_gradient(x, s.support, s.normalisation)
+
+    @wp.func
+    def hessian_product(x: vector, u: vector, s: surroundings) -> vector:
+        return smooth_hessian_product(x, u, s.support, s.normalisation)
+
+    @wp.func
+    def size(x: vector, s: surroundings) -> real:
+        return wp.dot(x, x) + real(0.01) * s.support * s.support
+
+    @wp.func
+    def factor(x: vector, s: surroundings) -> real:
+        return s.evenness * wp.dot(x, gradient(x, s)) / size(x, s)
+
+    @wp.func
+    def factor_gradient(x: vector, s: surroundings) -> vector:
+        d = size(x, s)
+        g = gradient(x, s)
+        return (s.evenness / d) * (g + hessian_product(x, x, s) - (real(2.0) * wp.dot(x, g) / d) * x)
+
+    @wp.func
+    def vectors(a: wp.array(dtype=vector), k: int, i: int, s: surroundings) -> rows:
+        return wp.matrix_from_rows(
+            a[s.neighbours[k, i]], a[s.neighbours[k + 1, i]], a[s.neighbours[k + 2, i]], a[s.neighbours[k + 3, i]]
+        )
+
+    @wp.func
+    def numbers(a: wp.array(dtype=real), k: int, i: int, s: surroundings) -> row:
+        return row(
+            a[s.neighbours[k, i]], a[s.neighbours[k + 1, i]], a[s.neighbours[k + 2, i]], a[s.neighbours[k + 3, i]]
+        )
+
+    return SimpleNamespace(
+        separation=separation,
+        weight=weight,
+        gradient=gradient,
+        hessian_product=hessian_product,
+        size=size,
+        factor=factor,
+        factor_gradient=factor_gradient,
+        vectors=vectors,
+        numbers=numbers,
+    )

@@ -1,0 +1,191 @@
+"""Neighbours: particles sorted by cell, and a symmetric list that the step keeps.
+
+The list reaches a little beyond the support radius (`SKIN`), because the density is also taken at predicted positions:
+without it a pair that comes into touch within the step would count or not depending on which side of the support it
+started, a jump in the map from one state to the next (and lattices start with pairs at just that distance).
+
+The list holds j for i exactly when it holds i for j, because |x_i - x_j| is computed with the same bits from both
+sides.
+"""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.device.cells import CellSort, Grid, cell_functions, cell_grid_type
+from cortado.device.launching import MOST_PARTS, Launcher
+from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
+
+
+@cache
+def _fill_kernel(discretisation: Discretisation) -> Any:
+    precision = discretisation.precision
+    vector = precision.vector
+    grid_type = cell_grid_type(precision)
+    surroundings = surroundings_type(precision)
+    cells = cell_functions(precision)
+    wrap, cell_of, below, above = cells.wrap, cells.cell_of, cells.below, cells.above
+    separation = pair_functions(discretisation).separation
+
+    @wp.func
+    def scan(
+        i: int,
+        own: int,
+        first: int,
+        last: int,
+        found: int,
+        x_i: vector,
+        positions: wp.array(dtype=vector),
+        s: surroundings,
+    ) -> int:
+        """Append the particles first ... last - 1 that lie within reach; ``own`` is left out."""
+        capacity = s.neighbours.shape[0]
+        total = found
+        limit = s.reach * s.reach
+        for j in range(first, last):
+            x_ij = separation(x_i, positions[j], s)
+            if wp.dot(x_ij, x_ij) < limit and j != own:
+                if total < capacity:
+                    s.neighbours[total, i] = j
+                total = total + 1
+        return total
+
+    @wp.func
+    def scan_row(
+        i: int,
+        own: int,
+        row: int,
+        c_x: int,
+        found: int,
+        x_i: vector,
+        positions: wp.array(dtype=vector),
+        grid: grid_type,
+        s: surroundings,
+    ) -> int:
+        """The cells c_x - 1, c_x, c_x + 1 of one row; away from the ends of the row they are one range."""
+        n = grid.shape[0]
+        total = found
+        if c_x > 0 and c_x + 1 < n:
+            total = scan(i, own, grid.starts[row + c_x - 1], grid.starts[row + c_x + 2], total, x_i, positions, s)
+        else:
+            for o in range(below(n), above(n)):
+                cell = row + wrap(c_x + o, n)
+                total = scan(i, own, grid.starts[cell], grid.starts[cell + 1], total, x_i, positions, s)
+        return total
+
+    @wp.kernel(module=discretisation.module(False, "neighbours"), enable_backward=False)
+    def fill(
+        s: surroundings,
+        grid: grid_type,
+        wall_grid: grid_type,
+        x: wp.array(dtype=vector),
+        # out
+        fluid_count: wp.array(dtype=wp.int32),
+        filling: wp.array(dtype=wp.int32),
+        count: wp.array(dtype=wp.int32),
+        needed: wp.array(dtype=wp.int32),
+    ):
+        """``needed``, for each range, becomes the longest list, also where that is more than there is room for."""
+        i = s.first + wp.tid()
+        x_i = x[i]
+        c = cell_of(x_i, grid)
+        n_y = grid.shape[1]
+        n_z = grid.shape[2]
+        capacity = s.neighbours.shape[0]
+        found = int(0)
+        for o_z in range(below(n_z), above(n_z)):
+            for o_y in range(below(n_y), above(n_y)):
+                row = (wrap(c[2] + o_z, n_z) * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]
+                found = scan_row(i, i, row, c[0], found, x_i, x, grid, s)
+        filled = (found + wp.static(UNROLL - 1)) // wp.static(UNROLL) * wp.static(UNROLL)
+        for k in range(found, wp.min(filled, capacity)):
+            s.neighbours[k, i] = i
+        filling[i] = filled - found
+        found = filled
+        fluid_count[i] = wp.min(found, capacity)
+        if s.wall_positions.shape[0] > 0:
+            for o_z in range(below(n_z), above(n_z)):
+                for o_y in range(below(n_y), above(n_y)):
+                    row = (wrap(c[2] + o_z, n_z) * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]
+                    found = scan_row(i, -1, row, c[0], found, x_i, s.wall_positions, wall_grid, s)
+        count[i] = wp.min(found, capacity)
+        if found > needed[s.part]:
+            wp.atomic_max(needed, s.part, found)
+
+    return fill
+
+
+class NeighbourSearch:
+    """Sorts a fixed number of particles by cell and lists their neighbours, on one device and without a host read.
+
+    The list is stored [particle][neighbour] on a CPU and [neighbour][particle] on a GPU, whichever a device reads
+    fastest; kernels index it [neighbour, particle] on both.
+    """
+
+    def __init__(
+        self,
+        discretisation: Discretisation,
+        grid: Grid,
+        walls: np.ndarray,
+        wall_weights: np.ndarray,
+        particles: int,
+        capacity: int,
+        device: Any,
+    ):
+        """``walls`` (b, 3) [m], ``wall_weights`` (b,) [-]."""
+        precision = discretisation.precision
+        self.particles, self.device = particles, device
+        self._fill = _fill_kernel(discretisation)
+        self._sort = CellSort(grid, particles, precision, device)
+        self.order = self._sort.order
+        self.fluid_count = wp.zeros(particles, dtype=wp.int32, device=device)
+        self.filling = wp.zeros(particles, dtype=wp.int32, device=device)
+        self.count = wp.zeros(particles, dtype=wp.int32, device=device)
+        self._launch = Launcher(particles, device, record_tape=False)
+        self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
+        self.wall_positions = wp.array(walls, dtype=precision.vector, device=device)
+        self.wall_weights = wp.array(wall_weights, dtype=precision.real, device=device)
+        self._wall_sort = CellSort(grid, len(walls), precision, device)
+        self._wall_sort(self.wall_positions)
+        sorted_to_given = self._wall_sort.order.numpy()[: len(walls)]
+        self.wall_positions.assign(walls[sorted_to_given])
+        self.wall_weights.assign(wall_weights[sorted_to_given])
+        self.allocate(capacity)
+
+    def allocate(self, capacity: int) -> None:
+        """Make room for lists of that length, rounded up to a multiple of `UNROLL`."""
+        self.capacity = -(-capacity // UNROLL) * UNROLL
+        shape = (self.particles, self.capacity)
+        if self.device.is_cpu:
+            self.neighbours = wp.empty(shape, dtype=wp.int32, device=self.device).transpose((1, 0))
+        else:
+            self.neighbours = wp.empty(shape[::-1], dtype=wp.int32, device=self.device)
+
+    def sort(self, positions: wp.array) -> None:
+        """Find the order of cells (``order``: sorted -> given) of positions (n,) [m]; ties keep the given order."""
+        self._sort(positions)
+
+    def fill(self, surroundings: Any, positions: wp.array) -> None:
+        """List the neighbours of sorted positions (n,) [m]; `needed` tells whether the lists were long enough."""
+        self._launch(
+            self._fill,
+            s=surroundings,
+            grid=self._sort.grid,
+            wall_grid=self._wall_sort.grid,
+            x=positions,
+            fluid_count=self.fluid_count,
+            filling=self.filling,
+            count=self.count,
+            needed=self._needed,
+        )
+
+    @property
+    def needed(self) -> int:
+        """The longest list since `forget_needed`; more than the capacity if there was too little room."""
+        return int(self._needed.numpy().max())
+
+    def forget_needed(self) -> None:
+        """Begin anew with `needed`."""
+        self._needed.zero_()

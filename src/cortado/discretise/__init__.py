@@ -1,0 +1,1 @@
+"""A scene cut into particles, with walls. NumPy, float64."""

@@ -1,0 +1,160 @@
+"""A scene cut into particles: first particles, walls, and the constants of the lattice. NumPy in float64 throughout.
+
+It is the same for every device, every precision and every engine.
+"""
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from cortado.discretise.sampling import FluidSample, fluid_particles, period, wall_particles
+from cortado.discretise.walls.layers import WallLayers, wall_layers
+from cortado.discretise.walls.weights import RestLattice, Surface
+from cortado.errors import CortadoWarning, InputError
+from cortado.lattice.calibration import (
+    laplacian_evenness,
+    pressure_stiffness,
+    rest_volume,
+    wall_rigidity,
+)
+from cortado.lattice.pairs import pairs_within
+from cortado.lattice.region import Region
+from cortado.lattice.shapes import Points
+from cortado.lattice.smoothing import SmoothingKernel, smoothing_kernel
+from cortado.scene.fluids import PointsFluid
+from cortado.scene.scene import Scene
+
+MOST_AVERAGE_COMPRESSION = 0.1
+"""Of the first particles, the mean of (n - 1)+ where n is the number density: a lattice that is squeezed by more
+bursts."""
+MOST_DENSITY = 1.5
+"""Greatest number density of a first particle; on a disturbed lattice with all particles half a spacing apart it is
+1.4."""
+NOTED_COMPRESSION = 0.03
+"""Average compression that is warned of; a lattice whose points are disturbed by a tenth of a spacing has 0.02."""
+NOTED_DENSITY = 0.5
+"""Where no particle has more, there is no fluid to speak of."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Constants of the rest lattice and of the kernel on it."""
+
+    support: float
+    """Support radius h [m]."""
+    normalisation: float
+    """sigma [1 / m^d]."""
+    self_weight: float
+    """W(0) [1 / m^d]."""
+    volume: float
+    """Rest volume V_0 of a particle [m^d]."""
+    stiffness: float
+    """k [m2]: delta = k / dt^2 [Pa m3 / kg] (report eq. 7, put right) for a filled neighbourhood."""
+    rigidity: float
+    """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of the yield, see `cortado.solvers.pcisph.wall_relaxation`."""
+    evenness: float
+    """[-], see `cortado.lattice.calibration.laplacian_evenness`."""
+
+    @classmethod
+    def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "Lattice":
+        """Those of a kernel with a support radius [m] on a lattice with a spacing [m]."""
+        return cls(
+            support=support,
+            normalisation=kernel.normalisation(dimension, support),
+            self_weight=float(kernel.weight(np.zeros(1), dimension, support)[0]),
+            volume=rest_volume(kernel, spacing, support, dimension),
+            stiffness=pressure_stiffness(kernel, spacing, support, dimension),
+            rigidity=wall_rigidity(kernel, spacing, support, dimension),
+            evenness=laplacian_evenness(kernel, spacing, support, dimension),
+        )
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Wall particles."""
+
+    positions: Points
+    """(b, d) [m]"""
+    weights: Points
+    """(b,) w_b [-]: what each counts for in the density, a fluid particle being 1."""
+
+
+@dataclass(frozen=True)
+class DiscreteScene:
+    """What a solver starts from, besides what the scene says itself."""
+
+    kernel: SmoothingKernel
+    """The smoothing kernel W."""
+    lattice: Lattice
+    """Constants."""
+    fluid: FluidSample
+    """The first fluid particles."""
+    wall_layers: WallLayers
+    """How the walls lie and how they drag; also for a scene without walls."""
+    walls: Walls
+    """The wall particles; none without a container."""
+    periods: Points
+    """(d,) lengths of the period [m], 0 along an axis that is not periodic."""
+
+    @cached_property
+    def near(self) -> Region:
+        """A box around all first particles and walls."""
+        everything = np.concatenate([self.fluid.positions, self.walls.positions])
+        return Region.between(everything.min(axis=0), everything.max(axis=0))
+
+
+def discretise(scene: Scene) -> DiscreteScene:
+    """Cut a scene into particles. Raises `InputError` if a file with points is gone since the scene was read, or if
+    points are packed too densely."""
+    kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
+    spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
+    layers = wall_layers(kernel, spacing, support, dimension)
+    lattice = Lattice.of(kernel, spacing, support, dimension)
+    fluid = fluid_particles(scene)
+    if any(isinstance(body, PointsFluid) for body in scene.fluid):
+        _check_packing(scene, fluid.positions, kernel, lattice)
+    walls = _walls(scene, layers, RestLattice(kernel, spacing, support))
+    return DiscreteScene(kernel, lattice, fluid, layers, walls, period(scene)[1])
+
+
+def _walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
+    particles = wall_particles(scene, layers.depths)
+    flat = np.repeat(layers.weights, [len(layer) for layer in particles])
+    positions, (lower, lengths) = np.concatenate(particles), period(scene)
+    places = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
+    region = scene.container.region(scene.dimension).opened(lengths)
+    return Walls(positions, Surface(positions, flat, lattice, region, lower, lengths).weights(places))
+
+
+def _check_packing(scene: Scene, positions: Points, kernel: SmoothingKernel, lattice: Lattice) -> None:
+    """Points of a file may have any density: fluid that starts compressed flies apart, and points that do not touch
+    each other are no fluid. Raises `InputError`, or warns where it may be meant."""
+    point, _, distances = pairs_within(positions, positions, lattice.support, *period(scene))
+    seen = kernel.weight(distances, scene.dimension, lattice.support)
+    densities = lattice.volume * np.bincount(point, seen, minlength=len(positions))
+    average, greatest = np.maximum(densities - 1.0, 0.0).mean(), densities.max()
+    spacing, inside = scene.discretisation.spacing, float(np.quantile(densities, 0.75))  # away from the surface
+    fit = spacing * inside ** (-1.0 / scene.dimension)
+    advice = f"discretisation.spacing is {spacing:g} m, and these points would fit one of {fit:.3g} m"
+    if average > MOST_AVERAGE_COMPRESSION or greatest > MOST_DENSITY:
+        place = ", ".join(f"{x:g}" for x in positions[densities.argmax()])
+        raise InputError(
+            f"The points of the fluid have {greatest:.3g} times the rest density at ({place}) m and are compressed by "
+            f"{average:.0%} on average, but must have at most {MOST_DENSITY:g} times and be compressed by at most "
+            f"{MOST_AVERAGE_COMPRESSION:.0%}: {advice}."
+        )
+    if average > NOTED_COMPRESSION:
+        warnings.warn(
+            f"the points of the fluid are compressed by {average:.0%} on average, and will fly apart: {advice}.",
+            CortadoWarning,
+            stacklevel=4,
+        )
+    if greatest < NOTED_DENSITY:
+        warnings.warn(
+            f"the points of the fluid have {greatest:.2g} times the rest density at most, and hardly touch each other: "
+            f"{advice}.",
+            CortadoWarning,
+            stacklevel=4,
+        )

@@ -1,0 +1,94 @@
+"""Filters of the adjoint of a state between two backward steps, and its norms (`cortado.gradients.filter_kernels`)."""
+
+from collections.abc import Iterable
+
+import numpy as np
+import warp as wp
+
+from cortado.device.launching import sum_of
+from cortado.device.state import Parameters, State
+from cortado.gradients.filter_kernels import adjoint_filter_kernels
+from cortado.solvers.solver import Solver
+
+FIELDS = ("positions", "velocities")
+"""Fields of a `State` that can be filtered."""
+
+
+class Average:
+    """Blends fields of an adjoint with their average over the neighbours that the solver holds."""
+
+    def __init__(self, solver: Solver, fields: Iterable[str]):
+        self._solver, self._fields = solver, tuple(fields)
+        self._kernels = adjoint_filter_kernels(solver.discretisation)
+        self._before = solver.new_state()
+        real, device = solver.discretisation.precision.real, solver.device
+        self._strength = wp.zeros(1, dtype=real, device=device)
+        self._most = wp.zeros(solver.particles, dtype=real, device=device)
+
+    def set_strength(self, strength: float) -> None:
+        """From now on; from 0, which leaves everything as it is, to 1."""
+        self._strength.fill_(strength)
+
+    def __call__(self, bar: State, parameters: Parameters) -> None:
+        """Blend the adjoint of the state whose step the solver has recorded."""
+        context = self._solver.context(parameters)
+        context.launch(self._kernels.crowd, most=self._most)
+        for name in self._fields:
+            wp.copy(self._before[name], bar[name])
+            arrays = {"a": self._before[name], "a_new": bar[name]}
+            context.launch(self._kernels.average, strength=self._strength, most=self._most, **arrays)
+
+
+class Limit:
+    """Cuts fields of an adjoint, particle by particle, to so many root mean squares over all particles."""
+
+    def __init__(self, solver: Solver, fields: Iterable[str]):
+        particles, device = solver.particles, solver.device
+        self._launch, self._particles, self._fields = solver.launch, particles, tuple(fields)
+        self._kernels = adjoint_filter_kernels(solver.discretisation)
+        self._squares = wp.zeros(particles, dtype=wp.vec2d, device=device)
+        self._sum = sum_of(wp.vec2d, particles, device)
+        self._times = wp.full(1, np.inf, dtype=wp.float64, device=device)
+
+    def set_times(self, times: float) -> None:
+        """From now on; infinitely many leave everything as it is."""
+        self._times.fill_(times)
+
+    def __call__(self, bar: State) -> None:
+        squares = self._squares
+        self._launch(self._kernels.squares, a=bar.positions, b=bar.velocities, found=squares)
+        known = {"times": self._times, "particles": self._particles, "squares": squares, "sums": self._sum(squares)}
+        for number, name in enumerate(FIELDS):
+            if name in self._fields:
+                self._launch(self._kernels.limit, known, field=number, a=bar[name])
+
+
+class Drag:
+    """Multiplies the adjoint of velocities by exp(-rate dt)."""
+
+    def __init__(self, solver: Solver, rate: float):
+        self._launch, self._rate = solver.launch, rate
+        self._kernel = adjoint_filter_kernels(solver.discretisation).drag
+
+    def __call__(self, bar: State, parameters: Parameters) -> None:
+        self._launch(self._kernel, rate=self._rate, time_step=parameters["time_step"], a=bar.velocities)
+
+
+class AdjointNorms:
+    """An observer of a way back that keeps the norms of adjoints, on the device until they are asked for."""
+
+    def __init__(self, solver: Solver, steps: int):
+        particles, device = solver.particles, solver.device
+        self._launch = solver.launch
+        self._kernel = adjoint_filter_kernels(solver.discretisation).squares
+        self._squares = wp.zeros(particles, dtype=wp.vec2d, device=device)
+        self._sum = sum_of(wp.vec2d, particles, device)
+        self._history = wp.zeros(steps + 1, dtype=wp.vec2d, device=device)
+
+    def __call__(self, step: int, bar: State) -> None:
+        self._launch(self._kernel, a=bar.positions, b=bar.velocities, found=self._squares)
+        wp.copy(self._history, self._sum(self._squares), dest_offset=step, count=1)
+
+    def numpy(self) -> np.ndarray:
+        """(steps + 1, 2) norms over all particles of the adjoints of positions and of velocities, state by state."""
+        return np.sqrt(self._history.numpy())

@@ -1,0 +1,122 @@
+"""What a policy is: a way to come by a gradient, given to `Problem.value_and_gradient`."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+from cortado.device.state import Parameters, State
+from cortado.errors import InputError
+from cortado.parameters.values import Arrays, Values
+from cortado.rollout import Observer, Rollout, StepDerivative
+from cortado.solvers.solver import Counts
+from cortado.words import sized
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A loss and its gradient, with what a policy has to say about it."""
+
+    loss: float
+    gradient: Arrays
+    """For each parameter given, an array of its shape (float64)."""
+    strength: float | None = None
+    """Of the smoothing that `AdjointSmoothing` applied, the weakest of those that were extrapolated."""
+    standard_error: Arrays | None = None
+    """Of every number of the gradient, where it is an average (`Smoothed`, `Averaged`)."""
+
+    def __repr__(self) -> str:
+        strength = "" if self.strength is None else f", strength {self.strength:.4g}"
+        error = "" if self.standard_error is None else ", with its standard error"
+        return f"Estimate(loss {self.loss:.6g}, gradient of {sized(self.gradient)}{strength}{error})"
+
+
+class Passage(Protocol):
+    """A forward run with its loss, which can be gone back through as often as wanted, until the problem's next run."""
+
+    @property
+    def loss(self) -> float:
+        """Of the run."""
+
+    @property
+    def rollout(self) -> Rollout:
+        """The run."""
+
+    def derivative(self, policy: "AdjointPolicy") -> StepDerivative:
+        """The policy's backward step, made once for each problem."""
+
+    def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:
+        """The gradient; ``observe`` is given the number and the adjoint of every state, from the last to the first."""
+
+
+class Differentiable(Protocol):
+    """What a policy sees of a `Problem`."""
+
+    simulation: Any
+
+    def value(self, parameters: Values) -> float:
+        """The loss, forward only."""
+
+    def passage(self, parameters: Values) -> Passage:
+        """A forward run that can be gone back through."""
+
+
+class Policy(Protocol):
+    """A way to come by a gradient."""
+
+    def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
+        """The loss and its gradient; ``observe`` is given the adjoint of every state, by policies that have any."""
+
+
+def checked_policy(policy: Policy) -> Policy:
+    """The policy, if it is one: its class is not."""
+    if isinstance(policy, type) or not hasattr(policy, "estimate"):
+        raise InputError(f"policy is {policy!r}, but must be an object such as cortado.gradients.Exact().")
+    return policy
+
+
+@runtime_checkable
+class Tunable(Protocol):
+    """A policy that finds something out before it makes a gradient."""
+
+    def tuned(self, problem: Differentiable, parameters: Values) -> Policy:
+        """The same with what it finds out here, for use at parameters nearby."""
+
+
+def tuned(policy: Policy, problem: Differentiable, parameters: Values) -> Policy:
+    """The policy with what there is to find out found out, so that a search does so once."""
+    checked_policy(policy)
+    return policy.tuned(problem, parameters) if isinstance(policy, Tunable) else policy
+
+
+class AdjointPolicy(ABC):
+    """A policy that goes back once through one rollout, step by step."""
+
+    @abstractmethod
+    def derivative(self, rollout: Rollout) -> StepDerivative:
+        """The backward step for one rollout."""
+
+    def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
+        """See `Policy`."""
+        passage = problem.passage(parameters)
+        return Estimate(passage.loss, passage.back(passage.derivative(self), observe))
+
+
+class Filtered:
+    """The backward step of another policy, and then a filter of the adjoint."""
+
+    def __init__(self, base: StepDerivative):
+        self._base, self.solver, self.capturable = base, base.solver, base.capturable
+
+    def begin(self) -> None:
+        self._base.begin()
+
+    def step(self, state: State, counts: Counts, bar: State) -> None:
+        self._base.step(state, counts, bar)
+        self.filter(bar)
+
+    def parameters(self) -> Parameters:
+        return self._base.parameters()
+
+    def filter(self, bar: State) -> None:
+        """Change the adjoint of the state whose step the solver has recorded."""
+        raise NotImplementedError

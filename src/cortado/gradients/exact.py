@@ -1,0 +1,118 @@
+"""Policies that differentiate the discrete step as it is, or as if positions were frozen within it."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from cortado.device.state import Parameters, State
+from cortado.gradients.estimator import AdjointPolicy
+from cortado.rollout import Rollout, StepDerivative
+from cortado.solvers.solver import Counts
+
+
+@dataclass(frozen=True)
+class Exact(AdjointPolicy):
+    """The exact adjoint of the discrete step, by gathers: no atomics, the same bits every time.
+
+    Formula: the transposed derivative of the step. Bias: none; but where neighbouring trajectories separate it grows as
+    they do, by a constant factor a step. Cost: each step once more forward, and about twice the neighbour sums of a
+    step backward.
+    """
+
+    def derivative(self, rollout: Rollout) -> StepDerivative:
+        return _AdjointStep(rollout, frozen_geometry=False)
+
+
+@dataclass(frozen=True)
+class VelocityOnly(AdjointPolicy):
+    """The adjoint of a step in which no force depends on positions.
+
+    Formula: for a new state with adjoints x^ and v^,
+
+        v^ <- B^T (v^ + dt x^),   x^ <- x^,   B = dv' / dv at fixed positions:
+
+    pressure and viscosity answer to velocities, neighbours and weights stay. B hardly amplifies, as viscosity damps and
+    pressure takes away what would compress, so that the adjoint grows at most linearly with the steps.
+
+    Bias: whatever pushes back a displaced fluid is missing, gravity waves for one; directions decay over times in which
+    the fluid sloshes. Cost: less than `Exact`, as there is no Hessian of the smoothing kernel. Prior art: the default
+    of DiffFR (Li et al. 2023).
+    """
+
+    def derivative(self, rollout: Rollout) -> StepDerivative:
+        return _AdjointStep(rollout, frozen_geometry=True)
+
+
+@dataclass(frozen=True)
+class Tape(AdjointPolicy):
+    """The exact adjoint again, by Warp's own automatic differentiation of the forward kernels.
+
+    The report's autograd: slower than `Exact`, with atomics on a GPU, and kept to check it.
+    """
+
+    def derivative(self, rollout: Rollout) -> StepDerivative:
+        return _TapeStep(rollout)
+
+
+class _AdjointStep:
+    capturable = True
+
+    def __init__(self, rollout: Rollout, frozen_geometry: bool):
+        solver = rollout.solver
+        self.solver, self._parameters = solver, rollout.parameters
+        self._adjoint = solver.adjoint(rollout.steps, frozen_geometry)
+
+    def begin(self) -> None:
+        self._adjoint.begin()
+
+    def step(self, state: State, counts: Counts, bar: State) -> None:
+        self.solver.replay(state, self._parameters, counts)
+        self._adjoint.step(counts, bar, bar, self._parameters)
+
+    def parameters(self) -> Parameters:
+        return self._adjoint.collect()
+
+
+class _TapeStep:
+    capturable = False
+
+    def __init__(self, rollout: Rollout):
+        solver = rollout.solver
+        self._given, self._parameters = solver, rollout.parameters
+        self.solver = solver.differentiable()
+        self._before, self._after = (self.solver.new_state(requires_grad=True) for _ in range(2))
+        self._own = self.solver.new_parameters(rollout.steps, requires_grad=True)
+
+    def begin(self) -> None:
+        self.solver.match(self._given)
+        self._own.assign(self._parameters)
+        for array in self._own.arrays():
+            array.grad.zero_()
+
+    def step(self, state: State, counts: Counts, bar: State) -> None:
+        self._before.assign(state)
+        wp.copy(self.solver.step_number, self._given.step_number)
+        tape = wp.Tape()
+        try:
+            self._back(tape, counts, bar)
+        finally:
+            self._forget(tape)
+
+    def _back(self, tape: wp.Tape, counts: Counts, bar: State) -> None:
+        with tape:
+            self.solver.replay(self._before, self._own, counts)
+            self.solver.write_state(counts, self._own, self._after)
+        tape.backward(grads=dict(zip(self._after.arrays(), bar.arrays(), strict=True)))
+        for own, total in zip(self._before.arrays(), bar.arrays(), strict=True):
+            wp.copy(total, own.grad)
+
+    def _forget(self, tape: Any) -> None:
+        """Zero every adjoint but those of the parameters, which add up over the steps."""
+        kept = {own.ptr for own in self._own.arrays()}
+        for array, gradient in tape.gradients.items():
+            if isinstance(array, wp.array) and array.ptr not in kept:
+                gradient.zero_()
+
+    def parameters(self) -> Parameters:
+        return self._own.gradients()

@@ -1,0 +1,87 @@
+"""The pictures of a solved task: the loss, parameters, particles or images on the way, and a video."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from cortado.figures import curve, images, loss_curve, parameters, particles
+from cortado.inverse.setup import Assignment
+from cortado.io.report import Figures
+from cortado.io.video import MOST_FRAMES, write_video
+from cortado.optimisation.optimise import Result
+from cortado.parameters.registry import BY_NAME, Axis
+from cortado.parameters.tilt import Tilt
+from cortado.parameters.values import OVER_TIME, UNITS
+
+MOST_CURVES = 12
+"""Parameters with more components get no picture of their own."""
+MOMENTS = 6
+"""Images on the way."""
+
+
+def task_figures(made: Assignment, result: Result, folder: Path) -> Figures:
+    """Draw them into a folder; (caption, path) of each."""
+    losses = [record.loss for record in result.history]
+    label = "loss [m²]" if made.renderer is None else "loss"
+    figures: Figures = [("The loss.", loss_curve(losses, folder / "loss.png", label=label))]
+    if made.renderer is None:
+        figures.append(_particles(made, result, folder))
+    else:
+        figures += _images(made, result, folder)
+    for name in result.parameters:
+        figures += _parameter(made, result, name, folder)
+    return figures
+
+
+def _particles(made: Assignment, result: Result, folder: Path) -> tuple[str, Path]:
+    before, after = (made.problem.end(made.search.parameters(u)).positions for u in (made.start, result.parameters))
+    target = made.targets[made.problem.steps]
+    path = particles([before, after, target], ["start", "found", "target"], folder / "particles.png")
+    return "Where the fluid ends: with the first guess, with the parameters found, and the target.", path
+
+
+def _images(made: Assignment, result: Result, folder: Path) -> Figures:
+    last, target = max(made.targets.items())
+
+    def image(u: dict[str, np.ndarray]) -> np.ndarray:
+        return made.image(made.problem.states(made.search.parameters(u), [last])[last])
+
+    path = images(
+        [image(made.start), image(result.parameters), target], ["start", "found", "target"], folder / "images.png"
+    )
+    figures: Figures = [("The last image: with the first guess, with the parameters found, and the target.", path)]
+    moments = np.unique(np.linspace(0, len(result.history) - 1, MOMENTS).astype(int))
+    shown = [image(result.history[k].parameters) for k in moments]
+    path = images(shown, [f"iteration {k}" for k in moments], folder / "progress.png")
+    figures.append(("The last image during the optimisation.", path))
+    steps = made.problem.steps
+    if steps > 0 and find_spec("av"):
+        numbers = np.unique(np.linspace(0, steps, MOST_FRAMES).astype(int))
+        found = made.problem.states(made.search.parameters(result.parameters), numbers.tolist())
+        path = write_video(folder / "found.mp4", (made.image(found[k]) for k in numbers.tolist()), 20)
+        figures.append(("What happens with the parameters found.", path))
+    return figures
+
+
+def _parameter(made: Assignment, result: Result, name: str, folder: Path) -> Figures:
+    """A small parameter over the iterations, one over time as it was found."""
+    found, hidden = made.search.parameters(result.parameters)[name], made.hidden(name)
+    if name in OVER_TIME and np.ndim(found) == 2:
+        axes = Tilt(made.task.scene.forces.gravity).towards if name == "tilt" else "xyz"
+        series = {f"{axis}, found": column for axis, column in zip(axes, found.T, strict=False)}
+        truth = () if hidden is None else tuple(np.broadcast_to(hidden, found.shape).T)
+        path = folder / f"{name}.png"
+        label = f"{name} [{UNITS[name]}]"
+        curve(np.arange(len(found)), series, path, title=name, x_label="step", y_label=label, hidden=truth)
+        return [(f"The parameter {name} over time.", path)]
+    if hidden is None or max(np.size(found), hidden.size) > MOST_CURVES:
+        return []
+    values = [made.search.parameters(record.parameters)[name] for record in result.history]
+    history = [np.broadcast_arrays(value, hidden)[0] for value in values]
+    hidden = np.broadcast_to(hidden, history[0].shape)
+    phases = [phase.name for phase in made.task.scene.phase]
+    is_material = BY_NAME[name].axis is Axis.PHASE and BY_NAME[name].components is None
+    names = phases if is_material and len(phases) > 1 else None
+    path = parameters(history, hidden, folder / f"{name}.png", names=names, title=name, unit=UNITS[name])
+    return [(f"The parameter {name} during the optimisation, and the hidden one.", path)]

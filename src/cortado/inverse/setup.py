@@ -1,0 +1,157 @@
+"""A task made ready: its problem with the target, in the coordinates in which it is searched, from a start."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cortado.errors import DivergedError, InputError
+from cortado.inverse.tables import DISTANCES, RANDOM
+from cortado.inverse.task import Task
+from cortado.io.pictures import heart, read_picture, rosetta
+from cortado.losses import FinalPositions, Frames, Image, Loss, TrajectoryEnd
+from cortado.optimisation.reparametrisation import Coordinates, Knots, Logarithm, Reparametrised, Softmax
+from cortado.parameters.registry import BY_NAME, Range
+from cortado.parameters.values import OVER_TIME, Arrays
+from cortado.problem import Problem
+from cortado.render.renderer import Renderer
+from cortado.render.scene_renderer import scene_renderer
+from cortado.scene.containers import CylinderContainer
+from cortado.simulation import Simulation
+
+DRAWN = {"heart": heart, "rosetta": rosetta}
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """What `cortado.optimise` is given, and what its result is held against."""
+
+    task: Task
+    problem: Problem
+    searches: tuple[Reparametrised, ...]
+    """One after the other, through thicker and thicker fluid, in the same coordinates; the last is the task's own."""
+    start: Arrays
+    """Coordinates to begin with."""
+    bounds: dict[str, tuple[Any, Any]]
+    """Of coordinates."""
+    renderer: Renderer | None
+    """None where positions are compared."""
+    targets: dict[int, np.ndarray]
+    """Images (rows, columns, 3) or positions (n, d) [m] by the number of steps before them."""
+
+    @property
+    def search(self) -> Reparametrised:
+        """The last one."""
+        return self.searches[-1]
+
+    def image(self, end: TrajectoryEnd) -> np.ndarray:
+        """The picture (rows, columns, 3) of a state."""
+        assert self.renderer is not None
+        return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
+
+    def hidden(self, name: str) -> np.ndarray | None:
+        """The parameter that made the target, None where a picture is the target."""
+        return self.task.hidden.get(name)
+
+
+def assignment(task: Task, device: str, precision: str) -> Assignment:
+    """The task on a device; raises `InputError` for a picture that cannot be read."""
+    simulation = Simulation(task.scene, device, precision)
+    start = {name: _start(name, value, simulation) for name, value in task.start.items()}
+    found = _coordinates(task, start)
+    searches = []
+    for share in task.optimise.extinctions:
+        renderer = scene_renderer(simulation, share) if task.problem.loss == "image" else None
+        targets = _targets(task, simulation, renderer)
+        problem = Problem(simulation, task.problem.steps, _frames(task, targets, renderer))
+        searches.append(Reparametrised(problem, found))
+    bounds = _bounds(task)
+    coordinates = searches[-1].coordinate(start)
+    for name, (lower, upper) in bounds.items():
+        coordinates[name] = np.clip(coordinates[name], lower, upper)  # what is random, or a little outside by round-off
+    return Assignment(task, problem, tuple(searches), coordinates, bounds, renderer, targets)
+
+
+def _frames(task: Task, targets: dict[int, np.ndarray], renderer: Renderer | None) -> Frames:
+    losses: dict[int, Loss] = {}
+    for step, target in targets.items():
+        if renderer is None:
+            losses[step] = FinalPositions(target)
+        else:
+            losses[step] = Image(renderer, target, DISTANCES[task.problem.distance])
+    return Frames(losses)
+
+
+def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> dict[int, np.ndarray]:
+    steps = task.problem.compared
+    if task.problem.picture is not None:
+        assert renderer is not None
+        return {steps[-1]: _picture(task, renderer)}
+    nothing = FinalPositions(simulation.positions)
+    try:
+        ends = Problem(simulation, task.problem.steps, nothing).states(task.hidden, steps)
+    except DivergedError as error:
+        advice = f"this is the run with the parameters of problem.target, so change those, or {error.advice}"
+        raise error.with_advice(advice) from None
+    except InputError as error:
+        raise InputError(f"problem.target: {error}") from None
+    if renderer is None:
+        return {step: end.positions for step, end in ends.items()}
+    return {
+        step: renderer.render(end.state.positions, end.state.mass_fractions, end.colours) for step, end in ends.items()
+    }
+
+
+def _picture(task: Task, renderer: Renderer) -> np.ndarray:
+    """The picture that a task names; one of ours in the colours of the scene, the last phase on the first."""
+    name, scene = task.problem.picture, task.scene
+    assert name is not None
+    rows, columns, _ = renderer.shape
+    if name not in DRAWN:
+        return read_picture(task.folder / name, (columns, rows))
+    colours = [phase.colour for phase in scene.phase]
+    background = scene.render.background if scene.render else (1.0, 1.0, 1.0)
+    under = colours[0] if len(colours) > 1 else background
+    cup = 1.0 if isinstance(scene.container, CylinderContainer) else None
+    options: dict[str, Any] = {"milk": colours[-1], "coffee": under, "background": background}
+    return DRAWN[name]((columns, rows), cup=cup, **options)
+
+
+def _start(name: str, value: Any, simulation: Simulation) -> np.ndarray:
+    if not isinstance(value, str) or value != RANDOM:
+        return np.asarray(value)
+    random = np.random.default_rng(0)
+    if name == "mass_fractions":
+        return random.dirichlet(np.ones(len(simulation.scene.phase)), simulation.particles)
+    container = simulation.scene.container
+    extent = container.extent()
+    if extent is None:
+        raise InputError('optimise.start.initial_positions is "random", but the scene has no container to fill.')
+    half = 0.5 * simulation.scene.discretisation.spacing
+    lower, upper = extent[0] + half, extent[1] - half
+    x = random.uniform(lower, upper, simulation.positions.shape)
+    while (outside := ~container.contains(x, 0.0)).any():  # in the corners around a cylinder
+        x[outside] = random.uniform(lower, upper, x[outside].shape)
+    return x
+
+
+def _coordinates(task: Task, start: Arrays) -> dict[str, Coordinates]:
+    found: dict[str, Coordinates] = {name: Logarithm() for name in task.optimise.logarithmic}
+    for name, value in start.items():
+        if name == "mass_fractions":
+            found[name] = Softmax()
+        elif name in OVER_TIME and value.ndim == 2 and task.optimise.knots is not None:
+            found[name] = Knots(task.problem.steps, task.optimise.knots)
+    return found
+
+
+def _bounds(task: Task) -> dict[str, tuple[Any, Any]]:
+    """Bounds hold for knots as they do for what lies between them, and for logarithms after they are taken. A parameter
+    that cannot be negative has 0 as a bound."""
+    with_zero = [name for name in task.start if BY_NAME[name].range is Range.NOT_NEGATIVE]
+    free = [name for name in with_zero if name not in task.optimise.logarithmic]
+    found: dict[str, tuple[Any, Any]] = dict.fromkeys(free, (0.0, None))
+    for name, pair in (task.optimise.bounds or {}).items():
+        lower, upper = (np.log(b) if name in task.optimise.logarithmic else b for b in pair)
+        found[name] = (lower, upper)
+    return found

@@ -1,0 +1,238 @@
+"""The tables [problem] and [optimise] of a task, with the kinds of values that only they have."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from cortado.errors import Phrase
+from cortado.gradients import AdjointPolicy, AdjointSmoothing, Averaged, Exact, Policy, VelocityOnly
+from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
+from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, Optimiser
+from cortado.parameters.values import NAMES
+from cortado.scene.fields import MISSING, Choice, Count, Kind, Quantity, Text, as_number, as_sequence, wrong
+from cortado.scene.tables import Table
+
+OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
+    "adam": Adam,
+    "gradient_descent": GradientDescent,
+    "lbfgs": lambda scale: LBFGS(scale=scale),
+}
+"""By the names in a file; each is made from the learning rate (for L-BFGS the size of its first step)."""
+DISTANCES: dict[str, ImageLoss] = {"squared_difference": SquaredDifference(), "pyramid": Pyramid()}
+POLICIES: dict[str, AdjointPolicy] = {
+    "exact": Exact(),
+    "velocity_only": VelocityOnly(),
+    "adjoint_smoothing": AdjointSmoothing(),
+}
+RANDOM = "random"
+CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
+
+
+@dataclass(frozen=True)
+class Values(Kind):
+    """Parameters by name: a number, or a list, of lists, of numbers."""
+
+    random: bool = False
+    """Whether `CAN_BE_RANDOM` may be the word "random"."""
+
+    wanted = f"a table of at least one parameter out of {', '.join(NAMES)}"
+
+    def check(self, value: Any) -> dict[str, Any]:
+        if not isinstance(value, Mapping) or not value:
+            raise wrong((), Phrase("empty") if value == {} else value, self.wanted)
+        return {name: self._array(name, entry) for name, entry in value.items()}
+
+    def _array(self, name: str, value: Any) -> Any:
+        if name not in NAMES:
+            raise wrong((name,), Phrase("unknown"), f"one of {', '.join(NAMES)}")
+        if self.random and name in CAN_BE_RANDOM and value == RANDOM:
+            return value
+        wanted = "made of finite numbers: one, a list of them, or a list of lists of one length"
+        if not _is_numeric(value):
+            raise wrong((name,), value, wanted)
+        try:
+            return np.array(value, dtype=np.float64)
+        except ValueError:
+            raise wrong((name,), value, wanted) from None
+
+
+@dataclass(frozen=True)
+class Names(Kind):
+    """A list of parameters."""
+
+    wanted = f"a list of parameters out of {', '.join(NAMES)}"
+
+    def check(self, value: Any) -> tuple[str, ...]:
+        if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) and name in NAMES for name in value):
+            raise wrong((), value, self.wanted)
+        return tuple(value)
+
+
+@dataclass(frozen=True)
+class Shares(Kind):
+    """Numbers that grow to 1."""
+
+    wanted = "a list of numbers greater than 0, each greater than the one before, the last of them 1"
+
+    def check(self, value: Any) -> tuple[float, ...]:
+        numbers = [as_number(entry) for entry in as_sequence(value) or ()]
+        shares = [number for number in numbers if number is not None and number > 0.0]
+        growing = all(a < b for a, b in pairwise(shares))
+        if not shares or len(shares) < len(numbers) or not growing or shares[-1] != 1.0:
+            raise wrong((), value, self.wanted)
+        return tuple(shares)
+
+
+def _is_numeric(value: Any) -> bool:
+    """Whether there is a finite number, or nothing else in a list that is not empty."""
+    if isinstance(value, list):
+        return bool(value) and all(map(_is_numeric, value))
+    return as_number(value) is not None
+
+
+class ProblemTable(Table):
+    """[problem]: a number of steps, and a target: what a run with hidden parameters makes, or a picture."""
+
+    steps: Annotated[int, Count(0, 10_000_000)]
+    """Time steps; 0 for a loss of the first state."""
+    loss: Annotated[str, Choice(("positions", "image"))] = "positions"
+    """What is compared: where the particles are, or how they look."""
+    distance: Annotated[str, Choice(tuple(DISTANCES))] = "squared_difference"
+    """How images are compared."""
+    frames: Annotated[int, Count(1, 10_000)] = 1
+    """How many states are compared, evenly spaced up to the last one."""
+    target: Annotated[dict[str, Any] | None, Values()] = None
+    """Hidden parameters: the target is what their run makes."""
+    picture: Annotated[str | None, Text()] = None
+    """"heart", "rosetta", or a file with a picture, beside the task's own."""
+
+    @model_validator(mode="after")
+    def _check_target(self) -> Self:
+        if self.picture is None and self.target is None:
+            raise wrong(("target",), MISSING, f"{Values.wanted}, as there is no picture")
+        if self.picture is not None and self.target is not None:
+            raise wrong(("picture",), self.picture, "left out, as there is a target")
+        if self.picture is not None and self.loss != "image":
+            raise wrong(("loss",), self.loss, '"image", as there is a picture')
+        if self.picture is not None and self.frames > 1:
+            raise wrong(("frames",), self.frames, "1, as there is a picture, which is one")
+        if self.loss != "image" and "distance" in self.model_fields_set:
+            raise wrong(("distance",), self.distance, "left out, as positions are compared")
+        if self.frames > max(self.steps, 1):
+            raise wrong(("frames",), self.frames, f"at most {max(self.steps, 1)}, as there are {self.steps} steps")
+        return self
+
+    @property
+    def compared(self) -> list[int]:
+        """The numbers of the states that are compared."""
+        return [round(self.steps * (k + 1) / self.frames) for k in range(self.frames)]
+
+
+class CheckTable(Table):
+    """[optimise.check]: what the run has to reach."""
+
+    loss_reduction: Annotated[float, Quantity(least=1.0)] = 1.0
+    """First loss / best loss."""
+    parameter_error: Annotated[float, Quantity(above=0.0)] = 1e50
+    """Largest relative distance (L2) of a found parameter from the hidden one."""
+    psnr: Annotated[float, Quantity("dB", least=0.0)] = 0.0
+    """Peak signal-to-noise ratio of the found image to the target."""
+
+
+class PolicyTable(Table):
+    """[optimise.policy]: which gradient the search follows, see docs/policies.md."""
+
+    name: Annotated[str, Choice(tuple(POLICIES))] = "exact"
+    """What is done on the way back through a run."""
+    strength: Annotated[float | None, Quantity(above=0.0, most=1.0)] = None
+    """Of adjoint smoothing; None: found at the start of a search."""
+    samples: Annotated[int, Count(1, 10_000)] = 1
+    """Runs of a cloud that the gradient is the mean of."""
+    spread: Annotated[dict[str, Any] | None, Values()] = None
+    """Of the cloud: by name a number, in the units of what is searched."""
+    disorder: Annotated[float, Quantity("spacings", least=0.0)] = Averaged.disorder
+    """Of the first positions in the cloud."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.strength is not None and self.name != "adjoint_smoothing":
+            raise wrong(("strength",), self.strength, "left out, as nothing is smoothed")
+        if self.strength is not None and self.strength * self._order > 1.0:
+            raise wrong(("strength",), self.strength, f"at most {1.0 / self._order:g}, as means are extrapolated")
+        if self.samples != 1 and (self.samples % 2 or self.samples < 4):
+            raise wrong(("samples",), self.samples, "1, or an even number of at least 4")
+        if self.samples > 1 and self.spread is None:
+            raise wrong(("spread",), MISSING, "a table of numbers greater than 0, as there are several samples")
+        for name in ("spread", "disorder"):
+            if self.samples == 1 and name in self.model_fields_set:
+                raise wrong((name,), Phrase("given"), "left out, as there is one sample")
+        for name, number in (self.spread or {}).items():
+            if number.ndim or not number > 0.0:
+                raise wrong(("spread", name), number.tolist(), "a number greater than 0")
+        return self
+
+    @property
+    def _order(self) -> int:
+        return 2 if self.samples > 1 else 1
+
+    def policy(self) -> Policy:
+        """As an object."""
+        one = POLICIES[self.name]
+        if isinstance(one, AdjointSmoothing):
+            one = AdjointSmoothing("auto" if self.strength is None else self.strength, order=self._order)
+        if self.spread is None:
+            return one
+        spread = {name: float(number) for name, number in self.spread.items()}
+        return Averaged(spread, self.samples, self.disorder, policy=one)
+
+
+class OptimiseTable(Table):
+    """[optimise]: from where, how and how long."""
+
+    start: Annotated[dict[str, Any], Values(random=True)]
+    """Parameters to begin with; these are optimised."""
+    knots: Annotated[int | None, Count(2, 10_000_000)] = None
+    """Parameters over time are interpolated between so many free values; None: every step has its own."""
+    logarithmic: Annotated[tuple[str, ...], Names()] = ()
+    """Parameters that are changed by factors."""
+    bounds: Annotated[dict[str, Any] | None, Values()] = None
+    """By name: two entries, the lower and the upper bound."""
+    extinctions: Annotated[tuple[float, ...], Shares()] = (1.0,)
+    """Of one search after the other, each from where the last one ended, relative to the scene's: through thinner fluid
+    a picture tells how much there is, and particles that hide behind each other have to part."""
+    optimiser: Annotated[str, Choice(tuple(OPTIMISERS))] = "adam"
+    """Name of the algorithm."""
+    learning_rate: Annotated[float, Quantity(above=0.0)]
+    """In units of the parameters; for L-BFGS the size of its first step."""
+    tolerance: Annotated[float | None, Quantity(above=0.0, most=0.5)] = None
+    """Of L-BFGS: it ends where the gradient is this part of the first; None: where round-off stops it."""
+    iterations: Annotated[int, Count(1, 10_000_000)]
+    """Updates at most, of each search."""
+    policy: PolicyTable = PolicyTable()
+    """Which gradient it follows."""
+    check: CheckTable = CheckTable()
+    """What the run has to reach."""
+
+    @model_validator(mode="after")
+    def _check_tolerance(self) -> Self:
+        if self.tolerance is not None and self.optimiser != "lbfgs":
+            raise wrong(("tolerance",), self.tolerance, 'left out, as only "lbfgs" has one')
+        return self
+
+    def algorithm(self) -> Optimiser:
+        """The optimiser as an object."""
+        made = OPTIMISERS[self.optimiser](self.learning_rate)
+        if isinstance(made, LBFGS) and self.tolerance is not None:
+            return replace(made, tolerance=self.tolerance)
+        return made
+
+
+class TaskTables(Table):
+    """The two tables of a task."""
+
+    problem: ProblemTable
+    optimise: OptimiseTable

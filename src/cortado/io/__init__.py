@@ -1,0 +1,1 @@
+"""What is read and written: run folders, trajectories, pictures, videos, reports, progress on a terminal."""

@@ -1,0 +1,243 @@
+"""The folder of one run: its scene, where and how it ran, its metrics, its trajectory and its pictures."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from cortado.errors import InputError
+from cortado.io.files import UNFINISHED, parsed_json, sentences, write_atomically
+from cortado.io.input_files import content, reason
+from cortado.io.run_environment import as_json, plain, require_same, session
+from cortado.optimisation.replay_log import FILE_NAME
+from cortado.parameters.values import NAMES
+
+_RESUMABLE = "optimise"
+"""The command that has --resume."""
+_LARGEST = 2**31
+"""Bytes of a file that is read again when a run goes on."""
+_FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html")
+_FOLDERS = ("checkpoint", "figures")
+_PICTURES = ("particles", "rendered", "density_errors", "loss", "images", "progress", *NAMES)
+FIGURES = (*(f"{name}.png" for name in _PICTURES), "run.mp4", "found.mp4")
+"""Every file that a run may have in its figures; whatever else is there is the user's."""
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths and files of one run: `create` makes one, `open` finds one, `resume` goes on with one.
+
+    Its mark, environment.json, comes first and is removed last, so that a process that is killed in between leaves
+    a folder which can be overwritten or resumed.
+    """
+
+    path: Path
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        scene_json: str,
+        command: Sequence[str],
+        *,
+        kind: str = "run",
+        settings: Mapping[str, Any] | None = None,
+        device: str = "",
+        overwrite: bool = False,
+    ) -> Self:
+        """Makes the folder of a new run.
+
+        Args:
+            path: the folder, made with its parents when missing.
+            scene_json: the resolved scene.
+            command: the command line, word by word.
+            kind: the command that writes it; only this one resumes it.
+            settings: tables of what else must be the same when it is resumed.
+            device: where the run computes, in words.
+            overwrite: removes an earlier run in this folder (its files only).
+
+        Raises:
+            InputError: the folder holds a run already, or files that a run would replace, or is not writable.
+            ComputationError: the disk is full.
+        """
+        folder = cls(Path(path).absolute())
+        noted = {**session(command, device), "kind": kind, "settings": as_json(settings or {}), "resumed": []}
+        with sentences(folder.path):
+            folder._make_room(kind, overwrite)
+            folder.path.mkdir(parents=True, exist_ok=True)
+            folder._complete(noted, scene_json)
+        return folder
+
+    @classmethod
+    def open(cls, path: str | Path) -> Self:
+        """The folder of an existing run.
+
+        Raises:
+            InputError: there is no run in it.
+        """
+        folder = cls(Path(path).absolute())
+        if not folder._holds_run():
+            raise InputError(f"There is no run in {folder.path}; choose another --out, or begin one without --resume.")
+        return folder
+
+    @classmethod
+    def resume(
+        cls,
+        path: str | Path,
+        scene_json: str,
+        command: Sequence[str],
+        *,
+        kind: str = "run",
+        settings: Mapping[str, Any] | None = None,
+        device: str = "",
+    ) -> Self:
+        """The folder of an existing run that goes on, noted in environment.json with versions and command.
+
+        Raises:
+            InputError: there is no run in it, or one of another kind, scene or settings; the sentence says which.
+            ComputationError: the disk is full.
+        """
+        folder = cls.open(path)
+        noted = _read_json(folder.environment)
+        former = noted.get("kind", kind)
+        if former != kind:
+            raise InputError(
+                f"{folder.path} holds what `cortado {former}` wrote, with which `cortado {kind}` cannot go on; choose "
+                f"another --out, or replace it with --overwrite."
+            )
+        if folder.scene.exists():
+            require_same(_read_json(folder.scene), json.loads(scene_json), folder.path)
+        if "settings" in noted:
+            require_same(noted["settings"], as_json(settings or {}), folder.path)
+        noted.setdefault("resumed", []).append(session(command, device))
+        with sentences(folder.path):
+            folder._remove_unfinished()
+            folder._complete(noted, scene_json)
+            _cut_torn_line(folder.metrics)
+        return folder
+
+    @property
+    def scene(self) -> Path:
+        """The resolved scene."""
+        return self.path / "scene.json"
+
+    @property
+    def environment(self) -> Path:
+        """Versions, device, command line and start of the run."""
+        return self.path / "environment.json"
+
+    @property
+    def metrics(self) -> Path:
+        """One JSON object a line."""
+        return self.path / "metrics.jsonl"
+
+    @property
+    def trajectory(self) -> Path:
+        """The recorded frames (VTKHDF)."""
+        return self.path / "trajectory.vtkhdf"
+
+    @property
+    def checkpoint(self) -> Path:
+        """The optimiser's own folder, from which it resumes."""
+        return self.path / "checkpoint"
+
+    @property
+    def figures(self) -> Path:
+        """The folder of the pictures."""
+        return self.path / "figures"
+
+    @property
+    def report(self) -> Path:
+        """The page that shows it all."""
+        return self.path / "report.html"
+
+    def append_metrics(self, **values: Any) -> None:
+        """Adds one line to metrics.jsonl, kept even if the process is killed next; takes NumPy values too."""
+        line = json.dumps(values, default=plain) + "\n"
+        with sentences(self.metrics), open(self.metrics, "a", encoding="utf-8") as file:
+            file.write(line)
+
+    def read_metrics(self) -> list[dict[str, Any]]:
+        """All lines of metrics.jsonl; a last line that a killed run left unfinished is left out.
+
+        Raises:
+            InputError: an earlier line is damaged.
+        """
+        if not self.metrics.exists():
+            return []
+        try:
+            return [parsed_json(line) for line in _bytes_of(self.metrics).split(b"\n")[:-1]]
+        except ValueError as problem:
+            raise InputError(f"{self.metrics} holds a line that is not JSON: {problem}.") from problem
+
+    def _holds_run(self) -> bool:
+        try:
+            return "cortado" in dict(parsed_json(_bytes_of(self.environment)))
+        except (InputError, ValueError, TypeError):
+            return False
+
+    def _complete(self, noted: Mapping[str, Any], scene_json: str) -> None:
+        """What is there from the first moment on, the mark before anything else."""
+        write_atomically(self.environment, json.dumps(noted, indent=2) + "\n")
+        write_atomically(self.scene, scene_json)
+        self.figures.mkdir(exist_ok=True)
+
+    def _make_room(self, kind: str, overwrite: bool) -> None:
+        present = [name for name in (self.environment.name, *_FILES, *_FOLDERS) if (self.path / name).exists()]
+        if present and not self._holds_run():
+            raise InputError(f"{self.path} holds {', '.join(present)}, but no run of Cortado; choose another --out.")
+        if present and not overwrite:
+            resumable = kind == _RESUMABLE == _read_json(self.environment).get("kind")
+            advice = ", or go on with it by --resume" if resumable else ""
+            raise InputError(
+                f"{self.path} already holds a run; choose another --out, or replace it with --overwrite{advice}."
+            )
+        self._remove_unfinished()
+        if present:
+            self._remove_run()
+
+    def _remove_run(self) -> None:
+        """Removes what a run wrote, its mark last, and leaves what others put beside it."""
+        written = (*map(self.figures.joinpath, FIGURES), *map(self.path.joinpath, _FILES))
+        for path in (*(folder / FILE_NAME for folder in self._checkpoints()), *written):
+            path.unlink(missing_ok=True)
+        for folder in (*self._checkpoints(), self.figures):
+            with suppress(OSError):  # it is not there, or something of the user's is in it
+                folder.rmdir()
+        self.environment.unlink()
+
+    def _remove_unfinished(self) -> None:
+        """Removes what killed processes left of files that they were writing."""
+        for folder in (self.path, self.figures, *self._checkpoints()):
+            for path in folder.glob(UNFINISHED):
+                path.unlink(missing_ok=True)
+
+    def _checkpoints(self) -> list[Path]:
+        """The folders with the logs of one search after the other, that of the first one last, as it holds the rest."""
+        return [*self.checkpoint.glob("[0-9]*/"), self.checkpoint]
+
+
+def _bytes_of(path: Path) -> bytes:
+    """All of a file; raises `InputError` if it is no regular one, or very large."""
+    try:
+        return content(path, _LARGEST)
+    except OSError as problem:
+        raise InputError(f"{path} cannot be read: {reason(problem)}.") from problem
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return parsed_json(_bytes_of(path))
+    except ValueError as problem:
+        raise InputError(f"{path} cannot be read: {reason(problem)}.") from problem
+
+
+def _cut_torn_line(path: Path) -> None:
+    """Removes what a killed run left of a last line, so that the next line begins a line."""
+    if path.exists():
+        os.truncate(path, _bytes_of(path).rfind(b"\n") + 1)

@@ -1,0 +1,263 @@
+"""Frames of particles in one temporal VTKHDF file, which ParaView opens and a killed run leaves readable.
+
+A frame is written at the places of its datasets (`Layout`) without HDF5, so that no cache holds anything back.
+Then one number of eight bytes counts it, and carries the CRC-32 of all frames so far: a SIGKILL comes before or
+after it. The checksums are not those of HDF5, which need datasets in chunks, whose index a killed process
+leaves half written.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cortado.errors import ComputationError, InputError
+from cortado.io.files import sentences, unfinished, write_fully
+from cortado.io.vtkhdf_layout import FORMAT, STEP_RECORD, STEPS_SEED, WRITTEN, Layout, frames_seed
+
+
+class TrajectoryWriter:
+    """Writes frames as they are computed; a context manager.
+
+    The file appears at `path` with its first frame and can be opened, by ParaView too, while it grows: frames that
+    are not written yet, or never were because the run ended early, have no particles there.
+
+    Args:
+        path: the file, replaced when it exists.
+        times: (frames,) [s] of the frames that will come.
+        particles: n.
+        dimension: 2 or 3; in 2-D the stored points have z = 0.
+        precision: of the stored positions, velocities and scalars.
+        steps: the most steps of which `append_steps` will be told.
+        scalars: names of further scalar fields of every frame, such as "density" and "pressure".
+        constants: arrays by name that hold for the whole run, or for each of the frames that will come.
+
+    Raises:
+        InputError: a size that makes no sense, or a path that cannot be written.
+        ComputationError: the disk has not enough room for all frames.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        times: ArrayLike,
+        particles: int,
+        dimension: int,
+        precision: Literal["float32", "float64"] = "float32",
+        steps: int = 0,
+        scalars: Sequence[str] = (),
+        constants: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
+        moments = np.array(times, dtype=np.float64, ndmin=1)
+        if len(moments) < 1 or particles < 1 or dimension not in (2, 3) or steps < 0:
+            raise InputError(
+                f"A trajectory needs at least 1 frame, 1 particle and dimension 2 or 3, but was given "
+                f"{len(moments)} frames, {particles} particles, dimension {dimension} and {steps} steps."
+            )
+        self.path = Path(path)
+        self.frames_written = 0
+        self.steps_written = 0
+        fixed = {name: np.asarray(value) for name, value in (constants or {}).items()}
+        self._layout = Layout(moments, (particles, dimension), np.dtype(precision), steps, tuple(scalars), fixed)
+        self._unfinished = unfinished(self.path)
+        with sentences(self.path):
+            _require_room(self._layout, self.path)
+            self._file = open(self._unfinished, "x+b", buffering=0)  # noqa: SIM115
+            try:
+                pages, self._places = self._layout.create()
+                pages.save(self._file)
+            except BaseException:
+                self.close()
+                raise
+        self._frames_checksum, self._steps_checksum = self._layout.seed, STEPS_SEED
+
+    def append(
+        self, positions: ArrayLike, velocities: ArrayLike, *, step: int | None = None, **scalars: ArrayLike
+    ) -> None:
+        """Writes one frame.
+
+        Args:
+            positions: (n, d) [m]
+            velocities: (n, d) [m/s]
+            step: number of steps taken so far; the number of this frame when left out.
+            scalars: (n,) each, exactly those named at construction.
+
+        Raises:
+            InputError: shapes or names other than announced, or more frames than announced.
+            ComputationError: the disk refused; the frames before this one stay readable.
+        """
+        frame = self.frames_written
+        frames = len(self._layout.times)
+        if frame >= frames:
+            raise InputError(f"{self.path} was laid out for {frames} frames, and one more came.")
+        if set(scalars) != set(self._layout.scalars):
+            raise InputError(f"Expected the scalar fields {sorted(self._layout.scalars)}, found {sorted(scalars)}.")
+        fields = {"VTKHDF/Points": self._vectors("positions", positions)}
+        fields["VTKHDF/PointData/velocity"] = self._vectors("velocities", velocities)
+        for name, values in scalars.items():
+            fields[f"VTKHDF/PointData/{name}"] = self._checked(name, values, self._layout.shape[:1])
+        number = np.int64(frame if step is None else step)
+        rows = [fields[name].tobytes() for name in self._layout.rows]
+        checksum = _frame_checksum(self._frames_checksum, self._layout.times[frame], number, rows)
+        with self._refusal():
+            for name, row in zip(self._layout.rows, rows, strict=True):
+                self._write(name, frame * len(row), row)
+            self._write("cortado/frame_steps", 8 * frame, number.tobytes())
+            self._write("VTKHDF/Steps/PartOffsets", 8 * frame, struct.pack("<q", WRITTEN))
+            self._write("cortado/progress", 0, struct.pack("<II", frame + 1, checksum))
+            if frame == 0:
+                os.replace(self._unfinished, self.path)
+        self.frames_written, self._frames_checksum = frame + 1, checksum
+
+    def append_steps(self, iterations: ArrayLike, density_errors: ArrayLike, converged: ArrayLike = True) -> None:
+        """Writes what the pressure solver reported of one step (scalars) or of several ((k,) each).
+
+        Raises:
+            InputError: more steps than announced.
+            ComputationError: the disk refused.
+        """
+        columns = np.broadcast_arrays(np.atleast_1d(iterations), density_errors, converged)
+        first, last = self.steps_written, self.steps_written + columns[0].size
+        if last > self._layout.steps:
+            raise InputError(f"{self.path} was laid out for {self._layout.steps} steps, and {last} came.")
+        records = _records(columns)
+        checksum = zlib.crc32(records.tobytes(), self._steps_checksum)
+        with self._refusal():
+            for name in STEP_RECORD.names or ():
+                self._write(f"cortado/{name}", first * STEP_RECORD[name].itemsize, records[name].tobytes())
+            self._write("cortado/progress", 8, struct.pack("<II", last, checksum))
+        self.steps_written, self._steps_checksum = last, checksum
+
+    def close(self) -> None:
+        """Ends the file; without any frame, none is left behind."""
+        self._file.close()
+        if self.frames_written == 0:
+            self._unfinished.unlink(missing_ok=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _checked(self, name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
+        array = np.asarray(values, dtype=self._layout.dtype)
+        if array.shape != shape:
+            raise InputError(f"Expected {name} of shape {shape}, found {array.shape}.")
+        return array
+
+    def _vectors(self, name: str, values: ArrayLike) -> NDArray[Any]:
+        """The values as (n, 3), with z = 0 in 2-D."""
+        array = self._checked(name, values, self._layout.shape)
+        return np.pad(array, ((0, 0), (0, 3 - array.shape[1])))
+
+    def _write(self, name: str, offset: int, content: bytes) -> None:
+        self._file.seek(self._places[name] + offset)
+        write_fully(self._file, content)
+
+    @contextmanager
+    def _refusal(self) -> Iterator[None]:
+        """Any trouble with the disk within ends the computation, in a sentence."""
+        try:
+            yield
+        except OSError as problem:
+            raise ComputationError(
+                f"{self.path} cannot be written: {problem.strerror or problem}; the {self.frames_written} frames so "
+                f"far are kept, free some space or choose another place."
+            ) from problem
+
+
+def read(path: str | Path) -> dict[str, Any]:
+    """Reads the frames and steps that were completed, while the writer is at work or after its death.
+
+    Returns:
+        times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s],
+        iterations (steps,), density_errors (steps,) and converged (steps,) bool as in `Trajectory`,
+        under its own name every scalar field (frames, n), and constants, by name what holds for the whole run.
+
+    Raises:
+        InputError: the file is missing, damaged, or none of Cortado's trajectories.
+    """
+    import h5py
+
+    if not Path(path).is_file():
+        raise InputError(f"There is no trajectory file {path}.")
+    try:
+        with h5py.File(path, "r") as file:
+            if "cortado" not in file:
+                raise InputError(f"{path} is an HDF5 file, but not a trajectory that Cortado wrote.")
+            if file["cortado"].attrs.get("format") != FORMAT:
+                raise InputError(f"{path} was written by another version of Cortado, or is damaged; run it again.")
+            arrays = _read_arrays(file, os.path.getsize(path))
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError, OverflowError) as problem:
+        reason = " ".join(str(problem).split())
+        raise InputError(f"{path} cannot be read as a VTKHDF trajectory: {reason}.") from problem
+    if arrays is None:
+        raise InputError(f"{path} is damaged: its checksums are not those of what it holds; restore or repeat it.")
+    return arrays
+
+
+def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
+    """None where a checksum is wrong."""
+    vtk, own = file["VTKHDF"], file["cortado"]
+    (frames, frames_checksum), (steps, steps_checksum) = own["progress"][:].tolist()
+    dimension, particles = int(own.attrs["dimension"]), int(vtk["NumberOfPoints"][0])
+    rows = {"VTKHDF/Points": vtk["Points"]}
+    rows |= {f"VTKHDF/PointData/{name}": dataset for name, dataset in sorted(vtk["PointData"].items())}
+    columns = [vtk["Steps/Values"], own["frame_steps"], *(own[name] for name in STEP_RECORD.names or ())]
+    if any(dataset.nbytes > size for dataset in (*columns, *rows.values(), *own["constants"].values())):
+        return None
+    constants = {name: dataset[()] for name, dataset in own["constants"].items()}
+    times, numbers = (column[:frames] for column in columns[:2])
+    records = _records([column[:steps] for column in columns[2:]])
+    fields = {name: dataset[: frames * particles] for name, dataset in rows.items()}
+    fields = {name: field.reshape(frames, particles, *field.shape[1:]) for name, field in fields.items()}
+
+    checksum = frames_seed((particles, dimension), {name: field.dtype for name, field in fields.items()}, constants)
+    for k in range(frames):
+        checksum = _frame_checksum(checksum, times[k], numbers[k], [field[k].tobytes() for field in fields.values()])
+    if checksum != frames_checksum or zlib.crc32(records.tobytes(), STEPS_SEED) != steps_checksum:
+        return None
+    arrays = {name.rpartition("/")[2]: field for name, field in fields.items()}
+    arrays["velocities"] = np.ascontiguousarray(arrays.pop("velocity")[..., :dimension])
+    arrays["positions"] = np.ascontiguousarray(arrays.pop("Points")[..., :dimension])
+    arrays |= {name: np.ascontiguousarray(records[name]) for name in STEP_RECORD.names or ()}
+    return arrays | {"times": times, "steps": numbers, "constants": constants}
+
+
+def _frame_checksum(checksum: int, time: Any, number: Any, rows: Sequence[bytes]) -> int:
+    """The CRC-32 of the frames so far with one more: its time [s], its number of steps, and its fields."""
+    for content in (time.tobytes(), number.tobytes(), *rows):
+        checksum = zlib.crc32(content, checksum)
+    return checksum
+
+
+def _records(columns: Sequence[Any]) -> NDArray[Any]:
+    """(steps,) of `STEP_RECORD` from one array for each of its names."""
+    records = np.zeros(len(columns[0]), STEP_RECORD)
+    for name, column in zip(STEP_RECORD.names or (), columns, strict=True):
+        records[name] = column
+    return records
+
+
+def _require_room(layout: Layout, path: Path) -> None:
+    """Raise ComputationError if the disk has no room for all the frames."""
+    free = shutil.disk_usage(path.absolute().parent).free
+    if layout.size > free:
+        raise ComputationError(
+            f"{path} needs {layout.size / 1e6:.4g} MB for {len(layout.times)} frames, but {free / 1e6:.4g} MB are "
+            f"free on its disk; record fewer frames, free some space, or choose another place."
+        )

@@ -1,0 +1,24 @@
+"""What a rollout is judged by: objects with a value and an adjoint at the end of the trajectory, or on the way."""
+
+from cortado.losses.centre_of_mass import CentreOfMass, CentreOfMassAlong
+from cortado.losses.image import Image
+from cortado.losses.loss import EndAdjoint, Frames, Loss, TrajectoryEnd, fingerprint
+from cortado.losses.positions import FinalPositions
+from cortado.losses.recorded import Recorded
+
+__all__ = [
+    "CentreOfMass",
+    "CentreOfMassAlong",
+    "EndAdjoint",
+    "FinalPositions",
+    "Frames",
+    "Image",
+    "Loss",
+    "Recorded",
+    "TrajectoryEnd",
+    "fingerprint",
+]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,101 @@
+"""A user's loss, in whatever form it comes, with a sentence where it cannot be used or gives what cannot be used."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.arrays import as_numbers, as_one_number
+from cortado.device.state import State
+from cortado.errors import InputError, shown
+from cortado.losses import EndAdjoint, Loss, Recorded, TrajectoryEnd
+from cortado.losses.loss import Adjoint
+
+FORMS = ("positions", "velocities", "mass fractions")
+"""What the arrays of an adjoint are with respect to, in their order."""
+
+
+class CheckedLoss:
+    """A loss whose value is a number, and whose adjoint fits the state."""
+
+    def __init__(self, loss: Any):
+        """A `Loss`; an ``adjoint`` of its own takes the place of ``value_and_adjoint``."""
+        self._loss = loss
+
+    def value(self, end: TrajectoryEnd) -> float:
+        return as_one_number("the loss's value", self._loss.value(end))
+
+    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
+        """As that of `Loss`; arrays come in float64."""
+        if hasattr(self._loss, "adjoint"):
+            return self.value(end), self._checked(self._loss.adjoint(end), end)
+        value, bar = self._loss.value_and_adjoint(end)
+        return as_one_number("the loss's value", value), self._checked(bar, end)
+
+    def _checked(self, bar: Any, end: TrajectoryEnd) -> Adjoint:
+        if isinstance(bar, State):
+            return _checked_state(bar, end)
+        if isinstance(bar, EndAdjoint):
+            colours = _checked_array("colours", bar.colours, end.colours.shape)
+            return EndAdjoint(_checked_state(bar.state, end), colours)
+        if not isinstance(bar, (tuple, list, np.ndarray)) or len(bar) not in (2, 3):
+            count = f" of {len(bar)}" if isinstance(bar, (tuple, list)) else ""
+            raise InputError(
+                f"the loss's adjoint is a {type(bar).__name__}{count}, but must be a tuple of two or three arrays, the "
+                f"derivatives with respect to {', '.join(FORMS[:2])} and {FORMS[2]}, or a State, or an EndAdjoint."
+            )
+        wanted = (end.positions.shape, end.velocities.shape, end.mass_fractions.shape)
+        return tuple(_checked_array(*entry) for entry in zip(FORMS, bar, wanted, strict=False))
+
+
+def as_loss(loss: Any) -> Loss:
+    """A loss with its results checked; a function of Warp arrays is made into one. Raises `InputError`."""
+    if isinstance(loss, type):
+        raise InputError(f"loss is the class {loss.__name__}, but must be an object that is made of it.")
+    derivative = next((name for name in ("adjoint", "value_and_adjoint") if hasattr(loss, name)), None)
+    if derivative is not None and hasattr(loss, "value"):
+        for name in ("value", derivative):
+            _require_arguments(f"the loss's {name}", getattr(loss, name), ("the end of a trajectory",))
+        return CheckedLoss(loss)
+    if not callable(loss):
+        raise InputError(f"loss is a {type(loss).__name__}, but must have a value and an adjoint, or be a function.")
+    _require_arguments("loss", loss, ("positions", "velocities", "an array for the loss"))
+    return CheckedLoss(Recorded(loss))
+
+
+def _require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...]) -> None:
+    """An `InputError` where a function does not take so many arguments, if Python can tell."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return
+    try:
+        signature.bind(*wanted)
+    except TypeError:
+        raise InputError(
+            f"{what} takes the arguments {shown(str(signature))}, but must take {len(wanted)}: {', '.join(wanted)}."
+        ) from None
+
+
+def _checked_state(bar: Any, end: TrajectoryEnd) -> State:
+    if not isinstance(bar, State):
+        raise InputError(f"the loss's adjoint has a {type(bar).__name__} as its state, but must have a State.")
+    for form, found, wanted in zip(FORMS, bar.arrays(), end.state.arrays(), strict=True):
+        if not isinstance(found, wp.array) or _layout(found) != _layout(wanted):
+            text = _layout(found) if isinstance(found, wp.array) else f"a {type(found).__name__}"
+            raise InputError(f"the loss's adjoint of {form} is {text}, but must be {_layout(wanted)}.")
+    return bar
+
+
+def _checked_array(form: str, bar: Any, shape: tuple[int, ...]) -> np.ndarray:
+    array = as_numbers(f"the loss's adjoint of {form}", bar)
+    if array.shape != shape:
+        raise InputError(f"the loss's adjoint of {form} has shape {array.shape}, but must be {shape}.")
+    return array
+
+
+def _layout(array: wp.array) -> str:
+    """What has to be the same for one array to be copied onto another."""
+    return f"a Warp array of {wp.types.type_repr(array.dtype)} of shape {array.shape} on {array.device}"

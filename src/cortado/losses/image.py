@@ -1,0 +1,67 @@
+"""How far the picture of a state is from a target picture."""
+
+from hashlib import sha256
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+from cortado.arrays import as_numbers
+from cortado.device.threads import WARP
+from cortado.errors import InputError
+from cortado.losses.image_losses import ImageLoss, SquaredDifference
+from cortado.losses.loss import EndAdjoint, TrajectoryEnd
+
+
+class Pictures(Protocol):
+    """What makes pictures, such as `cortado.render.renderer.Renderer`."""
+
+    def render(self, positions: wp.array, fractions: wp.array, colours: np.ndarray) -> np.ndarray:
+        """The picture (rows, columns, 3)."""
+
+    def adjoint(self, image_bar: np.ndarray) -> Any:
+        """``positions``, ``fractions`` and ``colours``: derivatives of a function of the last picture."""
+
+
+class Image:
+    """How far the picture of a state is from a target picture."""
+
+    def __init__(self, renderer: Pictures, target: np.ndarray, distance: ImageLoss | None = None):
+        """``target`` (rows, columns, 3), linear RGB; ``distance``: `cortado.image_losses.SquaredDifference`, the
+        default (the report's 6.2.2), or `Pyramid`, whose gradient leads shapes to each other that do not overlap."""
+        self.renderer, self.distance = renderer, SquaredDifference() if distance is None else distance
+        self.target = _target_image(target, getattr(renderer, "shape", None))
+        self.target.setflags(write=False)
+        parts = (self.distance.fingerprint, sha256(self.target.tobytes()).hexdigest())
+        self.fingerprint = " ".join((*parts, getattr(renderer, "fingerprint", "")))
+        """Tells one target, or one view of it, from another, for checkpoints."""
+
+    def image(self, end: TrajectoryEnd) -> np.ndarray:
+        """The picture (rows, columns, 3) of a state."""
+        return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
+
+    @WARP
+    def value(self, end: TrajectoryEnd) -> float:
+        return self.distance.value(self.image(end), self.target)
+
+    @WARP
+    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, EndAdjoint]:
+        image = self.image(end)
+        found = self.renderer.adjoint(self.distance.adjoint(image, self.target))
+        bar = end.state.like()
+        bar.velocities.zero_()
+        wp.copy(bar.positions, found.positions)
+        wp.copy(bar.mass_fractions, found.fractions)
+        return self.distance.value(image, self.target), EndAdjoint(bar, found.colours)
+
+
+def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:
+    """A copy (rows, columns, 3) in float64, or an `InputError`; ``shape``: of the renderer's pictures, if known."""
+    image = as_numbers("target", target).copy()
+    if image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise InputError(f"target has shape {image.shape}, but must be a picture (rows, columns, 3).")
+    if shape is not None and image.shape != shape:
+        raise InputError(f"target has shape {image.shape}, but must have that of the renderer's pictures, {shape}.")
+    if not np.isfinite(image).all():
+        raise InputError("target has a value that is not finite, but must be made of finite numbers.")
+    return image

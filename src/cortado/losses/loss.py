@@ -1,0 +1,95 @@
+"""What a loss is, what it is given, and the sum of several at several steps."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from cortado.device.precision import FLOAT32, FLOAT64, Precision
+from cortado.device.state import State
+from cortado.errors import InputError, shown
+from cortado.words import counted
+
+
+@dataclass(frozen=True)
+class TrajectoryEnd:
+    """A state of a rollout, the last one as a rule, as NumPy arrays or as Warp arrays, in the scene's order."""
+
+    state: State
+    """Warp arrays (n,): positions [m], velocities [m / s], mass fractions [-]."""
+    dimension: int
+    colours: np.ndarray
+    """(phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
+
+    def __repr__(self) -> str:
+        return f"TrajectoryEnd({counted(len(self.state.positions), 'particle')}, {self.precision.name})"
+
+    @property
+    def precision(self) -> Precision:
+        """Of the Warp arrays."""
+        return FLOAT64 if self.state.positions.dtype == FLOAT64.vector else FLOAT32
+
+    @cached_property
+    def positions(self) -> np.ndarray:
+        """(n, d) [m], float64"""
+        return self.state.positions.numpy()[:, : self.dimension].astype(np.float64)
+
+    @cached_property
+    def velocities(self) -> np.ndarray:
+        """(n, d) [m / s], float64"""
+        return self.state.velocities.numpy()[:, : self.dimension].astype(np.float64)
+
+    @cached_property
+    def mass_fractions(self) -> np.ndarray:
+        """(n, phases) [-], float64"""
+        return self.state.mass_fractions.numpy().astype(np.float64)
+
+
+@dataclass(frozen=True, repr=False)
+class EndAdjoint:
+    """Derivatives of a loss that also looks at the colours."""
+
+    state: State
+    """With respect to positions, velocities and mass fractions, as Warp arrays."""
+    colours: np.ndarray
+    """(phases, 3)"""
+
+
+Adjoint = State | EndAdjoint | tuple[np.ndarray, ...]
+"""Derivatives of a loss with respect to positions and velocities, (n, d) each, and, if there is a third array, mass
+fractions (n, phases); or as Warp arrays."""
+
+
+class Loss(Protocol):
+    """A differentiable number of the end of a trajectory.
+
+    A loss of your own may have a method ``adjoint(end)`` in the place of `value_and_adjoint`.
+    """
+
+    def value(self, end: TrajectoryEnd) -> float:
+        """The loss."""
+
+    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
+        """The loss and its derivatives, which share what both need."""
+
+
+class Frames:
+    """The sum of losses of several states on the way, by the number of steps before each."""
+
+    def __init__(self, losses: Mapping[int, Loss]):
+        """``losses`` {number of steps: loss}; 0 is the first state."""
+        if not isinstance(losses, Mapping) or not losses:
+            raise InputError(f"losses is {shown(losses)}, but must be a table with a loss for at least one frame.")
+        self.losses = dict(losses)
+
+    @property
+    def fingerprint(self) -> str:
+        """Tells one set of targets from another, for checkpoints."""
+        return " ".join(f"{step}:{fingerprint(loss)}" for step, loss in sorted(self.losses.items()))
+
+
+def fingerprint(loss: Any) -> str:
+    """A text that tells one loss from another; of a loss without its own ``fingerprint`` only the type."""
+    return getattr(loss, "fingerprint", type(loss).__qualname__)

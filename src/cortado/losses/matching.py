@@ -1,0 +1,40 @@
+"""How far particles are from where they should be."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from cortado.device.precision import Precision
+
+
+@cache
+def matching_kernels(precision: Precision) -> SimpleNamespace:
+    """Kernels ``squared_distance`` (in float64) and ``difference`` (times a factor) of two sets of vectors."""
+    real, vector = precision.real, precision.vector
+    module = wp.get_module(f"cortado_matching_{precision.name}")
+    module.options["enable_backward"] = False
+
+    @wp.kernel(module=module, enable_backward=False)
+    def squared_distance(
+        x: wp.array(dtype=vector),
+        target: wp.array(dtype=vector),
+        # out
+        squares: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        miss = wp.vec3d(x[i] - target[i])
+        squares[i] = wp.dot(miss, miss)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def difference(
+        factor: real,
+        x: wp.array(dtype=vector),
+        target: wp.array(dtype=vector),
+        # out
+        bar: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        bar[i] = factor * (x[i] - target[i])
+
+    return SimpleNamespace(squared_distance=squared_distance, difference=difference)

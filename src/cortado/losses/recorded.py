@@ -1,0 +1,43 @@
+"""Losses that are functions of Warp arrays."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.device.threads import WARP
+from cortado.losses.loss import Adjoint, TrajectoryEnd
+
+WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
+
+
+class Recorded:
+    """A loss that is any function of Warp arrays, differentiated by Warp's tape.
+
+    ``function(positions, velocities, loss)`` launches kernels that add to ``loss``, an array (1,) of the precision of
+    the (n,) vectors it is given. Mind Warp's rules for kernels that loop: a sum that is used non-linearly belongs
+    into a function of its own.
+    """
+
+    def __init__(self, function: WarpFunction):
+        self.function = function
+
+    @WARP
+    def value(self, end: TrajectoryEnd) -> float:
+        loss, _, _ = self._run(end)
+        return float(loss.numpy()[0])
+
+    @WARP
+    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
+        with wp.Tape() as tape:
+            loss, positions, velocities = self._run(end)
+        tape.backward(loss)
+        bars = tuple(array.grad.numpy()[:, : end.dimension].astype(np.float64) for array in (positions, velocities))
+        return float(loss.numpy()[0]), bars
+
+    def _run(self, end: TrajectoryEnd) -> tuple[wp.array, wp.array, wp.array]:
+        copies = [wp.clone(a, requires_grad=True) for a in (end.state.positions, end.state.velocities)]
+        loss = wp.zeros(1, dtype=end.precision.real, device=copies[0].device, requires_grad=True)
+        self.function(copies[0], copies[1], loss)
+        return loss, copies[0], copies[1]

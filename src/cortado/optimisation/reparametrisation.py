@@ -1,0 +1,147 @@
+"""Other coordinates for the parameters of a problem, in which an optimiser may step freely.
+
+A coordinate u stands for the parameter p(u): fractions that add up to 1, numbers that stay positive, controls that
+change slowly.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from cortado.arrays import as_numbers
+from cortado.errors import InputError
+from cortado.gradients import Estimate, Passage, Policy, estimate
+from cortado.parameters.values import Arrays
+from cortado.problem import Problem
+from cortado.rollout import Observer, StepDerivative
+
+SMALLEST = 1e-4
+"""Fractions below it are taken as it where coordinates are looked for: that of 0 is infinitely far away."""
+
+
+class Coordinates(Protocol):
+    """A smooth map p(u), with what it does to a gradient."""
+
+    def parameter(self, u: np.ndarray) -> np.ndarray:
+        """p(u)."""
+
+    def coordinate(self, parameter: np.ndarray) -> np.ndarray:
+        """A u with p(u) = ``parameter``, as nearly as there is one."""
+
+    def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
+        """The derivative with respect to u, from that with respect to p(u)."""
+
+
+@dataclass(frozen=True)
+class Logarithm:
+    """p = exp(u): a positive number, changed by factors."""
+
+    def parameter(self, u: np.ndarray) -> np.ndarray:
+        return np.exp(u)
+
+    def coordinate(self, parameter: np.ndarray) -> np.ndarray:
+        if (np.asarray(parameter) <= 0.0).any():
+            raise InputError("A parameter that is changed by factors must be greater than 0.")
+        return np.log(parameter)
+
+    def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
+        return bar * np.exp(u)
+
+
+@dataclass(frozen=True)
+class Softmax:
+    """p_k = exp(u_k) / sum_l exp(u_l), row by row: fractions (n, phases) that add up to 1."""
+
+    def parameter(self, u: np.ndarray) -> np.ndarray:
+        powers = np.exp(u - u.max(axis=1, keepdims=True))
+        return powers / powers.sum(axis=1, keepdims=True)
+
+    def coordinate(self, parameter: np.ndarray) -> np.ndarray:
+        u = np.log(np.maximum(parameter, SMALLEST))
+        return u - u.mean(axis=1, keepdims=True)
+
+    def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
+        p = self.parameter(u)
+        return p * (bar - (p * bar).sum(axis=1, keepdims=True))
+
+
+@dataclass(frozen=True)
+class Knots:
+    """p (steps, d) interpolated linearly in time between knots u (k, d), the first and last at both ends."""
+
+    steps: int
+    knots: int
+
+    @property
+    def _weights(self) -> np.ndarray:
+        """(steps, knots)"""
+        places = np.linspace(0.0, self.knots - 1.0, self.steps)
+        return np.maximum(1.0 - np.abs(places[:, None] - np.arange(self.knots)), 0.0)
+
+    def parameter(self, u: np.ndarray) -> np.ndarray:
+        return self._weights @ u
+
+    def coordinate(self, parameter: np.ndarray) -> np.ndarray:
+        return np.linalg.lstsq(self._weights, parameter, rcond=None)[0]
+
+    def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
+        return self._weights.T @ bar
+
+
+class Reparametrised:
+    """A problem whose parameters are coordinates; those without any are their own."""
+
+    def __init__(self, problem: Problem, coordinates: Mapping[str, Coordinates]):
+        self.problem, self.coordinates = problem, dict(coordinates)
+        self.simulation = problem.simulation
+
+    @property
+    def fingerprint(self) -> str:
+        """Which problem in which coordinates this is."""
+        return f"{self.problem.fingerprint}; coordinates {sorted(self.coordinates.items(), key=str)}"
+
+    def parameters(self, u: Mapping[str, Any]) -> Arrays:
+        """p(u) by name."""
+        known = {name: as_numbers(f"coordinate of {name}", u[name]) for name in self.coordinates.keys() & u.keys()}
+        return {**u, **{name: self.coordinates[name].parameter(value) for name, value in known.items()}}
+
+    def coordinate(self, parameters: Mapping[str, Any]) -> Arrays:
+        """u by name."""
+        names = self.coordinates.keys() & parameters.keys()
+        known = {name: as_numbers(f"parameter {name}", parameters[name]) for name in names}
+        return {**parameters, **{name: self.coordinates[name].coordinate(value) for name, value in known.items()}}
+
+    def value(self, u: Mapping[str, Any]) -> float:
+        """The loss, forward only."""
+        return self.problem.value(self.parameters(u))
+
+    def value_and_gradient(self, u: Mapping[str, Any], policy: Policy | None = None) -> tuple[float, Arrays]:
+        """The loss and its derivatives with respect to the coordinates."""
+        found = self.estimate(u, policy)
+        return found.loss, found.gradient
+
+    def estimate(self, u: Mapping[str, Any], policy: Policy | None = None, observe: Observer | None = None) -> Estimate:
+        """The same, with what the policy reports; a spread, of a policy that has one, is that of coordinates."""
+        return estimate(self, u, policy, observe)
+
+    def passage(self, u: Mapping[str, Any]) -> "CoordinatePassage":
+        """A forward run that can be gone back through: what policies work with."""
+        return CoordinatePassage(self.problem.passage(self.parameters(u)), self.coordinates, u)
+
+
+class CoordinatePassage:
+    """A forward run of a problem, and ways back to coordinates."""
+
+    def __init__(self, passage: Passage, coordinates: Mapping[str, Coordinates], u: Mapping[str, Any]):
+        self._passage, self._coordinates, self._u = passage, coordinates, u
+        self.loss, self.rollout, self.derivative = passage.loss, passage.rollout, passage.derivative
+
+    def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:
+        """The gradient with respect to the coordinates."""
+        gradient = self._passage.back(derivative, observe)
+        for name, coordinates in self._coordinates.items():
+            if name in gradient:
+                gradient[name] = coordinates.adjoint(np.asarray(self._u[name]), gradient[name])
+        return gradient

@@ -1,0 +1,60 @@
+"""What an optimisation leaves: its best parameters, and every evaluation on the way."""
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from cortado.io.notebook import with_picture
+from cortado.words import counted, sized
+
+Parameters = dict[str, Any]
+# by name: a float where the user gave a number, otherwise a float64 array of the shape that the user gave
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One evaluation in the history of an optimisation."""
+
+    iteration: int
+    # index of the evaluation, from 0; with Adam and gradient descent also the number of updates before it
+    loss: float
+    gradient_norm: float
+    # Euclidean, over all the parameters
+    parameters: Parameters
+    # at which the loss was evaluated
+    replayed: bool
+    # whether it was read from the checkpoint
+
+    def __repr__(self) -> str:
+        return f"Record(iteration {self.iteration}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g})"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What an optimisation found."""
+
+    parameters: Parameters
+    # with the lowest loss seen
+    loss: float
+    # the lowest seen
+    last_parameters: Parameters
+    # the optimiser's last iterate
+    history: tuple[Record, ...]
+    # one per evaluation, in order
+    evaluations: int
+    # how many the optimiser asked for, with those replayed from the checkpoint
+    message: str
+    # how it ended, a sentence
+    converged: bool
+    # whether the optimiser's own test was met; Adam and gradient descent have none
+
+    def __repr__(self) -> str:
+        found = f"loss {self.loss:.6g} after {counted(self.evaluations, 'evaluation')}"
+        end = re.split("[,:;.]", self.message)[0]
+        return f"Result({sized(self.parameters)}: {found}; {end})"
+
+    def _repr_html_(self) -> str:
+        """With the losses of all evaluations."""
+        from cortado.figures.curves import loss_curve
+
+        return with_picture(self, lambda path: loss_curve([record.loss for record in self.history], path))

@@ -1,0 +1,76 @@
+"""Trilinear interpolation between the nodes of a colour field, which is 0 at all nodes that are not there.
+
+So it is continuous everywhere, and a field of one layer (2-D) is a sheet that is one node distance thick.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from cortado.device.precision import Precision
+from cortado.render.colour_field import ink_type, nodes_type
+
+
+@cache
+def interpolation_functions(precision: Precision) -> SimpleNamespace:
+    """Warp functions ``value`` at a point, ``slope`` (the gradient of bar . value) and ``share`` (of one node)."""
+    real, vector, ink = precision.real, precision.vector, ink_type(precision)
+    nodes_struct = nodes_type(precision)
+
+    @wp.func
+    def node(i: int, j: int, k: int, field: wp.array3d(dtype=ink), nodes: nodes_struct) -> ink:
+        n = nodes.shape
+        if i >= 0 and j >= 0 and k >= 0 and i < n[0] and j < n[1] and k < n[2]:
+            return field[k, j, i]
+        return ink()
+
+    @wp.func
+    def part(f: real, side: int) -> real:
+        return wp.where(side == 0, real(1.0) - f, f)
+
+    @wp.func
+    def value(x: vector, field: wp.array3d(dtype=ink), nodes: nodes_struct) -> ink:
+        s = nodes.frequency * (x - nodes.origin)
+        i = int(wp.floor(s[0]))
+        j = int(wp.floor(s[1]))
+        k = int(wp.floor(s[2]))
+        f = s - vector(real(i), real(j), real(k))
+        total = ink()
+        for a in range(2):
+            for b in range(2):
+                for c in range(2):
+                    w = part(f[0], a) * part(f[1], b) * part(f[2], c)
+                    total += w * node(i + a, j + b, k + c, field, nodes)
+        return total
+
+    @wp.func
+    def slope(x: vector, bar: ink, field: wp.array3d(dtype=ink), nodes: nodes_struct) -> vector:
+        """On the face of a cell, where the gradient jumps, that of the cell which begins there."""
+        s = nodes.frequency * (x - nodes.origin)
+        i = int(wp.floor(s[0]))
+        j = int(wp.floor(s[1]))
+        k = int(wp.floor(s[2]))
+        f = s - vector(real(i), real(j), real(k))
+        total = vector()
+        for a in range(2):
+            for b in range(2):
+                for c in range(2):
+                    w = vector(
+                        real(2 * a - 1) * part(f[1], b) * part(f[2], c),
+                        real(2 * b - 1) * part(f[2], c) * part(f[0], a),
+                        real(2 * c - 1) * part(f[0], a) * part(f[1], b),
+                    )
+                    total += wp.dot(bar, node(i + a, j + b, k + c, field, nodes)) * w
+        return nodes.frequency * total
+
+    @wp.func
+    def share(x: vector, x_g: vector, nodes: nodes_struct) -> real:
+        """How much of the value at x comes from the node at x_g."""
+        s = nodes.frequency * (x - x_g)
+        w_x = wp.max(real(1.0) - wp.abs(s[0]), real(0.0))
+        w_y = wp.max(real(1.0) - wp.abs(s[1]), real(0.0))
+        w_z = wp.max(real(1.0) - wp.abs(s[2]), real(0.0))
+        return w_x * w_y * w_z
+
+    return SimpleNamespace(value=value, slope=slope, share=share)

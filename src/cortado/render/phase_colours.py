@@ -1,0 +1,56 @@
+"""Colours of particles, mixed from the colours of their phases: colour_j = sum_k c_jk colours_k."""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from cortado.device.precision import Precision
+
+
+@cache
+def colours_type(precision: Precision, phases: int) -> Any:
+    """Warp matrix type (phases, 3)."""
+    return wp.types.matrix(shape=(phases, 3), dtype=precision.real)
+
+
+@cache
+def tint_kernels(precision: Precision, phases: int) -> SimpleNamespace:
+    """Kernels ``forward`` (which sorts positions besides) and ``adjoint``."""
+    vector, fractions = precision.vector, precision.fractions(phases)
+    colours_matrix = colours_type(precision, phases)
+    module = wp.get_module(f"cortado_tint_{phases}_{precision.name}")
+    module.options["enable_backward"] = False
+
+    @wp.kernel(module=module, enable_backward=False)
+    def tint(
+        colours: wp.array(dtype=colours_matrix),
+        order: wp.array(dtype=wp.int32),
+        x_scene: wp.array(dtype=vector),
+        c_scene: wp.array(dtype=fractions),
+        # out
+        x: wp.array(dtype=vector),
+        colour: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        j = order[i]
+        x[i] = x_scene[j]
+        colour[i] = wp.transpose(colours[0]) * c_scene[j]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def tint_adjoint(
+        colours: wp.array(dtype=colours_matrix),
+        c_scene: wp.array(dtype=fractions),
+        colour_scene_bar: wp.array(dtype=vector),
+        # out
+        c_scene_bar: wp.array(dtype=fractions),
+        colours_bar: wp.array(dtype=colours_matrix),
+    ):
+        """``colours_bar`` gathers the adjoint of the colours particle by particle."""
+        j = wp.tid()
+        bar = colour_scene_bar[j]
+        c_scene_bar[j] = colours[0] * bar
+        colours_bar[j] = wp.outer(c_scene[j], bar)
+
+    return SimpleNamespace(forward=tint, adjoint=tint_adjoint)

@@ -1,0 +1,218 @@
+"""What must hold for a scene as a whole: names, sizes, and where the fluid is. Each check raises `wrong`."""
+
+from itertools import product
+
+import numpy as np
+from pydantic_core import PydanticCustomError
+from scipy.spatial import cKDTree
+
+from cortado.device.memory import sampling_parts, shortage
+from cortado.errors import InputError, Phrase, shown
+from cortado.lattice.shapes import Points
+from cortado.scene.containers import check_length
+from cortado.scene.emitter import Emitter
+from cortado.scene.fields import FieldPath, wrong
+from cortado.scene.fluids import Body, Fluid, PointsFluid
+from cortado.scene.mixture import Mixture
+from cortado.scene.model import SceneTables
+from cortado.scene.tables import field_name
+
+MOST_PARTICLES = 2e8
+FURTHEST = 1e9
+"""In spacings from the origin; further away, neighbours would not have distinct positions in float64."""
+NEAREST = 0.5
+"""In spacings: particles that start nearer to each other overlap."""
+
+
+def check_scene(scene: SceneTables) -> None:
+    """All checks, those that guard others first."""
+    spacing = scene.discretisation.spacing
+    _check_phases(scene)
+    _check_files(scene)
+    _check_counts(scene)
+    for index, fluid in enumerate(scene.fluid):
+        _check_size(index, fluid, spacing)
+    if scene.emitter is not None:
+        _check_length(scene.emitter, spacing)
+    for path, body in _bodies(scene):
+        _check_distance(path, body, spacing)
+    check_length(scene.container, spacing, scene.discretisation.support_radius)
+    _check_place(scene)
+    for index, fluid in enumerate(scene.fluid):
+        _check_inside(scene, index, fluid)
+        _check_distinct(index, fluid, spacing)
+    if scene.emitter is not None:
+        _check_outlet(scene, scene.emitter)
+    _check_overlaps(scene)
+
+
+def _bodies(scene: SceneTables) -> list[tuple[FieldPath, Body]]:
+    """All that has particles, in their order, each with its path in the scene."""
+    fluids: list[tuple[FieldPath, Body]] = [(("fluid", index), fluid) for index, fluid in enumerate(scene.fluid)]
+    return fluids if scene.emitter is None else [*fluids, (("emitter",), scene.emitter)]
+
+
+def _check_phases(scene: SceneTables) -> None:
+    names = [phase.name for phase in scene.phase]
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            raise wrong(("phase", index, "name"), name, f"different from that of phase[{names.index(name)}]")
+    for path, body in _bodies(scene):
+        if body.phase not in names:
+            raise wrong((*path, "phase"), body.phase, f"the name of a phase, of {shown(names)}")
+    if len(names) == 1 and scene.mixture != Mixture():
+        raise wrong(("mixture",), Phrase("given"), "left out, as the scene has only one phase")
+
+
+def _check_files(scene: SceneTables) -> None:
+    for index, fluid in enumerate(scene.fluid):
+        if isinstance(fluid, PointsFluid):
+            try:
+                fluid.points()
+            except InputError as error:
+                sentence = f"cannot be used: {error}"
+                raise wrong(("fluid", index, "file"), fluid.file, "a file of positions", sentence) from None
+
+
+def _check_counts(scene: SceneTables) -> None:
+    """Before anything is allocated."""
+    spacing = scene.discretisation.spacing
+    fluid, walls = sum(body.count(spacing) for _, body in _bodies(scene)), scene.container.wall_count(spacing)
+    for count, what in ((fluid, "particles of fluid"), (walls, "wall particles")):
+        if count > MOST_PARTICLES:
+            wanted = f"so large that there are at most {MOST_PARTICLES:.0e} {what}, not about {count:.1e}"
+            raise wrong(("discretisation", "spacing"), spacing, wanted)
+    lack = shortage(sampling_parts(fluid, walls))
+    if lack:
+        wanted = f"larger, or the fluid and the container smaller: the scene needs {lack}"
+        raise wrong(("discretisation", "spacing"), spacing, wanted)
+
+
+def _check_place(scene: SceneTables) -> None:
+    spacing, ends = scene.discretisation.spacing, scene.container.extent()
+    if ends is not None and np.abs(ends).max() > FURTHEST * spacing:
+        raise wrong(("container",), Phrase(f"{np.abs(ends).max():g} m from the origin"), _nearer(spacing))
+
+
+def _check_size(index: int, fluid: Fluid, spacing: float) -> None:
+    if fluid.count(spacing) == 0.0:
+        wanted = f"at least one spacing, {spacing:g} m, wide along every axis"
+        raise wrong(("fluid", index), Phrase("too thin to hold a particle"), wanted)
+
+
+def _check_length(emitter: Emitter, spacing: float) -> None:
+    if emitter.layers(spacing) == 0.0:
+        wanted = f"greater than half a spacing, {0.5 * spacing:g} m, for the column to hold a layer of particles"
+        raise wrong(("emitter", "length"), emitter.length, wanted)
+
+
+def _check_distance(path: FieldPath, body: Body, spacing: float) -> None:
+    furthest = np.abs(body.extent(spacing)).max()
+    if furthest > FURTHEST * spacing:
+        raise wrong(path, Phrase(f"{furthest:g} m from the origin"), _nearer(spacing))
+
+
+def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
+    """Containers are convex: if the corners of a box around the particles are inside, all are. A body that is too long
+    along an axis is refused before any of its particles is made."""
+    spacing = scene.discretisation.spacing
+    if scene.container.contains(fluid.corners(spacing), 1e-6 * spacing).all():
+        return
+    region, (lower, upper) = scene.container.region(scene.dimension), fluid.extent(spacing)
+    for ends, beyond in ((lower, region.lower - lower), (upper, upper - region.upper)):
+        axis = int(np.argmax(beyond))
+        if beyond[axis] > 1e-6 * spacing:
+            place = 0.5 * (lower + upper)
+            place[axis] = ends[axis]
+            raise _outside(index, place)
+    witnesses = fluid.witnesses(spacing)
+    outside = ~scene.container.contains(witnesses, 1e-6 * spacing)
+    if outside.any():
+        raise _outside(index, witnesses[outside][0])
+
+
+def _outside(index: int, place: Points) -> PydanticCustomError:
+    found = Phrase(f"partly outside, for example at {_place(place)}")
+    return wrong(("fluid", index), found, "inside the container")
+
+
+def _check_outlet(scene: SceneTables, emitter: Emitter) -> None:
+    """The opening is inside, and fluid comes in through it; upstream of it the column may be outside.
+
+    Along a periodic axis it may not: what is outside there comes in again on the other side.
+    """
+    spacing, lengths = scene.discretisation.spacing, scene.container.periods(scene.dimension)[1]
+    tolerance, outlet, opening = 1e-6 * spacing, np.array(emitter.outlet), emitter.opening(spacing)
+    if not scene.container.contains(outlet[None], tolerance).all():
+        raise wrong(("emitter", "outlet"), emitter.outlet, "inside the container")
+    outside = ~scene.container.contains(opening, tolerance)
+    if outside.any():
+        wanted = f"so small that the opening is inside the container, also at {_place(opening[outside][0])}"
+        raise wrong(("emitter", "radius"), emitter.radius, wanted)
+    ahead = outlet + np.where(lengths > 0.0, 0.0, spacing * np.array(emitter.direction))
+    if not scene.container.contains(ahead[None], tolerance).all():
+        raise wrong(("emitter", "direction"), emitter.direction, "into the container, where the outlet is")
+    ends, (lower, upper) = scene.container.extent(), emitter.extent(spacing)
+    if ends is None:
+        return
+    out = (lengths > 0.0) & ((lower < ends[0] - tolerance) | (upper > ends[1] + tolerance))
+    if out.any():
+        found = Phrase(f"partly outside along axis {int(np.argmax(out))}, which is periodic")
+        raise wrong(("emitter",), found, "inside the container along that axis")
+
+
+def _check_distinct(index: int, fluid: Fluid, spacing: float) -> None:
+    """The points of a file may overlap each other; those of a lattice cannot."""
+    if not isinstance(fluid, PointsFluid) or fluid.count(spacing) < 2:
+        return
+    points = fluid.points()
+    distinct, counts = np.unique(points, axis=0, return_counts=True)
+    if len(distinct) < len(points):
+        raise wrong(("fluid", index), *_overlap("itself", distinct[np.argmax(counts)], spacing))
+    distances = cKDTree(points).query(points, k=[2])[0].ravel()
+    if distances.min() < _nearest(spacing):
+        raise wrong(("fluid", index), *_overlap("itself", points[np.argmin(distances)], spacing))
+
+
+def _check_overlaps(scene: SceneTables) -> None:
+    """Between different bodies, and between a body and the periodic images of all."""
+    spacing = scene.discretisation.spacing
+    paths, bodies = zip(*_bodies(scene), strict=True)
+    lengths = scene.container.periods(scene.dimension)[1]
+    lower, upper = np.swapaxes([body.extent(spacing) for body in bodies], 0, 1)
+    shifts = [np.array(s) * lengths for s in product(*[(0, -1, 1) if length else (0,) for length in lengths])]
+    for second, shift in product(range(len(bodies)), shifts):
+        last = second + 1 if shift.any() else second
+        gaps = np.maximum(lower[:last] - upper[second] - shift, lower[second] + shift - upper[:last])
+        for first in np.nonzero((gaps < _nearest(spacing)).all(axis=1))[0]:
+            place = _meeting(bodies[first], bodies[second], shift, spacing)
+            if place is not None:
+                raise wrong(paths[second], *_overlap(field_name(paths[first]), place, spacing))
+
+
+def _meeting(first: Body, second: Body, shift: Points, spacing: float) -> Points | None:
+    """(d,) where a particle of the second body, shifted, is too near to one of the first; None if nowhere."""
+    lower, upper = first.extent(spacing)
+    moved = second.particles(spacing) + shift
+    near = moved[((moved > lower - spacing) & (moved < upper + spacing)).all(axis=1)]
+    if not len(near):
+        return None
+    distances = cKDTree(first.particles(spacing)).query(near)[0]
+    return near[np.argmin(distances)] if distances.min() < _nearest(spacing) else None
+
+
+def _overlap(other: str, place: Points, spacing: float) -> tuple[Phrase, str]:
+    wanted = f"at least half a spacing, {NEAREST * spacing:g} m, from it everywhere"
+    return Phrase(f"overlapping {other} at {_place(place)}"), wanted
+
+
+def _nearest(spacing: float) -> float:
+    return NEAREST * spacing * (1.0 - 1e-6)
+
+
+def _nearer(spacing: float) -> str:
+    return f"within {FURTHEST:g} spacings of {spacing:g} m"
+
+
+def _place(point: Points) -> str:
+    return f"({', '.join(f'{value:g}' for value in point)})"

@@ -1,0 +1,176 @@
+"""The shapes that a container may have, each with its walls."""
+
+from abc import abstractmethod
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from cortado.discretise.walls.places import Places, box_places, cup_places
+from cortado.discretise.walls.points import box_walls, cup_walls
+from cortado.errors import Phrase
+from cortado.lattice.region import Region
+from cortado.lattice.shapes import Points
+from cortado.scene.fields import Choice, Components, FieldPath, Flag, Quantity, Shaped, wrong
+from cortado.scene.fluids import INDEX_OF_AXIS, LENGTH, check_order, refuse_plane
+from cortado.scene.tables import Table
+
+
+class Container(Table):
+    """What holds the fluid."""
+
+    @abstractmethod
+    def extent(self) -> tuple[Points, Points] | None:
+        """The box around it: lower and upper, each (d,) [m]; None if there is none."""
+
+    @abstractmethod
+    def region(self, dimension: int) -> Region:
+        """Where fluid may be, within one period."""
+
+    def contains(self, points: Points, tolerance: float) -> np.ndarray:
+        """(n,) whether points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
+        return self.region(points.shape[1]).contains(points, tolerance)
+
+    @abstractmethod
+    def walls(self, dimension: int, spacing: float, depth: float) -> Points:
+        """(b, d) one layer of wall particles [m], ``depth`` [m] outside"""
+
+    @abstractmethod
+    def places(self, dimension: int, spacing: float, reach: float) -> Places:
+        """Where fluid may rest less than ``reach`` [m] from a wall."""
+
+    def wall_count(self, spacing: float) -> float:
+        """About how many wall particles one layer has, without making any."""
+        ends = self.extent()
+        if ends is None:
+            return 0.0
+        cells = np.maximum((ends[1] - ends[0]) / spacing, 1.0)
+        return float(2.0 * np.sum(np.prod(cells) / cells))
+
+    def periods(self, dimension: int) -> tuple[Points, Points]:
+        """Where the period begins and how long it is, each (d,) [m]; the length is 0 for axes without one."""
+        return np.zeros(dimension), np.zeros(dimension)
+
+
+class NoContainer(Container):
+    """Free space."""
+
+    shape: Literal["none"] = "none"
+
+    def extent(self) -> None:
+        return None
+
+    def region(self, dimension: int) -> Region:
+        return Region.everywhere(dimension)
+
+    def walls(self, dimension: int, spacing: float, depth: float) -> Points:
+        return np.zeros((0, dimension))
+
+    def places(self, dimension: int, spacing: float, reach: float) -> Places:
+        return Places.upright(np.zeros((0, dimension)))
+
+
+class BoxContainer(Container):
+    """A box, closed on all sides along which it is not periodic."""
+
+    shape: Literal["box"] = "box"
+    lower: Annotated[tuple[float, ...], Components(LENGTH)]
+    """(d,) [m]"""
+    upper: Annotated[tuple[float, ...], Components(LENGTH)]
+    """(d,) [m]"""
+    periodic: Annotated[tuple[bool, ...], Components(Flag(), default=(False, False, False))] = ()
+    """(d,) whether what leaves on one side of an axis comes back on the other."""
+    slip: Annotated[str, Choice(("free", "no"))] = "free"
+    """"no": the viscous force acts between fluid and wall; "free": it does not."""
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        check_order(self.lower, self.upper)
+        return self
+
+    def extent(self) -> tuple[Points, Points]:
+        return np.array(self.lower), np.array(self.upper)
+
+    def region(self, dimension: int) -> Region:
+        return Region.between(*self.extent())
+
+    def walls(self, dimension: int, spacing: float, depth: float) -> Points:
+        return box_walls(*self.extent(), self.periodic, spacing, depth)
+
+    def places(self, dimension: int, spacing: float, reach: float) -> Places:
+        return box_places(*self.extent(), self.periodic, spacing, reach)
+
+    def periods(self, dimension: int) -> tuple[Points, Points]:
+        lower, upper = self.extent()
+        return lower, np.where(self.periodic, upper - lower, 0.0)
+
+
+class CylinderContainer(Container):
+    """A cup, in 3-D."""
+
+    shape: Literal["cylinder"] = "cylinder"
+    base: Annotated[tuple[float, ...], Components(LENGTH)]
+    """(3,) centre of the bottom [m]"""
+    radius: Annotated[float, Quantity("m", above=0.0)]
+    """[m]"""
+    height: Annotated[float, Quantity("m", above=0.0)]
+    """From the base, along the axis [m]."""
+    axis: Annotated[str, Choice(("x", "y", "z"))] = "y"
+    """The axis of space along which it stands."""
+    lid: Annotated[bool, Flag()] = True
+    """Whether it is closed on top; without a lid, fluid may be above the rim."""
+    slip: Annotated[str, Choice(("free", "no"))] = "free"
+    """"no": the viscous force acts between fluid and wall; "free": it does not."""
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        refuse_plane(dimension, path, '"box" or "none"')
+        return super().in_dimension(dimension, path)
+
+    def extent(self) -> tuple[Points, Points]:
+        axis = INDEX_OF_AXIS[self.axis]
+        lower, upper = np.array(self.base) - self.radius, np.array(self.base) + self.radius
+        lower[axis], upper[axis] = self.base[axis], self.base[axis] + self.height
+        return lower, upper
+
+    def region(self, dimension: int) -> Region:
+        axis, (lower, upper) = INDEX_OF_AXIS[self.axis], self.extent()
+        across, rim = np.ones(3), float(upper[axis])
+        across[axis] = 0.0
+        if not self.lid:
+            upper[axis] = np.inf
+        return Region(lower, upper, np.array(self.base), across, self.radius, np.inf if self.lid else rim)
+
+    def walls(self, dimension: int, spacing: float, depth: float) -> Points:
+        upright = cup_walls(self.radius, self.height, self.lid, spacing, depth)
+        return self.base + np.roll(upright, INDEX_OF_AXIS[self.axis] + 1, axis=1)
+
+    def places(self, dimension: int, spacing: float, reach: float) -> Places:
+        upright, turn = cup_places(self.radius, self.height, self.lid, spacing, reach), INDEX_OF_AXIS[self.axis] + 1
+        return Places(self.base + np.roll(upright.points, turn, axis=1), np.roll(upright.axes, turn, axis=2))
+
+
+AnyContainer = Annotated[
+    Annotated[BoxContainer | CylinderContainer | NoContainer, Field(discriminator="shape")],
+    Shaped(("box", "cylinder", "none")),
+]
+
+
+def check_length(container: Container, spacing: float, support_radius: float) -> None:
+    """A container is at least one spacing wide, and a period longer than two support radii.
+
+    The neighbour search takes the nearest periodic image only; in a shorter period a pair would have two.
+    """
+    ends = container.extent()
+    if ends is None:
+        return
+    lengths = ends[1] - ends[0]
+    if lengths.min() < spacing * (1.0 - 1e-6):
+        found = Phrase(f"only {lengths.min():g} m wide")
+        raise wrong(("container",), found, f"at least one spacing, {spacing:g} m, wide")
+    periods = container.periods(len(lengths))[1]
+    short = (periods > 0.0) & (periods <= 2.0 * support_radius)
+    if short.any():
+        axis = int(np.argmax(short))
+        reason = f"the {periods[axis]:g} m of this axis are not more than two support radii, {2.0 * support_radius:g} m"
+        wanted = f"false, as {reason}"
+        raise wrong(("container", "periodic", axis), True, wanted)

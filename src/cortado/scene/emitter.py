@@ -1,0 +1,97 @@
+"""Fluid that comes out of a nozzle: a column of particles that waits upstream of an opening."""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from pydantic import field_validator
+
+from cortado.lattice.shapes import ROUND_OFF, Points, across, disc, disc_cells
+from cortado.scene.fields import GREATEST, Components, Quantity, wrong
+from cortado.scene.fluids import LENGTH, Body
+
+
+@dataclass(frozen=True)
+class EmitterSample:
+    """The particles of an emitter, m of them: layer after layer from the outlet upstream, alike in each."""
+
+    offsets: Points
+    """(m, d) from the axis, perpendicular to it [m]"""
+    upstream: Points
+    """(m,) distance from the opening, against the direction [m]"""
+    positions: Points
+    """(m, d) [m]"""
+    velocities: Points
+    """(m, d) [m/s]"""
+    speed: float
+    """[m/s]"""
+    layer: int
+    """Particles in a layer; m is a multiple of it."""
+
+
+class Emitter(Body):
+    """A nozzle: a disc, or a line in 2-D, out of which a column of fluid comes with one speed."""
+
+    outlet: Annotated[tuple[float, ...], Components(LENGTH)]
+    """(d,) centre of the opening [m]"""
+    direction: Annotated[tuple[float, ...], Components(Quantity(), default=(0.0, -1.0, 0.0))] = ()
+    """(d,) of the flow, a unit vector once read"""
+    radius: Annotated[float, Quantity("m", above=0.0)]
+    """Of the opening [m]."""
+    length: Annotated[float, Quantity("m", above=0.0)]
+    """Of the column that waits upstream of the opening [m]."""
+    flow_rate: Annotated[float, Quantity("m3/s (m2/s in 2-D)", above=0.0)]
+    """Volume that comes out in a second [m3/s], in 2-D [m2/s]."""
+
+    @field_validator("direction")
+    @classmethod
+    def _normalise(cls, direction: tuple[float, ...]) -> tuple[float, ...]:
+        """A vector that is normalised but for round-off stays what it is, so that JSON brings the same emitter back."""
+        size = math.hypot(*direction)
+        if size < 1.0 / GREATEST:
+            raise wrong((), direction, "a vector that is not zero")
+        return direction if abs(size - 1.0) < 1e-12 else tuple(value / size for value in direction)
+
+    def layers(self, spacing: float) -> float:
+        """How many layers have their middle within the length, a whole number that may be larger than any array."""
+        return float(max(math.ceil(self.length / spacing - 0.5 - ROUND_OFF), 0))
+
+    def speed(self, spacing: float) -> float:
+        """[m/s]; with it the volume of the particles that come out is that of the flow rate."""
+        return self.flow_rate / (len(self._cross_section(spacing)) * spacing ** (len(self.outlet) - 1))
+
+    def opening(self, spacing: float) -> Points:
+        """(n, d) [m] a layer of particles, moved into the opening."""
+        return np.array(self.outlet) + self._cross_section(spacing)
+
+    def sample(self, spacing: float) -> EmitterSample:
+        """The particles on a lattice of the spacing [m]."""
+        cross_section = self._cross_section(spacing)
+        layers, speed = int(self.layers(spacing)), self.speed(spacing)
+        offsets = np.tile(cross_section, (layers, 1))
+        upstream = np.repeat((np.arange(layers) + 0.5) * spacing, len(cross_section))
+        return EmitterSample(
+            offsets=offsets,
+            upstream=upstream,
+            positions=np.array(self.outlet) + offsets - np.outer(upstream, self.direction),
+            velocities=np.tile(speed * np.array(self.direction), (len(upstream), 1)),
+            speed=speed,
+            layer=len(cross_section),
+        )
+
+    def count(self, spacing: float) -> float:
+        cells = disc_cells(self.radius, spacing, len(self.outlet) - 1)
+        return float(np.prod(cells)) * self.layers(spacing)
+
+    def extent(self, spacing: float) -> tuple[Points, Points]:
+        opening, direction = self.opening(spacing), np.array(self.direction)
+        first, last = 0.5 * spacing * direction, (self.layers(spacing) - 0.5) * spacing * direction
+        return opening.min(axis=0) - np.maximum(first, last), opening.max(axis=0) - np.minimum(first, last)
+
+    def particles(self, spacing: float) -> Points:
+        return self.sample(spacing).positions
+
+    def _cross_section(self, spacing: float) -> Points:
+        """(n, d) offsets of the particles of a layer from the axis [m]."""
+        return disc(self.radius, spacing, len(self.outlet) - 1) @ across(self.direction)

@@ -1,0 +1,197 @@
+"""The shapes that fluid may have, each with its particles."""
+
+from abc import abstractmethod
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from cortado.lattice.region import Region
+from cortado.lattice.shapes import ROUND_OFF, Block, Points, block_about, block_between, corners
+from cortado.scene.fields import Choice, Components, FieldPath, Quantity, Shaped, Text, wrong
+from cortado.scene.points import read_points
+from cortado.scene.tables import Table
+
+LENGTH = Quantity("m")
+INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
+
+
+class Body(Table):
+    """Particles of one phase: a body of fluid, or what an emitter holds."""
+
+    phase: Annotated[str, Text()]
+    """Name of its phase."""
+
+    @abstractmethod
+    def count(self, spacing: float) -> float:
+        """The number of particles or somewhat more, without making any."""
+
+    @abstractmethod
+    def extent(self, spacing: float) -> tuple[Points, Points]:
+        """A box that holds all particles: lower and upper, each (d,) [m]."""
+
+    @abstractmethod
+    def particles(self, spacing: float) -> Points:
+        """(n, d) [m]"""
+
+
+class Fluid(Body):
+    """A body of fluid."""
+
+    velocity: Annotated[tuple[float, ...], Components(Quantity("m/s"), default=(0.0, 0.0, 0.0))] = ()
+    """(d,) [m/s]"""
+
+    def corners(self, spacing: float) -> Points:
+        """(2^d, d) the corners of the extent [m]."""
+        return corners(*self.extent(spacing))
+
+    def witnesses(self, spacing: float) -> Points:
+        """(n, d) [m] particles that lie in a convex region only if all of them do."""
+        return self.particles(spacing)
+
+    def particles_in(self, region: Region, spacing: float) -> Points:
+        """(n, d) [m] those that a container leaves room for."""
+        return self.particles(spacing)
+
+
+class LatticeFluid(Fluid):
+    """A body of fluid whose particles are on a lattice of the spacing."""
+
+    @abstractmethod
+    def block(self, spacing: float) -> Block:
+        """The lattice in the box around the shape."""
+
+    def inside(self, points: Points) -> Points:
+        """Those of the points (n, d) [m] that are in the shape."""
+        return points
+
+    def count(self, spacing: float) -> float:
+        return self.block(spacing).size
+
+    def extent(self, spacing: float) -> tuple[Points, Points]:
+        return self.block(spacing).extent
+
+    def particles(self, spacing: float) -> Points:
+        return self.inside(self.block(spacing).points())
+
+    def particles_in(self, region: Region, spacing: float) -> Points:
+        """(n, d) [m] those that are half a spacing or more from all walls, where they would be compressed otherwise."""
+        everything = self.particles(spacing)
+        return everything[region.contains(everything, (ROUND_OFF - 0.5) * spacing)]
+
+
+class BoxFluid(LatticeFluid):
+    """A box, filled with particles at ``lower + (i + 1/2) spacing``."""
+
+    shape: Literal["box"] = "box"
+    lower: Annotated[tuple[float, ...], Components(LENGTH)]
+    """(d,) [m]"""
+    upper: Annotated[tuple[float, ...], Components(LENGTH)]
+    """(d,) [m]"""
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        check_order(self.lower, self.upper)
+        return self
+
+    def block(self, spacing: float) -> Block:
+        return block_between(self.lower, self.upper, spacing)
+
+    def witnesses(self, spacing: float) -> Points:
+        return self.corners(spacing)
+
+
+class SphereFluid(LatticeFluid):
+    """A sphere, or a disc in 2-D."""
+
+    shape: Literal["sphere"] = "sphere"
+    centre: Annotated[tuple[float, ...], Components(LENGTH)]
+    """(d,) [m]"""
+    radius: Annotated[float, Quantity("m", above=0.0)]
+    """[m]"""
+
+    def block(self, spacing: float) -> Block:
+        return block_about(self.centre, np.full(len(self.centre), self.radius), spacing)
+
+    def inside(self, points: Points) -> Points:
+        return points[np.linalg.norm(points - self.centre, axis=1) <= self.radius]
+
+
+class CylinderFluid(LatticeFluid):
+    """A cylinder, in 3-D."""
+
+    shape: Literal["cylinder"] = "cylinder"
+    base: Annotated[tuple[float, ...], Components(LENGTH)]
+    """(3,) centre of the bottom [m]"""
+    radius: Annotated[float, Quantity("m", above=0.0)]
+    """[m]"""
+    height: Annotated[float, Quantity("m", above=0.0)]
+    """From the base, along the axis [m]."""
+    axis: Annotated[str, Choice(("x", "y", "z"))] = "y"
+    """The axis of space along which it stands."""
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        refuse_plane(dimension, path, '"box", "sphere" or "points"')
+        return super().in_dimension(dimension, path)
+
+    def block(self, spacing: float) -> Block:
+        axis = INDEX_OF_AXIS[self.axis]
+        base, half = np.array(self.base), np.full(3, self.radius)
+        half[axis] = 0.5 * self.height
+        block = block_about(base, half, spacing)
+        standing = np.where(np.arange(3) == axis, base + 0.5 * spacing, block.first)
+        return Block(standing, block.counts, spacing)
+
+    def inside(self, points: Points) -> Points:
+        from_axis = np.delete(points - self.base, INDEX_OF_AXIS[self.axis], axis=1)
+        return points[np.linalg.norm(from_axis, axis=1) <= self.radius]
+
+
+class PointsFluid(Fluid):
+    """Particles at the positions that a file holds."""
+
+    shape: Literal["points"] = "points"
+    file: Annotated[str, Text()]
+    """An array (n, d) [m] as .npy, or a .vtk, .vtp or .vtkhdf file, of which the first step is read; beside the scene
+    file, and absolute once read."""
+
+    @field_validator("file")
+    @classmethod
+    def _make_absolute(cls, file: str, info: ValidationInfo) -> str:
+        folder = Path((info.context or {}).get("folder", "."))
+        try:
+            return str((folder / file).absolute())
+        except (OSError, ValueError):
+            raise wrong((), file, "the name of a file") from None
+
+    def points(self) -> Points:
+        """(n, d) [m]; raises `InputError`."""
+        return read_points(self.file, len(self.velocity))
+
+    def count(self, spacing: float) -> float:
+        return float(len(self.points()))
+
+    def extent(self, spacing: float) -> tuple[Points, Points]:
+        return self.points().min(axis=0), self.points().max(axis=0)
+
+    def particles(self, spacing: float) -> Points:
+        return self.points().copy()
+
+
+AnyFluid = Annotated[
+    Annotated[BoxFluid | CylinderFluid | SphereFluid | PointsFluid, Field(discriminator="shape")],
+    Shaped(("box", "cylinder", "sphere", "points")),
+]
+
+
+def check_order(lower: tuple[float, ...], upper: tuple[float, ...]) -> None:
+    """Every component of upper must be greater than that of lower."""
+    if len(lower) == len(upper) and any(b <= a for a, b in zip(lower, upper, strict=True)):
+        raise wrong(("upper",), upper, f"greater than lower, {list(lower)}, in every component")
+
+
+def refuse_plane(dimension: int, path: FieldPath, others: str) -> None:
+    """A cylinder needs three dimensions."""
+    if dimension == 2:
+        raise wrong((*path, "shape"), "cylinder", f"{others} in 2-D")

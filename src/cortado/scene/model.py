@@ -1,0 +1,134 @@
+"""The tables of a scene together, and those that no other module has. SI units.
+
+Vectors have as many components as the scene has dimensions. Whatever is wrong raises a `SceneError`, one sentence.
+"""
+
+from typing import Annotated, Any, ClassVar, Self
+
+from pydantic import Field, ValidationInfo, create_model, field_validator, model_validator
+
+from cortado.parameters.registry import PARAMETERS
+from cortado.scene.containers import AnyContainer, NoContainer
+from cortado.scene.emitter import Emitter
+from cortado.scene.fields import COLOUR, Choice, Components, Count, Flag, Quantity, Tables, Text, wrong
+from cortado.scene.fluids import AnyFluid
+from cortado.scene.mixture import Mixture
+from cortado.scene.render import Render
+from cortado.scene.tables import Table
+
+OTHER_TABLES = ("problem", "optimise")
+"""Tables that a scene file may hold for other modules."""
+
+
+class Discretisation(Table):
+    """How the fluid is cut into particles."""
+
+    spacing: Annotated[float, Quantity("m", above=0.0)]
+    """Distance between particles at rest [m]."""
+    support: Annotated[float, Quantity(least=1.2, most=4.0)] = 2.0
+    """Support radius / spacing."""
+    kernel: Annotated[str, Choice(("cubic_spline", "wendland_c2", "wendland_c4"))] = "cubic_spline"
+    """Name of the smoothing kernel."""
+
+    @property
+    def support_radius(self) -> float:
+        """The distance at which the smoothing kernel ends [m]."""
+        return self.support * self.spacing
+
+
+class Phase(Table):
+    """A material."""
+
+    name: Annotated[str, Text()]
+    """What fluids call it."""
+    rest_density: Annotated[float, Quantity("kg/m3", above=0.0)]
+    """[kg/m3]"""
+    viscosity: Annotated[float, Quantity("Pa s", least=0.0)]
+    """Dynamic [Pa s]."""
+    colour: Annotated[tuple[float, ...], COLOUR] = (0.1, 0.3, 0.8)
+    """(3,) red, green and blue, each from 0 to 1."""
+
+
+class FixedForces(Table):
+    """The forces that every scene has."""
+
+    gravity: Annotated[tuple[float, ...], Components(Quantity("m/s2"), default=(0.0, -9.81, 0.0))] = ()
+    """(d,) [m/s2]"""
+    viscosity: Annotated[str, Choice(("pairwise", "laminar", "none"))] = "pairwise"
+    """"pairwise": the report's equation 10; "laminar": Morris et al. (1997)."""
+    pressure: Annotated[bool, Flag()] = True
+    """Whether the fluid resists compression."""
+
+
+_OPTIONAL: dict[str, Any] = {
+    parameter.name: (Annotated[float, Quantity(parameter.unit, least=0.0)] | None, None)
+    for parameter in PARAMETERS
+    if parameter.is_optional
+}
+Forces: Any = create_model("Forces", __base__=FixedForces, __module__=__name__, **_OPTIONAL)
+"""Which forces act: `FixedForces`, and the optional ones of the registry of parameters."""
+
+
+class Solver(Table):
+    """How a step is solved."""
+
+    kind: Annotated[str, Choice(("pcisph",))] = "pcisph"
+    """Name of the algorithm."""
+    time_step: Annotated[float, Quantity("s", above=0.0)]
+    """[s]"""
+    minimum_iterations: Annotated[int, Count(1, 1_000_000)] = 3
+    """Pressure iterations of a step, at least."""
+    maximum_iterations: Annotated[int, Count(1, 1_000_000)] = 50
+    """Pressure iterations of a step, at most."""
+    density_tolerance: Annotated[float, Quantity(least=0.0)] = 0.01
+    """On the average of (rho - rho_0) / rho_0."""
+    maximum_density_tolerance: Annotated[float, Quantity(least=0.0)] | None = None
+    """On the maximum of (rho - rho_0) / rho_0; not used if None."""
+
+    @model_validator(mode="after")
+    def _check_iterations(self) -> Self:
+        if self.minimum_iterations > self.maximum_iterations:
+            wanted = f"at most maximum_iterations, {self.maximum_iterations}"
+            raise wrong(("minimum_iterations",), self.minimum_iterations, wanted)
+        return self
+
+
+class SceneTables(Table):
+    """Everything that a simulation starts from, each table right in itself."""
+
+    beside: ClassVar = OTHER_TABLES
+    name: Annotated[str, Text()] = "scene"
+    """Shown in titles."""
+    dimension: Annotated[int, Count(2, 3)]
+    """2 or 3; d below."""
+    discretisation: Discretisation
+    """How the fluid is cut into particles."""
+    phase: Annotated[tuple[Phase, ...], Tables("phase")]
+    """The materials: in this order the components of mass fractions."""
+    fluid: Annotated[tuple[AnyFluid, ...], Tables("fluid")]
+    """The bodies of fluid; particles come in this order."""
+    emitter: Emitter | None = None
+    """Fluid that comes out of a nozzle; its particles come after those of all fluids."""
+    container: AnyContainer = Field(default=NoContainer(), validate_default=True)
+    """What holds the fluid."""
+    mixture: Mixture = Mixture()
+    """How phases mix; the default if there is only one."""
+    forces: Forces = Field(default=Forces(), validate_default=True)
+    """Which forces act."""
+    solver: Solver
+    """How a step is solved."""
+    render: Render | None = None
+    """How pictures are taken."""
+
+    @field_validator("emitter", "container", "forces", "render")
+    @classmethod
+    def _resolve(cls, table: Any, info: ValidationInfo) -> Any:
+        given = table is not None and "dimension" in info.data
+        return table.in_dimension(info.data["dimension"]) if given else table
+
+    @field_validator("fluid")
+    @classmethod
+    def _resolve_fluids(cls, fluids: Any, info: ValidationInfo) -> Any:
+        if "dimension" not in info.data:
+            return fluids
+        return tuple(fluid.in_dimension(info.data["dimension"], (index,)) for index, fluid in enumerate(fluids))

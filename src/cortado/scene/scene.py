@@ -1,0 +1,80 @@
+"""What the user writes: a scene, from a TOML file or in Python, checked and frozen.
+
+Whatever is wrong raises a `SceneError`, one sentence.
+"""
+
+import json
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import model_validator
+
+from cortado.errors import CortadoWarning, InputError, SceneError, shown
+from cortado.scene.checks import check_scene
+from cortado.scene.model import OTHER_TABLES, SceneTables
+from cortado.scene.stability import stability_limit
+from cortado.scene.tables import sentences
+from cortado.scene.toml import read_toml
+
+
+class Scene(SceneTables):
+    """Everything that a simulation starts from: `SceneTables` that fit each other."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        check_scene(self)
+        limit, time_step = stability_limit(self), self.solver.time_step
+        if time_step > limit * (1.0 + 1e-9):
+            sentence = f"solver.time_step is {time_step:g} s, but the limit of stability is about {limit:.3g} s."
+            warnings.warn(sentence, CortadoWarning, stacklevel=2)
+        return self
+
+    def to_json(self) -> str:
+        """The scene with all defaults filled in, to be read by `from_json`."""
+        return json.dumps(self.model_dump(mode="json"), indent=2)
+
+    @classmethod
+    def from_json(cls, text: str) -> "Scene":
+        """The scene that `to_json` wrote."""
+        try:
+            data = json.loads(text)
+        except (ValueError, RecursionError) as problem:
+            raise SceneError(None, "", sentence=f"is not valid JSON: {problem}.") from None
+        return scene_from_dict(data)
+
+
+def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Scene:
+    """Read a scene from a TOML file.
+
+    Args:
+        path: the file. Its tables [problem] and [optimise] belong to others and are ignored.
+        overrides: replacements such as ``solver.time_step=0.002`` or ``fluid[0].upper=[1,1,1]``.
+
+    Raises:
+        SceneError: in one sentence, with the file, the field, what was found and what was wanted.
+    """
+    return scene_from_dict(read_toml(path, overrides), os.fspath(path))
+
+
+def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
+    """The scene itself, or the one in the file at a path; raises `InputError` for anything else, and `SceneError`."""
+    if isinstance(scene, Scene):
+        return scene
+    if isinstance(scene, (str, os.PathLike)):
+        return load_scene(scene)
+    raise InputError(f"scene is {shown(scene)}, but must be a cortado.Scene or the path of a scene file.")
+
+
+def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
+    """A scene from the contents of its file, whose folder is where its other files are looked for."""
+    if isinstance(data, Mapping):
+        data = {key: value for key, value in data.items() if key not in OTHER_TABLES}
+    folder = Path(file).parent if file else Path()
+    try:
+        with sentences():
+            return Scene.model_validate(data, context={"folder": folder})
+    except SceneError as error:
+        raise (error.in_file(file) if file else error) from None

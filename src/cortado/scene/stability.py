@@ -1,0 +1,75 @@
+"""The largest time step at which an explicit simulation of a scene is likely to be stable."""
+
+from math import inf, sqrt
+
+import numpy as np
+
+from cortado.lattice.shapes import Points
+from cortado.parameters.registry import PARAMETERS
+from cortado.parameters.values import Arrays
+from cortado.scene.model import SceneTables
+
+
+def stability_limit(scene: SceneTables, values: Arrays | None = None) -> float:
+    """The smallest of several limits [s], infinite if nothing moves; h is the support radius.
+
+    Courant: 0.4 h / v, where v is the largest initial speed and that of a free fall through the container, or through
+    the extent of the fluid if there is none (Monaghan 1992); an emitter has its speed, and fluid falls from its outlet.
+    Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity: 0.06 h^2 rho / mu of the most viscous and the lightest phase
+    in use, as they may meet: the least that a lattice bears of explicit steps with any kernel here (Wendland C4 in 3-D;
+    the form is that of Morris et al. 1997, whose 0.125 is for an h of half the support).
+
+    Optional forces have limits of their own, in the registry of parameters.
+
+    ``values``: parameters by name that replace the scene's; of a gravity for each step the strongest counts.
+    """
+    values = values or {}
+    support, gravity = scene.discretisation.support_radius, np.atleast_2d(values.get("gravity", scene.forces.gravity))
+    strength = float(np.linalg.norm(gravity, axis=1).max())
+    lower, upper = _extent(scene)
+    speed = _first_speed(scene, values) + sqrt(2.0 * float((np.abs(gravity) @ (upper - lower)).max()))
+    courant = 0.4 * support / speed if speed > 0.0 else inf
+    force = 0.25 * sqrt(support / strength) if strength > 0.0 else inf
+    optional = [p.longest_step(scene, values) for p in PARAMETERS if p.is_optional and p.present(scene)]
+    return min(courant, force, _viscous_limit(scene, values), *optional)
+
+
+def _first_speed(scene: SceneTables, values: Arrays) -> float:
+    """The largest speed with which fluid starts or comes out of a nozzle [m/s]."""
+    if "initial_velocities" in values:
+        speed = float(np.linalg.norm(values["initial_velocities"], axis=1).max())
+    else:
+        speed = max(float(np.linalg.norm(fluid.velocity)) for fluid in scene.fluid)
+    if scene.emitter is None:
+        return speed
+    faster = float(values.get("flow_rate", scene.emitter.flow_rate)) / scene.emitter.flow_rate
+    return max(speed, faster * scene.emitter.speed(scene.discretisation.spacing))
+
+
+def _viscous_limit(scene: SceneTables, values: Arrays) -> float:
+    if scene.forces.viscosity == "none":
+        return inf
+    names = {fluid.phase for fluid in scene.fluid} | ({scene.emitter.phase} if scene.emitter else set())
+    used = [k for k, phase in enumerate(scene.phase) if phase.name in names]
+    densities = np.atleast_1d(values.get("rest_density", [phase.rest_density for phase in scene.phase]))
+    viscosities = np.atleast_1d(values.get("viscosity", [phase.viscosity for phase in scene.phase]))
+    density, viscosity = float(densities[used].min()), float(viscosities[used].max())
+    return 0.06 * scene.discretisation.support_radius**2 * density / viscosity if viscosity > 0.0 else inf
+
+
+def _extent(scene: SceneTables) -> tuple[Points, Points]:
+    """The box through which fluid may fall: lower and upper, each (d,) [m]."""
+    lower, upper = _room(scene)
+    if scene.emitter is None:
+        return lower, upper
+    return np.minimum(lower, scene.emitter.outlet), np.maximum(upper, scene.emitter.outlet)
+
+
+def _room(scene: SceneTables) -> tuple[Points, Points]:
+    """The box around the container, or around the fluids if there is none: lower and upper, each (d,) [m]."""
+    ends = scene.container.extent()
+    if ends is not None:
+        return ends
+    lower, upper = np.swapaxes([fluid.extent(scene.discretisation.spacing) for fluid in scene.fluid], 0, 1)
+    half = 0.5 * scene.discretisation.spacing
+    return lower.min(axis=0) - half, upper.max(axis=0) + half

@@ -1,0 +1,107 @@
+"""From a TOML file and overrides such as ``solver.time_step=0.002`` to a dictionary."""
+
+import os
+import re
+import tomllib
+from collections.abc import Sequence
+from typing import Any
+
+from cortado.errors import LONGEST, SceneError, shown
+from cortado.io.input_files import content, reason
+
+MOST_BYTES = 1_000_000
+"""Of a file: TOML of that size, made to be as bad as it can, takes a few seconds and some hundred MB."""
+MOST_PARTS = 10
+"""Of a dotted key: the time and the memory that one takes grow with the square of their number."""
+
+_ASIDE = re.compile(
+    r'''#[^\n]*|"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5}|\Z)|"(?:[^"\\\n]|\\.)*+"?'''
+    r"""|'{3}(?:[^']|'(?!''))*+(?:'{3,5}|\Z)|'[^'\n]*+'?""",
+    re.DOTALL,
+)
+"""Comments and quoted texts, unfinished ones too."""
+_TOO_DEEP = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_PARTS}}}[\w-]++")
+_KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
+
+
+def read_toml(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """The contents of a TOML file with overrides put in. Raises `SceneError`.
+
+    An override is ``key=value``: ``forces.gravity=[0,-5,0]``, ``fluid.0.upper=[1,1,1]`` or ``fluid[0].upper=[1,1,1]``.
+    A value that is not TOML is taken as text.
+    """
+    file = os.fspath(path)
+    try:
+        text = content(path, MOST_BYTES).decode("utf-8")
+        _require_shallow(text, file)
+        data = tomllib.loads(text)
+    except UnicodeDecodeError as problem:
+        line = problem.object[: problem.start].count(b"\n") + 1
+        raise _unreadable(file, f"is not text in UTF-8 (at line {line}).") from None
+    except (ValueError, RecursionError) as problem:  # among them TOMLDecodeError, which names the line
+        raise _unreadable(file, f"is not valid TOML: {reason(problem)}.") from None
+    except OSError as problem:
+        raise _unreadable(file, f"cannot be read: {reason(problem)}.") from None
+    for override in overrides:
+        _apply(data, override, file)
+    return data
+
+
+def _unreadable(file: str, sentence: str) -> SceneError:
+    return SceneError(file, "", sentence=sentence)
+
+
+def _require_shallow(text: str, file: str) -> None:
+    """Raises `SceneError` for a key of very many parts, wherever it stands, before anything is made of it."""
+    plain = _ASIDE.sub(lambda found: "" if found[0].startswith("#") else "text", text)
+    deep = _TOO_DEEP.search(plain)
+    if deep:
+        raise _too_deep(file, deep[0])
+
+
+def _too_deep(file: str, key: str) -> SceneError:
+    return _unreadable(file, f"has a key of more than {MOST_PARTS} parts, {shown(key)}, but no table lies that deep.")
+
+
+def _apply(data: dict[str, Any], override: str, file: str) -> None:
+    """Put one override in."""
+    if len(override) > MOST_BYTES:
+        sentence = f"is the beginning of {len(override)} characters, but an override must have at most {MOST_BYTES}."
+        raise SceneError(file, shown(override), sentence=sentence)
+    _require_shallow(override, file)
+    key, equals, text = override.partition("=")
+    key = key.strip()
+    if not equals or not _KEY.fullmatch(key):
+        raise SceneError(file, shown(override), sentence="is not an override of the form key=value.")
+    parts = key.replace("[", ".").replace("]", "").split(".")
+    if len(parts) > MOST_PARTS:
+        raise _too_deep(file, key)
+    field = key if len(key) <= LONGEST else shown(key)
+    place: Any = data
+    for depth, part in enumerate(parts):
+        last = depth == len(parts) - 1
+        index: str | int = part
+        if isinstance(place, list):
+            if not part.isdecimal() or len(part) > 9 or int(part) >= len(place):
+                wanted = f"an index from 0 to {len(place) - 1}" if place else "left out, as the list is empty"
+                raise SceneError(file, field, part, wanted)
+            index = int(part)
+        elif not isinstance(place, dict):
+            raise SceneError(
+                file, field, sentence=f"cannot be set, as {'.'.join(parts[:depth])[:LONGEST]} is not a table."
+            )
+        elif not last:
+            place.setdefault(part, {})
+        if last:
+            place[index] = _value(text.strip())
+        else:
+            place = place[index]
+
+
+def _value(text: str) -> Any:
+    """A TOML value, or the text itself."""
+    try:
+        parsed = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
+        return text
+    return parsed["value"] if parsed.keys() == {"value"} else text

@@ -1,0 +1,110 @@
+"""Which particles are lost: outside of their container, too far away for their precision, or not finite."""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.precision import Precision
+
+NO_PARTICLE = 2**31 - 1
+"""What stands for 'every particle is well' where the first bad one would be named."""
+
+
+@cache
+def bounds_type(precision: Precision) -> Any:
+    """The Warp struct of a `Region`, a tolerance included, and of how far particles may go."""
+    real, vector = precision.real, precision.vector
+
+    class Bounds:
+        lower: vector
+        upper: vector
+        base: vector
+        across: vector
+        up: vector
+        """Along the axis of an open cup; 0 where there is none."""
+        radius: real
+        rim: real
+        nearest: vector
+        """The corners of the box in which positions are precise enough."""
+        furthest: vector
+
+    Bounds.__name__ = Bounds.__qualname__ = f"Bounds_{precision.name}"
+    return wp.struct(Bounds)
+
+
+@cache
+def lost_kernel(precision: Precision) -> Any:
+    """The kernel that looks for particles that were lost in a step."""
+    real, vector = precision.real, precision.vector
+    bounds_struct = bounds_type(precision)
+    module = wp.get_module(f"cortado_containment_{precision.name}")
+    module.options["enable_backward"] = False
+
+    @wp.func
+    def between(x: vector, lower: vector, upper: vector) -> bool:
+        """False for what is not a number, too."""
+        return (
+            x[0] >= lower[0]
+            and x[1] >= lower[1]
+            and x[2] >= lower[2]
+            and x[0] <= upper[0]
+            and x[1] <= upper[1]
+            and x[2] <= upper[2]
+        )
+
+    @wp.func
+    def contains(x: vector, b: bounds_struct) -> bool:
+        return between(x, b.lower, b.upper) and wp.length(wp.cw_mul(x - b.base, b.across)) <= b.radius
+
+    @wp.func
+    def below_rim(x: vector, b: bounds_struct) -> bool:
+        return wp.dot(x, b.up) < b.rim
+
+    @wp.kernel(module=module, enable_backward=False)
+    def find_lost(
+        bounds: bounds_struct,
+        first_waiting: int,
+        order: wp.array(dtype=wp.int32),
+        x_before: wp.array(dtype=vector),
+        rho_0: wp.array(dtype=real),
+        x_free: wp.array(dtype=vector),
+        v_free: wp.array(dtype=vector),
+        x: wp.array(dtype=vector),
+        bad_step: wp.array(dtype=wp.int32),
+        # in and out
+        bad: wp.array(dtype=wp.int32),
+        count: wp.array(dtype=wp.int32),
+    ):
+        """``bad``: the first particle, in scene order, that is lost; ``count``: how many are. After a bad step nothing
+        is looked for.
+
+        Lost is what is not finite, too far away, of a mixture without a volume, or what went through a wall: it was
+        inside before the step and is outside after it. Over the rim of an open cup fluid may go, and what a nozzle
+        leads, so that it is not where it would be without one, passes walls with it: such are only among the particles
+        from ``first_waiting`` on, in scene order. ``x`` is the new state in that order; the others are sorted, and
+        ``x_free`` and ``v_free`` are the new state without the nozzle.
+        """
+        if bad_step[0] >= 0:
+            return
+        i = wp.tid()
+        p = order[i]
+        x_i = x_free[i]
+        let_go = bool(True)
+        if p >= first_waiting:
+            let_go = x[p] == x_i
+            x_i = x[p]
+        before = x_before[i]
+        good = between(x_i, bounds.nearest, bounds.furthest) and wp.isfinite(v_free[i]) and rho_0[i] > real(0.0)
+        escaped = (
+            let_go
+            and contains(before, bounds)
+            and not contains(x_i, bounds)
+            and below_rim(before, bounds)
+            and below_rim(x_i, bounds)
+        )
+        if escaped or not good:
+            wp.atomic_min(bad, 0, p)
+            wp.atomic_add(count, 0, 1)
+
+    return find_lost

@@ -1,0 +1,255 @@
+"""Cahn-Hilliard diffusion between the phases of a mixture (Yang et al. 2015; report eqs. 15 to 19, put right):
+
+    chi_k,i = alpha P f'(c_i)_k - (eps^2 / m_i) B(m; c_k)_i,         P u = u - (1 / phases) sum_l u_l
+    c'_k,i  = c_k,i + (dt / m_i) B(m M; chi_k)_i,                    M_i = M_0 m(c_i)
+    B(w; u)_i = V sum_j (w_i / n_j + w_j / n_i) (u_i - u_j) F_ij,    F = x . G / (|x|^2 + 0.01 h^2)
+
+chi is the chemical potential. B is antisymmetric in i and j: each phase keeps its mass, sum_i m_i c_k,i, to round-off,
+and sum_k c_k stays what it was, by P. The same B in both lines makes the discrete free energy
+
+    E = V sum_i m_i alpha f(c_i) - (eps^2 V^2 / 4) sum_ij (m_i / n_j + m_j / n_i) F_ij |c_i - c_j|^2
+
+fall along the flow on particles at rest (F <= 0). Nothing is clipped: that would break both.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.kernels import Kernels
+from cortado.device.neighbourhood import Discretisation, surroundings_type
+from cortado.sph.free_energy import FreeEnergy, Mobility
+from cortado.sph.pairwise_laplacian import spreading_functions
+
+
+@dataclass(frozen=True)
+class Diffusion:
+    """What the kernels of a mixture are made for."""
+
+    discretisation: Discretisation
+    phases: int
+    energy: FreeEnergy
+    mobility: Mobility
+
+    def module(self, differentiable: bool) -> Any:
+        """The Warp module of these kernels."""
+        topic = f"diffusion_{self.phases}_{self.energy.name}_{self.mobility.name}"
+        return self.discretisation.module(differentiable, topic)
+
+
+@dataclass(frozen=True)
+class DiffusionKernels:
+    """The kernels of one substep of diffusion."""
+
+    potential: Kernels
+    flux: Kernels
+    scale_adjoint: Any
+
+
+@cache
+def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
+    """Kernels of the potential, of the flux, and of the adjoint of the flux's scale."""
+    discretisation, phases = diffusion.discretisation, diffusion.phases
+    precision = discretisation.precision
+    real, vector, fractions = precision.real, precision.vector, precision.fractions(phases)
+    surroundings = surroundings_type(precision)
+    sums = spreading_functions(discretisation, phases)
+    spread, spread_tangent, spread_adjoint = sums.spread, sums.spread_tangent, sums.spread_adjoint
+    energy, form = diffusion.energy.functions(precision, phases), diffusion.mobility.functions(precision, phases)
+    energy_slope, energy_bend = energy.slope, energy.bend
+    mobile, mobile_slope = form.value, form.slope
+
+    @wp.func
+    def project(u: fractions) -> fractions:
+        mean = real(0.0)
+        for k in range(wp.static(phases)):
+            mean += u[k]
+        mean = mean / real(wp.static(phases))
+        result = fractions()
+        for k in range(wp.static(phases)):
+            result[k] = u[k] - mean
+        return result
+
+    @wp.kernel(module=diffusion.module(True))
+    def potential(
+        s: surroundings,
+        strength: real,
+        interface_width: wp.array(dtype=real),
+        mobility: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        n: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        c: wp.array(dtype=fractions),
+        # out
+        chi: wp.array(dtype=fractions),
+        w: wp.array(dtype=real),
+    ):
+        """``w``: m M of a particle."""
+        i = s.first + wp.tid()
+        total = spread(i, x, n, m, c, s)
+        stiffness = interface_width[0] * interface_width[0] * s.volume / m[i]
+        chi[i] = strength * project(energy_slope(c[i])) - stiffness * total
+        w[i] = m[i] * mobility[0] * mobile(c[i])
+
+    @wp.kernel(module=diffusion.module(True))
+    def flux(
+        s: surroundings,
+        substeps: int,
+        time_step: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        n: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        w: wp.array(dtype=real),
+        chi: wp.array(dtype=fractions),
+        c: wp.array(dtype=fractions),
+        # out
+        c_new: wp.array(dtype=fractions),
+    ):
+        i = s.first + wp.tid()
+        total = spread(i, x, n, w, chi, s)
+        c_new[i] = c[i] + (time_step[0] / real(substeps) * s.volume / m[i]) * total
+
+    @wp.kernel(module=diffusion.module(False), enable_backward=False)
+    def potential_tangent(
+        s: surroundings,
+        strength: real,
+        interface_width: wp.array(dtype=real),
+        interface_width_dot: wp.array(dtype=real),
+        mobility: wp.array(dtype=real),
+        mobility_dot: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        n: wp.array(dtype=real),
+        n_dot: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        m_dot: wp.array(dtype=real),
+        c: wp.array(dtype=fractions),
+        c_dot: wp.array(dtype=fractions),
+        # out
+        chi_dot: wp.array(dtype=fractions),
+        w_dot: wp.array(dtype=real),
+    ):
+        i = s.first + wp.tid()
+        total = spread(i, x, n, m, c, s)
+        total_dot = spread_tangent(i, x, x_dot, n, n_dot, m, m_dot, c, c_dot, s)
+        width = interface_width[0]
+        scale = s.volume / m[i]
+        stiffness = width * width * scale
+        stiffness_dot = real(2.0) * width * interface_width_dot[0] * scale - stiffness * m_dot[i] / m[i]
+        chi_dot[i] = strength * project(energy_bend(c[i], c_dot[i])) - stiffness * total_dot - stiffness_dot * total
+        m_0 = mobility[0]
+        w_dot[i] = (m_dot[i] * m_0 + m[i] * mobility_dot[0]) * mobile(c[i]) + m[i] * m_0 * wp.dot(
+            mobile_slope(c[i]), c_dot[i]
+        )
+
+    @wp.kernel(module=diffusion.module(False), enable_backward=False)
+    def flux_tangent(
+        s: surroundings,
+        substeps: int,
+        time_step: wp.array(dtype=real),
+        time_step_dot: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        n: wp.array(dtype=real),
+        n_dot: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        m_dot: wp.array(dtype=real),
+        w: wp.array(dtype=real),
+        w_dot: wp.array(dtype=real),
+        chi: wp.array(dtype=fractions),
+        chi_dot: wp.array(dtype=fractions),
+        c_dot: wp.array(dtype=fractions),
+        # out
+        c_new_dot: wp.array(dtype=fractions),
+    ):
+        i = s.first + wp.tid()
+        total = spread(i, x, n, w, chi, s)
+        total_dot = spread_tangent(i, x, x_dot, n, n_dot, w, w_dot, chi, chi_dot, s)
+        scale = time_step[0] / real(substeps) * s.volume / m[i]
+        change = time_step_dot[0] / time_step[0] - m_dot[i] / m[i]
+        c_new_dot[i] = c_dot[i] + scale * (total_dot + change * total)
+
+    @wp.kernel(module=diffusion.module(False), enable_backward=False)
+    def scale_adjoint(
+        s: surroundings,
+        substeps: int,
+        time_step: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        c_bar: wp.array(dtype=fractions),
+        # out
+        y: wp.array(dtype=fractions),
+    ):
+        """``y``: the adjoint of the flux's raw sum."""
+        i = s.first + wp.tid()
+        y[i] = (time_step[0] / real(substeps) * s.volume / m[i]) * c_bar[i]
+
+    @wp.kernel(module=diffusion.module(False), enable_backward=False)
+    def flux_adjoint(
+        s: surroundings,
+        strength: real,
+        time_step: wp.array(dtype=real),
+        interface_width: wp.array(dtype=real),
+        mobility: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        n: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        w: wp.array(dtype=real),
+        chi: wp.array(dtype=fractions),
+        c: wp.array(dtype=fractions),
+        y: wp.array(dtype=fractions),
+        # in and out
+        x_bar: wp.array(dtype=vector),
+        n_bar: wp.array(dtype=real),
+        m_bar: wp.array(dtype=real),
+        c_bar: wp.array(dtype=fractions),
+        time_step_bar: wp.array(dtype=real),
+        mobility_bar: wp.array(dtype=real),
+        # out
+        z: wp.array(dtype=fractions),
+    ):
+        """``z``: the adjoint of the potential's raw sum."""
+        i = s.first + wp.tid()
+        x_sum, n_sum, w_bar, chi_bar, own = spread_adjoint(i, x, n, w, chi, y, s)
+        m_i = m[i]
+        m_0 = mobility[0]
+        mobile_i = mobile(c[i])
+        x_bar[i] = x_bar[i] + x_sum
+        n_bar[i] = n_bar[i] + n_sum
+        m_bar[i] = m_bar[i] + w_bar * m_0 * mobile_i - own / m_i
+        straight = project(chi_bar)
+        c_bar[i] = c_bar[i] + (w_bar * m_i * m_0) * mobile_slope(c[i]) + strength * energy_bend(c[i], straight)
+        time_step_bar[i] = time_step_bar[i] + own / time_step[0]
+        mobility_bar[i] = mobility_bar[i] + w_bar * m_i * mobile_i
+        z[i] = (-interface_width[0] * interface_width[0] * s.volume / m_i) * chi_bar
+
+    @wp.kernel(module=diffusion.module(False), enable_backward=False)
+    def potential_adjoint(
+        s: surroundings,
+        interface_width: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        n: wp.array(dtype=real),
+        m: wp.array(dtype=real),
+        c: wp.array(dtype=fractions),
+        z: wp.array(dtype=fractions),
+        # in and out
+        x_bar: wp.array(dtype=vector),
+        n_bar: wp.array(dtype=real),
+        m_bar: wp.array(dtype=real),
+        c_bar: wp.array(dtype=fractions),
+        interface_width_bar: wp.array(dtype=real),
+    ):
+        i = s.first + wp.tid()
+        x_sum, n_sum, m_sum, c_sum, own = spread_adjoint(i, x, n, m, c, z, s)
+        x_bar[i] = x_bar[i] + x_sum
+        n_bar[i] = n_bar[i] + n_sum
+        m_bar[i] = m_bar[i] + m_sum - own / m[i]
+        c_bar[i] = c_bar[i] + c_sum
+        interface_width_bar[i] = interface_width_bar[i] + real(2.0) * own / interface_width[0]
+
+    return DiffusionKernels(
+        Kernels(potential, potential_tangent, potential_adjoint),
+        Kernels(flux, flux_tangent, flux_adjoint),
+        scale_adjoint,
+    )

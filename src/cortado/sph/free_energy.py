@@ -1,0 +1,151 @@
+"""Helmholtz free energies F(c) = alpha f(c) of a mixture, and how mobile its phases are (Yang et al. 2015).
+
+    double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: phases part, into pure ones (Lee and Kim 2015)
+    miscible     f = sum_k c_k^2 / 2: phases mix, by Fick's law
+
+    constant     m = 1
+    degenerate   m = (z + sqrt(z^2 + delta^2)) / 2,   z = sum_(k<l) c_k c_l: where phases touch
+
+For two phases the double well is c_1^2 c_2^2. The other generalisation, sum_(k < l) c_k^2 c_l^2, pulls a third phase
+into the interface of two, and lets equal parts of three or more stay mixed.
+
+delta keeps the mobility positive, and smooth, where a fraction strays out of [0, 1]: a negative one would feed the
+excursion. It leaves a pure phase delta / 2, and z <= 1 / 4 for two phases is hardly touched.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from cortado.device.precision import Precision
+
+FLOOR = 1e-3
+"""delta of the degenerate mobility."""
+
+
+@dataclass(frozen=True)
+class FreeEnergy:
+    """f(c) of mass fractions c (phases,), for kernels and for NumPy. A user's own is another object of this class."""
+
+    name: str
+    """Tells kernels of one energy from those of another."""
+    value: Callable[[np.ndarray], np.ndarray]
+    """f of (n, phases) -> (n,)."""
+    curvature: float
+    """The greatest eigenvalue of the Hessian of f, without its part along (1, ..., 1), for fractions in [0, 1]: it
+    bounds the time step."""
+    functions: Callable[[Precision, int], SimpleNamespace]
+    """Warp functions of fractions, for a number of phases: ``slope`` (grad f) and ``bend`` (the Hessian times u)."""
+
+
+@dataclass(frozen=True)
+class Mobility:
+    """m(c), from 0 to 1."""
+
+    name: str
+    greatest: Callable[[int], float]
+    """The greatest m of so many phases."""
+    functions: Callable[[Precision, int], SimpleNamespace]
+    """Warp functions ``value`` and ``slope`` (grad m) of fractions."""
+
+
+@cache
+def _double_well(precision: Precision, phases: int) -> SimpleNamespace:
+    real, fractions = precision.real, precision.fractions(phases)
+
+    @wp.func
+    def slope(c: fractions) -> fractions:
+        squares = wp.cw_mul(c, c)
+        return c - real(3.0) * squares + real(2.0) * wp.cw_mul(squares, c)
+
+    @wp.func
+    def bend(c: fractions, u: fractions) -> fractions:
+        return u - real(6.0) * wp.cw_mul(c, u) + real(6.0) * wp.cw_mul(wp.cw_mul(c, c), u)
+
+    return SimpleNamespace(slope=slope, bend=bend)
+
+
+@cache
+def _miscible(precision: Precision, phases: int) -> SimpleNamespace:
+    fractions = precision.fractions(phases)
+
+    @wp.func
+    def slope(c: fractions) -> fractions:
+        return c
+
+    @wp.func
+    def bend(c: fractions, u: fractions) -> fractions:
+        return u
+
+    return SimpleNamespace(slope=slope, bend=bend)
+
+
+@cache
+def _constant(precision: Precision, phases: int) -> SimpleNamespace:
+    real, fractions = precision.real, precision.fractions(phases)
+
+    @wp.func
+    def value(c: fractions) -> real:
+        return real(1.0)
+
+    @wp.func
+    def slope(c: fractions) -> fractions:
+        return fractions()
+
+    return SimpleNamespace(value=value, slope=slope)
+
+
+@cache
+def _degenerate(precision: Precision, phases: int) -> SimpleNamespace:
+    real, fractions = precision.real, precision.fractions(phases)
+    floor = wp.constant(real(FLOOR))
+
+    @wp.func
+    def total(c: fractions) -> real:
+        t = real(0.0)
+        for k in range(wp.static(phases)):
+            t += c[k]
+        return t
+
+    @wp.func
+    def products(c: fractions) -> real:
+        """sum_(k < l) c_k c_l"""
+        t = total(c)
+        return real(0.5) * (t * t - wp.dot(c, c))
+
+    @wp.func
+    def value(c: fractions) -> real:
+        z = products(c)
+        return real(0.5) * (z + wp.sqrt(z * z + floor * floor))
+
+    @wp.func
+    def slope(c: fractions) -> fractions:
+        z = products(c)
+        t = total(c)
+        along = fractions()
+        for k in range(wp.static(phases)):
+            along[k] = t - c[k]
+        return (real(0.5) + real(0.5) * z / wp.sqrt(z * z + floor * floor)) * along
+
+    return SimpleNamespace(value=value, slope=slope)
+
+
+def _double_well_value(c: np.ndarray) -> np.ndarray:
+    return np.asarray(0.5 * (c**2 * (1.0 - c) ** 2).sum(1))
+
+
+def _miscible_value(c: np.ndarray) -> np.ndarray:
+    return np.asarray(0.5 * (c**2).sum(1))
+
+
+DOUBLE_WELL = FreeEnergy("double_well", _double_well_value, curvature=1.0, functions=_double_well)
+MISCIBLE = FreeEnergy("miscible", _miscible_value, curvature=1.0, functions=_miscible)
+FREE_ENERGIES = {energy.name: energy for energy in (DOUBLE_WELL, MISCIBLE)}
+
+CONSTANT = Mobility("constant", lambda phases: 1.0, _constant)
+DEGENERATE = Mobility("degenerate", lambda phases: 0.5 * (phases - 1) / phases, _degenerate)
+MOBILITIES = {mobility.name: mobility for mobility in (CONSTANT, DEGENERATE)}

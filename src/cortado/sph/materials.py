@@ -1,0 +1,141 @@
+"""What a particle of several phases is made of: its mass fractions c, and what follows from them.
+
+    1 / rho_0i = sum_k c_k,i / rho_0k,    ln mu_i = sum_k c_k,i ln mu_k    (Arrhenius 1887)
+
+Masses are constant (Yang et al. 2015 and the report's Algorithm 3 leave open whether mass or volume is; with mass
+fractions it is the mass), so that a particle's rest volume follows its rest density. The logarithms keep the viscosity
+positive where fractions stray out of [0, 1].
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.kernels import Kernels
+from cortado.device.precision import Precision
+
+
+def mixture_module(precision: Precision, phases: int, differentiable: bool) -> Any:
+    """The Warp module of kernels for a number of phases that need no smoothing kernel."""
+    kind = "forward" if differentiable else "derivative"
+    module = wp.get_module(f"cortado_mixture_{kind}_{phases}_{precision.name}")
+    module.options["enable_backward"] = differentiable
+    return module
+
+
+@dataclass(frozen=True)
+class MixtureKernels:
+    """The kernels that carry fractions into a step and out of it, and make materials of them."""
+
+    sort: Any
+    unsort: Any
+    blend: Kernels
+
+
+@cache
+def mixture_kernels(precision: Precision, phases: int) -> MixtureKernels:
+    """The kernels for a number of phases; their materials are arrays (phases,)."""
+    real, fractions = precision.real, precision.fractions(phases)
+    tiny = wp.constant(real(precision.tiny))
+
+    @wp.func
+    def logarithm(viscosity: real) -> real:
+        """tiny stands in for a phase without viscosity, of which any amount makes a mixture thin."""
+        return wp.log(viscosity + tiny)
+
+    @wp.kernel(module=mixture_module(precision, phases, True))
+    def sort_fractions(
+        order: wp.array(dtype=wp.int32),
+        c_scene: wp.array(dtype=fractions),
+        # out
+        c: wp.array(dtype=fractions),
+    ):
+        i = wp.tid()
+        c[i] = c_scene[order[i]]
+
+    @wp.kernel(module=mixture_module(precision, phases, True))
+    def unsort_fractions(
+        order: wp.array(dtype=wp.int32),
+        c: wp.array(dtype=fractions),
+        # out
+        c_scene: wp.array(dtype=fractions),
+    ):
+        i = wp.tid()
+        c_scene[order[i]] = c[i]
+
+    @wp.kernel(module=mixture_module(precision, phases, True))
+    def blend(
+        c: wp.array(dtype=fractions),
+        rest_density: wp.array(dtype=real),
+        viscosity: wp.array(dtype=real),
+        # out
+        rho_0: wp.array(dtype=real),
+        mu: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        specific_volume = real(0.0)
+        power = real(0.0)
+        for k in range(wp.static(phases)):
+            specific_volume += c[i][k] / rest_density[k]
+            power += c[i][k] * logarithm(viscosity[k])
+        rho_0[i] = real(1.0) / specific_volume
+        mu[i] = wp.exp(power)
+
+    @wp.kernel(module=mixture_module(precision, phases, False), enable_backward=False)
+    def blend_tangent(
+        c: wp.array(dtype=fractions),
+        c_dot: wp.array(dtype=fractions),
+        rest_density: wp.array(dtype=real),
+        rest_density_dot: wp.array(dtype=real),
+        viscosity: wp.array(dtype=real),
+        viscosity_dot: wp.array(dtype=real),
+        rho_0: wp.array(dtype=real),
+        mu: wp.array(dtype=real),
+        # out
+        rho_0_dot: wp.array(dtype=real),
+        mu_dot: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        change = real(0.0)
+        power_dot = real(0.0)
+        for k in range(wp.static(phases)):
+            change += (c_dot[i][k] - c[i][k] * rest_density_dot[k] / rest_density[k]) / rest_density[k]
+            power_dot += c_dot[i][k] * logarithm(viscosity[k]) + c[i][k] * viscosity_dot[k] / (viscosity[k] + tiny)
+        rho_0_dot[i] = -rho_0[i] * rho_0[i] * change
+        mu_dot[i] = mu[i] * power_dot
+
+    @wp.kernel(module=mixture_module(precision, phases, False), enable_backward=False)
+    def blend_adjoint(
+        order: wp.array(dtype=wp.int32),
+        c: wp.array(dtype=fractions),
+        rest_density: wp.array(dtype=real),
+        viscosity: wp.array(dtype=real),
+        rho_0: wp.array(dtype=real),
+        mu: wp.array(dtype=real),
+        rho_0_bar: wp.array(dtype=real),
+        mu_bar: wp.array(dtype=real),
+        c_scene_bar: wp.array(dtype=fractions),
+        # in and out
+        rest_density_bar: wp.array(dtype=fractions),
+        viscosity_bar: wp.array(dtype=fractions),
+        # out
+        c_bar: wp.array(dtype=fractions),
+    ):
+        """``c_scene_bar``: the adjoint of the new state's fractions. Those of the phases add up by particle."""
+        i = wp.tid()
+        c_bar_i = c_scene_bar[order[i]]
+        rest_density_bar_i = rest_density_bar[i]
+        viscosity_bar_i = viscosity_bar[i]
+        power_bar = mu_bar[i] * mu[i]
+        for k in range(wp.static(phases)):
+            by_volume = rho_0_bar[i] * rho_0[i] * rho_0[i] / rest_density[k]
+            c_bar_i[k] = c_bar_i[k] - by_volume + power_bar * logarithm(viscosity[k])
+            rest_density_bar_i[k] = rest_density_bar_i[k] + by_volume * c[i][k] / rest_density[k]
+            viscosity_bar_i[k] = viscosity_bar_i[k] + power_bar * c[i][k] / (viscosity[k] + tiny)
+        rest_density_bar[i] = rest_density_bar_i
+        viscosity_bar[i] = viscosity_bar_i
+        c_bar[i] = c_bar_i
+
+    return MixtureKernels(sort_fractions, unsort_fractions, Kernels(blend, blend_tangent, blend_adjoint))

@@ -1,0 +1,108 @@
+"""The one sum over neighbours that diffusion is made of, B of `cortado.sph.diffusion`, and its derivatives."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
+
+
+@cache
+def spreading_functions(discretisation: Discretisation, phases: int) -> SimpleNamespace:
+    """Raw sums of B / V over the neighbours: ``spread``, ``spread_tangent``, ``spread_adjoint``."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    fractions = discretisation.precision.fractions(phases)
+    surroundings = surroundings_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    separation, factor, factor_gradient = pair.separation, pair.factor, pair.factor_gradient
+
+    @wp.func
+    def spread(
+        i: int,
+        x: wp.array(dtype=vector),
+        n: wp.array(dtype=real),
+        w: wp.array(dtype=real),
+        u: wp.array(dtype=fractions),
+        s: surroundings,
+    ) -> fractions:
+        x_i = x[i]
+        n_i = n[i]
+        w_i = w[i]
+        u_i = u[i]
+        total = fractions()
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for t in range(UNROLL):
+                j = s.neighbours[k + t, i]
+                weight = (w_i / n[j] + w[j] / n_i) * factor(separation(x_i, x[j], s), s)
+                total += weight * (u_i - u[j])
+        return total
+
+    @wp.func
+    def spread_tangent(
+        i: int,
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        n: wp.array(dtype=real),
+        n_dot: wp.array(dtype=real),
+        w: wp.array(dtype=real),
+        w_dot: wp.array(dtype=real),
+        u: wp.array(dtype=fractions),
+        u_dot: wp.array(dtype=fractions),
+        s: surroundings,
+    ) -> fractions:
+        x_i = x[i]
+        n_i = n[i]
+        w_i = w[i]
+        total = fractions()
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for t in range(UNROLL):
+                j = s.neighbours[k + t, i]
+                x_ij = separation(x_i, x[j], s)
+                n_j = n[j]
+                weight = w_i / n_j + w[j] / n_i
+                weight_dot = (w_dot[i] - w_i * n_dot[j] / n_j) / n_j + (w_dot[j] - w[j] * n_dot[i] / n_i) / n_i
+                f = factor(x_ij, s)
+                f_dot = wp.dot(factor_gradient(x_ij, s), x_dot[i] - x_dot[j])
+                total += (weight_dot * f + weight * f_dot) * (u[i] - u[j])
+                total += (weight * f) * (u_dot[i] - u_dot[j])
+        return total
+
+    @wp.func
+    def spread_adjoint(
+        i: int,
+        x: wp.array(dtype=vector),
+        n: wp.array(dtype=real),
+        w: wp.array(dtype=real),
+        u: wp.array(dtype=fractions),
+        y: wp.array(dtype=fractions),
+        s: surroundings,
+    ):
+        """For an adjoint y of the sums: what it gives those of x_i, n_i, w_i and u_i, and y_i times the sum itself."""
+        x_i = x[i]
+        n_i = n[i]
+        w_i = w[i]
+        u_i = u[i]
+        y_i = y[i]
+        x_bar = vector()
+        n_bar = real(0.0)
+        w_bar = real(0.0)
+        u_bar = fractions()
+        own = real(0.0)
+        for k in range(0, s.fluid_count[i], UNROLL):
+            for t in range(UNROLL):
+                j = s.neighbours[k + t, i]
+                x_ij = separation(x_i, x[j], s)
+                f = factor(x_ij, s)
+                weight = w_i / n[j] + w[j] / n_i
+                u_ij = u_i - u[j]
+                y_ij = y_i - y[j]
+                work = wp.dot(u_ij, y_ij)
+                x_bar += (weight * work) * factor_gradient(x_ij, s)
+                n_bar -= w[j] * f * work
+                w_bar += f * work / n[j]
+                u_bar += (weight * f) * y_ij
+                own += weight * f * wp.dot(u_ij, y_i)
+        return x_bar, n_bar / (n_i * n_i), w_bar, u_bar, own
+
+    return SimpleNamespace(spread=spread, spread_tangent=spread_tangent, spread_adjoint=spread_adjoint)
