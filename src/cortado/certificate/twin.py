@@ -5,7 +5,6 @@ from typing import Any
 from cortado.device.precision import FLOAT64
 from cortado.device.state import State
 from cortado.losses import (
-    Adjoint,
     CentreOfMass,
     CentreOfMassAlong,
     EndAdjoint,
@@ -15,6 +14,7 @@ from cortado.losses import (
     TrajectoryEnd,
 )
 from cortado.losses.checked import as_loss
+from cortado.losses.loss import Adjoint
 from cortado.problem import Problem
 from cortado.render.renderer import Renderer
 from cortado.simulation import Simulation
