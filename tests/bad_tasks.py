@@ -51,7 +51,7 @@ PARTICLES = 64
 _TABLES = GOOD_TASK[GOOD_TASK.index("[problem]") :]
 _OPTIMISE = GOOD_TASK[GOOD_TASK.index("[optimise]") :]
 _TARGET, _START = "target.gravity = [1.5, -9.81]", "start.gravity = [0.0, -7.0]"
-_CHECK, _SMOOTHING = "[optimise.check]", '[optimise.policy]\nname = "adjoint_smoothing"\n'
+_CHECK, _SMOOTHING = "[optimise.check]", '[optimise.gradient]\nname = "adjoint_viscosity"\n'
 _SEVERAL = "samples = 4\nspread.gravity = 0.1"
 _RATE, _STEPS = "learning_rate = 0.5", "steps = 5"
 _ROWS = "start.gravity = [[0.0, -7.0], [0.0, -8.0]]"
@@ -149,25 +149,25 @@ BAD_TASKS = [
     ("tilt of nothing", _TABLES, f"[forces]\ngravity = [0.0, 0.0]\n{_both('tilt', [5.0])}", "problem.target.tilt"),
     ("start beyond the bounds of a tilt", _TABLES, _both("tilt", [50.0], "bounds.tilt = [-30.0, 30.0]"),
      "optimise.start.tilt"),
-    ("unknown policy", _CHECK, f'[optimise.policy]\nname = "adjoint"\n{_CHECK}', "optimise.policy.name"),
-    ("policy without a table", _RATE, f'{_RATE}\npolicy = "exact"', "optimise.policy"),
-    ("strength of nothing", _CHECK, f"[optimise.policy]\nstrength = 0.1\n{_CHECK}", "optimise.policy.strength"),
-    ("strength beyond 1", _CHECK, f"{_SMOOTHING}strength = 1.5\n{_CHECK}", "optimise.policy.strength"),
+    ("unknown estimator", _CHECK, f'[optimise.gradient]\nname = "adjoint"\n{_CHECK}', "optimise.gradient.name"),
+    ("estimator without a table", _RATE, f'{_RATE}\ngradient = "exact"', "optimise.gradient"),
+    ("strength of nothing", _CHECK, f"[optimise.gradient]\nstrength = 0.1\n{_CHECK}", "optimise.gradient.strength"),
+    ("strength beyond 1", _CHECK, f"{_SMOOTHING}strength = 1.5\n{_CHECK}", "optimise.gradient.strength"),
     ("strength of a mean beyond a half", _CHECK, f"{_SMOOTHING}strength = 0.6\n{_SEVERAL}\n{_CHECK}",
-     "optimise.policy.strength"),
-    ("no samples", _CHECK, f"{_SMOOTHING}samples = 0\n{_CHECK}", "optimise.policy.samples"),
+     "optimise.gradient.strength"),
+    ("no samples", _CHECK, f"{_SMOOTHING}samples = 0\n{_CHECK}", "optimise.gradient.samples"),
     ("an odd number of samples", _CHECK, f"{_SMOOTHING}samples = 5\nspread.gravity = 0.1\n{_CHECK}",
-     "optimise.policy.samples"),
-    ("disorder of one sample", _CHECK, f"{_SMOOTHING}disorder = 0.0\n{_CHECK}", "optimise.policy.disorder"),
-    ("negative disorder", _CHECK, f"{_SMOOTHING}{_SEVERAL}\ndisorder = -0.1\n{_CHECK}", "optimise.policy.disorder"),
-    ("samples without a spread", _CHECK, f"{_SMOOTHING}samples = 4\n{_CHECK}", "optimise.policy.spread"),
-    ("spread of one sample", _CHECK, f"{_SMOOTHING}spread.gravity = 0.1\n{_CHECK}", "optimise.policy.spread"),
+     "optimise.gradient.samples"),
+    ("disorder of one sample", _CHECK, f"{_SMOOTHING}disorder = 0.0\n{_CHECK}", "optimise.gradient.disorder"),
+    ("negative disorder", _CHECK, f"{_SMOOTHING}{_SEVERAL}\ndisorder = -0.1\n{_CHECK}", "optimise.gradient.disorder"),
+    ("samples without a spread", _CHECK, f"{_SMOOTHING}samples = 4\n{_CHECK}", "optimise.gradient.spread"),
+    ("spread of one sample", _CHECK, f"{_SMOOTHING}spread.gravity = 0.1\n{_CHECK}", "optimise.gradient.spread"),
     ("spread of a vector", _CHECK, f"{_SMOOTHING}samples = 4\nspread.gravity = [0.1, 0.1]\n{_CHECK}",
-     "optimise.policy.spread.gravity"),
+     "optimise.gradient.spread.gravity"),
     ("no spread", _CHECK, f"{_SMOOTHING}samples = 4\nspread.gravity = 0.0\n{_CHECK}",
-     "optimise.policy.spread.gravity"),
+     "optimise.gradient.spread.gravity"),
     ("spread of something else", _CHECK, f"{_SMOOTHING}{_SEVERAL}\nspread.viscosity = 0.1\n{_CHECK}",
-     "optimise.policy.spread.viscosity"),
+     "optimise.gradient.spread.viscosity"),
     ("one knot", _RATE, f"{_RATE}\nknots = 1", "optimise.knots"),
     ("knots of a constant", _RATE, f"{_RATE}\nknots = 3", "optimise.knots"),
     ("more knots than steps", _START, f"{_ROWS}\nknots = 6", "optimise.knots"),

@@ -49,8 +49,8 @@ class Pcisph:
         self.walls, self.wall_weights = walls, wall_weights
         self.viscosity_form = options.get("viscosity", "pairwise")
         self.friction = options.get("friction", 0.0)
-        self.reach, self.rigidity = options["reach"], options["rigidity"]
-        self.evenness = options.get("evenness", 1.0)
+        self.reach, self.response = options["reach"], options["rigidity"]
+        self.laplacian_correction = options.get("evenness", 1.0)
 
     def _pairs(self, x, y):
         s = x[:, None, :] - y[None, :, :]
@@ -88,7 +88,7 @@ class Pcisph:
         pull = (self.wall_weights[None, :, None] * near_walls[..., None] * g_walls).sum(1)
         lighter = self.volume * (self.weight(x, x) * near * (mass[:, None] / mass[None, :] - 1)).sum(1)
         contrast = np.where(lighter.real > 0, lighter**2 / 2 / (lighter + 0.2), 0)
-        delta = self.stiffness / time_step**2 / (1 + (pull * pull).sum(1) / self.rigidity) / (1 + contrast)
+        delta = self.stiffness / time_step**2 / (1 + (pull * pull).sum(1) / self.response) / (1 + contrast)
         for _ in range(iterations):
             v_star = v + time_step * (acceleration + push)
             x_star = x + time_step * v_star
@@ -118,7 +118,7 @@ class Pcisph:
         size = (s * s).sum(-1) + 0.01 * self.h**2
         if self.viscosity_form == "pairwise":
             return ((v * s).sum(-1) / size)[..., None] * g
-        return (self.evenness * (s * g).sum(-1) / size)[..., None] * v
+        return (self.laplacian_correction * (s * g).sum(-1) / size)[..., None] * v
 
 
 def complex_step(function, values, directions):

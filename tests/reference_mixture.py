@@ -22,7 +22,7 @@ class Mixture:
         self.alpha, self.mobility, self.eps = options["alpha"], options["mobility"], options["eps"]
         self.form = options.get("form", "constant")
         self.well = options.get("energy", "double_well")
-        self.evenness = options.get("evenness", 1.0)
+        self.laplacian_correction = options.get("evenness", 1.0)
 
     def pairs(self, x, n=0.0):
         """F (n, n) and the volumes V / n_i; ``n`` (n,) is what walls add to the number density."""
@@ -32,7 +32,9 @@ class Mixture:
         size = (s * s).sum(-1)
         q = np.sqrt(size) / self.h
         density = self.volume * (self.sigma * value(self.name, q)).sum(1) + n
-        pull = self.evenness * self.sigma / self.h**2 * slope(self.name, q) * size / (size + 0.01 * self.h**2)
+        pull = (
+            self.laplacian_correction * self.sigma / self.h**2 * slope(self.name, q) * size / (size + 0.01 * self.h**2)
+        )
         return pull, self.volume / density
 
     def exchange(self, s, volumes, pull, u):

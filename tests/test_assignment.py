@@ -11,7 +11,7 @@ from cortado.inverse.task import load_task
 from cortado.io.pictures import heart, rosetta, write_picture
 from cortado.losses.image_losses import Pyramid, SquaredDifference
 from cortado.optimisation.optimisers import LBFGS, Adam
-from cortado.optimisation.reparametrisation import Knots, Logarithm, Softmax
+from cortado.optimisation.transforms import Knots, Logarithm, Softmax
 from cortado.parameters.tilt import Tilt
 
 

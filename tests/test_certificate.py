@@ -15,7 +15,7 @@ from cortado.certificate import Comparison, certify
 from cortado.certificate.agreement import Agreement, Judged
 from cortado.certificate.horizon import Horizon
 from cortado.certificate.twin import in_float64
-from cortado.problem import Passage
+from cortado.problem import ForwardPass
 from cortado.render.scene_renderer import scene_renderer
 from cortado.scene.scene import load_scene
 from cortado.sph.free_energy import FREE_ENERGIES
@@ -72,27 +72,27 @@ def centre(simulation):
 
 @cache
 def long():
-    """250 steps of a splash in the plane, long beyond its horizon; after 300 no policy agrees by more than 0.75."""
+    """250 steps of a splash in the plane, long beyond its horizon; after 300 no estimator agrees by more than 0.75."""
     return certify(problem_of(plane(), 250, centre), ["gravity"])
 
 
-def test_beyond_the_horizon_another_policy_is_advised():
+def test_beyond_the_horizon_another_estimator_is_advised():
     found = long()
     (horizon,) = found.horizons
     assert found.right and not horizon.lasts
     assert 0.6 < horizon.predicted / horizon.measured < 1.6
     assert found.growth > 0.02
-    exact, *others = found.agreement.policies
+    exact, *others = found.agreement.estimators
     best = max(others, key=lambda judged: judged.merit)
-    assert found.policy == best.policy and best.cosine > 0.9 and 0.1 < best.size < 10.0
+    assert found.estimator == best.estimator and best.cosine > 0.9 and 0.1 < best.size < 10.0
     assert exact.size > 3.0
 
 
 def test_within_the_horizon_the_exact_gradient_is_advised():
     found = certify(problem_of(plane(), 40))
-    assert found.policy == "Exact()" and found.horizon == 40
-    exact, *_ = found.agreement.policies
-    assert exact.policy == "Exact()" and exact.cosine > 0.99 and exact.size == pytest.approx(1.0, abs=0.1)
+    assert found.estimator == "Exact()" and found.horizon == 40
+    exact, *_ = found.agreement.estimators
+    assert exact.estimator == "Exact()" and exact.cosine > 0.99 and exact.size == pytest.approx(1.0, abs=0.1)
     assert found.horizons[0].predicted is None
 
 
@@ -166,13 +166,13 @@ def test_right_gradients_are_found_right_in_float32(name):
 @pytest.mark.parametrize("name", ["3-D, two fluids, a picture", "2-D, three fluids, a loss of one's own"])
 def test_a_sign_flipped_is_found_in_float32(name, monkeypatch):
     """In the gradient with respect to one parameter, as a wrong adjoint would."""
-    back = Passage.back
+    back = ForwardPass.back
 
     def wrong(*arguments):
         gradient = back(*arguments)
         return {**gradient, "viscosity": -gradient["viscosity"]}
 
-    monkeypatch.setattr(Passage, "back", wrong)
+    monkeypatch.setattr(ForwardPass, "back", wrong)
     assert certified_in_single(name).wrong == ("viscosity",)
 
 
@@ -330,14 +330,14 @@ def test_the_predicted_horizon():
 def test_the_advice():
     far = horizon((1.0, 9.0, 9.0), (1.0, 1.0, 1.0))
     found = replace(long(), horizons=(far,))
-    judged = [Judged("Exact()", 0.99, 9.0), Judged("AdjointSmoothing(strength=0.1)", 0.8, 1.0)]
+    judged = [Judged("Exact()", 0.99, 9.0), Judged("AdjointViscosity(strength=0.1)", 0.8, 1.0)]
     for (cosine, size), wanted in {
-        (0.9, 1.0): "VelocityOnly()",
-        (0.9, 3.0): "AdjointSmoothing(strength=0.1)",
-        (0.7, 1.0): "AdjointSmoothing(strength=0.1)",
+        (0.9, 1.0): "FrozenGeometry()",
+        (0.9, 3.0): "AdjointViscosity(strength=0.1)",
+        (0.7, 1.0): "AdjointViscosity(strength=0.1)",
     }.items():
-        both = (*judged, Judged("VelocityOnly()", cosine, size))
-        assert replace(found, agreement=Agreement(0.1, both)).policy == wanted
-    lost = (judged[0], Judged("AdjointSmoothing(strength=0.1)", 0.1, 1.0), Judged("VelocityOnly()", 0.2, 1.0))
-    assert replace(found, agreement=Agreement(0.1, lost)).policy == "Smoothed()"
-    assert replace(found, agreement=None).policy == "AdjointSmoothing()"
+        both = (*judged, Judged("FrozenGeometry()", cosine, size))
+        assert replace(found, agreement=Agreement(0.1, both)).estimator == wanted
+    lost = (judged[0], Judged("AdjointViscosity(strength=0.1)", 0.1, 1.0), Judged("FrozenGeometry()", 0.2, 1.0))
+    assert replace(found, agreement=Agreement(0.1, lost)).estimator == "Smoothed()"
+    assert replace(found, agreement=None).estimator == "AdjointViscosity()"

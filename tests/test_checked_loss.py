@@ -7,7 +7,7 @@ import warp as wp
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.device.state import State
 from cortado.errors import InputError
-from cortado.losses import EndAdjoint, FinalPositions, Frames, TrajectoryEnd
+from cortado.losses import FinalPositions, Frames, Snapshot, SnapshotAdjoint
 from cortado.losses.checked import as_loss
 
 N, PHASES = 5, 2
@@ -17,7 +17,7 @@ def state(particles: int = N, phases: int = PHASES, precision=FLOAT64) -> State:
     return State.zeros(particles, phases, precision, "cpu")
 
 
-END = TrajectoryEnd(state(), 2, np.zeros((PHASES, 3)))
+END = Snapshot(state(), 2, np.zeros((PHASES, 3)))
 
 
 class Given:
@@ -59,7 +59,7 @@ def test_adjoints_of_every_form_come_through():
             np.testing.assert_array_equal(one, wanted)
     bar = state()
     assert adjoint_of(bar) is bar
-    found = as_loss(Given(adjoint=EndAdjoint(bar, np.ones((PHASES, 3)))))
+    found = as_loss(Given(adjoint=SnapshotAdjoint(bar, np.ones((PHASES, 3)))))
     assert found.value_and_adjoint(END)[1].state is bar
 
 
@@ -104,11 +104,11 @@ MISTAKES = {
         "of velocities is a ndarray",
     ),
     "colours": (
-        lambda: adjoint_of(EndAdjoint(state(), np.ones(3))),
+        lambda: adjoint_of(SnapshotAdjoint(state(), np.ones(3))),
         "of colours has shape",
     ),
     "no state": (
-        lambda: adjoint_of(EndAdjoint(None, np.ones((2, 3)))),
+        lambda: adjoint_of(SnapshotAdjoint(None, np.ones((2, 3)))),
         "a NoneType as its",
     ),
     "a class": (lambda: as_loss(FinalPositions), "loss is the class FinalPositions"),

@@ -385,12 +385,14 @@ def test_a_killed_optimisation_resumes_bit_for_bit(cortado_command):
     assert len(json.loads(Path("killed/environment.json").read_text())["resumed"]) == 1
 
 
-SMOOTHED = ["name=adjoint_smoothing", "strength=0.2", "samples=4", "spread.gravity=0.1", "disorder=0.001"]
+SMOOTHED = ["name=adjoint_viscosity", "strength=0.2", "samples=4", "spread.gravity=0.1", "disorder=0.001"]
 
 
-@pytest.mark.parametrize("policy", [[], ["name=adjoint_smoothing"], SMOOTHED], ids=["exact", "smoothing", "averaged"])
-def test_an_interrupted_optimisation_resumes_bit_for_bit(cortado_command, monkeypatch, policy):
-    options = ["check.loss_reduction=1", "check.parameter_error=100", *(f"policy.{one}" for one in policy)]
+@pytest.mark.parametrize(
+    "estimator", [[], ["name=adjoint_viscosity"], SMOOTHED], ids=["exact", "smoothing", "averaged"]
+)
+def test_an_interrupted_optimisation_resumes_bit_for_bit(cortado_command, monkeypatch, estimator):
+    options = ["check.loss_reduction=1", "check.parameter_error=100", *(f"gradient.{one}" for one in estimator)]
     task = ["optimise", "task.toml", *(word for one in options for word in ("--set", f"optimise.{one}"))]
     with monkeypatch.context() as patch:
         patch.setattr(cortado.commands.optimise, "track", interrupting(after=3))
@@ -652,7 +654,7 @@ def test_the_check_speaks_json(cortado_command):
     certificate = json.loads(out)
     assert code == 0 and certificate["right"] is True and certificate["wrong"] == []
     assert certificate["shares"].keys() >= {"gravity", "initial_positions", "viscosity"}
-    assert certificate["horizon"] == 3 and certificate["policy"] == "Exact()"
+    assert certificate["horizon"] == 3 and certificate["estimator"] == "Exact()"
 
 
 @pytest.mark.parametrize("loss", ["centre-of-mass", "image"])

@@ -9,7 +9,7 @@ import warp as wp
 
 from cortado import CortadoWarning, DivergedError, InputError, Problem, Scene, Simulation, Trajectory, losses
 from cortado.commands.bench import dam_break
-from cortado.device.launching import Launcher
+from cortado.device.launching import KernelLauncher
 from cortado.device.precision import precision_named
 from cortado.device.state import State, to_device
 from cortado.lattice.region import Region
@@ -157,7 +157,7 @@ def test_the_device_finds_the_particles_that_numpy_finds(name, precision):
     assert wanted.sum() == 2 if name == "space" else 10 < wanted.sum() < n - 10
     device = wp.get_device("cpu")
     near = Region.between(np.full(d, -2.0), np.full(d, 3.0))
-    containment = Containment(Walled(region, near, spacing), real, Launcher(n, device, record_tape=False), n)
+    containment = Containment(Walled(region, near, spacing), real, KernelLauncher(n, device, record_tape=False), n)
     order = random.permutation(n)
     state = State.zeros(n, 1, real, device)
     state.set(after, np.zeros((n, d)), np.ones((n, 1)))

@@ -137,7 +137,7 @@ def test_gradient_equals_warps_tape(name, over_time):
     problem = problem_of(name)
     point = point_of(problem, over_time)
     (loss, gathered), (taped_loss, taped) = (
-        problem.value_and_gradient(point, policy) for policy in (gradients.Exact(), gradients.Tape())
+        problem.value_and_gradient(point, estimator) for estimator in (gradients.Exact(), gradients.Tape())
     )
     assert loss == taped_loss
     for key, gradient in gathered.items():

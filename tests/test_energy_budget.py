@@ -13,7 +13,7 @@ import pytest
 import warp as wp
 
 from cortado import Simulation, reference
-from cortado.device.neighbourhood import surroundings_type
+from cortado.device.neighbourhood import neighbourhood_type
 from cortado.device.state import to_device
 from scenes import plane, plane_of_three, scene, two_layers
 
@@ -41,9 +41,9 @@ class Step:
         _, self.new_velocities, _ = rollout.forward().numpy(shape[1])
         """(n, d) in the scene's order [m/s]."""
         self.solver = rollout.solver
-        self.whole = self.solver.context(rollout.parameters).surroundings
+        self.whole = self.solver.context(rollout.parameters).neighbourhood
         """What particles see: each other and the walls."""
-        self.among_particles = surroundings_type(self.solver.discretisation.precision)()
+        self.among_particles = neighbourhood_type(self.solver.discretisation.precision)()
         """The same without the walls."""
         self.among_particles.assign(self.whole)
         self.among_particles.count = self.whole.fluid_count
@@ -61,7 +61,7 @@ class Step:
         made = self.simulation.scene
         return self.masses[:, None] * (gained / made.solver.time_step - np.array(made.forces.gravity))
 
-    def forces(self, surroundings):
+    def forces(self, neighbourhood):
         """(n, d) pressure forces from the solver's kernel [N]: what particles at rest gain in a second."""
         fields, real = self.solver.fields, self.solver.discretisation.precision.real
         time_step = wp.ones(1, dtype=real, device=self.solver.search.device)
@@ -69,7 +69,7 @@ class Step:
         self.solver.launch(
             self.solver.kernels.force.forward,
             {"x": fields["x"], "m": fields["m"], "v": at_rest, "acceleration": at_rest},
-            s=surroundings,
+            s=neighbourhood,
             time_step=time_step,
             c=self.solver.iterates.c[0],
             x_star=x_star,
@@ -77,11 +77,11 @@ class Step:
         )
         return self.masses[:, None] * v_star.numpy()[:, : self.u.shape[1]]
 
-    def compressions(self, surroundings):
+    def compressions(self, neighbourhood):
         """(n,) changes of number densities by the displacements [-], from the solver's kernel."""
         solver, n_dot = self.solver, wp.zeros_like(self.solver.fields["n"])
         x_dot = to_device(self.u, solver.discretisation.precision, solver.search.device)
-        solver.launch(solver.kernels.density.tangent, s=surroundings, x=solver.fields["x"], x_dot=x_dot, n_dot=n_dot)
+        solver.launch(solver.kernels.density.tangent, s=neighbourhood, x=solver.fields["x"], x_dot=x_dot, n_dot=n_dot)
         return n_dot.numpy().astype(np.float64)
 
     def gap(self, forces, compressions):

@@ -1,4 +1,4 @@
-"""Policies: each does to the adjoint what its formula says, and nothing else."""
+"""Estimators: each does to the adjoint what its formula says, and nothing else."""
 
 from dataclasses import replace
 from functools import cache, partial
@@ -126,34 +126,34 @@ class Twin:
         x = state[: state.size // 2].reshape(self.shape)
         return averaging(self.simulation, x[:, None] - x[None, :], strength)
 
-    def adjoint(self, bar, policy):
+    def adjoint(self, bar, estimator):
         """The gradient with respect to the first state, for the adjoint of the last."""
-        if getattr(policy, "order", 1) == 1:
-            return self.back(bar, policy)
-        s, once = policy.strength, partial(replace, policy, order=1)
+        if getattr(estimator, "order", 1) == 1:
+            return self.back(bar, estimator)
+        s, once = estimator.strength, partial(replace, estimator, order=1)
         return 2 * self.back(bar, once(strength=s)) - self.back(bar, once(strength=2 * s))
 
-    def back(self, bar, policy):
+    def back(self, bar, estimator):
         """Without an extrapolation."""
-        chain = [policy]
+        chain = [estimator]
         while hasattr(chain[0], "base"):
             chain.insert(0, chain[0].base)
-        frozen = isinstance(chain[0], gradients.VelocityOnly)
+        frozen = isinstance(chain[0], gradients.FrozenGeometry)
         for state, jacobian in zip(reversed(self.states[:-1]), reversed(self.jacobians), strict=True):
             bar = (self.detached(jacobian) if frozen else jacobian).T @ bar
             for each in chain[1:]:
                 bar = self.filtered(bar, state, each)
         return bar
 
-    def filtered(self, bar, state, policy):
-        """What a policy does to the adjoint of a state."""
+    def filtered(self, bar, state, estimator):
+        """What an estimator does to the adjoint of a state."""
         x_bar, v_bar = bar.reshape(2, *self.shape)
-        if isinstance(policy, gradients.Damped):
-            v_bar = np.exp(-policy.rate * DT) * v_bar
-        if isinstance(policy, gradients.AdjointSmoothing):
-            averaging = self.averaging(state, policy.strength)
-            x_bar = limited(averaging @ x_bar, policy.limit) if "positions" in policy.fields else x_bar
-            v_bar = limited(averaging @ v_bar, policy.limit) if "velocities" in policy.fields else v_bar
+        if isinstance(estimator, gradients.Damped):
+            v_bar = np.exp(-estimator.rate * DT) * v_bar
+        if isinstance(estimator, gradients.AdjointViscosity):
+            averaging = self.averaging(state, estimator.strength)
+            x_bar = limited(averaging @ x_bar, estimator.limit) if "positions" in estimator.fields else x_bar
+            v_bar = limited(averaging @ v_bar, estimator.limit) if "velocities" in estimator.fields else v_bar
         return np.concatenate([x_bar.ravel(), v_bar.ravel()])
 
 
@@ -164,32 +164,32 @@ def limited(vectors, times):
 
 
 twin_of = cache(Twin)
-POLICIES = (
+ESTIMATORS = (
     gradients.Exact(),
-    gradients.VelocityOnly(),
-    gradients.AdjointSmoothing(0.3),
-    gradients.AdjointSmoothing(0.3, limit=1.2, order=2),
-    gradients.AdjointSmoothing(0.7, fields=["velocities"], limit=1.1),
-    gradients.AdjointSmoothing(0.7, fields=["positions"]),
-    gradients.AdjointSmoothing(0.3, order=2),
-    gradients.AdjointSmoothing(0.3, base=gradients.VelocityOnly()),
-    gradients.AdjointSmoothing(0.3, base=gradients.Tape()),
+    gradients.FrozenGeometry(),
+    gradients.AdjointViscosity(0.3),
+    gradients.AdjointViscosity(0.3, limit=1.2, order=2),
+    gradients.AdjointViscosity(0.7, fields=["velocities"], limit=1.1),
+    gradients.AdjointViscosity(0.7, fields=["positions"]),
+    gradients.AdjointViscosity(0.3, order=2),
+    gradients.AdjointViscosity(0.3, base=gradients.FrozenGeometry()),
+    gradients.AdjointViscosity(0.3, base=gradients.Tape()),
     gradients.Damped(100.0),
-    gradients.Damped(100.0, base=gradients.AdjointSmoothing(0.3)),
+    gradients.Damped(100.0, base=gradients.AdjointViscosity(0.3)),
 )
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("policy", POLICIES, ids=repr)
-def test_gradients_equal_those_of_the_twin(policy, dimension):
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=repr)
+def test_gradients_equal_those_of_the_twin(estimator, dimension):
     slow = twin_of(dimension)
     loss = Mixed(slow.simulation)
-    _, found = Problem(slow.simulation, STEPS, loss).value_and_gradient(slow.point, policy)
+    _, found = Problem(slow.simulation, STEPS, loss).value_and_gradient(slow.point, estimator)
     last = np.concatenate([w.ravel() for w in loss.weights[:2]])
-    wanted, exact = slow.adjoint(last, policy), slow.adjoint(last, gradients.Exact())
+    wanted, exact = slow.adjoint(last, estimator), slow.adjoint(last, gradients.Exact())
     gradient = np.concatenate([found[name].ravel() for name in slow.point])
     np.testing.assert_allclose(gradient, wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())
-    assert (np.linalg.norm(wanted - exact) > 0.01 * np.linalg.norm(exact)) == (policy != gradients.Exact())
+    assert (np.linalg.norm(wanted - exact) > 0.01 * np.linalg.norm(exact)) == (estimator != gradients.Exact())
 
 
 # ---- velocities only ------------------------------------------------------------------------------------------------
@@ -201,7 +201,7 @@ def test_velocity_only_leaves_out_positions_and_nothing_else(kind):
     simulation = simulation_of(kind)
     problem, point = Problem(simulation, 1, Mixed(simulation)), point_of(simulation)
     _, exact = problem.value_and_gradient(point)
-    _, found = problem.value_and_gradient(point, gradients.VelocityOnly())
+    _, found = problem.value_and_gradient(point, gradients.FrozenGeometry())
     first = exact.pop("initial_positions")
     for name, wanted in exact.items():
         np.testing.assert_allclose(found[name], wanted, rtol=0, atol=1e-12 * np.abs(wanted).max(), err_msg=name)
@@ -224,7 +224,7 @@ def test_velocity_only_grows_at_most_linearly(make):
     steps = 300
     problem, dt = Problem(simulation, steps, losses.FinalPositions(simulation.positions + 0.1)), 0.0021
     point = {"initial_positions": point_of(simulation)["initial_positions"]}
-    norms = norms_of(problem, point, gradients.VelocityOnly())
+    norms = norms_of(problem, point, gradients.FrozenGeometry())
     np.testing.assert_allclose(norms[:, 0], norms[-1, 0], rtol=1e-13)
     back = steps - np.arange(steps + 1)
     assert (norms[:, 1] <= 1.05 * back * dt * norms[:, 0]).all()
@@ -232,9 +232,9 @@ def test_velocity_only_grows_at_most_linearly(make):
     assert exact[0, 1] > 10.0 * steps * dt * exact[-1, 0]
 
 
-def norms_of(problem, point, policy):
+def norms_of(problem, point, estimator):
     norms = gradients.AdjointNorms(problem.simulation.solver, problem.steps)
-    problem.estimate(point, policy, norms)
+    problem.estimate(point, estimator, norms)
     return norms.numpy()
 
 
@@ -294,27 +294,27 @@ def test_an_average_leaves_other_fields_alone():
 
 @kinds
 @pytest.mark.parametrize(
-    "policy", [gradients.AdjointSmoothing(0), gradients.AdjointSmoothing("auto"), gradients.Damped(0.0)], ids=repr
+    "estimator", [gradients.AdjointViscosity(0), gradients.AdjointViscosity("auto"), gradients.Damped(0.0)], ids=repr
 )
-def test_without_strength_a_policy_is_exact_bit_for_bit(kind, policy):
+def test_without_strength_an_estimator_is_exact_bit_for_bit(kind, estimator):
     """Also with "auto" over a few steps, in which nothing grows."""
     simulation = simulation_of(kind)
     problem, point = Problem(simulation, 5, losses.FinalPositions(simulation.positions + 0.1)), point_of(simulation)
     _, exact = problem.value_and_gradient(point)
-    found = problem.estimate(point, policy)
+    found = problem.estimate(point, estimator)
     assert not found.strength
     for name, wanted in exact.items():
         assert found.gradient[name].tobytes() == wanted.tobytes(), name
 
 
 @kinds
-@pytest.mark.parametrize("policy", [gradients.AdjointSmoothing(0.2), gradients.VelocityOnly()], ids=repr)
-def test_the_same_bits_twice_and_float32_is_near(kind, policy):
+@pytest.mark.parametrize("estimator", [gradients.AdjointViscosity(0.2), gradients.FrozenGeometry()], ids=repr)
+def test_the_same_bits_twice_and_float32_is_near(kind, estimator):
     gradients = []
     for precision in ("float64", "float64", "float32"):
         simulation = Simulation(MAKERS[kind](), precision=precision)
         loss = losses.FinalPositions(simulation.positions + 0.1)
-        gradients.append(Problem(simulation, 20, loss).value_and_gradient(point_of(simulation), policy)[1])
+        gradients.append(Problem(simulation, 20, loss).value_and_gradient(point_of(simulation), estimator)[1])
     for name, wanted in gradients[0].items():
         assert wanted.tobytes() == gradients[1][name].tobytes(), name
     for name in ("gravity", "initial_velocities"):
@@ -334,16 +334,16 @@ def chaotic():
 @pytest.mark.parametrize("order", [1, 2])
 def test_auto_takes_so_many_times_the_smallest_sufficient_strength(chaotic, order):
     point = {"gravity": np.array([0.5, -9.81, 0.0])}
-    auto = chaotic.estimate(point, gradients.AdjointSmoothing(order=order))
+    auto = chaotic.estimate(point, gradients.AdjointViscosity(order=order))
     least = auto.strength / (order + 1)
     chosen = int(np.argmin(np.abs(np.array(LADDER) - least)))
     assert LADDER[chosen] == pytest.approx(least, rel=1e-15)
     _, exact = chaotic.value_and_gradient(point)
     assert np.linalg.norm(exact["gravity"]) > 30 * np.linalg.norm(auto.gradient["gravity"])
-    fixed = chaotic.estimate(point, gradients.AdjointSmoothing(order=order).tuned(chaotic, point))
+    fixed = chaotic.estimate(point, gradients.AdjointViscosity(order=order).tuned(chaotic, point))
     assert auto.gradient["gravity"].tobytes() == fixed.gradient["gravity"].tobytes()
     for k, strength in enumerate(LADDER[: chosen + 1]):
-        history = norms_of(chaotic, point, gradients.AdjointSmoothing(strength))
+        history = norms_of(chaotic, point, gradients.AdjointViscosity(strength))
         assert (growth(history, DT) <= MOST_GROWTH) == (k == chosen)
 
 
@@ -384,7 +384,7 @@ def test_every_adjoint_of_a_state_can_be_observed():
         seen[step] = bar.numpy(2)
         norms(step, bar)
 
-    found = problem.estimate(point, gradients.AdjointSmoothing(0.1), observe)
+    found = problem.estimate(point, gradients.AdjointViscosity(0.1), observe)
     assert list(seen) == [7, 6, 5, 4, 3, 2, 1, 0]
     for k, name in enumerate(("initial_positions", "initial_velocities")):
         np.testing.assert_array_equal(seen[7][k], problem.loss.weights[k])
@@ -417,7 +417,7 @@ def quadratic(p):
 
 def test_smoothed_differences_of_a_quadratic_are_exact():
     stub = Stub(quadratic, simulation_of("2-D"))
-    found = gradients.Smoothed({"gravity": 0.5, "viscosity": 0.1}, samples=3).estimate(stub, POINT)
+    found = gradients.RandomizedSmoothing({"gravity": 0.5, "viscosity": 0.1}, samples=3).estimate(stub, POINT)
     assert found.loss == quadratic(POINT)
     np.testing.assert_allclose(found.gradient["gravity"], [[6.0, -0.5], [2.0, 1.4]], rtol=1e-12)
     np.testing.assert_allclose(found.gradient["viscosity"], 7.4, rtol=1e-12)
@@ -428,7 +428,7 @@ def test_smoothed_differences_of_a_quadratic_are_exact():
 def test_smoothing_takes_waves_off_that_are_narrower_than_the_spread():
     """L = u + sin(k u) / k: its gradient at 0 is 2, that of its average 1 + sin(k r) / (k r)."""
     stub = Stub(lambda p: p["viscosity"] + np.sin(40.0 * p["viscosity"]) / 40.0, simulation_of("2-D"))
-    found = gradients.Smoothed(0.3).estimate(stub, {"viscosity": 0.0})
+    found = gradients.RandomizedSmoothing(0.3).estimate(stub, {"viscosity": 0.0})
     assert found.gradient["viscosity"] == pytest.approx(1.0 + np.sin(12.0) / 12.0)
 
 
@@ -440,12 +440,12 @@ def test_standard_errors_tell_how_gradients_scatter():
         return quadratic(p) + 1e4 * p["gravity"][0, 0] * (x[3, 0] - first[3, 0])
 
     stub = Stub(noisy, simulation_of("2-D"))
-    runs = [gradients.Smoothed(0.5, samples=20, seed=seed).estimate(stub, POINT) for seed in range(40)]
+    runs = [gradients.RandomizedSmoothing(0.5, samples=20, seed=seed).estimate(stub, POINT) for seed in range(40)]
     scatter = np.std([run.gradient["gravity"] for run in runs], axis=0, ddof=1)
     believed = np.sqrt(np.mean([run.standard_error["gravity"] ** 2 for run in runs], axis=0))
     np.testing.assert_allclose(believed, scatter, rtol=0.4)
     assert runs[0].gradient["gravity"].tobytes() != runs[1].gradient["gravity"].tobytes()
-    again = gradients.Smoothed(0.5, samples=20, seed=0).estimate(stub, POINT)
+    again = gradients.RandomizedSmoothing(0.5, samples=20, seed=0).estimate(stub, POINT)
     assert runs[0].gradient["gravity"].tobytes() == again.gradient["gravity"].tobytes()
 
 
@@ -454,12 +454,12 @@ def test_before_chaos_smoothed_and_exact_agree():
     problem = Problem(simulation, 60, losses.CentreOfMass([0.1, 0.1, 0.1]))
     point = {"gravity": np.array([0.5, -9.81, 0.0])}
     _, exact = problem.value_and_gradient(point)
-    found = problem.estimate(point, gradients.Smoothed(0.1, samples=4, disorder=0.001))
+    found = problem.estimate(point, gradients.RandomizedSmoothing(0.1, samples=4, disorder=0.001))
     assert np.linalg.norm(found.gradient["gravity"] - exact["gravity"]) < 0.02 * np.linalg.norm(exact["gravity"])
 
 
 class Slopes:
-    """In place of a policy: the gradient of a function of two parameters."""
+    """In place of an estimator: the gradient of a function of two parameters."""
 
     def __init__(self, gravity, viscosity):
         self.gravity, self.viscosity, self.asked = gravity, viscosity, []
@@ -479,7 +479,7 @@ def slopes_of_quadratic():
 
 def test_averaged_gradients_of_a_quadratic_are_exact():
     stub, inner = Stub(quadratic, simulation_of("2-D")), slopes_of_quadratic()
-    found = gradients.Averaged({"gravity": 0.5, "viscosity": 0.1}, samples=4, policy=inner).estimate(stub, POINT)
+    found = gradients.EnsembleMean({"gravity": 0.5, "viscosity": 0.1}, samples=4, estimator=inner).estimate(stub, POINT)
     assert (found.loss, found.strength, len(inner.asked)) == (quadratic(POINT), 0.5, 4)
     np.testing.assert_allclose(found.gradient["gravity"], [[6.0, -0.5], [2.0, 1.4]], rtol=1e-12)
     np.testing.assert_allclose(found.gradient["viscosity"], 7.4, rtol=1e-12)
@@ -488,7 +488,7 @@ def test_averaged_gradients_of_a_quadratic_are_exact():
 
 def test_a_cloud_is_a_ball_and_perturbs_positions():
     stub, inner = Stub(quadratic, simulation_of("2-D")), slopes_of_quadratic()
-    gradients.Averaged(0.3, samples=4000, policy=inner).estimate(stub, POINT)
+    gradients.EnsembleMean(0.3, samples=4000, estimator=inner).estimate(stub, POINT)
     moved = np.array([np.append(p["gravity"] - POINT["gravity"], p["viscosity"] - 0.7) for p in inner.asked]) / 0.3
     assert (np.linalg.norm(moved, axis=1) <= np.sqrt(5.0) + 1e-12).all()
     np.testing.assert_allclose(moved.std(axis=0), np.sqrt(5.0 / 7.0), rtol=0.05)
@@ -501,21 +501,21 @@ def test_averaged_and_smoothed_differentiate_the_same_loss():
     stub = Stub(lambda p: (p["gravity"] ** 3).sum() + p["viscosity"] ** 3, simulation_of("2-D"))
     cubes = Slopes(lambda g, mu: 3.0 * g**2, lambda g, mu: 3.0 * mu**2)
     origin = {"gravity": np.zeros((2, 2)), "viscosity": 0.0}
-    for policy in (gradients.Smoothed(0.3, 400), gradients.Averaged(0.3, 4000, policy=cubes)):
-        found = policy.estimate(stub, origin)
+    for estimator in (gradients.RandomizedSmoothing(0.3, 400), gradients.EnsembleMean(0.3, 4000, estimator=cubes)):
+        found = estimator.estimate(stub, origin)
         for name, gradient in found.gradient.items():
             assert (np.abs(gradient - 3.0 * 0.3**2 * 5.0 / 7.0) < 4.0 * found.standard_error[name]).all()
             assert (found.standard_error[name] < 0.05 * gradient).all()
-    again = gradients.Averaged(0.3, 4000, policy=cubes).estimate(stub, origin)
+    again = gradients.EnsembleMean(0.3, 4000, estimator=cubes).estimate(stub, origin)
     assert found.gradient["gravity"].tobytes() == again.gradient["gravity"].tobytes()
 
 
 def test_an_average_finds_its_strength_once(chaotic):
     point, cloud = {"gravity": np.array([0.5, -9.81, 0.0])}, {"spread": 0.1, "samples": 4}
-    found = chaotic.estimate(point, gradients.Averaged(**cloud))
-    smoothing = gradients.AdjointSmoothing(order=2).tuned(chaotic, point)
+    found = chaotic.estimate(point, gradients.EnsembleMean(**cloud))
+    smoothing = gradients.AdjointViscosity(order=2).tuned(chaotic, point)
     assert found.strength == smoothing.strength > 0.0
-    again = chaotic.estimate(point, gradients.Averaged(**cloud, policy=smoothing))
+    again = chaotic.estimate(point, gradients.EnsembleMean(**cloud, estimator=smoothing))
     assert found.gradient["gravity"].tobytes() == again.gradient["gravity"].tobytes()
 
 
@@ -524,8 +524,10 @@ def test_before_chaos_an_average_and_the_exact_gradient_agree():
     problem = Problem(simulation, 60, losses.CentreOfMass([0.1, 0.1, 0.1]))
     point = {"gravity": np.array([0.5, -9.81, 0.0]), "initial_positions": simulation.positions}
     _, exact = problem.value_and_gradient(point)
-    policy = gradients.Averaged({"gravity": 0.1, "initial_positions": 1e-6}, disorder=0.001, policy=gradients.Exact())
-    found = problem.estimate(point, policy)
+    estimator = gradients.EnsembleMean(
+        {"gravity": 0.1, "initial_positions": 1e-6}, disorder=0.001, estimator=gradients.Exact()
+    )
+    found = problem.estimate(point, estimator)
     assert found.strength is None and found.gradient["initial_positions"].shape == simulation.positions.shape
     assert np.linalg.norm(found.gradient["gravity"] - exact["gravity"]) < 0.02 * np.linalg.norm(exact["gravity"])
 
@@ -554,40 +556,42 @@ def test_centres_of_mass_and_their_gradients(make, masses):
 # ---- mistakes -------------------------------------------------------------------------------------------------------
 
 MISTAKES = {
-    "strength above 1": lambda p: gradients.AdjointSmoothing(1.5),
-    "strength twice 0.6": lambda p: gradients.AdjointSmoothing(0.6, order=2),
-    "order 0": lambda p: gradients.AdjointSmoothing(order=0),
-    "order in words": lambda p: gradients.AdjointSmoothing(order="two"),
-    "order with a point": lambda p: gradients.AdjointSmoothing(order=2.0),
-    "order 3": lambda p: gradients.AdjointSmoothing(order=3),
-    "samples in words": lambda p: gradients.Averaged(samples="4"),
-    "odd samples": lambda p: gradients.Averaged(samples=5),
-    "half a sample": lambda p: gradients.Smoothed(samples=2.5),
-    "no disorder": lambda p: gradients.Smoothed(disorder=None),
-    "endless disorder": lambda p: gradients.Averaged(disorder=np.inf),
-    "negative seed": lambda p: gradients.Smoothed(seed=-1),
+    "strength above 1": lambda p: gradients.AdjointViscosity(1.5),
+    "strength twice 0.6": lambda p: gradients.AdjointViscosity(0.6, order=2),
+    "order 0": lambda p: gradients.AdjointViscosity(order=0),
+    "order in words": lambda p: gradients.AdjointViscosity(order="two"),
+    "order with a point": lambda p: gradients.AdjointViscosity(order=2.0),
+    "order 3": lambda p: gradients.AdjointViscosity(order=3),
+    "samples in words": lambda p: gradients.EnsembleMean(samples="4"),
+    "odd samples": lambda p: gradients.EnsembleMean(samples=5),
+    "half a sample": lambda p: gradients.RandomizedSmoothing(samples=2.5),
+    "no disorder": lambda p: gradients.RandomizedSmoothing(disorder=None),
+    "endless disorder": lambda p: gradients.EnsembleMean(disorder=np.inf),
+    "negative seed": lambda p: gradients.RandomizedSmoothing(seed=-1),
     "a sample out of range": lambda p: p.estimate(
-        {"viscosity": 0.1}, gradients.Averaged(1.0, policy=gradients.Exact())
+        {"viscosity": 0.1}, gradients.EnsembleMean(1.0, estimator=gradients.Exact())
     ),
-    "spread in words": lambda p: p.estimate({"viscosity": 0.1}, gradients.Averaged("wide")),
-    "a class is tuned": lambda p: gradients.tuned(gradients.AdjointSmoothing, p, {}),
+    "spread in words": lambda p: p.estimate({"viscosity": 0.1}, gradients.EnsembleMean("wide")),
+    "a class is tuned": lambda p: gradients.tuned(gradients.AdjointViscosity, p, {}),
     "auto as a base": lambda p: p.estimate(
-        {"viscosity": 1.0}, gradients.Damped(1.0, base=gradients.AdjointSmoothing())
+        {"viscosity": 1.0}, gradients.Damped(1.0, base=gradients.AdjointViscosity())
     ),
-    "strength NaN": lambda p: gradients.AdjointSmoothing(float("nan")),
-    "strength in words": lambda p: gradients.AdjointSmoothing("strong"),
-    "limit below 1": lambda p: gradients.AdjointSmoothing(limit=0.5),
-    "no fields": lambda p: gradients.AdjointSmoothing(fields=()),
-    "a field that is none": lambda p: gradients.AdjointSmoothing(fields=("densities",)),
+    "strength NaN": lambda p: gradients.AdjointViscosity(float("nan")),
+    "strength in words": lambda p: gradients.AdjointViscosity("strong"),
+    "limit below 1": lambda p: gradients.AdjointViscosity(limit=0.5),
+    "no fields": lambda p: gradients.AdjointViscosity(fields=()),
+    "a field that is none": lambda p: gradients.AdjointViscosity(fields=("densities",)),
     "rate below 0": lambda p: gradients.Damped(-1.0),
-    "one sample": lambda p: gradients.Smoothed(samples=1),
-    "an average of one": lambda p: gradients.Averaged(samples=1),
-    "an average over no spread": lambda p: p.estimate({"viscosity": 1.0}, gradients.Averaged(0.0)),
-    "an average of no policy": lambda p: gradients.Averaged(policy=gradients.Exact),
-    "disorder below 0": lambda p: gradients.Smoothed(disorder=-0.1),
-    "spread 0": lambda p: p.estimate({"viscosity": 1.0}, gradients.Smoothed(0.0)),
-    "spread without a name": lambda p: p.estimate({"viscosity": 1.0}, gradients.Smoothed({"gravity": 1.0})),
-    "too many numbers": lambda p: p.estimate({"initial_positions": p.simulation.positions}, gradients.Smoothed()),
+    "one sample": lambda p: gradients.RandomizedSmoothing(samples=1),
+    "an average of one": lambda p: gradients.EnsembleMean(samples=1),
+    "an average over no spread": lambda p: p.estimate({"viscosity": 1.0}, gradients.EnsembleMean(0.0)),
+    "an average of no estimator": lambda p: gradients.EnsembleMean(estimator=gradients.Exact),
+    "disorder below 0": lambda p: gradients.RandomizedSmoothing(disorder=-0.1),
+    "spread 0": lambda p: p.estimate({"viscosity": 1.0}, gradients.RandomizedSmoothing(0.0)),
+    "spread without a name": lambda p: p.estimate({"viscosity": 1.0}, gradients.RandomizedSmoothing({"gravity": 1.0})),
+    "too many numbers": lambda p: p.estimate(
+        {"initial_positions": p.simulation.positions}, gradients.RandomizedSmoothing()
+    ),
     "masses of others": lambda p: Problem(p.simulation, 1, losses.CentreOfMass([0.0] * 3, np.ones(7))).value({}),
     "no masses": lambda p: losses.CentreOfMass([0.0] * 3, np.zeros(7)),
     "target's shape": lambda p: Problem(p.simulation, 1, losses.CentreOfMass([0.0] * 2)).value({}),
@@ -608,8 +612,8 @@ def test_a_filter_stays_off_a_users_tape():
     simulation = simulation_of("2-D")
     problem = Problem(simulation, 2, losses.FinalPositions(simulation.positions))
     recorded = []
-    for policy in (gradients.Exact(), gradients.AdjointSmoothing(0.1)):
+    for estimator in (gradients.Exact(), gradients.AdjointViscosity(0.1)):
         with wp.Tape() as tape:
-            problem.estimate({"gravity": [0.0, -9.81]}, policy)
+            problem.estimate({"gravity": [0.0, -9.81]}, estimator)
         recorded.append(len(tape.launches))
     assert recorded[0] == recorded[1]

@@ -15,8 +15,8 @@ import pytest
 import warp as wp
 
 from cortado.device.cells import Grid
-from cortado.device.launching import TreeSum, add, sum_and_maximum, sum_of
-from cortado.device.neighbourhood import Discretisation, surroundings_type
+from cortado.device.launching import TreeReduction, add, sum_and_maximum, sum_of
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type
 from cortado.device.neighbours import NeighbourSearch
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.lattice.smoothing import CUBIC_SPLINE
@@ -25,7 +25,7 @@ from cortado.parameters.reference_density import (
     reference_density_adjoint,
     reference_density_tangent,
 )
-from cortado.solvers.pcisph.density_ratio_relaxation import contrast_kernels
+from cortado.solvers.pcisph.density_ratio_relaxation import density_ratio_kernels
 from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
 from cortado.solvers.pcisph.wall_relaxation import wall_kernels
 from cortado.sph.density import density_kernels
@@ -50,7 +50,7 @@ class Kernels:
 
     density = density_kernels(DISCRETISATION)
     walls = wall_kernels(DISCRETISATION)
-    contrast = contrast_kernels(DISCRETISATION)
+    contrast = density_ratio_kernels(DISCRETISATION)
     pressure = pressure_kernels(DISCRETISATION)
     force = pressure_force_kernels(DISCRETISATION)
     integration = integration_kernels(FLOAT64)
@@ -95,7 +95,7 @@ class Cloud:
     """Random fluid and wall particles in a small box, with their lists."""
 
     x: np.ndarray
-    surroundings: Any
+    neighbourhood: Any
     search: NeighbourSearch
     dimension: int
 
@@ -118,14 +118,14 @@ def cloud(name: str) -> Cloud:
     period = np.array([side, 0.0, 0.0]) * (name == "periodic")
     grid = Grid.around(np.full(3, -0.4)[:dimension], np.full(3, side)[:dimension], period, 1.03 * SUPPORT, 512)
     search = NeighbourSearch(DISCRETISATION, grid, walls, random.uniform(0.5, 1.5, WALLS), N, 100, CPU)
-    s = surroundings_type(FLOAT64)()
+    s = neighbourhood_type(FLOAT64)()
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count
     s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
     s.support, s.reach = SUPPORT, 1.03 * SUPPORT
     s.normalisation = CUBIC_SPLINE.normalisation(dimension, SUPPORT)
     s.self_weight = float(CUBIC_SPLINE.weight(np.zeros(1), dimension, SUPPORT)[0])
-    s.volume, s.pliancy, s.evenness = 0.11, 30.0**-0.5, 1.3
+    s.volume, s.response_scale, s.laplacian_correction = 0.11, 30.0**-0.5, 1.3
     s.periodic, s.period = int(period.any()), wp.vec3d(*period)
     s.frequency = wp.vec3d(1.0 / side if period.any() else 0.0, 0.0, 0.0)
     search.sort(array(x))
@@ -152,7 +152,7 @@ class Operation:
     def __init__(self, cloud: Cloud):
         self.cloud = cloud
         random = np.random.default_rng(11)
-        self.s = cloud.surroundings
+        self.s = cloud.neighbourhood
         self.start: Values = {
             "x": cloud.x,
             "v": cloud.vectors(1),
@@ -743,7 +743,7 @@ SIZES = [1, 2, 63, 64, 65, 128, 4096, 4097, 5000]
 precisions = pytest.mark.parametrize("precision", [FLOAT32, FLOAT64], ids=lambda precision: precision.name)
 
 
-def summed(tree: TreeSum, values: np.ndarray, dtype: Any) -> np.ndarray:
+def summed(tree: TreeReduction, values: np.ndarray, dtype: Any) -> np.ndarray:
     return tree(wp.array(values, dtype=dtype, device=CPU)).numpy()
 
 

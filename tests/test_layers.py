@@ -54,7 +54,7 @@ LAYERS = """
     figures.curves figures
     certificate.agreement certificate.changes certificate.twin certificate.course certificate.horizon
     certificate.rightness certificate.text certificate.certificate certificate certificate.figure
-    optimisation optimisation.differentiable optimisation.reparametrisation optimisation.replay_log
+    optimisation optimisation.differentiable optimisation.transforms optimisation.replay_log
     optimisation.optimisers optimisation.named_optimisers optimisation.result optimisation.optimise
     io.run_folder io.report
     inverse inverse.tables inverse.task inverse.setup inverse.figures

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cortado.device.cells import Grid
-from cortado.device.neighbourhood import UNROLL, Discretisation, surroundings_type
+from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type
 from cortado.device.neighbours import NeighbourSearch
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.lattice.calibration import SKIN
@@ -30,7 +30,7 @@ def padded(vectors: np.ndarray) -> np.ndarray:
 
 def around(search: NeighbourSearch, period: np.ndarray, precision: Precision) -> Any:
     """What `NeighbourSearch.fill` reads of the surroundings, as `PcisphSteps.resize` sets it."""
-    s = surroundings_type(precision)()
+    s = neighbourhood_type(precision)()
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count
     s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
@@ -81,11 +81,11 @@ def lists(
     search = NeighbourSearch(discretisation, grid, padded(walls), names, n, capacity, CPU)
     memory = wp.full((n, capacity + 8), GUARD, dtype=wp.int32, device=CPU)
     search.neighbours = memory[:, :capacity].transpose((1, 0))
-    surroundings = around(search, period, precision)
+    neighbourhood = around(search, period, precision)
     given_positions = padded(positions).astype(precision.numpy)
     search.sort(wp.array(given_positions, dtype=precision.vector, device=CPU))
     order = search.order.numpy()[:n]
-    search.fill(surroundings, wp.array(given_positions[order], dtype=precision.vector, device=CPU))
+    search.fill(neighbourhood, wp.array(given_positions[order], dtype=precision.vector, device=CPU))
     rows, fluid_count, count = memory.numpy(), search.fluid_count.numpy(), search.count.numpy()
     own = fluid_count - search.filling.numpy()
     wall_names = search.wall_weights.numpy().astype(int)

@@ -31,7 +31,7 @@ class Rosenbrock:
         self.evaluations = 0
         self.fail_at = fail_at
 
-    def value_and_gradient(self, parameters, policy=None):
+    def value_and_gradient(self, parameters, gradient=None):
         if self.evaluations == self.fail_at:
             raise Interrupted
         self.evaluations += 1
@@ -48,11 +48,11 @@ class Quadratic:
         self.targets = {name: np.asarray(target) for name, target in targets.items()}
         self.stiffness = stiffness
         self.seen: list[dict[str, np.ndarray]] = []
-        self.policies: list[object] = []
+        self.estimators: list[object] = []
 
-    def value_and_gradient(self, parameters, policy=None):
+    def value_and_gradient(self, parameters, gradient=None):
         self.seen.append(parameters)
-        self.policies.append(policy)
+        self.estimators.append(gradient)
         offsets = {name: parameters[name] - target for name, target in self.targets.items()}
         loss = sum(0.5 * self.stiffness * float(np.sum(offset**2)) for offset in offsets.values())
         return loss, {name: self.stiffness * np.asarray(offset) for name, offset in offsets.items()}
@@ -111,7 +111,7 @@ def test_rosenbrock_converges(optimiser, iterations, tolerance):
 @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
 def test_lbfgs_takes_its_tolerance_from_the_first_gradient(unit):
     class InUnit(Rosenbrock):
-        def value_and_gradient(self, parameters, policy=None):
+        def value_and_gradient(self, parameters, gradient=None):
             loss, gradient = super().value_and_gradient(parameters)
             return unit * loss, {name: unit * slope for name, slope in gradient.items()}
 
@@ -249,10 +249,10 @@ sys.path.insert(0, {tests!r})
 from test_optimise import Adam, Rosenbrock, rosenbrock
 
 class Killed(Rosenbrock):
-    def value_and_gradient(self, parameters, policy=None):
+    def value_and_gradient(self, parameters, estimator=None):
         if self.evaluations == 17:
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().value_and_gradient(parameters, policy)
+        return super().value_and_gradient(parameters, estimator)
 
 rosenbrock(Adam(learning_rate=0.05), problem=Killed(), checkpoint={folder!r})
 """
@@ -316,8 +316,8 @@ def test_other_settings_are_refused_and_leave_the_log(tmp_path):
     before = (tmp_path / FILE_NAME).read_bytes()
     with pytest.raises(InputError, match=r"learning_rate=0.05.* now given optimiser = .*learning_rate=0.06"):
         rosenbrock(replace(optimiser, learning_rate=0.06), 5, checkpoint=tmp_path, resume=True)
-    with pytest.raises(InputError, match="policy = None and is now given policy = 'exact'"):
-        rosenbrock(optimiser, 5, checkpoint=tmp_path, resume=True, policy="exact")
+    with pytest.raises(InputError, match="estimator = None and is now given estimator = 'exact'"):
+        rosenbrock(optimiser, 5, checkpoint=tmp_path, resume=True, gradient="exact")
     with pytest.raises(InputError, match=r"names = \[.a., .b.\] and is now given names = \[.c.\]"):
         optimise(Quadratic({"c": 0.0}), {"c": 1.0}, optimiser, 5, checkpoint=tmp_path, resume=True)
     with pytest.raises(InputError, match="evaluation 0 at another 'b'"):
@@ -338,13 +338,13 @@ def test_another_problem_is_refused_by_its_fingerprint(tmp_path):
         rosenbrock(Adam(0.05), 2, problem=other, checkpoint=tmp_path, resume=True)
 
 
-def test_a_policy_without_a_repr_of_its_own_can_be_resumed(tmp_path):
+def test_an_estimator_without_a_repr_of_its_own_can_be_resumed(tmp_path):
     class Plain:
         pass
 
     one, same = Plain(), Plain()
-    rosenbrock(Adam(0.05), 2, checkpoint=tmp_path, policy=one)
-    assert rosenbrock(Adam(0.05), 3, checkpoint=tmp_path, policy=same, resume=True).evaluations == 4
+    rosenbrock(Adam(0.05), 2, checkpoint=tmp_path, gradient=one)
+    assert rosenbrock(Adam(0.05), 3, checkpoint=tmp_path, gradient=same, resume=True).evaluations == 4
 
 
 def test_resume_begins_where_there_is_nothing(tmp_path):
@@ -374,7 +374,7 @@ class Breaks:
     gradient: float = 1.0
     evaluations: int = 0
 
-    def value_and_gradient(self, parameters, policy=None):
+    def value_and_gradient(self, parameters, gradient=None):
         self.evaluations += 1
         broken = self.evaluations > 2
         x, g = parameters["x"], parameters["g"].copy()
@@ -418,7 +418,7 @@ class Walled:
 
     floor: float
 
-    def value_and_gradient(self, parameters, policy=None):
+    def value_and_gradient(self, parameters, gradient=None):
         if parameters["x"] < self.floor:
             raise InputError(f"parameter x is {parameters['x']:g}, but must be at least {self.floor:g}.")
         return float(parameters["x"] ** 2), {"x": 2.0 * parameters["x"]}
@@ -511,7 +511,7 @@ def test_wrong_input_is_refused_before_anything_is_evaluated(change, message):
 
 def test_a_gradient_of_another_shape_is_refused():
     class Wrong(Quadratic):
-        def value_and_gradient(self, parameters, policy=None):
+        def value_and_gradient(self, parameters, gradient=None):
             loss, gradient = super().value_and_gradient(parameters)
             return loss, {"x": gradient["x"][:1]}
 
@@ -522,11 +522,11 @@ def test_a_gradient_of_another_shape_is_refused():
 # What is handed on
 
 
-def test_policy_and_values_are_handed_on_as_given():
-    problem, policy = Quadratic({"x": 0.0, "y": 0.0, "z": np.zeros(2)}), object()
+def test_gradient_and_values_are_handed_on_as_given():
+    problem, estimator = Quadratic({"x": 0.0, "y": 0.0, "z": np.zeros(2)}), object()
     start = {"x": 1, "y": np.array(1.0), "z": [1, 2]}
-    result = optimise(problem, start, Adam(0.1), 2, policy=policy)
-    assert all(found is policy for found in problem.policies)
+    result = optimise(problem, start, Adam(0.1), 2, gradient=estimator)
+    assert all(found is estimator for found in problem.estimators)
     for parameters in (result.parameters, result.last_parameters, result.history[0].parameters):
         assert list(parameters) == ["x", "y", "z"]
         assert type(parameters["x"]) is float
@@ -537,7 +537,7 @@ def test_policy_and_values_are_handed_on_as_given():
 
 def test_the_history_is_safe_from_a_problem_that_overwrites_its_arguments():
     class Careless(Quadratic):
-        def value_and_gradient(self, parameters, policy=None):
+        def value_and_gradient(self, parameters, gradient=None):
             answer = super().value_and_gradient({"x": parameters["x"].copy()})
             parameters["x"][:] = np.nan
             return answer
@@ -606,5 +606,5 @@ def test_what_cannot_be_optimised_is_refused():
         rosenbrock(LBFGS(), problem=3)
     with pytest.raises(InputError, match=r"^What is optimised is the class Rosenbrock, but must be an object"):
         rosenbrock(LBFGS(), problem=Rosenbrock)
-    with pytest.raises(InputError, match=r"^A policy is given, but must be left out"):
-        rosenbrock(LBFGS(), problem=lambda parameters: (0.0, {}), policy=object())
+    with pytest.raises(InputError, match=r"^An estimator is given, but must be left out"):
+        rosenbrock(LBFGS(), problem=lambda parameters: (0.0, {}), gradient=object())

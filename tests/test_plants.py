@@ -13,7 +13,7 @@ import pytest
 
 import cortado
 from cortado import Problem, Simulation
-from cortado.device.launching import Launcher
+from cortado.device.launching import KernelLauncher
 from cortado.rollout import Rollout
 from planting import case, plant_all
 from scenes import HONEY, MIXING, OIL, plane, scene
@@ -25,10 +25,10 @@ ADJOINTS = {
         "density_sums.weights_adjoint": 5,
         "density_kernels.density_adjoint": 1,
     },
-    "solvers.pcisph.wall_relaxation": {"wall_kernels.wall_yield_adjoint": 1},
+    "solvers.pcisph.wall_relaxation": {"wall_kernels.wall_relaxation_adjoint": 1},
     "solvers.pcisph.density_ratio_relaxation": {
-        "contrast_kernels.factor_adjoint": 2,
-        "contrast_kernels.contrast_adjoint": 10,
+        "density_ratio_kernels.factor_adjoint": 2,
+        "density_ratio_kernels.density_ratio_adjoint": 10,
     },
     "solvers.pcisph.pressure": {
         "pressure_kernels.pressure_adjoint": 4,
@@ -49,7 +49,7 @@ ADJOINTS = {
     },
     "sph.gravity": {"gravity_kernels.adjoint": 1},
     "sph.materials": {"mixture_kernels.blend_adjoint": 7},
-    "sph.pairwise_laplacian": {"spreading_functions.spread_adjoint": 12},
+    "sph.pairwise_laplacian": {"pairwise_laplacian_functions.spread_adjoint": 12},
     "sph.diffusion": {
         "diffusion_kernels.scale_adjoint": 1,
         "diffusion_kernels.flux_adjoint": 9,
@@ -62,12 +62,12 @@ ADJOINTS = {
 SHARED = {
     "device.smoothing": {"_cubic_spline.bend": 5, "smoothing_functions.hessian_product": 3},
     "device.neighbourhood": {"pair_functions.factor_gradient": 4},
-    "solvers.pcisph.density_ratio_relaxation": {"contrast_kernels.excess_slope": 3},
+    "solvers.pcisph.density_ratio_relaxation": {"density_ratio_kernels.excess_slope": 3},
     "sph.viscosity": {"viscosity_kernels.share": 1},
     "sph.free_energy": {"_double_well.bend": 3, "_miscible.bend": 1, "_degenerate.slope": 4},
     "losses.matching": {"matching_kernels.difference": 3},
     "render.colour_field": {"colour_field_kernels.colour_field_adjoint": 11},
-    "render.phase_colours": {"tint_kernels.tint_adjoint": 2},
+    "render.phase_colours": {"phase_colour_kernels.phase_colour_adjoint": 2},
     "render.absorption": {
         "brightness_functions.brightness_slope": 5,
         "absorption_kernels.march_adjoint": 9,
@@ -78,8 +78,8 @@ SHARED = {
 }
 """Derivatives that forward mode uses too, the adjoints of pictures among them, so that only differences can tell."""
 ELSEWHERE = {
-    "solvers.pcisph.frozen_pressure": "a policy that is not exact: tests/test_policies.py",
-    "gradients.filter_kernels": "policies that are not exact: tests/test_policies.py",
+    "solvers.pcisph.frozen_pressure": "an estimator that is not exact: tests/test_estimators.py",
+    "gradients.filter_kernels": "estimators that are not exact: tests/test_estimators.py",
 }
 """Modules with adjoints that no plant is in, and why."""
 
@@ -187,7 +187,7 @@ def test_every_adjoint_is_planted(path):
 
 def test_every_kernel_on_the_way_back_is_planted(monkeypatch):
     seen: dict[str, set[str]] = {"forward": set(), "backward": set()}
-    launch, way = Launcher.__call__, ["forward"]
+    launch, way = KernelLauncher.__call__, ["forward"]
 
     def keep(self, kernel, *arguments, **options):
         seen[way[0]].add(kernel.key)
@@ -201,7 +201,7 @@ def test_every_kernel_on_the_way_back_is_planted(monkeypatch):
         way[0] = "forward"
         return found
 
-    monkeypatch.setattr(Launcher, "__call__", keep)
+    monkeypatch.setattr(KernelLauncher, "__call__", keep)
     monkeypatch.setattr(Rollout, "backward", backward)
     for made, loss in SCENES.values():
         problem, point = case(made, loss)

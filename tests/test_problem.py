@@ -37,11 +37,11 @@ def test_problems_and_runs_share_a_simulation(simulation, problem):
         assert gradient.tobytes() == found[1][name].tobytes()
 
 
-@pytest.mark.parametrize("policy", [gradients.Exact(), gradients.Tape()], ids=repr)
-def test_an_interruption_leaves_nothing_behind(simulation, policy, monkeypatch):
+@pytest.mark.parametrize("estimator", [gradients.Exact(), gradients.Tape()], ids=repr)
+def test_an_interruption_leaves_nothing_behind(simulation, estimator, monkeypatch):
     problem = Problem(simulation, 30, losses.FinalPositions(np.zeros_like(simulation.positions)))
     point = {**GRAVITY, "initial_positions": simulation.positions}
-    _, wanted = problem.value_and_gradient(point, policy)
+    _, wanted = problem.value_and_gradient(point, estimator)
     fresh = Problem(simulation, 30, losses.FinalPositions(np.zeros_like(simulation.positions)))
     solver = simulation.solver
     recorded = type(solver).write_state
@@ -56,9 +56,9 @@ def test_an_interruption_leaves_nothing_behind(simulation, policy, monkeypatch):
     monkeypatch.setattr(type(solver), "write_state", interrupted)
     with pytest.raises(KeyboardInterrupt):
         for _ in range(3):
-            fresh.value_and_gradient(point, policy)
+            fresh.value_and_gradient(point, estimator)
     monkeypatch.undo()
-    _, found = fresh.value_and_gradient(point, policy)
+    _, found = fresh.value_and_gradient(point, estimator)
     for name, gradient in wanted.items():
         assert gradient.tobytes() == found[name].tobytes()
     np.testing.assert_array_equal(fresh.iterations(), np.full(30, 5))
@@ -124,8 +124,8 @@ MISTAKES = {
     "shape of positions": lambda p: p.value({"initial_positions": np.zeros((3, 3))}),
     "array for a number": lambda p: p.value({"viscosity": [0.1, 0.2]}),
     "unknown direction": lambda p: p.tangent(GRAVITY, {"speed": 1.0}),
-    "policy by name": lambda p: p.value_and_gradient(GRAVITY, policy="exact"),
-    "policy class": lambda p: p.value_and_gradient(GRAVITY, policy=gradients.Exact),
+    "estimator by name": lambda p: p.value_and_gradient(GRAVITY, gradient="exact"),
+    "estimator class": lambda p: p.value_and_gradient(GRAVITY, gradient=gradients.Exact),
     "loss is an array": lambda p: Problem(p.simulation, 10, np.zeros((125, 3))),
     "steps 0 of a run": lambda p: p.simulation.run(0),
     "steps -1": lambda p: Problem(p.simulation, -1, p.loss),
@@ -205,13 +205,13 @@ def test_a_free_energy_that_does_not_fit_is_a_sentence(simulation):
 def test_a_passage_ends_with_the_next_evaluation(problem, simulation):
     point = {**GRAVITY, "viscosity": 0.1}
     _, wanted = problem.value_and_gradient(point)
-    passage = problem.passage(point)
+    forward_pass = problem.forward_pass(point)
     for _ in range(2):
-        found = passage.back(passage.derivative(gradients.Exact()))
+        found = forward_pass.back(forward_pass.derivative(gradients.Exact()))
         assert found["gravity"].tobytes() == wanted["gravity"].tobytes()
     problem.value({"gravity": [1.0, -5.0, 0.0]})
     with pytest.raises(InputError, match="evaluated again"):
-        passage.back(passage.derivative(gradients.Exact()))
+        forward_pass.back(forward_pass.derivative(gradients.Exact()))
 
 
 class Overflowing:

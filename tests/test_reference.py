@@ -227,7 +227,7 @@ def test_printed_equations_against_numpy(method):
     lattice, mass, mu, dt = warp.solver.lattice, 1000.0, 0.05, 0.002
     twin = twins.Pcisph(
         warp.smoothing, 2, lattice.support, lattice.volume, lattice.stiffness, np.zeros((0, 2)), np.zeros(0),
-        reach=1.03 * lattice.support, rigidity=1.0,
+        reach=1.03 * lattice.support, response=1.0,
     )  # fmt: skip
     random = np.random.default_rng(2)
     x = 0.97 * simulation.positions + 0.001 * random.standard_normal(simulation.positions.shape)

@@ -56,7 +56,7 @@ def test_what_a_run_leaves(trajectory, problem):
     assert repr(trajectory) == "Trajectory(5 frames of 64 particles, 0 to 0.0084 s)"
     assert repr(trajectory[:0]) == "Trajectory(0 frames of 64 particles)"
     assert repr(trajectory[-1]) == "Frame(64 particles, t = 0.0084 s)"
-    assert repr(problem.end({})) == "TrajectoryEnd(64 particles, float32)"
+    assert repr(problem.end({})) == "Snapshot(64 particles, float32)"
     restart = repr(trajectory.last_state)
     assert restart.startswith("RestartState(positions=array (64, 2), velocities=array (64, 2), mass_fractions=None, ")
     assert "RunConstants(reference_density=array (64,), time_step=0.0021" in restart
@@ -68,11 +68,11 @@ def test_what_a_search_finds(result):
     assert re.fullmatch(r"Record\(iteration 0: loss [\d.e-]+, gradient norm [\d.e-]+\)", repr(result.history[0]))
 
 
-def test_what_a_policy_says(problem):
+def test_what_an_estimator_says(problem):
     at = {"gravity": np.array([0.0, -9.0]), "viscosity": 0.05}
     exact = repr(problem.estimate(at))
     assert re.fullmatch(r"Estimate\(loss [\d.e-]+, gradient of gravity \(2,\), viscosity\)", exact)
-    smoothed = repr(problem.estimate({"gravity": at["gravity"]}, gradients.Smoothed({"gravity": 0.1}, 2)))
+    smoothed = repr(problem.estimate({"gravity": at["gravity"]}, gradients.RandomizedSmoothing({"gravity": 0.1}, 2)))
     assert smoothed.endswith(", gradient of gravity (2,), with its standard error)")
 
 

@@ -18,7 +18,7 @@ from cortado.lattice.calibration import (
     lattice_offsets,
     pressure_stiffness,
     rest_volume,
-    wall_rigidity,
+    wall_response,
 )
 from cortado.lattice.smoothing import KERNELS, smoothing_kernel
 
@@ -356,7 +356,7 @@ def test_wall_rigidity(name, dimension, support):
     points, middle = block(dimension)
     g = KERNELS[name].gradient(points[middle] - points, support * SPACING)
     expected = sum(float(row @ row) for row in g)
-    assert wall_rigidity(KERNELS[name], SPACING, support * SPACING, dimension) == pytest.approx(expected, rel=1e-12)
+    assert wall_response(KERNELS[name], SPACING, support * SPACING, dimension) == pytest.approx(expected, rel=1e-12)
 
 
 def test_the_polynomials_of_this_file_have_their_textbook_normalisations():

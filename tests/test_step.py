@@ -53,8 +53,8 @@ def twin(simulation):
         viscosity=simulation.scene.forces.viscosity,
         friction=viscous[0].friction if viscous else 0.0,
         reach=1.03 * lattice.support,
-        rigidity=lattice.rigidity,
-        evenness=lattice.evenness,
+        response=lattice.response,
+        laplacian_correction=lattice.laplacian_correction,
     )
 
 
@@ -72,7 +72,7 @@ def twins_steps(simulation, substeps):
             alpha=mixture.strength,
             mobility=mobility,
             eps=width,
-            evenness=lattice.evenness,
+            laplacian_correction=lattice.laplacian_correction,
             form=mixture.mobility_form,
             energy=mixture.free_energy,
         )

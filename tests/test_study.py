@@ -9,7 +9,7 @@ from cortado.reference import Terms
 from cortado.study.comparison import compare, growth
 from cortado.study.scenes import varied
 from cortado.study.sources import (
-    ByPolicy,
+    ByEstimator,
     FiniteDifference,
     Reference,
     ReferenceAdjoint,
@@ -105,11 +105,11 @@ PARAMETERS = {"gravity": np.array([0.7, -9.81]), "viscosity": np.array(0.05)}
 
 @pytest.fixture(scope="module")
 def truth(problem):
-    return ByPolicy(gradients.Exact())(problem, PARAMETERS)
+    return ByEstimator(gradients.Exact())(problem, PARAMETERS)
 
 
 SOURCES = {
-    "tape": (ByPolicy(gradients.Tape()), 1e-10),
+    "tape": (ByEstimator(gradients.Tape()), 1e-10),
     "Warp tangent": (WarpTangent(), 1e-10),
     "reference adjoint": (ReferenceAdjoint(), 1e-10),
     "reference adjoint in float80": (ReferenceAdjoint("float80"), 1e-10),
@@ -151,14 +151,14 @@ def test_terms_left_out_are_left_out(problem, truth):
 
 
 def test_a_smoothed_gradient_has_no_history(problem, truth):
-    found = ByPolicy(gradients.Smoothed(spread=1e-3, samples=2, disorder=0.0))(problem, PARAMETERS)
+    found = ByEstimator(gradients.RandomizedSmoothing(spread=1e-3, samples=2, disorder=0.0))(problem, PARAMETERS)
     assert found.history is None and compare(found.gradient, truth.gradient).relative_l2 < 1e-3
 
 
 def test_losses_of_positions_keep_their_digits_and_frames_are_refused(problem):
     target = problem.simulation.positions
     final = Problem(problem.simulation, STEPS, losses.FinalPositions(target))
-    expected = ByPolicy(gradients.Exact())(final, PARAMETERS)
+    expected = ByEstimator(gradients.Exact())(final, PARAMETERS)
     assert compare(ReferenceAdjoint("float128")(final, PARAMETERS).gradient, expected.gradient).relative_l2 < 1e-10
     frames = Problem(problem.simulation, STEPS, losses.Frames({STEPS: losses.FinalPositions(target)}))
     assert FiniteDifference(1e-5, Warp())(frames, PARAMETERS).loss == pytest.approx(expected.loss, rel=1e-6)

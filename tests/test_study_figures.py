@@ -12,7 +12,7 @@ from PIL import Image
 from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_LATTE
 from cortado.cli import main
-from cortado.gradients import Exact, VelocityOnly
+from cortado.gradients import Exact, FrozenGeometry
 from cortado.inverse.setup import assignment
 from cortado.inverse.task import load_task
 from cortado.optimisation.optimise import optimise
@@ -90,19 +90,19 @@ def test_pictures_come_nearer_to_the_target(measured):
     assert len(table.where(picture="target")) == 32 * 32
 
 
-def test_a_task_is_searched_with_its_own_policy(tmp_path):
-    """Its losses are those of a search with the policy, and others without."""
+def test_a_task_is_searched_with_its_own_gradient(tmp_path):
+    """Its losses are those of a search with the estimator, and others without."""
     file = tmp_path / "task.toml"
     file.write_text(TINY_LATTE)
     losses = {}
-    for name, policy in (("velocity_only", VelocityOnly()), ("exact", Exact())):
-        overrides = [f"optimise.policy.name={name}"]
+    for name, estimator in (("frozen_geometry", FrozenGeometry()), ("exact", Exact())):
+        overrides = [f"optimise.gradient.name={name}"]
         settings = TaskSettings(title="a cup", task=str(file), overrides=overrides)
         made = assignment(load_task(file, overrides), "cpu", "float32")
-        wanted = optimise(made.search, made.start, Adam(0.5), 3, policy=policy)
+        wanted = optimise(made.search, made.start, Adam(0.5), 3, gradient=estimator)
         losses[name] = TASK.measure(settings, no_progress).where(picture="")["loss"]
         np.testing.assert_array_equal(losses[name], [record.loss for record in wanted.history])
-    assert (losses["velocity_only"][1:] != losses["exact"][1:]).all()
+    assert (losses["frozen_geometry"][1:] != losses["exact"][1:]).all()
 
 
 def no_progress(total):

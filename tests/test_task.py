@@ -126,25 +126,25 @@ def test_options_of_the_search(task_file):
     np.testing.assert_array_equal(task.optimise.bounds["gravity"], [[-5, -20], [5, 0]])
 
 
-SMOOTHING = ['optimise.policy.name="adjoint_smoothing"']
-SEVERAL = ["optimise.policy.samples=4", "optimise.policy.spread.gravity=0.5"]
-POLICIES = {
+SMOOTHING = ['optimise.gradient.name="adjoint_viscosity"']
+SEVERAL = ["optimise.gradient.samples=4", "optimise.gradient.spread.gravity=0.5"]
+ESTIMATORS = {
     "exact": ([], gradients.Exact()),
-    "velocity only": (['optimise.policy.name="velocity_only"'], gradients.VelocityOnly()),
-    "smoothing": (SMOOTHING, gradients.AdjointSmoothing()),
-    "with a strength": ([*SMOOTHING, "optimise.policy.strength=0.3"], gradients.AdjointSmoothing(0.3)),
-    "averaged": ([*SMOOTHING, *SEVERAL], gradients.Averaged({"gravity": 0.5}, 4)),
+    "velocity only": (['optimise.gradient.name="frozen_geometry"'], gradients.FrozenGeometry()),
+    "smoothing": (SMOOTHING, gradients.AdjointViscosity()),
+    "with a strength": ([*SMOOTHING, "optimise.gradient.strength=0.3"], gradients.AdjointViscosity(0.3)),
+    "averaged": ([*SMOOTHING, *SEVERAL], gradients.EnsembleMean({"gravity": 0.5}, 4)),
     "averaged without disorder": (
-        [*SMOOTHING, *SEVERAL, "optimise.policy.disorder=0"],
-        gradients.Averaged({"gravity": 0.5}, 4, 0.0),
+        [*SMOOTHING, *SEVERAL, "optimise.gradient.disorder=0"],
+        gradients.EnsembleMean({"gravity": 0.5}, 4, 0.0),
     ),
-    "averaged without smoothing": (SEVERAL, gradients.Averaged({"gravity": 0.5}, 4, policy=gradients.Exact())),
+    "averaged without smoothing": (SEVERAL, gradients.EnsembleMean({"gravity": 0.5}, 4, estimator=gradients.Exact())),
 }
 
 
-@pytest.mark.parametrize(("overrides", "wanted"), POLICIES.values(), ids=POLICIES)
-def test_a_policy_is_chosen_by_name(task_file, overrides, wanted):
-    assert load_task(task_file, overrides).optimise.policy.policy() == wanted
+@pytest.mark.parametrize(("overrides", "wanted"), ESTIMATORS.values(), ids=ESTIMATORS)
+def test_a_gradient_is_chosen_by_name(task_file, overrides, wanted):
+    assert load_task(task_file, overrides).optimise.estimator.estimator() == wanted
 
 
 def test_random_values_are_drawn_later(task_file):

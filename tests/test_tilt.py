@@ -5,7 +5,7 @@ import pytest
 
 import cortado
 from cortado import InputError, Problem, Simulation, losses
-from cortado.optimisation.reparametrisation import Knots, Reparametrised
+from cortado.optimisation.transforms import Knots, Transformed
 from cortado.parameters.tilt import SMALL, Tilt
 from scenes import plane, scene, splash
 
@@ -125,10 +125,10 @@ def test_one_tilt_may_vary_where_there_is_a_row_for_each_step():
 def test_it_is_searched_between_knots():
     problem = problem_of(plane())
     knots = Knots(STEPS, 3)
-    search = Reparametrised(problem, {"tilt": knots})
+    search = Transformed(problem, {"tilt": knots})
     hidden = {"tilt": np.array([[10.0], [-15.0], [5.0]])}
     target = problem.end(search.parameters(hidden)).positions
-    search = Reparametrised(Problem(problem.simulation, STEPS, losses.FinalPositions(target)), {"tilt": knots})
+    search = Transformed(Problem(problem.simulation, STEPS, losses.FinalPositions(target)), {"tilt": knots})
     found = cortado.optimise(search, {"tilt": np.zeros((3, 1))}, cortado.optimisers.LBFGS(scale=5.0), 25)
     np.testing.assert_allclose(found.parameters["tilt"], hidden["tilt"], atol=0.1)
 

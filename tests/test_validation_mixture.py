@@ -99,7 +99,7 @@ class Energy:
         weights = kernel.weight(np.linalg.norm(separations, axis=1), 2, lattice.support)
         n = np.bincount(i, weights, particles) + np.bincount(j, weights, particles) + lattice.self_weight
         n *= lattice.volume
-        factors = lattice.evenness * shear_factor(kernel, separations, lattice.support)
+        factors = lattice.laplacian_correction * shear_factor(kernel, separations, lattice.support)
         pairs = i, j, (self.masses[i] / n[j] + self.masses[j] / n[i]) * factors
         object.__setattr__(self, "_pairs", pairs)
 

@@ -1,13 +1,13 @@
-"""Policies against the gradient of a smoothed loss: ``python validation/policies.py --out runs/policies`` (an hour).
+"""Estimators against the gradient of a smoothed loss: ``python validation/gradients.py --out runs/gradients`` (1 h).
 
 A dam break of 144 particles in the plane, 12 x 12 with a spacing of 0.025 m, time step 1 ms, 4 pressure iterations a
 step, in float64. The parameter is gravity, constant or in equal blocks of time (``--blocks``). A seed moves the first
 positions by 1 % of the spacing, and draws the gravity of a run whose last state is the target of the losses: centre of
 mass, Gaussian density on a grid, picture with two distances, and positions particle by particle.
 
-The reference is `gradients.Smoothed` with a spread of 0.5 m/s2. For each policy the script writes the cosine of its
-gradient to the reference, and its size over the reference's, into `policies_1.csv` (for 1 block) with a picture, and
-prints the medians over seeds.
+The reference is `gradients.RandomizedSmoothing` with a spread of 0.5 m/s2. For each estimator the script writes the
+cosine of its gradient to the reference, and its size over the reference's, into `gradients_1.csv` (for 1 block) with a
+picture, and prints the medians over seeds.
 """
 
 import argparse
@@ -36,14 +36,14 @@ SPREAD = 0.5
 TILT, HIDDEN = 3.0, 1.0
 """How far the target's gravities lean to a side, and their standard deviation [m/s2]."""
 LOSSES = ("centre of mass", "density grid", "picture, pyramid", "picture", "particles")
-POLICIES: dict[str, gradients.Policy] = {
+ESTIMATORS: dict[str, gradients.GradientEstimator] = {
     "exact": gradients.Exact(),
-    "velocity only": gradients.VelocityOnly(),
+    "velocity only": gradients.FrozenGeometry(),
     "damped 20/s": gradients.Damped(20.0),
-    "smoothing 0.1": gradients.AdjointSmoothing(0.1),
-    "smoothing": gradients.AdjointSmoothing(),
-    "smoothing, extrapolated": gradients.AdjointSmoothing(order=2),
-    "averaged over 8": gradients.Averaged(SPREAD, 8, DISORDER),
+    "smoothing 0.1": gradients.AdjointViscosity(0.1),
+    "smoothing": gradients.AdjointViscosity(),
+    "smoothing, extrapolated": gradients.AdjointViscosity(order=2),
+    "averaged over 8": gradients.EnsembleMean(SPREAD, 8, DISORDER),
 }
 DRAWN = ("exact", "velocity only", "smoothing", "averaged over 8")
 
@@ -81,10 +81,10 @@ class DensityGrid:
         a, b = self.axes(x)
         return a.T @ b / len(x)
 
-    def value(self, end: losses.TrajectoryEnd) -> float:
+    def value(self, end: losses.Snapshot) -> float:
         return float(((self.density(end.positions) - self.target) ** 2).sum())
 
-    def adjoint(self, end: losses.TrajectoryEnd) -> tuple[np.ndarray, np.ndarray]:
+    def adjoint(self, end: losses.Snapshot) -> tuple[np.ndarray, np.ndarray]:
         x = end.positions
         (a, b), bar = self.axes(x), 2.0 * (self.density(x) - self.target) / len(x)
         slopes = [-(x[:, k, None] - self.nodes) / self.width**2 * w for k, w in enumerate((a, b))]
@@ -130,13 +130,13 @@ class Case:
             self._seen[key] = {name: loss.value(end) for name, loss in self.losses.items()}
         return self._seen[key]
 
-    def estimate(self, loss: str, policy: gradients.Policy) -> gradients.Estimate:
+    def estimate(self, loss: str, estimator: gradients.GradientEstimator) -> gradients.Estimate:
         """The gradient of a loss with respect to gravity in blocks."""
-        return policy.estimate(One(self, loss), {"gravity": self.gravity})
+        return estimator.estimate(One(self, loss), {"gravity": self.gravity})
 
 
 class One:
-    """One loss of a case with gravity in blocks, as policies see a problem."""
+    """One loss of a case with gravity in blocks, as estimators see a problem."""
 
     def __init__(self, case: Case, name: str):
         self._case, self._name = case, name
@@ -146,16 +146,16 @@ class One:
     def value(self, values: dict[str, np.ndarray]) -> float:
         return self._case.values(values)[self._name]
 
-    def passage(self, values: dict[str, np.ndarray]) -> "InBlocks":
-        return InBlocks(self._problem.passage(self._case.parameters(values)), self._case.blocks)
+    def forward_pass(self, values: dict[str, np.ndarray]) -> "InBlocks":
+        return InBlocks(self._problem.forward_pass(self._case.parameters(values)), self._case.blocks)
 
 
 class InBlocks:
     """The ways back through a run, with the gradient in blocks."""
 
-    def __init__(self, passage: Any, blocks: int):
-        self._passage, self._blocks = passage, blocks
-        self.loss, self.rollout, self.derivative = passage.loss, passage.rollout, passage.derivative
+    def __init__(self, forward_pass: Any, blocks: int):
+        self._passage, self._blocks = forward_pass, blocks
+        self.loss, self.rollout, self.derivative = forward_pass.loss, forward_pass.rollout, forward_pass.derivative
 
     def back(self, derivative: Any, observe: Any = None) -> dict[str, np.ndarray]:
         gradient = self._passage.back(derivative, observe)["gravity"]
@@ -163,7 +163,16 @@ class InBlocks:
 
 
 Row = dict[str, Any]
-FIELDS = ("seed", "steps", "loss", "policy", "strength", "cosine", "size", *(f"g{k}" for k in range(2 * MOST_BLOCKS)))
+FIELDS = (
+    "seed",
+    "steps",
+    "loss",
+    "estimator",
+    "strength",
+    "cosine",
+    "size",
+    *(f"g{k}" for k in range(2 * MOST_BLOCKS)),
+)
 
 
 def references(seed: int, steps: int, blocks: int, samples: int) -> list[Row]:
@@ -171,23 +180,23 @@ def references(seed: int, steps: int, blocks: int, samples: int) -> list[Row]:
     case = Case(Simulation(dam_break(), precision="float64"), seed, steps, blocks)
     rows = []
     for half in (1, 2):
-        cloud = gradients.Smoothed(SPREAD, samples // 2, DISORDER, 1000 * seed + half)
+        cloud = gradients.RandomizedSmoothing(SPREAD, samples // 2, DISORDER, 1000 * seed + half)
         name = f"reference {half} of {samples}"
         rows += [row(seed, steps, loss, name, case.estimate(loss, cloud)) for loss in LOSSES]
     return rows
 
 
-def policy_rows(seed: int, steps: int, blocks: int, loss: str) -> list[Row]:
-    """The gradients of every policy, for a loss."""
+def estimator_rows(seed: int, steps: int, blocks: int, loss: str) -> list[Row]:
+    """The gradients of every estimator, for a loss."""
     case = Case(Simulation(dam_break(), precision="float64"), seed, steps, blocks)
-    return [row(seed, steps, loss, name, case.estimate(loss, policy)) for name, policy in POLICIES.items()]
+    return [row(seed, steps, loss, name, case.estimate(loss, estimator)) for name, estimator in ESTIMATORS.items()]
 
 
-def row(seed: int, steps: int, loss: str, policy: str, found: gradients.Estimate) -> Row:
+def row(seed: int, steps: int, loss: str, estimator: str, found: gradients.Estimate) -> Row:
     """One line of the file."""
     numbers = {f"g{k}": float(value) for k, value in enumerate(found.gradient["gravity"].ravel())}
     strength = "" if found.strength is None else found.strength
-    return {"seed": seed, "steps": steps, "loss": loss, "policy": policy, "strength": strength, **numbers}
+    return {"seed": seed, "steps": steps, "loss": loss, "estimator": estimator, "strength": strength, **numbers}
 
 
 def gradient_of(line: Row) -> np.ndarray:
@@ -240,29 +249,29 @@ def report(rows: list[Row]) -> None:
     for steps in cases:
         print(f"\n{steps} steps: median cosine to the reference [least], median size over the reference's")
         print(f"{'':40}" + "".join(f"{name:>28}" for name in names))
-        for policy in dict.fromkeys(line["policy"] for line in rows):
+        for estimator in dict.fromkeys(line["estimator"] for line in rows):
             cells = []
             for name in names:
-                of = [x for x in rows if (int(x["steps"]), x["loss"], x["policy"]) == (steps, name, policy)]
+                of = [x for x in rows if (int(x["steps"]), x["loss"], x["estimator"]) == (steps, name, estimator)]
                 cosines, sizes = ([float(x[key]) for x in of] for key in ("cosine", "size"))
                 cells.append(f"{np.median(cosines):8.3f} [{min(cosines):6.3f}] {np.median(sizes):9.2g}")
-            print(f"{policy:40}" + "".join(f"{cell:>28}" for cell in cells))
+            print(f"{estimator:40}" + "".join(f"{cell:>28}" for cell in cells))
 
 
 def draw(rows: list[Row], path: Path) -> None:
-    """Cosine and size of each policy, a dot a seed and a line at the median."""
+    """Cosine and size of each estimator, a dot a seed and a line at the median."""
     horizons = sorted({int(line["steps"]) for line in rows})
     with drawing(path, 6.5 * len(horizons), 7.0) as figure:
         panels = figure.subplots(2, len(horizons), sharex=True, sharey="row", squeeze=False)
         for k, steps in enumerate(horizons):
             for key, panel in zip(("cosine", "size"), panels[:, k], strict=True):
-                for number, policy in enumerate(DRAWN):
+                for number, estimator in enumerate(DRAWN):
                     for at, loss in enumerate(LOSSES):
-                        chosen = (steps, loss, policy)
-                        of = [x for x in rows if (int(x["steps"]), x["loss"], x["policy"]) == chosen]
+                        chosen = (steps, loss, estimator)
+                        of = [x for x in rows if (int(x["steps"]), x["loss"], x["estimator"]) == chosen]
                         values = np.array([float(x[key]) for x in of])
                         x = at + 0.15 * (number - (len(DRAWN) - 1) / 2)
-                        label = policy if at == 0 else None
+                        label = estimator if at == 0 else None
                         panel.plot(np.full(len(values), x), values, ".", color=PALETTE[number], ms=5, alpha=0.7)
                         line = {"color": PALETTE[number], "lw": 2.5, "label": label}
                         panel.plot([x - 0.06, x + 0.06], [np.median(values)] * 2, **line)
@@ -278,7 +287,7 @@ def draw(rows: list[Row], path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """See the head of the file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("runs/policies"))
+    parser.add_argument("--out", type=Path, default=Path("runs/estimators"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
     parser.add_argument("--steps", type=int, nargs="+", default=[400, 800], help="multiples of the blocks")
     parser.add_argument("--blocks", type=int, default=1, help="of time in which gravity is a parameter, at most 8")
@@ -298,19 +307,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         wanted = {
             pool.submit(references, *case, given.blocks, given.samples): kept for case in cases if case not in known
         }
-        wanted |= {pool.submit(policy_rows, *case, given.blocks, loss): rows for case in cases for loss in LOSSES}
+        wanted |= {pool.submit(estimator_rows, *case, given.blocks, loss): rows for case in cases for loss in LOSSES}
         for done in as_completed(wanted):
             wanted[done].extend(done.result())
             write(file, kept)
             advance()
     halves = [line for line in kept if (int(line["seed"]), int(line["steps"])) in cases]
-    order = {name: k for k, name in enumerate(POLICIES)}
-    rows.sort(key=lambda line: (line["steps"], line["seed"], order[line["policy"]], LOSSES.index(line["loss"])))
+    order = {name: k for k, name in enumerate(ESTIMATORS)}
+    rows.sort(key=lambda line: (line["steps"], line["seed"], order[line["estimator"]], LOSSES.index(line["loss"])))
     found = compared(rows, halves)
-    write(given.out / f"policies_{given.blocks}.csv", found)
+    write(given.out / f"gradients_{given.blocks}.csv", found)
     report(found)
-    draw(found, given.out / f"policies_{given.blocks}.png")
-    print(f"\nwritten: {given.out / f'policies_{given.blocks}.csv'}")
+    draw(found, given.out / f"gradients_{given.blocks}.png")
+    print(f"\nwritten: {given.out / f'gradients_{given.blocks}.csv'}")
 
 
 if __name__ == "__main__":

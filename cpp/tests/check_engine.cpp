@@ -28,8 +28,8 @@ Scene box(int d, const std::string& kernel, const std::string& viscosity, bool p
     s.normalisation = d == 2 ? 40 / (7 * pi * h * h) : 8 / (pi * h * h * h);
     s.volume = std::pow(0.05, d);
     s.stiffness = 0.1 * h * h * (d == 2 ? 1 : 0.5);
-    s.rigidity = std::pow(h, -2.0 * (d + 1));
-    s.evenness = 1.05;
+    s.response = std::pow(h, -2.0 * (d + 1));
+    s.laplacian_correction = 1.05;
     for (double x = -0.1; x < 0.4; x += 0.05)
         for (double z = -0.1; z < (d == 3 ? 0.3 : -0.09); z += 0.05) {
             s.wall_positions.insert(s.wall_positions.end(), {x, -0.02});

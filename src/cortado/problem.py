@@ -12,9 +12,9 @@ from cortado.device.memory import require
 from cortado.device.state import State
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import CortadoWarning, InputError
-from cortado.gradients import AdjointPolicy, Estimate, Policy, estimate
+from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator, estimate
 from cortado.io.trajectory import Trajectory
-from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd, fingerprint
+from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, fingerprint
 from cortado.losses.checked import as_loss
 from cortado.losses.loss import Adjoint
 from cortado.parameters.space import ParameterSpace
@@ -68,7 +68,7 @@ class Problem:
         self._losses: dict[int, Loss] = {step: as_loss(one) for step, one in by_step.items()}
         self._space = ParameterSpace(simulation, self.steps)
         self._rollout = Rollout(simulation.solver, self.steps, memory_budget)
-        self._derivatives: dict[AdjointPolicy, StepDerivative] = {}
+        self._derivatives: dict[AdjointEstimator, StepDerivative] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled and copied as what it is made from."""
@@ -88,12 +88,12 @@ class Problem:
         """The loss, forward only."""
         return self._total(self._ends(self._space.checked(parameters), self._losses, keep=False))
 
-    def end(self, parameters: Values) -> TrajectoryEnd:
+    def end(self, parameters: Values) -> Snapshot:
         """The last state of the rollout under these parameters."""
         return self.states(parameters, [self.steps])[self.steps]
 
     @in_turn
-    def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, TrajectoryEnd]:
+    def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, Snapshot]:
         """States of the rollout under these parameters, by the number of steps before them."""
         return self._ends(self._space.checked(parameters), steps, keep=False)
 
@@ -103,37 +103,39 @@ class Problem:
         self._space.begin(self._rollout, self._space.checked(parameters))
         return self.simulation.collect(self._rollout, record_every)
 
-    def value_and_gradient(self, parameters: Values, policy: Policy | None = None) -> tuple[float, Arrays]:
+    def value_and_gradient(self, parameters: Values, gradient: GradientEstimator | None = None) -> tuple[float, Arrays]:
         """The loss and its derivatives: for each parameter given, an array of its shape (float64)."""
-        found = self.estimate(parameters, policy)
+        found = self.estimate(parameters, gradient)
         return found.loss, found.gradient
 
     @in_turn
-    def estimate(self, parameters: Values, policy: Policy | None = None, observe: Observer | None = None) -> Estimate:
-        """The same, with what the policy (`gradients.Exact` by default) reports.
+    def estimate(
+        self, parameters: Values, gradient: GradientEstimator | None = None, observe: Observer | None = None
+    ) -> Estimate:
+        """The same, with what the estimator ``gradient`` (`gradients.Exact` by default) reports.
 
-        ``observe`` is given the number and the adjoint of every state, from the last to the first, by policies that go
-        back through a run; `gradients.AdjointNorms` is such an observer.
+        ``observe`` is given the number and the adjoint of every state, from the last to the first, by estimators that
+        go back through a run; `gradients.AdjointNorms` is such an observer.
         """
-        found = estimate(self, parameters, policy, observe)
+        found = estimate(self, parameters, gradient, observe)
         broken = [name for name, value in found.gradient.items() if not np.isfinite(value).all()]
         if broken:
             warnings.warn(
                 f"the gradient with respect to {', '.join(broken)} is not finite, as it grew beyond what "
-                f"{self.simulation.precision.name} holds: try fewer steps, float64, or a policy for long runs.",
+                f"{self.simulation.precision.name} holds: try fewer steps, float64, or an estimator for long runs.",
                 CortadoWarning,
                 stacklevel=4,
             )
         return found
 
     @in_turn
-    def passage(self, parameters: Values) -> "Passage":
-        """A forward run that can be gone back through, until the next evaluation: what policies work with."""
+    def forward_pass(self, parameters: Values) -> "ForwardPass":
+        """A forward run that can be gone back through, until the next evaluation: what estimators work with."""
         values = self._space.checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         evaluation = self._rollout.evaluation  # before the loss, which may evaluate the problem itself
         loss, bars = self._judged(ends)
-        return Passage(loss, self._rollout, values, bars, self._space, self._derivatives, evaluation)
+        return ForwardPass(loss, self._rollout, values, bars, self._space, self._derivatives, evaluation)
 
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> float:
@@ -158,7 +160,7 @@ class Problem:
     @in_turn
     def tangents(
         self, parameters: Values, directions: Values, observe: Observer, steps: Iterable[int] = ()
-    ) -> dict[int, TrajectoryEnd]:
+    ) -> dict[int, Snapshot]:
         """Forward mode: run, and give ``observe`` the number of every state and its tangent along ``directions`` (any
         of the parameters), which the next step overwrites. Returns the states after ``steps`` steps, by these."""
         values = self._space.checked(parameters)
@@ -188,14 +190,14 @@ class Problem:
 
     def _ends(
         self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()
-    ) -> dict[int, TrajectoryEnd]:
+    ) -> dict[int, Snapshot]:
         """States by the number of steps before them; ``keep`` checkpoints for a way back."""
         wanted, colours = set(steps), self._space.colours(values)
-        ends: dict[int, TrajectoryEnd] = {}
+        ends: dict[int, Snapshot] = {}
 
         def observe(step: int, state: State) -> None:
             if step in wanted:
-                ends[step] = TrajectoryEnd(state, self.simulation.dimension, colours)
+                ends[step] = Snapshot(state, self.simulation.dimension, colours)
 
         self._space.begin(self._rollout, values, varied)
         if 0 in wanted:
@@ -205,37 +207,37 @@ class Problem:
         self._rollout.forward(observe, keep)
         return ends
 
-    def _total(self, ends: dict[int, TrajectoryEnd]) -> float:
+    def _total(self, ends: dict[int, Snapshot]) -> float:
         return sum(loss.value(ends[step]) for step, loss in self._losses.items())
 
-    def _judged(self, ends: dict[int, TrajectoryEnd]) -> tuple[float, dict[int, EndAdjoint]]:
+    def _judged(self, ends: dict[int, Snapshot]) -> tuple[float, dict[int, SnapshotAdjoint]]:
         """The loss of a run, and its adjoints of states by the number of steps before them."""
         found = {step: loss.value_and_adjoint(ends[step]) for step, loss in self._losses.items()}
         bars = {step: self._on_device(bar, ends[step]) for step, (_, bar) in found.items()}
         return sum(value for value, _ in found.values()), bars
 
-    def _on_device(self, bar: Adjoint, end: TrajectoryEnd) -> EndAdjoint:
-        if isinstance(bar, EndAdjoint):
+    def _on_device(self, bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
+        if isinstance(bar, SnapshotAdjoint):
             return bar
         no_colours = np.zeros_like(end.colours)
         if isinstance(bar, State):
-            return EndAdjoint(bar, no_colours)
+            return SnapshotAdjoint(bar, no_colours)
         positions, velocities, *rest = bar
         state = self.simulation.solver.new_state()
         state.set(positions, velocities, *rest or [np.zeros_like(end.mass_fractions)])
-        return EndAdjoint(state, no_colours)
+        return SnapshotAdjoint(state, no_colours)
 
 
 @dataclass(frozen=True)
-class Passage:
+class ForwardPass:
     """A forward run of a problem with its loss, and the ways back through it."""
 
     loss: float
     rollout: Rollout
     _values: Arrays
-    _bars: Mapping[int, EndAdjoint]
+    _bars: Mapping[int, SnapshotAdjoint]
     _space: ParameterSpace
-    _derivatives: dict[AdjointPolicy, StepDerivative]
+    _derivatives: dict[AdjointEstimator, StepDerivative]
     _evaluation: int
 
     @property
@@ -244,14 +246,14 @@ class Passage:
         return self.rollout.turn
 
     @in_turn
-    def derivative(self, policy: AdjointPolicy) -> StepDerivative:
-        """The policy's backward step, made once for each problem."""
-        if policy not in self._derivatives:
+    def derivative(self, estimator: AdjointEstimator) -> StepDerivative:
+        """The estimator's backward step, made once for each problem."""
+        if estimator not in self._derivatives:
             solver = self.rollout.solver
             parts = solver.gradient_memory(self.rollout.log)
             require(parts, "take a larger spacing or fewer pressure iterations", solver.device)
-            self._derivatives[policy] = policy.derivative(self.rollout)
-        return self._derivatives[policy]
+            self._derivatives[estimator] = estimator.derivative(self.rollout)
+        return self._derivatives[estimator]
 
     @in_turn
     def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:

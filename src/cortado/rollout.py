@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from cortado.device.launching import Replayed, add
+from cortado.device.launching import CapturedGraph, add
 from cortado.device.memory import require, step_parts, within
 from cortado.device.state import Parameters, State
 from cortado.device.threads import WARP, Turn, in_turn
@@ -30,7 +30,7 @@ Observer = Callable[[int, State], None]
 
 
 class StepDerivative(Protocol):
-    """How one step is gone back through; made by a policy for one rollout."""
+    """How one step is gone back through; made by an estimator for one rollout."""
 
     capturable: bool
     """Whether a step may be captured as a graph."""
@@ -146,8 +146,8 @@ class Rollout:
             return
         self._generation = self.solver.generation
         step = partial(self.solver.step, self._buffer, self._buffer, self.parameters, self.log)
-        self._step = Replayed(step, self.solver.launch)
-        self._steps_back: dict[tuple[StepDerivative, Counts], Replayed] = {}
+        self._step = CapturedGraph(step, self.solver.launch)
+        self._steps_back: dict[tuple[StepDerivative, Counts], CapturedGraph] = {}
 
     def _diverged(self, lost: Lost, state: State) -> DivergedError:
         containment = self.solver.containment
@@ -196,7 +196,7 @@ class Rollout:
         key = (derivative, counts)
         if key not in self._steps_back:
             self.solver.reserve(counts)
-            self._steps_back[key] = Replayed(work, self.solver.launch)
+            self._steps_back[key] = CapturedGraph(work, self.solver.launch)
         self._steps_back[key]()
 
     @in_turn

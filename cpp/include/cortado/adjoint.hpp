@@ -101,7 +101,7 @@ void step_adjoint(const Model<Real, D>& model, Step<Real, D>& step, const State<
         for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair)
             bar.x[i] += (model.volume * (n_bar[i] + n_bar[pair->other]) * pair->a) * pair->x;
         const Vector<Real, D> wall_bar =
-            (-2 * y_bar[i] * step.y[i] * step.y[i] / model.rigidity) * step.wall_gradient[i];
+            (-2 * y_bar[i] * step.y[i] * step.y[i] / model.response) * step.wall_gradient[i];
         for (auto pair = walls.begin_of(i); pair != walls.end_of(i); ++pair) {
             const Real weight = model.wall_weights[pair->other];
             bar.x[i] += (model.volume * weight * n_bar[i] * pair->a) * pair->x;

@@ -26,8 +26,8 @@ struct Scene {
     double normalisation;   // sigma [1 / m^d]
     double volume;          // V [m^d]
     double stiffness;       // k
-    double rigidity;        // of the yield beside walls
-    double evenness;
+    double response;        // of the yield beside walls
+    double laplacian_correction;
     std::vector<double> wall_positions;  // (b, d) [m]
     std::vector<double> wall_weights;    // (b,) w_b, a fluid particle being 1
     std::array<double, 3> periods;       // [m], 0 along an axis that is not periodic

@@ -17,7 +17,7 @@ struct Model {
     Period<Scalar, D> period;
     std::array<double, 3> periods;
     double reach;
-    Scalar volume, self_weight, stiffness, rigidity, evenness, size_floor;
+    Scalar volume, self_weight, stiffness, response, laplacian_correction, size_floor;
     Scalar rest_density, time_step, friction, kappa;
     Viscosity viscosity;
     bool pressure;
@@ -36,8 +36,8 @@ struct Model {
           volume(Real(s.volume)),
           self_weight(smoothing.weight(Scalar(0))),
           stiffness(Real(s.stiffness)),
-          rigidity(Real(s.rigidity)),
-          evenness(Real(s.evenness)),
+          response(Real(s.response)),
+          laplacian_correction(Real(s.laplacian_correction)),
           size_floor(Real(1) / Real(100) * smoothing.h_squared),
           rest_density(Real(s.rest_density)),
           time_step(Real(s.time_step)),
@@ -60,7 +60,7 @@ struct Model {
     Vector<Scalar, D> phi(const Pair<Scalar, D>& pair, const Vector<Scalar, D>& v) const {
         const Scalar r_squared = pair.x.dot(pair.x), size = r_squared + size_floor;
         if (viscosity == Viscosity::pairwise) return (v.dot(pair.x) / size * pair.a) * pair.x;
-        return (evenness * pair.a * r_squared / size) * v;
+        return (laplacian_correction * pair.a * r_squared / size) * v;
     }
 
     // sum_j W(x_j) + sum_b w_b W(x_b) over lists, at other positions than those that the lists are of.

@@ -50,7 +50,7 @@ struct Step {
             }
             n[i] = model.volume * total;
             wall_gradient[i] = gradient;
-            y[i] = Scalar(1) / (Scalar(1) + gradient.dot(gradient) / model.rigidity);
+            y[i] = Scalar(1) / (Scalar(1) + gradient.dot(gradient) / model.response);
         });
         friction_sum.assign(count, Vector<Scalar, D>::Constant(Scalar(0)));
         acceleration.assign(count, gravity);

@@ -114,7 +114,7 @@ State<Real, D> step_tangent(const Model<Real, D>& model, Step<Real, D>& step, co
         Vector<Real, D> change = Vector<Real, D>::Constant(Real(0));
         for (auto pair = step.walls.begin_of(i); pair != step.walls.end_of(i); ++pair)
             change += model.wall_weights[pair->other] * pair->hessian_product(dot.x[i]);
-        dy[i] = -2 * step.y[i] * step.y[i] * step.wall_gradient[i].dot(change) / model.rigidity;
+        dy[i] = -2 * step.y[i] * step.y[i] * step.wall_gradient[i].dot(change) / model.response;
     });
     State<Real, D> new_dot{Vectors<Real, D>(count), Vectors<Real, D>(count)};
     const auto predict = [&](std::size_t i, const Vector<Real, D>& push_dot) {

@@ -16,7 +16,7 @@ Vector<Real, D> phi_tangent(const Model<Real, D>& model, const Pair<Real, D>& pa
         const Real dB = (dv.dot(x) + v.dot(dx) - 2 * B * x.dot(dx)) / size;
         return dB * pair.gradient() + B * pair.hessian_product(dx);
     }
-    const Real F = model.evenness * pair.a * r_squared / size;
+    const Real F = model.laplacian_correction * pair.a * r_squared / size;
     return F * dv + (factor_slope(model, pair) * x.dot(dx)) * v;
 }
 
@@ -31,15 +31,15 @@ std::pair<Vector<Real, D>, Vector<Real, D>> phi_adjoint(const Model<Real, D>& mo
         const Real B = v.dot(x) / size, work = pair.a * x.dot(w) / size;
         return {B * pair.hessian_product(w) + work * (v - (2 * B) * x), work * x};
     }
-    const Real F = model.evenness * pair.a * r_squared / size;
+    const Real F = model.laplacian_correction * pair.a * r_squared / size;
     return {(factor_slope(model, pair) * v.dot(w)) * x, F * w};
 }
 
-// s in grad F = s x, with F = evenness x . G / (|x|^2 + 0.01 h^2) of the laminar form.
+// s in grad F = s x, with F = laplacian_correction x . G / (|x|^2 + 0.01 h^2) of the laminar form.
 template <class Real, int D>
 Real factor_slope(const Model<Real, D>& model, const Pair<Real, D>& pair) {
     const Real r_squared = pair.x.dot(pair.x), size = r_squared + model.size_floor;
-    return model.evenness * (pair.b * r_squared + 2 * pair.a * (1 - r_squared / size)) / size;
+    return model.laplacian_correction * (pair.b * r_squared + 2 * pair.a * (1 - r_squared / size)) / size;
 }
 
 }  // namespace cortado

@@ -1,11 +1,11 @@
-"""Which gradient points the way: those of the policies, against that of the loss smoothed over meaningful changes."""
+"""Which gradient points the way: those of the estimators, against that of the loss smoothed over meaningful changes."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from cortado.errors import DivergedError
-from cortado.gradients import AdjointSmoothing, Estimate, Exact, Policy, Smoothed, VelocityOnly
+from cortado.gradients import AdjointViscosity, Estimate, Exact, FrozenGeometry, GradientEstimator, RandomizedSmoothing
 from cortado.parameters.values import Arrays
 from cortado.problem import Problem
 
@@ -14,15 +14,15 @@ MOST_NUMBERS = 12
 SAMPLES = 2
 ALIKE = 0.5
 """Cosine below which a gradient does not point the way."""
-POLICIES: tuple[Policy, ...] = (Exact(), AdjointSmoothing(), VelocityOnly())
+ESTIMATORS: tuple[GradientEstimator, ...] = (Exact(), AdjointViscosity(), FrozenGeometry())
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A policy's gradient beside the smoothed one, every number in units of its meaningful change."""
+    """An estimator's gradient beside the smoothed one, every number in units of its meaningful change."""
 
-    policy: str
-    """As it is written in Python, after ``policies.``"""
+    estimator: str
+    """As it is written in Python, after ``estimators.``"""
     cosine: float
     size: float
     """Over that of the smoothed gradient."""
@@ -39,13 +39,13 @@ class Agreement:
 
     noise: float
     """Standard error of the smoothed gradient, relative."""
-    policies: tuple[Judged, ...]
+    estimators: tuple[Judged, ...]
     """`Exact` comes first."""
 
     @property
     def best(self) -> Judged | None:
-        """The policy, other than `Exact`, of the greatest merit among those that point the way, if any does."""
-        good = [judged for judged in self.policies[1:] if judged.cosine > ALIKE]
+        """The estimator, other than `Exact`, of the greatest merit among those that point the way, if any does."""
+        good = [judged for judged in self.estimators[1:] if judged.cosine > ALIKE]
         return max(good, key=lambda judged: judged.merit, default=None)
 
 
@@ -56,7 +56,7 @@ def agreement(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) ->
         return None
     spread = {name: float(size.mean()) for name, size in sizes.items()}
     try:
-        smoothed = Smoothed(spread, SAMPLES).estimate(problem, values)
+        smoothed = RandomizedSmoothing(spread, SAMPLES).estimate(problem, values)
     except DivergedError:
         return None
 
@@ -66,18 +66,18 @@ def agreement(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) ->
     reference, error = numbers(smoothed.gradient), numbers(smoothed.standard_error or {})
     length = float(np.linalg.norm(reference))
 
-    def judged(policy: Policy) -> Judged:
-        found = Estimate(0.0, exact) if policy == Exact() else problem.estimate(values, policy)
+    def judged(estimator: GradientEstimator) -> Judged:
+        found = Estimate(0.0, exact) if estimator == Exact() else problem.estimate(values, estimator)
         gradient = numbers(found.gradient)
         size = float(np.linalg.norm(gradient))
         cosine = float(gradient @ reference) / (size * length) if 0.0 < size < np.inf else 0.0
-        return Judged(_written(policy, found), cosine, size / length)
+        return Judged(_written(estimator, found), cosine, size / length)
 
     if not length > 0.0:
         return None
-    return Agreement(float(np.linalg.norm(error)) / length, tuple(map(judged, POLICIES)))
+    return Agreement(float(np.linalg.norm(error)) / length, tuple(map(judged, ESTIMATORS)))
 
 
-def _written(policy: Policy, found: Estimate) -> str:
+def _written(estimator: GradientEstimator, found: Estimate) -> str:
     inside = f"strength={found.strength:g}" if found.strength is not None else ""
-    return f"{type(policy).__name__}({inside})"
+    return f"{type(estimator).__name__}({inside})"

@@ -12,7 +12,7 @@ from cortado.certificate.changes import CHANGE, coherent_directions, directions,
 from cortado.certificate.course import Course
 from cortado.certificate.horizon import Horizon, horizon
 from cortado.certificate.rightness import Comparison, balanced, compare
-from cortado.certificate.text import agreement_words, horizon_table, parameter_table, policy_table
+from cortado.certificate.text import agreement_words, gradient_table, horizon_table, parameter_table
 from cortado.certificate.twin import in_float64
 from cortado.errors import InputError, shown
 from cortado.gradients import AdjointNorms
@@ -54,7 +54,7 @@ class Certificate:
     def __repr__(self) -> str:
         verdict = f"right, horizon {self.horizon}" if self.right else f"WRONG for {', '.join(self.wrong)}"
         size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}"
-        return f"Certificate({size}, {verdict}, use policies.{self.policy})"
+        return f"Certificate({size}, {verdict}, use estimators.{self.estimator})"
 
     def __str__(self) -> str:
         """As tables and sentences."""
@@ -66,9 +66,9 @@ class Certificate:
             f"The adjoint is right: {agreement_words(self.comparison)}.",
             f"The adjoint of a state grows by e^{self.growth:.4f} a step.",
             horizon_table(self.horizons),
-            *([] if self.agreement is None else [policy_table(self.agreement)]),
+            *([] if self.agreement is None else [gradient_table(self.agreement)]),
             f"Up to step {self.horizon} of {self.steps} the exact gradient means something. For {self.steps} steps use "
-            f"policies.{self.policy}.",
+            f"estimators.{self.estimator}.",
         ]
         return "\n".join(lines)
 
@@ -86,16 +86,16 @@ class Certificate:
         return min((one.measured for one in self.horizons), default=0)
 
     @property
-    def policy(self) -> str:
+    def estimator(self) -> str:
         """Which to use for these parameters and that many steps, as it is written in Python."""
         if not self.right:
             return "Smoothed()"
         if all(one.lasts for one in self.horizons):
             return "Exact()"
         if self.agreement is None:
-            return "AdjointSmoothing()"
+            return "AdjointViscosity()"
         best = self.agreement.best
-        return "Smoothed()" if best is None else best.policy
+        return "Smoothed()" if best is None else best.estimator
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -103,7 +103,7 @@ class Certificate:
         found["comparison"] |= {"disagreement": c.disagreement, "miss": c.miss, "last_believed": c.last_believed}
         for one, made in zip(self.horizons, found["horizons"], strict=True):
             made |= {"measured": one.measured, "predicted": one.predicted}
-        found |= {"right": self.right, "horizon": self.horizon, "policy": self.policy}
+        found |= {"right": self.right, "horizon": self.horizon, "estimator": self.estimator}
         return _plain(found)
 
 
@@ -121,7 +121,7 @@ def certify(
     against its own differences to a tenth, which is what float32 allows.
 
     Whether the adjoint is right is asked of every parameter that the scene has. How long it means something, and which
-    policy to use beyond, of ``parameters``: values, or names of the scene's.
+    estimator to use beyond, of ``parameters``: values, or names of the scene's.
 
     Args:
         problem: one; or, with a number of ``steps``, a simulation, a scene or the path of its file: the loss is then

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from cortado.certificate.twin import Rounded
 from cortado.device.state import State
 from cortado.errors import DivergedError
-from cortado.losses import EndAdjoint, Frames, Loss, TrajectoryEnd
+from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint
 from cortado.losses.checked import as_loss
 from cortado.parameters.values import Arrays
 from cortado.problem import Problem
@@ -76,9 +76,7 @@ class Course:
         seen = found.min(axis=0)
         return float(np.median(seen[np.isfinite(seen)])) if np.isfinite(seen).any() else 0.0
 
-    def _beside(
-        self, parameters: Arrays, along: Arrays, h: float
-    ) -> Iterator[tuple[Loss, TrajectoryEnd, TrajectoryEnd]]:
+    def _beside(self, parameters: Arrays, along: Arrays, h: float) -> Iterator[tuple[Loss, Snapshot, Snapshot]]:
         """At every moment its loss, and the states a step of -h and of h away; none where a run diverges."""
         try:
             behind, ahead = (
@@ -108,16 +106,16 @@ class Course:
             strain.append(_strain(ends[step].positions, dots[step][0]))
         return Tangent(self._judged(ends), self._total(slopes), np.array(strain))
 
-    def _judged(self, ends: dict[int, TrajectoryEnd]) -> np.ndarray:
+    def _judged(self, ends: dict[int, Snapshot]) -> np.ndarray:
         return self._total([loss.value(ends[step]) for step, loss in self._losses.items()])
 
 
-def _values(loss: Loss, before: TrajectoryEnd, after: TrajectoryEnd) -> float:
+def _values(loss: Loss, before: Snapshot, after: Snapshot) -> float:
     """By how much the loss of the latter state is greater."""
     return loss.value(after) - loss.value(before)
 
 
-def _change(loss: Loss, before: TrajectoryEnd, after: TrajectoryEnd) -> float:
+def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
     """The same by the loss's adjoints: the mean of both times the distance of the states, which is exact to second
     order and has no round-off of the loss in it."""
     ends = (before, after)
@@ -127,16 +125,16 @@ def _change(loss: Loss, before: TrajectoryEnd, after: TrajectoryEnd) -> float:
     return 0.5 * sum(_product(bar, distance) + _of_colours(bar, colours) for bar in bars)
 
 
-def _product(bar: State | EndAdjoint | tuple[np.ndarray, ...], dot: tuple[np.ndarray, ...]) -> float:
+def _product(bar: State | SnapshotAdjoint | tuple[np.ndarray, ...], dot: tuple[np.ndarray, ...]) -> float:
     """The adjoint of a state times its tangent."""
-    if isinstance(bar, EndAdjoint):
+    if isinstance(bar, SnapshotAdjoint):
         return _product(bar.state, dot)
     arrays = bar.numpy(dot[0].shape[1]) if isinstance(bar, State) else bar
     return float(sum((a.astype(np.float64) * b).sum() for a, b in zip(arrays, dot, strict=False)))
 
 
 def _of_colours(bar: object, along: Arrays) -> float:
-    if isinstance(bar, EndAdjoint) and "colours" in along:
+    if isinstance(bar, SnapshotAdjoint) and "colours" in along:
         return float((bar.colours * along["colours"]).sum())
     return 0.0
 

@@ -16,16 +16,16 @@ if TYPE_CHECKING:
 
 
 def gradient_check(certificate: Certificate, path: str | Path) -> Path:
-    """Four panels: differences against the adjoint, the adjoint's growth, its horizon, and policies.
+    """Four panels: differences against the adjoint, the adjoint's growth, its horizon, and estimators.
 
     The horizon is shown for the parameter with the nearest. What a wrong adjoint leaves unasked stays empty.
     """
     with drawing(path, 12.0, 8.4) as figure:
-        (differences, growth), (horizon, policies) = figure.subplots(2, 2)
+        (differences, growth), (horizon, estimators) = figure.subplots(2, 2)
         _differences(differences, certificate)
         _growth(growth, certificate)
         _horizon(horizon, min(certificate.horizons, key=lambda one: one.measured, default=None))
-        _policies(policies, certificate.agreement)
+        _policies(estimators, certificate.agreement)
         verdict = "right" if certificate.right else "WRONG"
         figure.suptitle(
             f"The adjoint is {verdict}; {certificate.particles} particles, {certificate.steps} steps", weight="bold"
@@ -81,12 +81,12 @@ def _policies(axes: Any, agreement: Agreement | None) -> None:
     if agreement is None:
         _empty(axes, "no smoothed gradient to compare with")
         return
-    for k, judged in enumerate(agreement.policies):
+    for k, judged in enumerate(agreement.estimators):
         axes.barh(-k, judged.cosine, color=PALETTE[k], height=0.42)
-        axes.text(-1.0, -k + 0.25, f"{judged.policy}: {judged.cosine:.2f}, size x {judged.size:.2g}", va="bottom")
+        axes.text(-1.0, -k + 0.25, f"{judged.estimator}: {judged.cosine:.2f}, size x {judged.size:.2g}", va="bottom")
     axes.axvline(0.0, color=FAINT, linewidth=1.0)
     axes.set(title="Gradients against the smoothed one", xlabel="cosine", xlim=(-1.02, 1.02), yticks=[])
-    axes.set_ylim(0.6 - len(agreement.policies), 0.6)
+    axes.set_ylim(0.6 - len(agreement.estimators), 0.6)
 
 
 def _empty(axes: Any, words: str) -> None:

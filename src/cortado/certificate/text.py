@@ -44,11 +44,11 @@ def horizon_table(horizons: Sequence[Horizon]) -> str:
     return _table(["parameter", "predicted horizon", "measured horizon"], rows)
 
 
-def policy_table(agreement: Agreement) -> str:
+def gradient_table(agreement: Agreement) -> str:
     """How near each gradient is to that of the smoothed loss."""
-    rows = [[judged.policy, f"{judged.cosine:.3f}", f"{judged.size:.3g}"] for judged in agreement.policies]
+    rows = [[judged.estimator, f"{judged.cosine:.3f}", f"{judged.size:.3g}"] for judged in agreement.estimators]
     return (
-        f"{_table(['policy', 'cosine', 'size'], rows)}\n"
+        f"{_table(['estimator', 'cosine', 'size'], rows)}\n"
         f"to the gradient of the smoothed loss, whose own error is {agreement.noise:.0%}"
     )
 

@@ -7,11 +7,11 @@ from cortado.device.state import State
 from cortado.losses import (
     CentreOfMass,
     CentreOfMassAlong,
-    EndAdjoint,
     FinalPositions,
     Frames,
     Image,
-    TrajectoryEnd,
+    Snapshot,
+    SnapshotAdjoint,
 )
 from cortado.losses.checked import as_loss
 from cortado.losses.loss import Adjoint
@@ -57,20 +57,20 @@ class Rounded:
         """``single``: the simulation in float32 that the loss was made for."""
         self._loss, self._single = as_loss(loss), single
 
-    def value(self, end: TrajectoryEnd) -> float:
+    def value(self, end: Snapshot) -> float:
         return self._loss.value(self._rounded(end))
 
-    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
         value, bar = self._loss.value_and_adjoint(self._rounded(end))
         if isinstance(bar, State):
             return value, bar.numpy(end.dimension)
-        if isinstance(bar, EndAdjoint):
+        if isinstance(bar, SnapshotAdjoint):
             state = end.state.like()
             state.set(*bar.state.numpy(end.dimension))
-            return value, EndAdjoint(state, bar.colours)
+            return value, SnapshotAdjoint(state, bar.colours)
         return value, bar
 
-    def _rounded(self, end: TrajectoryEnd) -> TrajectoryEnd:
+    def _rounded(self, end: Snapshot) -> Snapshot:
         state = self._single.solver.new_state()
         state.set(end.positions, end.velocities, end.mass_fractions)
-        return TrajectoryEnd(state, end.dimension, end.colours)
+        return Snapshot(state, end.dimension, end.colours)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cortado.errors import ComputationError, DivergedError
-from cortado.gradients import Policy, tuned
+from cortado.gradients import GradientEstimator, tuned
 from cortado.inverse.figures import task_figures
 from cortado.inverse.setup import Assignment, assignment
 from cortado.inverse.task import Task, load_task
@@ -82,7 +82,7 @@ def _kept(folder: RunFolder) -> str:
 def _solved(made: Assignment, folder: RunFolder, resume: bool) -> str:
     """Search, judge, and write what came out; returns the sentence about it."""
     try:
-        result, policy = _search(made, folder, resume)
+        result, estimator = _search(made, folder, resume)
     except DivergedError as error:
         evaluations = len(folder.read_metrics())
         write_report(folder, made.task.scene.name, [("ended early", error), ("evaluations", evaluations)], [])
@@ -97,7 +97,7 @@ def _solved(made: Assignment, folder: RunFolder, resume: bool) -> str:
     first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
     verdict = judge(made.task, result, found, noise, first)
     figures = task_figures(made, result, folder.figures)
-    write_report(folder, made.task.scene.name, _rows(made, found, result, verdict, policy), figures)
+    write_report(folder, made.task.scene.name, _rows(made, found, result, verdict, estimator), figures)
     if verdict.failures:
         raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
     return f"{_summary(made, result, verdict)} The results are in {folder.path}; open report.html."
@@ -138,8 +138,8 @@ def _distance(found: ArrayLike, hidden: ArrayLike) -> float:
     return float(np.linalg.norm(found - hidden) / (np.linalg.norm(hidden) or 1.0))
 
 
-def _search(made: Assignment, folder: RunFolder, resume: bool) -> tuple[Result, Policy]:
-    """What came out, and the policy of the last search as it was tuned."""
+def _search(made: Assignment, folder: RunFolder, resume: bool) -> tuple[Result, GradientEstimator]:
+    """What came out, and the estimator of the last search as it was tuned."""
     settings = made.task.optimise
     known = len(folder.read_metrics()) if resume else 0
     history: list[Record] = []
@@ -154,20 +154,20 @@ def _search(made: Assignment, folder: RunFolder, resume: bool) -> tuple[Result, 
             advance(loss=record.loss)
 
         for k, search in enumerate(made.searches):
-            policy = tuned(settings.policy.policy(), search, start)
+            estimator = tuned(settings.gradient.estimator(), search, start)
             result = optimise(
                 search,
                 start,
                 settings.algorithm(),
                 settings.iterations,
                 bounds=made.bounds,
-                policy=policy,
+                gradient=estimator,
                 checkpoint=folder.checkpoint / str(k) if k else folder.checkpoint,
                 resume=resume,
                 on_iteration=note,
             )
             start = result.last_parameters
-    return replace(result, history=tuple(history), evaluations=len(history)), policy
+    return replace(result, history=tuple(history), evaluations=len(history)), estimator
 
 
 def _summary(made: Assignment, result: Result, verdict: Verdict) -> str:
@@ -179,11 +179,13 @@ def _summary(made: Assignment, result: Result, verdict: Verdict) -> str:
     return f"{'; '.join([text, ', '.join(reached)]) if reached else text}."
 
 
-def _rows(made: Assignment, found: dict[str, np.ndarray], result: Result, verdict: Verdict, policy: Policy) -> Rows:
+def _rows(
+    made: Assignment, found: dict[str, np.ndarray], result: Result, verdict: Verdict, estimator: GradientEstimator
+) -> Rows:
     rows: Rows = [
         ("particles", made.problem.simulation.particles),
         ("steps", made.problem.steps),
-        ("gradients", repr(policy)),
+        ("gradients", repr(estimator)),
         ("evaluations", len(result.history)),
         ("first loss", f"{verdict.first:.4g}"),
         ("best loss", f"{result.loss:.4g}"),

@@ -58,7 +58,7 @@ def launch(kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, **argum
     wp.launch(kernel, threads, inputs=bound(kernel, groups, arguments), device=device, record_tape=False)
 
 
-class Launcher:
+class KernelLauncher:
     """Launches kernels with one thread a particle on one device, with arguments by name (see `bound`).
 
     On a CPU Warp launches in one thread; a kernel that sums over neighbours, which begins with its surroundings, is cut
@@ -120,23 +120,23 @@ class Launcher:
         for helper in begun:
             helper.result()
 
-    def _part(self, surroundings: Any, number: int) -> Any:
+    def _part(self, neighbourhood: Any, number: int) -> Any:
         """The surroundings as one range sees them."""
-        part = surroundings._cls()
-        for name in surroundings._cls.vars:
-            setattr(part, name, getattr(surroundings, name))
+        part = neighbourhood._cls()
+        for name in neighbourhood._cls.vars:
+            setattr(part, name, getattr(neighbourhood, name))
         part.first, part.part = self._bounds[number], number
         return part
 
 
-class Replayed:
+class CapturedGraph:
     """Work that is done over and over with the same arrays: a captured graph from the second time on.
 
     The first time loads modules and allocates what a capture must not. On a CPU a graph saves the packing of arguments:
     half of the time with a hundred particles.
     """
 
-    def __init__(self, work: Callable[[], None], launch: Launcher):
+    def __init__(self, work: Callable[[], None], launch: KernelLauncher):
         self._work, self._launch = work, launch
         self._warm, self._graph = False, None
 
@@ -153,7 +153,7 @@ class Replayed:
             wp.capture_launch(self._graph)
 
 
-class TreeSum:
+class TreeReduction:
     """Adds one value of each particle on the device, in the same order every time."""
 
     def __init__(self, kernel: Any, dtype: Any, particles: int, device: Any):
@@ -173,14 +173,14 @@ class TreeSum:
         return values
 
 
-def sum_of(dtype: Any, particles: int, device: Any) -> TreeSum:
+def sum_of(dtype: Any, particles: int, device: Any) -> TreeReduction:
     """Sums of (n,) numbers, vectors or matrices of a Warp type."""
-    return TreeSum(sum_kernel(dtype), dtype, particles, device)
+    return TreeReduction(sum_kernel(dtype), dtype, particles, device)
 
 
-def sum_and_maximum(particles: int, precision: Precision, device: Any) -> TreeSum:
+def sum_and_maximum(particles: int, precision: Precision, device: Any) -> TreeReduction:
     """Sums of first and maxima of second components of pairs (n,)."""
-    return TreeSum(sum_and_maximum_kernel(precision), precision.pair, particles, device)
+    return TreeReduction(sum_and_maximum_kernel(precision), precision.pair, particles, device)
 
 
 def add(values: wp.array, total: wp.array) -> None:

@@ -32,11 +32,11 @@ class Discretisation:
 
 
 @cache
-def surroundings_type(precision: Precision) -> Any:
+def neighbourhood_type(precision: Precision) -> Any:
     """The Warp struct of one precision; arrays are sorted by cell, lists are [neighbour, particle]."""
     real, vector = precision.real, precision.vector
 
-    class Surroundings:
+    class Neighbourhood:
         first: wp.int32
         """Particle of a launch's first thread: a launch may be cut into ranges of particles."""
         part: wp.int32
@@ -60,10 +60,10 @@ def surroundings_type(precision: Precision) -> Any:
         """sigma of the kernel [1 / m^d]."""
         self_weight: real
         """W(0) [1 / m^d]."""
-        pliancy: real
+        response_scale: real
         """(sum_j G_j . G_j)^(-1/2) of a filled neighbourhood [m^(d + 1)], for the relaxation beside walls."""
-        evenness: real
-        """What second derivatives are multiplied with [-], see `cortado.lattice.calibration.laplacian_evenness`."""
+        laplacian_correction: real
+        """What second derivatives are multiplied with [-], see `cortado.lattice.calibration`."""
         volume: real
         """Volume V of a particle on the rest lattice [m^d]: with it that lattice has the rest density."""
         periodic: wp.int32
@@ -72,9 +72,9 @@ def surroundings_type(precision: Precision) -> Any:
         frequency: vector
         """1 / period [1 / m], or 0."""
 
-    Surroundings.__qualname__ = f"Surroundings_{precision.name}"
-    Surroundings.__name__ = Surroundings.__qualname__
-    return wp.struct(Surroundings)
+    Neighbourhood.__qualname__ = f"Surroundings_{precision.name}"
+    Neighbourhood.__name__ = Neighbourhood.__qualname__
+    return wp.struct(Neighbourhood)
 
 
 @cache
@@ -88,7 +88,7 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
     loads do not wait for one another (on a GPU a tenth of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     smooth = smoothing_functions(discretisation.smoothing, discretisation.precision)
     smooth_weight, smooth_gradient = smooth.weight, smooth.gradient
     smooth_hessian_product = smooth.hessian_product
@@ -96,7 +96,7 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
     row = wp.types.vector(length=UNROLL, dtype=real)
 
     @wp.func
-    def separation(x_i: vector, x_j: vector, s: surroundings) -> vector:
+    def separation(x_i: vector, x_j: vector, s: neighbourhood) -> vector:
         """x_i - x_j, of the nearest image."""
         x_ij = x_i - x_j
         if s.periodic != 0:
@@ -109,39 +109,39 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
         return x_ij
 
     @wp.func
-    def weight(x: vector, s: surroundings) -> real:
+    def weight(x: vector, s: neighbourhood) -> real:
         return smooth_weight(x, s.support, s.normalisation)
 
     @wp.func
-    def gradient(x: vector, s: surroundings) -> vector:
+    def gradient(x: vector, s: neighbourhood) -> vector:
         return smooth_gradient(x, s.support, s.normalisation)
 
     @wp.func
-    def hessian_product(x: vector, u: vector, s: surroundings) -> vector:
+    def hessian_product(x: vector, u: vector, s: neighbourhood) -> vector:
         return smooth_hessian_product(x, u, s.support, s.normalisation)
 
     @wp.func
-    def size(x: vector, s: surroundings) -> real:
+    def size(x: vector, s: neighbourhood) -> real:
         return wp.dot(x, x) + real(0.01) * s.support * s.support
 
     @wp.func
-    def factor(x: vector, s: surroundings) -> real:
-        return s.evenness * wp.dot(x, gradient(x, s)) / size(x, s)
+    def factor(x: vector, s: neighbourhood) -> real:
+        return s.laplacian_correction * wp.dot(x, gradient(x, s)) / size(x, s)
 
     @wp.func
-    def factor_gradient(x: vector, s: surroundings) -> vector:
+    def factor_gradient(x: vector, s: neighbourhood) -> vector:
         d = size(x, s)
         g = gradient(x, s)
-        return (s.evenness / d) * (g + hessian_product(x, x, s) - (real(2.0) * wp.dot(x, g) / d) * x)
+        return (s.laplacian_correction / d) * (g + hessian_product(x, x, s) - (real(2.0) * wp.dot(x, g) / d) * x)
 
     @wp.func
-    def vectors(a: wp.array(dtype=vector), k: int, i: int, s: surroundings) -> rows:
+    def vectors(a: wp.array(dtype=vector), k: int, i: int, s: neighbourhood) -> rows:
         return wp.matrix_from_rows(
             a[s.neighbours[k, i]], a[s.neighbours[k + 1, i]], a[s.neighbours[k + 2, i]], a[s.neighbours[k + 3, i]]
         )
 
     @wp.func
-    def numbers(a: wp.array(dtype=real), k: int, i: int, s: surroundings) -> row:
+    def numbers(a: wp.array(dtype=real), k: int, i: int, s: neighbourhood) -> row:
         return row(
             a[s.neighbours[k, i]], a[s.neighbours[k + 1, i]], a[s.neighbours[k + 2, i]], a[s.neighbours[k + 3, i]]
         )

@@ -15,8 +15,8 @@ import numpy as np
 import warp as wp
 
 from cortado.device.cells import CellSort, Grid, cell_functions, cell_grid_type
-from cortado.device.launching import MOST_PARTS, Launcher
-from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.device.launching import MOST_PARTS, KernelLauncher
+from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 
 @cache
@@ -24,7 +24,7 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
     precision = discretisation.precision
     vector = precision.vector
     grid_type = cell_grid_type(precision)
-    surroundings = surroundings_type(precision)
+    neighbourhood = neighbourhood_type(precision)
     cells = cell_functions(precision)
     wrap, cell_of, below, above = cells.wrap, cells.cell_of, cells.below, cells.above
     separation = pair_functions(discretisation).separation
@@ -38,7 +38,7 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
         found: int,
         x_i: vector,
         positions: wp.array(dtype=vector),
-        s: surroundings,
+        s: neighbourhood,
     ) -> int:
         """Append the particles first ... last - 1 that lie within reach; ``own`` is left out."""
         capacity = s.neighbours.shape[0]
@@ -62,7 +62,7 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
         x_i: vector,
         positions: wp.array(dtype=vector),
         grid: grid_type,
-        s: surroundings,
+        s: neighbourhood,
     ) -> int:
         """The cells c_x - 1, c_x, c_x + 1 of one row; away from the ends of the row they are one range."""
         n = grid.shape[0]
@@ -77,7 +77,7 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
 
     @wp.kernel(module=discretisation.module(False, "neighbours"), enable_backward=False)
     def fill(
-        s: surroundings,
+        s: neighbourhood,
         grid: grid_type,
         wall_grid: grid_type,
         x: wp.array(dtype=vector),
@@ -143,7 +143,7 @@ class NeighbourSearch:
         self.fluid_count = wp.zeros(particles, dtype=wp.int32, device=device)
         self.filling = wp.zeros(particles, dtype=wp.int32, device=device)
         self.count = wp.zeros(particles, dtype=wp.int32, device=device)
-        self._launch = Launcher(particles, device, record_tape=False)
+        self._launch = KernelLauncher(particles, device, record_tape=False)
         self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
         self.wall_positions = wp.array(walls, dtype=precision.vector, device=device)
         self.wall_weights = wp.array(wall_weights, dtype=precision.real, device=device)
@@ -167,11 +167,11 @@ class NeighbourSearch:
         """Find the order of cells (``order``: sorted -> given) of positions (n,) [m]; ties keep the given order."""
         self._sort(positions)
 
-    def fill(self, surroundings: Any, positions: wp.array) -> None:
+    def fill(self, neighbourhood: Any, positions: wp.array) -> None:
         """List the neighbours of sorted positions (n,) [m]; `needed` tells whether the lists were long enough."""
         self._launch(
             self._fill,
-            s=surroundings,
+            s=neighbourhood,
             grid=self._sort.grid,
             wall_grid=self._wall_sort.grid,
             x=positions,

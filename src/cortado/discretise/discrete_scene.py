@@ -14,10 +14,10 @@ from cortado.discretise.walls.layers import WallLayers, wall_layers
 from cortado.discretise.walls.weights import RestLattice, Surface
 from cortado.errors import CortadoWarning, InputError
 from cortado.lattice.calibration import (
-    laplacian_evenness,
+    lattice_laplacian_correction,
     pressure_stiffness,
     rest_volume,
-    wall_rigidity,
+    wall_response,
 )
 from cortado.lattice.pairs import pairs_within
 from cortado.lattice.region import Region
@@ -52,10 +52,10 @@ class Lattice:
     """Rest volume V_0 of a particle [m^d]."""
     stiffness: float
     """k [m2]: delta = k / dt^2 [Pa m3 / kg] (report eq. 7, put right) for a filled neighbourhood."""
-    rigidity: float
+    response: float
     """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of the yield, see `cortado.solvers.pcisph.wall_relaxation`."""
-    evenness: float
-    """[-], see `cortado.lattice.calibration.laplacian_evenness`."""
+    laplacian_correction: float
+    """[-], see `cortado.lattice.calibration.lattice_laplacian_correction`."""
 
     @classmethod
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "Lattice":
@@ -66,8 +66,8 @@ class Lattice:
             self_weight=float(kernel.weight(np.zeros(1), dimension, support)[0]),
             volume=rest_volume(kernel, spacing, support, dimension),
             stiffness=pressure_stiffness(kernel, spacing, support, dimension),
-            rigidity=wall_rigidity(kernel, spacing, support, dimension),
-            evenness=laplacian_evenness(kernel, spacing, support, dimension),
+            response=wall_response(kernel, spacing, support, dimension),
+            laplacian_correction=lattice_laplacian_correction(kernel, spacing, support, dimension),
         )
 
 

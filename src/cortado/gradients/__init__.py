@@ -1,32 +1,40 @@
 """How a gradient is come by: objects to be given to `Problem.value_and_gradient`, each with its formula, bias and cost.
 
 `Exact` is the derivative of the discrete map, `Tape` the same by other means. Where neighbouring trajectories separate
-it says less and less, and others take its place: `AdjointSmoothing`, `VelocityOnly`, `Damped`, or the mean of theirs
-over a cloud, `Averaged`. `Smoothed`, from forward runs alone, is what they are measured by.
+it says less and less, and others take its place: `AdjointViscosity`, `FrozenGeometry`, `Damped`, or the mean of theirs
+over a cloud, `EnsembleMean`. `RandomizedSmoothing`, from forward runs alone, is what they are measured by.
 """
 
 from cortado.gradients.adjoint_filters import AdjointNorms
-from cortado.gradients.ensemble import Averaged, Smoothed
-from cortado.gradients.estimator import AdjointPolicy, Differentiable, Estimate, Passage, Policy, checked_policy, tuned
-from cortado.gradients.exact import Exact, Tape, VelocityOnly
-from cortado.gradients.filters import AdjointSmoothing, Damped
+from cortado.gradients.ensemble import EnsembleMean, RandomizedSmoothing
+from cortado.gradients.estimator import (
+    AdjointEstimator,
+    Differentiable,
+    Estimate,
+    ForwardPass,
+    GradientEstimator,
+    checked_estimator,
+    tuned,
+)
+from cortado.gradients.exact import Exact, FrozenGeometry, Tape
+from cortado.gradients.filters import AdjointViscosity, Damped
 from cortado.parameters.values import Values
 from cortado.rollout import Observer
 
 __all__ = [
+    "AdjointEstimator",
     "AdjointNorms",
-    "AdjointPolicy",
-    "AdjointSmoothing",
-    "Averaged",
+    "AdjointViscosity",
     "Damped",
     "Differentiable",
+    "EnsembleMean",
     "Estimate",
     "Exact",
-    "Passage",
-    "Policy",
-    "Smoothed",
+    "ForwardPass",
+    "FrozenGeometry",
+    "GradientEstimator",
+    "RandomizedSmoothing",
     "Tape",
-    "VelocityOnly",
     "estimate",
     "tuned",
 ]
@@ -37,7 +45,10 @@ def __dir__() -> list[str]:
 
 
 def estimate(
-    problem: Differentiable, parameters: Values, policy: Policy | None = None, observe: Observer | None = None
+    problem: Differentiable,
+    parameters: Values,
+    estimator: GradientEstimator | None = None,
+    observe: Observer | None = None,
 ) -> Estimate:
-    """What a policy, `Exact` if none is given, has to say of a problem, or an `InputError` where it is none."""
-    return checked_policy(Exact() if policy is None else policy).estimate(problem, parameters, observe)
+    """What an estimator, `Exact` if none is given, has to say of a problem, or an `InputError` where it is none."""
+    return checked_estimator(Exact() if estimator is None else estimator).estimate(problem, parameters, observe)

@@ -8,18 +8,18 @@ import numpy as np
 
 from cortado.errors import InputError, shown
 from cortado.gradients.ensemble_members import Cloud
-from cortado.gradients.estimator import Differentiable, Estimate, Policy, checked_policy, tuned
-from cortado.gradients.filters import AdjointSmoothing
+from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator, checked_estimator, tuned
+from cortado.gradients.filters import AdjointViscosity
 from cortado.parameters.values import Arrays, Values
 from cortado.rollout import Observer
 
-SMOOTHING = AdjointSmoothing(order=2)
+SMOOTHING = AdjointViscosity(order=2)
 MOST_NUMBERS = 64
 """Numbers that differences may be taken along: each costs two runs a sample."""
 
 
 @dataclass(frozen=True)
-class Smoothed(Cloud):
+class RandomizedSmoothing(Cloud):
     """Central differences, averaged over a cloud of parameters and first states: the reference beyond chaos.
 
     Formula: for parameters u of N numbers, each in units of its spread h,
@@ -40,7 +40,7 @@ class Smoothed(Cloud):
         if numbers > MOST_NUMBERS:
             raise InputError(
                 f"the parameters are {numbers} numbers, but must be {MOST_NUMBERS} at most, as Smoothed runs the "
-                "simulation twice for each: take fewer, such as one gravity for all steps, or another policy."
+                "simulation twice for each: take fewer, such as one gravity for all steps, or another estimator."
             )
         found, r = np.zeros((self.samples, numbers)), np.sqrt(numbers)
         for sample in found:
@@ -53,33 +53,33 @@ class Smoothed(Cloud):
 
 
 @dataclass(frozen=True)
-class Averaged(Cloud):
-    """Gradients of another policy, averaged over a cloud of parameters and first states: an ensemble mean.
+class EnsembleMean(Cloud):
+    """Gradients of another estimator, averaged over a cloud of parameters and first states: an ensemble mean.
 
-    Formula: g = mean over points of the cloud of the policy's gradient there. It is the gradient of the loss that
-    `Smoothed` differentiates, as far as the policy's are right, for any number of parameters. Of `Exact` gradients
-    beyond chaos the mean is useless, as few of them drown the rest.
+    Formula: g = mean over points of the cloud of the estimator's gradient there. It is the gradient of the loss that
+    `RandomizedSmoothing` differentiates, as far as the estimator's are right, for any number of parameters. Of `Exact`
+    gradients beyond chaos the mean is useless, as few of them drown the rest.
 
-    Bias: that of the policy; the perturbed first positions' part of the loss, where that is small; noise, which
-    `Estimate`'s ``standard_error`` tells. Cost: ``samples`` times that of the policy, and a forward run.
+    Bias: that of the estimator; the perturbed first positions' part of the loss, where that is small; noise, which
+    `Estimate`'s ``standard_error`` tells. Cost: ``samples`` times that of the estimator, and a forward run.
     """
 
     samples: int = 4
     """An even number, as points come in pairs of opposite ones."""
-    policy: Policy = SMOOTHING
-    """Whose gradients are averaged. The strength of an `AdjointSmoothing` is found once, at the parameters."""
+    estimator: GradientEstimator = SMOOTHING
+    """Whose gradients are averaged. The strength of an `AdjointViscosity` is found once, at the parameters."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.samples % 2 or self.samples < 4:
             raise InputError(f"samples is {shown(self.samples)}, but must be an even number of at least 4.")
-        checked_policy(self.policy)
+        checked_estimator(self.estimator)
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         """``observe`` is given the adjoints of one point after the other."""
         cloud = self.around(problem, parameters)
-        loss, policy = problem.value(cloud.values), tuned(self.policy, problem, cloud.values)
-        made = partial(policy.estimate, problem, observe=observe)
+        loss, estimator = problem.value(cloud.values), tuned(self.estimator, problem, cloud.values)
+        made = partial(estimator.estimate, problem, observe=observe)
         pairs = []
         for _ in range(self.samples // 2):
             u, displacement = cloud.offset(), cloud.displacement()
@@ -88,9 +88,9 @@ class Averaged(Cloud):
         gradient, error = (cloud.named(one) for one in _mean_and_error(np.array(means)))
         return Estimate(loss, gradient, pairs[-1][-1].strength, error)
 
-    def tuned(self, problem: Differentiable, parameters: Values) -> "Averaged":
-        """The same with a policy that is tuned here."""
-        return replace(self, policy=tuned(self.policy, problem, parameters))
+    def tuned(self, problem: Differentiable, parameters: Values) -> "EnsembleMean":
+        """The same with an estimator that is tuned here."""
+        return replace(self, estimator=tuned(self.estimator, problem, parameters))
 
 
 def _mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

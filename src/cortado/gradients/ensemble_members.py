@@ -93,7 +93,7 @@ class Sampler:
         try:
             return made(values)
         except InputError as error:
-            advice = "Take a smaller spread, or a logarithm (cortado.optimisation.reparametrisation)."
+            advice = "Take a smaller spread, or a logarithm (cortado.optimisation.transforms)."
             raise InputError(f"A sample of the cloud does not fit: {error} {advice}") from error
 
     def named(self, numbers: np.ndarray) -> Arrays:

@@ -1,4 +1,4 @@
-"""What a policy is: a way to come by a gradient, given to `Problem.value_and_gradient`."""
+"""What an estimator is: a way to come by a gradient, given to `Problem.value_and_gradient`."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from cortado.words import sized
 
 @dataclass(frozen=True)
 class Estimate:
-    """A loss and its gradient, with what a policy has to say about it."""
+    """A loss and its gradient, with what an estimator has to say about it."""
 
     loss: float
     gradient: Arrays
     """For each parameter given, an array of its shape (float64)."""
     strength: float | None = None
-    """Of the smoothing that `AdjointSmoothing` applied, the weakest of those that were extrapolated."""
+    """Of the smoothing that `AdjointViscosity` applied, the weakest of those that were extrapolated."""
     standard_error: Arrays | None = None
-    """Of every number of the gradient, where it is an average (`Smoothed`, `Averaged`)."""
+    """Of every number of the gradient, where it is an average (`RandomizedSmoothing`, `EnsembleMean`)."""
 
     def __repr__(self) -> str:
         strength = "" if self.strength is None else f", strength {self.strength:.4g}"
@@ -30,7 +30,7 @@ class Estimate:
         return f"Estimate(loss {self.loss:.6g}, gradient of {sized(self.gradient)}{strength}{error})"
 
 
-class Passage(Protocol):
+class ForwardPass(Protocol):
     """A forward run with its loss, which can be gone back through as often as wanted, until the problem's next run."""
 
     @property
@@ -41,68 +41,68 @@ class Passage(Protocol):
     def rollout(self) -> Rollout:
         """The run."""
 
-    def derivative(self, policy: "AdjointPolicy") -> StepDerivative:
-        """The policy's backward step, made once for each problem."""
+    def derivative(self, estimator: "AdjointEstimator") -> StepDerivative:
+        """The estimator's backward step, made once for each problem."""
 
     def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:
         """The gradient; ``observe`` is given the number and the adjoint of every state, from the last to the first."""
 
 
 class Differentiable(Protocol):
-    """What a policy sees of a `Problem`."""
+    """What an estimator sees of a `Problem`."""
 
     simulation: Any
 
     def value(self, parameters: Values) -> float:
         """The loss, forward only."""
 
-    def passage(self, parameters: Values) -> Passage:
+    def forward_pass(self, parameters: Values) -> ForwardPass:
         """A forward run that can be gone back through."""
 
 
-class Policy(Protocol):
+class GradientEstimator(Protocol):
     """A way to come by a gradient."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """The loss and its gradient; ``observe`` is given the adjoint of every state, by policies that have any."""
+        """The loss and its gradient; ``observe`` is given the adjoint of every state, by estimators that have any."""
 
 
-def checked_policy(policy: Policy) -> Policy:
-    """The policy, if it is one: its class is not."""
-    if isinstance(policy, type) or not hasattr(policy, "estimate"):
-        raise InputError(f"policy is {policy!r}, but must be an object such as cortado.gradients.Exact().")
-    return policy
+def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
+    """The estimator, if it is one: its class is not."""
+    if isinstance(estimator, type) or not hasattr(estimator, "estimate"):
+        raise InputError(f"estimator is {estimator!r}, but must be an object such as cortado.gradients.Exact().")
+    return estimator
 
 
 @runtime_checkable
 class Tunable(Protocol):
-    """A policy that finds something out before it makes a gradient."""
+    """An estimator that finds something out before it makes a gradient."""
 
-    def tuned(self, problem: Differentiable, parameters: Values) -> Policy:
+    def tuned(self, problem: Differentiable, parameters: Values) -> GradientEstimator:
         """The same with what it finds out here, for use at parameters nearby."""
 
 
-def tuned(policy: Policy, problem: Differentiable, parameters: Values) -> Policy:
-    """The policy with what there is to find out found out, so that a search does so once."""
-    checked_policy(policy)
-    return policy.tuned(problem, parameters) if isinstance(policy, Tunable) else policy
+def tuned(estimator: GradientEstimator, problem: Differentiable, parameters: Values) -> GradientEstimator:
+    """The estimator with what there is to find out found out, so that a search does so once."""
+    checked_estimator(estimator)
+    return estimator.tuned(problem, parameters) if isinstance(estimator, Tunable) else estimator
 
 
-class AdjointPolicy(ABC):
-    """A policy that goes back once through one rollout, step by step."""
+class AdjointEstimator(ABC):
+    """An estimator that goes back once through one rollout, step by step."""
 
     @abstractmethod
     def derivative(self, rollout: Rollout) -> StepDerivative:
         """The backward step for one rollout."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """See `Policy`."""
-        passage = problem.passage(parameters)
-        return Estimate(passage.loss, passage.back(passage.derivative(self), observe))
+        """See `GradientEstimator`."""
+        forward_pass = problem.forward_pass(parameters)
+        return Estimate(forward_pass.loss, forward_pass.back(forward_pass.derivative(self), observe))
 
 
 class Filtered:
-    """The backward step of another policy, and then a filter of the adjoint."""
+    """The backward step of another estimator, and then a filter of the adjoint."""
 
     def __init__(self, base: StepDerivative):
         self._base, self.solver, self.capturable = base, base.solver, base.capturable

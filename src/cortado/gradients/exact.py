@@ -1,4 +1,4 @@
-"""Policies that differentiate the discrete step as it is, or as if positions were frozen within it."""
+"""Estimators that differentiate the discrete step as it is, or as if positions were frozen within it."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,13 +6,13 @@ from typing import Any
 import warp as wp
 
 from cortado.device.state import Parameters, State
-from cortado.gradients.estimator import AdjointPolicy
+from cortado.gradients.estimator import AdjointEstimator
 from cortado.rollout import Rollout, StepDerivative
 from cortado.solvers.solver import Counts
 
 
 @dataclass(frozen=True)
-class Exact(AdjointPolicy):
+class Exact(AdjointEstimator):
     """The exact adjoint of the discrete step, by gathers: no atomics, the same bits every time.
 
     Formula: the transposed derivative of the step. Bias: none; but where neighbouring trajectories separate it grows as
@@ -25,7 +25,7 @@ class Exact(AdjointPolicy):
 
 
 @dataclass(frozen=True)
-class VelocityOnly(AdjointPolicy):
+class FrozenGeometry(AdjointEstimator):
     """The adjoint of a step in which no force depends on positions.
 
     Formula: for a new state with adjoints x^ and v^,
@@ -45,7 +45,7 @@ class VelocityOnly(AdjointPolicy):
 
 
 @dataclass(frozen=True)
-class Tape(AdjointPolicy):
+class Tape(AdjointEstimator):
     """The exact adjoint again, by Warp's own automatic differentiation of the forward kernels.
 
     The report's autograd: slower than `Exact`, with atomics on a GPU, and kept to check it.

@@ -16,7 +16,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class FilterKernels:
 def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
     """The kernels for a smoothing kernel and a precision."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, weight, vectors, numbers = pair.separation, pair.weight, pair.vectors, pair.numbers
     module = discretisation.module(False, "adjoint_filters")
 
     @wp.kernel(module=module, enable_backward=False)
     def crowd(
-        s: surroundings,
+        s: neighbourhood,
         x: wp.array(dtype=vector),
         # out
         most: wp.array(dtype=real),
@@ -59,7 +59,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
 
     @wp.kernel(module=module, enable_backward=False)
     def average(
-        s: surroundings,
+        s: neighbourhood,
         order: wp.array(dtype=wp.int32),
         strength: wp.array(dtype=real),
         x: wp.array(dtype=vector),

@@ -1,4 +1,4 @@
-"""Policies that change the adjoint between two backward steps of another policy."""
+"""Estimators that change the adjoint between two backward steps of another estimator."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -8,7 +8,7 @@ import numpy as np
 from cortado.device.state import State
 from cortado.errors import InputError, shown
 from cortado.gradients.adjoint_filters import FIELDS, AdjointNorms, Average, Drag, Limit
-from cortado.gradients.estimator import AdjointPolicy, Differentiable, Estimate, Filtered, Passage
+from cortado.gradients.estimator import AdjointEstimator, Differentiable, Estimate, Filtered, ForwardPass
 from cortado.gradients.exact import Exact
 from cortado.gradients.strength import sufficient
 from cortado.parameters.values import Arrays, Values
@@ -18,7 +18,7 @@ EXACT = Exact()
 
 
 @dataclass(frozen=True)
-class AdjointSmoothing(AdjointPolicy):
+class AdjointViscosity(AdjointEstimator):
     """The adjoint, blended after each backward step with its average over neighbours: an eddy viscosity of the adjoint.
 
     Formula: for each field a of the adjoint, over the fluid neighbours of the state that it belongs to,
@@ -36,22 +36,22 @@ class AdjointSmoothing(AdjointPolicy):
     g(2 s) of two strengths, both of which are tame, are extrapolated to none (Richardson): g = 2 g(s) - g(2 s).
 
     Bias: what short waves would have told, and of long ones a part that falls as s^order; noise, of which the second
-    order has up to 3 times as much: it is for means over several runs (`Averaged`). Losses of single particles, which
-    have no long waves, get no good gradient. Cost: ``order`` ways back, with a sum over neighbours more a field and
-    step; with "auto" some more through the same run (see `gradients.strength`), which `tuned` saves a search.
+    order has up to 3 times as much: it is for means over several runs (`EnsembleMean`). Losses of single particles,
+    which have no long waves, get no good gradient. Cost: ``order`` ways back, with a sum over neighbours more a field
+    and step; with "auto" some more through the same run (see `gradients.strength`), which `tuned` saves a search.
     """
 
     strength: float | Literal["auto"] = "auto"
-    """s, up to 1 / ``order``; 0 is the base policy bit for bit; "auto" is ``order`` + 1 times the smallest at which the
-    adjoint does not grow exponentially, if that is not too much; reported as ``strength`` of the `Estimate`."""
+    """s, up to 1 / ``order``; 0 is the base estimator bit for bit; "auto" is ``order`` + 1 times the smallest at which
+    the adjoint does not grow exponentially, if that is not too much; reported as ``strength`` of the `Estimate`."""
     fields: tuple[str, ...] = FIELDS
     """Of "positions" and "velocities"."""
     limit: float = 4.0
     """Greatest vector of a particle, in root mean squares over all; infinite for none. Not applied with a strength of
     0."""
     order: int = 1
-    """1, or 2 for an extrapolation. As the base of another policy this one is not extrapolated."""
-    base: AdjointPolicy = EXACT
+    """1, or 2 for an extrapolation. As the base of another estimator this one is not extrapolated."""
+    base: AdjointEstimator = EXACT
     """Whose backward steps these are."""
 
     def __post_init__(self) -> None:
@@ -68,55 +68,55 @@ class AdjointSmoothing(AdjointPolicy):
             wanted = f'a number from 0 to {most} with an order of {self.order}, or "auto"'
             raise InputError(f"strength is {shown(self.strength)}, but must be {wanted}.")
 
-    def derivative(self, rollout: Rollout) -> "SmoothedStep":
+    def derivative(self, rollout: Rollout) -> "ViscousStep":
         if self.strength == "auto":
-            raise InputError('strength is "auto", but must be a number where smoothing is the base of another policy.')
-        return SmoothedStep(self.base.derivative(rollout), rollout, self)
+            raise InputError('strength is "auto", but must be a number where it is the base of another estimator.')
+        return ViscousStep(self.base.derivative(rollout), rollout, self)
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         """``observe`` is given the adjoints of the weakest strength."""
-        passage = problem.passage(parameters)
-        strength = self._sufficient(passage) if self.strength == "auto" else float(self.strength)
-        gradient = self._back(passage, strength, observe)
+        forward_pass = problem.forward_pass(parameters)
+        strength = self._sufficient(forward_pass) if self.strength == "auto" else float(self.strength)
+        gradient = self._back(forward_pass, strength, observe)
         if strength > 0.0 and self.order == 2:
-            twice = self._back(passage, 2.0 * strength)
+            twice = self._back(forward_pass, 2.0 * strength)
             gradient = {name: 2.0 * once - twice[name] for name, once in gradient.items()}
-        return Estimate(passage.loss, gradient, strength=strength)
+        return Estimate(forward_pass.loss, gradient, strength=strength)
 
-    def tuned(self, problem: Differentiable, parameters: Values) -> "AdjointSmoothing":
+    def tuned(self, problem: Differentiable, parameters: Values) -> "AdjointViscosity":
         """The same with the strength that "auto" finds here, for use at parameters nearby."""
         if self.strength != "auto":
             return self
-        return replace(self, strength=self._sufficient(problem.passage(parameters)))
+        return replace(self, strength=self._sufficient(problem.forward_pass(parameters)))
 
-    def _back(self, passage: Passage, strength: float, observe: Observer | None = None) -> Arrays:
+    def _back(self, forward_pass: ForwardPass, strength: float, observe: Observer | None = None) -> Arrays:
         """The gradient with one strength."""
-        derivative = passage.derivative(replace(self, strength=0.0, order=1))
-        assert isinstance(derivative, SmoothedStep)
+        derivative = forward_pass.derivative(replace(self, strength=0.0, order=1))
+        assert isinstance(derivative, ViscousStep)
         derivative.set_strength(strength)
-        return passage.back(derivative, observe)
+        return forward_pass.back(derivative, observe)
 
-    def _sufficient(self, passage: Passage) -> float:
-        rollout = passage.rollout
+    def _sufficient(self, forward_pass: ForwardPass) -> float:
+        rollout = forward_pass.rollout
         norms = AdjointNorms(rollout.solver, rollout.steps)
 
         def history(strength: float) -> np.ndarray:
-            self._back(passage, strength, norms)
+            self._back(forward_pass, strength, norms)
             return norms.numpy()
 
         time_step = float(rollout.parameters["time_step"].numpy()[0])
         return min((self.order + 1) * sufficient(history, time_step), 1.0 / self.order)
 
 
-class SmoothedStep(Filtered):
-    """The backward step of `AdjointSmoothing`."""
+class ViscousStep(Filtered):
+    """The backward step of `AdjointViscosity`."""
 
-    def __init__(self, base: StepDerivative, rollout: Rollout, policy: AdjointSmoothing):
+    def __init__(self, base: StepDerivative, rollout: Rollout, estimator: AdjointViscosity):
         super().__init__(base)
-        self._average, self._limit = Average(base.solver, policy.fields), Limit(base.solver, policy.fields)
+        self._average, self._limit = Average(base.solver, estimator.fields), Limit(base.solver, estimator.fields)
         self._parameters = rollout.parameters
-        self._times = policy.limit
-        self.set_strength(float(policy.strength))
+        self._times = estimator.limit
+        self.set_strength(float(estimator.strength))
 
     def set_strength(self, strength: float) -> None:
         """From now on."""
@@ -129,7 +129,7 @@ class SmoothedStep(Filtered):
 
 
 @dataclass(frozen=True)
-class Damped(AdjointPolicy):
+class Damped(AdjointEstimator):
     """The adjoint, with that of velocities damped after each backward step.
 
     Formula: v^ <- exp(-rate dt) v^. Bias: what happened earlier counts less, by exp(-rate time); long waves suffer as
@@ -138,7 +138,7 @@ class Damped(AdjointPolicy):
 
     rate: float
     """[1 / s]"""
-    base: AdjointPolicy = EXACT
+    base: AdjointEstimator = EXACT
     """Whose backward steps these are."""
 
     def __post_init__(self) -> None:

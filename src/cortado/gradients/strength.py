@@ -1,8 +1,8 @@
 """How strong a smoothing of the adjoint has to be for it not to grow exponentially.
 
-Ladder, `AdjointSmoothing.limit` and the factor on the least strength were chosen on dam breaks of 144 particles in the
+Ladder, `AdjointViscosity.limit` and the factor on the least strength were chosen on dam breaks of 144 particles in the
 plane, of 400 and 800 steps, with four losses and two first states (for the second order eight);
-`validation/policies.py` judges them on others.
+`validation/gradients.py` judges them on others.
 """
 
 from collections.abc import Callable

@@ -9,8 +9,8 @@ from cortado.errors import DivergedError, InputError
 from cortado.inverse.tables import DISTANCES, RANDOM
 from cortado.inverse.task import Task
 from cortado.io.pictures import heart, read_picture, rosetta
-from cortado.losses import FinalPositions, Frames, Image, Loss, TrajectoryEnd
-from cortado.optimisation.reparametrisation import Coordinates, Knots, Logarithm, Reparametrised, Softmax
+from cortado.losses import FinalPositions, Frames, Image, Loss, Snapshot
+from cortado.optimisation.transforms import Bijector, Knots, Logarithm, Softmax, Transformed
 from cortado.parameters.registry import BY_NAME, Range
 from cortado.parameters.values import OVER_TIME, Arrays
 from cortado.problem import Problem
@@ -28,7 +28,7 @@ class Assignment:
 
     task: Task
     problem: Problem
-    searches: tuple[Reparametrised, ...]
+    searches: tuple[Transformed, ...]
     """One after the other, through thicker and thicker fluid, in the same coordinates; the last is the task's own."""
     start: Arrays
     """Coordinates to begin with."""
@@ -40,11 +40,11 @@ class Assignment:
     """Images (rows, columns, 3) or positions (n, d) [m] by the number of steps before them."""
 
     @property
-    def search(self) -> Reparametrised:
+    def search(self) -> Transformed:
         """The last one."""
         return self.searches[-1]
 
-    def image(self, end: TrajectoryEnd) -> np.ndarray:
+    def image(self, end: Snapshot) -> np.ndarray:
         """The picture (rows, columns, 3) of a state."""
         assert self.renderer is not None
         return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
@@ -64,7 +64,7 @@ def assignment(task: Task, device: str, precision: str) -> Assignment:
         renderer = scene_renderer(simulation, share) if task.problem.loss == "image" else None
         targets = _targets(task, simulation, renderer)
         problem = Problem(simulation, task.problem.steps, _frames(task, targets, renderer))
-        searches.append(Reparametrised(problem, found))
+        searches.append(Transformed(problem, found))
     bounds = _bounds(task)
     coordinates = searches[-1].coordinate(start)
     for name, (lower, upper) in bounds.items():
@@ -135,8 +135,8 @@ def _start(name: str, value: Any, simulation: Simulation) -> np.ndarray:
     return x
 
 
-def _coordinates(task: Task, start: Arrays) -> dict[str, Coordinates]:
-    found: dict[str, Coordinates] = {name: Logarithm() for name in task.optimise.logarithmic}
+def _coordinates(task: Task, start: Arrays) -> dict[str, Bijector]:
+    found: dict[str, Bijector] = {name: Logarithm() for name in task.optimise.logarithmic}
     for name, value in start.items():
         if name == "mass_fractions":
             found[name] = Softmax()

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import model_validator
 
 from cortado.errors import Phrase
-from cortado.gradients import AdjointPolicy, AdjointSmoothing, Averaged, Exact, Policy, VelocityOnly
+from cortado.gradients import AdjointEstimator, AdjointViscosity, EnsembleMean, Exact, FrozenGeometry, GradientEstimator
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, Optimiser
 from cortado.parameters.values import NAMES
@@ -23,10 +23,10 @@ OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
 }
 """By the names in a file; each is made from the learning rate (for L-BFGS the size of its first step)."""
 DISTANCES: dict[str, ImageLoss] = {"squared_difference": SquaredDifference(), "pyramid": Pyramid()}
-POLICIES: dict[str, AdjointPolicy] = {
+ESTIMATORS: dict[str, AdjointEstimator] = {
     "exact": Exact(),
-    "velocity_only": VelocityOnly(),
-    "adjoint_smoothing": AdjointSmoothing(),
+    "frozen_geometry": FrozenGeometry(),
+    "adjoint_viscosity": AdjointViscosity(),
 }
 RANDOM = "random"
 CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
@@ -143,10 +143,10 @@ class CheckTable(Table):
     """Peak signal-to-noise ratio of the found image to the target."""
 
 
-class PolicyTable(Table):
-    """[optimise.policy]: which gradient the search follows, see docs/policies.md."""
+class GradientTable(Table):
+    """[optimise.gradient]: which gradient the search follows, see docs/gradients.md."""
 
-    name: Annotated[str, Choice(tuple(POLICIES))] = "exact"
+    name: Annotated[str, Choice(tuple(ESTIMATORS))] = "exact"
     """What is done on the way back through a run."""
     strength: Annotated[float | None, Quantity(above=0.0, most=1.0)] = None
     """Of adjoint smoothing; None: found at the start of a search."""
@@ -154,12 +154,12 @@ class PolicyTable(Table):
     """Runs of a cloud that the gradient is the mean of."""
     spread: Annotated[dict[str, Any] | None, Values()] = None
     """Of the cloud: by name a number, in the units of what is searched."""
-    disorder: Annotated[float, Quantity("spacings", least=0.0)] = Averaged.disorder
+    disorder: Annotated[float, Quantity("spacings", least=0.0)] = EnsembleMean.disorder
     """Of the first positions in the cloud."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.strength is not None and self.name != "adjoint_smoothing":
+        if self.strength is not None and self.name != "adjoint_viscosity":
             raise wrong(("strength",), self.strength, "left out, as nothing is smoothed")
         if self.strength is not None and self.strength * self._order > 1.0:
             raise wrong(("strength",), self.strength, f"at most {1.0 / self._order:g}, as means are extrapolated")
@@ -179,15 +179,15 @@ class PolicyTable(Table):
     def _order(self) -> int:
         return 2 if self.samples > 1 else 1
 
-    def policy(self) -> Policy:
+    def estimator(self) -> GradientEstimator:
         """As an object."""
-        one = POLICIES[self.name]
-        if isinstance(one, AdjointSmoothing):
-            one = AdjointSmoothing("auto" if self.strength is None else self.strength, order=self._order)
+        one = ESTIMATORS[self.name]
+        if isinstance(one, AdjointViscosity):
+            one = AdjointViscosity("auto" if self.strength is None else self.strength, order=self._order)
         if self.spread is None:
             return one
         spread = {name: float(number) for name, number in self.spread.items()}
-        return Averaged(spread, self.samples, self.disorder, policy=one)
+        return EnsembleMean(spread, self.samples, self.disorder, estimator=one)
 
 
 class OptimiseTable(Table):
@@ -212,7 +212,7 @@ class OptimiseTable(Table):
     """Of L-BFGS: it ends where the gradient is this part of the first; None: where round-off stops it."""
     iterations: Annotated[int, Count(1, 10_000_000)]
     """Updates at most, of each search."""
-    policy: PolicyTable = PolicyTable()
+    gradient: GradientTable = GradientTable()
     """Which gradient it follows."""
     check: CheckTable = CheckTable()
     """What the run has to reach."""

@@ -11,7 +11,7 @@ import numpy as np
 from cortado.discretise.sampling import fluid_particles
 from cortado.errors import Phrase, SceneError
 from cortado.inverse.tables import OptimiseTable, ProblemTable, TaskTables
-from cortado.optimisation.reparametrisation import Knots
+from cortado.optimisation.transforms import Knots
 from cortado.parameters.registry import BY_NAME, Range
 from cortado.parameters.values import OVER_TIME, SUM_TOLERANCE, Arrays, is_too_small
 from cortado.scene.fields import MISSING
@@ -112,10 +112,10 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
             raise SceneError(None, "optimise.logarithmic", name, wanted)
         if not isinstance(start[name], str) and (start[name] <= 0.0).any():
             raise SceneError(None, f"optimise.start.{name}", float(start[name].min()), "greater than 0")
-    spread = optimise.policy.spread
+    spread = optimise.gradient.spread
     for name in sorted(set(start) ^ set(spread or start)):
         wanted, found = ("given, as it is searched", MISSING) if name in start else ("left out", Phrase("given"))
-        raise SceneError(None, f"optimise.policy.spread.{name}", found, wanted)
+        raise SceneError(None, f"optimise.gradient.spread.{name}", found, wanted)
     given = optimise.check.model_fields_set
     if problem.loss != "image" and len(optimise.extinctions) > 1:
         wanted = "left out, as positions are compared"

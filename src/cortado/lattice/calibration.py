@@ -72,14 +72,14 @@ def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: floa
     return (separations * kernel.gradient(separations, support)).sum(axis=1) / (squares + 0.01 * support**2)
 
 
-def wall_rigidity(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+def wall_response(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
     """sum_j G_j . G_j [1 / m^(2 d + 2)]: what a wall's own answer is measured by, see
     `cortado.solvers.pcisph.wall_relaxation`."""
     return float((kernel.gradient(lattice_offsets(spacing, support, dimension), support) ** 2).sum())
 
 
 @cache
-def laplacian_evenness(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+def lattice_laplacian_correction(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
     """What the Laplacian 2 V sum_j (u_i - u_j) F_ij must be multiplied with to be that of a parabola on the lattice.
 
     Without it second derivatives are 1 to 8 % small at any resolution, mostly by the 0.01 h^2 of F.
@@ -93,9 +93,9 @@ def laplacian_evenness(kernel: SmoothingKernel, spacing: float, support: float, 
 def laplacian_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
     """The greatest eigenvalue [1 / m2] of the Laplacian on the lattice, without its sign."""
     offsets = lattice_offsets(spacing, support, dimension)
-    evenness = laplacian_evenness(kernel, spacing, support, dimension)
+    laplacian_correction = lattice_laplacian_correction(kernel, spacing, support, dimension)
     volume = rest_volume(kernel, spacing, support, dimension) / (1.0 - SLACK)
-    weights = -2.0 * volume * evenness * shear_factor(kernel, offsets, support)
+    weights = -2.0 * volume * laplacian_correction * shear_factor(kernel, offsets, support)
     waves = np.array(list(itertools.product(np.linspace(0.0, np.pi / spacing, 25), repeat=dimension)))
     return float(((1.0 - np.cos(waves @ offsets.T)) @ weights).max())
 

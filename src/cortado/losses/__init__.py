@@ -2,20 +2,20 @@
 
 from cortado.losses.centre_of_mass import CentreOfMass, CentreOfMassAlong
 from cortado.losses.image import Image
-from cortado.losses.loss import EndAdjoint, Frames, Loss, TrajectoryEnd, fingerprint
+from cortado.losses.loss import Frames, Loss, Snapshot, SnapshotAdjoint, fingerprint
 from cortado.losses.positions import FinalPositions
 from cortado.losses.recorded import Recorded
 
 __all__ = [
     "CentreOfMass",
     "CentreOfMassAlong",
-    "EndAdjoint",
     "FinalPositions",
     "Frames",
     "Image",
     "Loss",
     "Recorded",
-    "TrajectoryEnd",
+    "Snapshot",
+    "SnapshotAdjoint",
     "fingerprint",
 ]
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from cortado.arrays import as_numbers
 from cortado.errors import InputError
-from cortado.losses.loss import Adjoint, TrajectoryEnd
+from cortado.losses.loss import Adjoint, Snapshot
 
 
 class CentreOfMass:
@@ -19,14 +19,14 @@ class CentreOfMass:
         self.fingerprint = _checksum(self.target, self._weights)
         """Tells one target from another, for checkpoints."""
 
-    def value(self, end: TrajectoryEnd) -> float:
+    def value(self, end: Snapshot) -> float:
         return float((self._miss(end) ** 2).sum())
 
-    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
         bar = 2.0 * _shares(self._weights, end)[:, None] * self._miss(end)
         return self.value(end), (bar, np.zeros_like(end.velocities))
 
-    def _miss(self, end: TrajectoryEnd) -> np.ndarray:
+    def _miss(self, end: Snapshot) -> np.ndarray:
         if self.target.shape != (end.dimension,):
             raise InputError(f"target has shape {self.target.shape}, but must be {(end.dimension,)}.")
         return _shares(self._weights, end) @ end.positions - self.target
@@ -41,13 +41,13 @@ class CentreOfMassAlong:
         self.fingerprint = _checksum(self.direction, self._weights)
         """Tells one direction from another, for checkpoints."""
 
-    def value(self, end: TrajectoryEnd) -> float:
+    def value(self, end: Snapshot) -> float:
         return float((self._slopes(end) * end.positions).sum())
 
-    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
         return self.value(end), (self._slopes(end), np.zeros_like(end.velocities))
 
-    def _slopes(self, end: TrajectoryEnd) -> np.ndarray:
+    def _slopes(self, end: Snapshot) -> np.ndarray:
         if self.direction.shape != (end.dimension,):
             raise InputError(f"direction has shape {self.direction.shape}, but must be {(end.dimension,)}.")
         return _shares(self._weights, end)[:, None] * self.direction
@@ -71,7 +71,7 @@ def _weights(masses: np.ndarray | None) -> np.ndarray | None:
     return array
 
 
-def _shares(weights: np.ndarray | None, end: TrajectoryEnd) -> np.ndarray:
+def _shares(weights: np.ndarray | None, end: Snapshot) -> np.ndarray:
     """(n,) of the particles in the mass of all."""
     n = len(end.positions)
     if weights is None:

@@ -10,7 +10,7 @@ import warp as wp
 from cortado.arrays import as_numbers, as_one_number
 from cortado.device.state import State
 from cortado.errors import InputError, shown
-from cortado.losses import EndAdjoint, Loss, Recorded, TrajectoryEnd
+from cortado.losses import Loss, Recorded, Snapshot, SnapshotAdjoint
 from cortado.losses.loss import Adjoint
 
 FORMS = ("positions", "velocities", "mass fractions")
@@ -24,27 +24,27 @@ class CheckedLoss:
         """A `Loss`; an ``adjoint`` of its own takes the place of ``value_and_adjoint``."""
         self._loss = loss
 
-    def value(self, end: TrajectoryEnd) -> float:
+    def value(self, end: Snapshot) -> float:
         return as_one_number("the loss's value", self._loss.value(end))
 
-    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
         """As that of `Loss`; arrays come in float64."""
         if hasattr(self._loss, "adjoint"):
             return self.value(end), self._checked(self._loss.adjoint(end), end)
         value, bar = self._loss.value_and_adjoint(end)
         return as_one_number("the loss's value", value), self._checked(bar, end)
 
-    def _checked(self, bar: Any, end: TrajectoryEnd) -> Adjoint:
+    def _checked(self, bar: Any, end: Snapshot) -> Adjoint:
         if isinstance(bar, State):
             return _checked_state(bar, end)
-        if isinstance(bar, EndAdjoint):
+        if isinstance(bar, SnapshotAdjoint):
             colours = _checked_array("colours", bar.colours, end.colours.shape)
-            return EndAdjoint(_checked_state(bar.state, end), colours)
+            return SnapshotAdjoint(_checked_state(bar.state, end), colours)
         if not isinstance(bar, (tuple, list, np.ndarray)) or len(bar) not in (2, 3):
             count = f" of {len(bar)}" if isinstance(bar, (tuple, list)) else ""
             raise InputError(
                 f"the loss's adjoint is a {type(bar).__name__}{count}, but must be a tuple of two or three arrays, the "
-                f"derivatives with respect to {', '.join(FORMS[:2])} and {FORMS[2]}, or a State, or an EndAdjoint."
+                f"derivatives with respect to {', '.join(FORMS[:2])} and {FORMS[2]}, or a State, or an SnapshotAdjoint."
             )
         wanted = (end.positions.shape, end.velocities.shape, end.mass_fractions.shape)
         return tuple(_checked_array(*entry) for entry in zip(FORMS, bar, wanted, strict=False))
@@ -79,7 +79,7 @@ def _require_arguments(what: str, function: Callable[..., Any], wanted: tuple[st
         ) from None
 
 
-def _checked_state(bar: Any, end: TrajectoryEnd) -> State:
+def _checked_state(bar: Any, end: Snapshot) -> State:
     if not isinstance(bar, State):
         raise InputError(f"the loss's adjoint has a {type(bar).__name__} as its state, but must have a State.")
     for form, found, wanted in zip(FORMS, bar.arrays(), end.state.arrays(), strict=True):

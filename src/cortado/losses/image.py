@@ -10,7 +10,7 @@ from cortado.arrays import as_numbers
 from cortado.device.threads import WARP
 from cortado.errors import InputError
 from cortado.losses.image_losses import ImageLoss, SquaredDifference
-from cortado.losses.loss import EndAdjoint, TrajectoryEnd
+from cortado.losses.loss import Snapshot, SnapshotAdjoint
 
 
 class Pictures(Protocol):
@@ -36,23 +36,23 @@ class Image:
         self.fingerprint = " ".join((*parts, getattr(renderer, "fingerprint", "")))
         """Tells one target, or one view of it, from another, for checkpoints."""
 
-    def image(self, end: TrajectoryEnd) -> np.ndarray:
+    def image(self, end: Snapshot) -> np.ndarray:
         """The picture (rows, columns, 3) of a state."""
         return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
 
     @WARP
-    def value(self, end: TrajectoryEnd) -> float:
+    def value(self, end: Snapshot) -> float:
         return self.distance.value(self.image(end), self.target)
 
     @WARP
-    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, EndAdjoint]:
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, SnapshotAdjoint]:
         image = self.image(end)
         found = self.renderer.adjoint(self.distance.adjoint(image, self.target))
         bar = end.state.like()
         bar.velocities.zero_()
         wp.copy(bar.positions, found.positions)
         wp.copy(bar.mass_fractions, found.fractions)
-        return self.distance.value(image, self.target), EndAdjoint(bar, found.colours)
+        return self.distance.value(image, self.target), SnapshotAdjoint(bar, found.colours)
 
 
 def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:

@@ -14,7 +14,7 @@ from cortado.words import counted
 
 
 @dataclass(frozen=True)
-class TrajectoryEnd:
+class Snapshot:
     """A state of a rollout, the last one as a rule, as NumPy arrays or as Warp arrays, in the scene's order."""
 
     state: State
@@ -24,7 +24,7 @@ class TrajectoryEnd:
     """(phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
 
     def __repr__(self) -> str:
-        return f"TrajectoryEnd({counted(len(self.state.positions), 'particle')}, {self.precision.name})"
+        return f"Snapshot({counted(len(self.state.positions), 'particle')}, {self.precision.name})"
 
     @property
     def precision(self) -> Precision:
@@ -48,7 +48,7 @@ class TrajectoryEnd:
 
 
 @dataclass(frozen=True, repr=False)
-class EndAdjoint:
+class SnapshotAdjoint:
     """Derivatives of a loss that also looks at the colours."""
 
     state: State
@@ -57,7 +57,7 @@ class EndAdjoint:
     """(phases, 3)"""
 
 
-Adjoint = State | EndAdjoint | tuple[np.ndarray, ...]
+Adjoint = State | SnapshotAdjoint | tuple[np.ndarray, ...]
 """Derivatives of a loss with respect to positions and velocities, (n, d) each, and, if there is a third array, mass
 fractions (n, phases); or as Warp arrays."""
 
@@ -68,10 +68,10 @@ class Loss(Protocol):
     A loss of your own may have a method ``adjoint(end)`` in the place of `value_and_adjoint`.
     """
 
-    def value(self, end: TrajectoryEnd) -> float:
+    def value(self, end: Snapshot) -> float:
         """The loss."""
 
-    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
         """The loss and its derivatives, which share what both need."""
 
 

@@ -12,7 +12,7 @@ from cortado.device.precision import Precision
 from cortado.device.state import State, to_device
 from cortado.device.threads import WARP
 from cortado.errors import InputError
-from cortado.losses.loss import TrajectoryEnd
+from cortado.losses.loss import Snapshot
 from cortado.losses.matching import matching_kernels
 
 
@@ -34,12 +34,12 @@ class FinalPositions:
         return FinalPositions, (self.target,)
 
     @WARP
-    def value(self, end: TrajectoryEnd) -> float:
+    def value(self, end: Snapshot) -> float:
         x, target, device = self._positions_and_target(end)
         return self._mean_square(x, target, device, end.precision)
 
     @WARP
-    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, State]:
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, State]:
         x, target, device = self._positions_and_target(end)
         bar = end.state.like()
         bar.clear()
@@ -53,7 +53,7 @@ class FinalPositions:
         total = sum_of(wp.float64, len(x), device)(squares)
         return float(total.numpy()[0]) / len(x)
 
-    def _positions_and_target(self, end: TrajectoryEnd) -> tuple[wp.array, wp.array, Any]:
+    def _positions_and_target(self, end: Snapshot) -> tuple[wp.array, wp.array, Any]:
         x = end.state.positions
         if (len(x), end.dimension) != self.target.shape:
             raise InputError(f"target has shape {self.target.shape}, but must be {(len(x), end.dimension)}.")

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.threads import WARP
-from cortado.losses.loss import Adjoint, TrajectoryEnd
+from cortado.losses.loss import Adjoint, Snapshot
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
 
@@ -24,19 +24,19 @@ class Recorded:
         self.function = function
 
     @WARP
-    def value(self, end: TrajectoryEnd) -> float:
+    def value(self, end: Snapshot) -> float:
         loss, _, _ = self._run(end)
         return float(loss.numpy()[0])
 
     @WARP
-    def value_and_adjoint(self, end: TrajectoryEnd) -> tuple[float, Adjoint]:
+    def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
         with wp.Tape() as tape:
             loss, positions, velocities = self._run(end)
         tape.backward(loss)
         bars = tuple(array.grad.numpy()[:, : end.dimension].astype(np.float64) for array in (positions, velocities))
         return float(loss.numpy()[0]), bars
 
-    def _run(self, end: TrajectoryEnd) -> tuple[wp.array, wp.array, wp.array]:
+    def _run(self, end: Snapshot) -> tuple[wp.array, wp.array, wp.array]:
         copies = [wp.clone(a, requires_grad=True) for a in (end.state.positions, end.state.velocities)]
         loss = wp.zeros(1, dtype=end.precision.real, device=copies[0].device, requires_grad=True)
         self.function(copies[0], copies[1], loss)

@@ -16,7 +16,7 @@ class Differentiable(Protocol):
     The fingerprint is kept in the checkpoint, so that the run of one problem is not resumed with another.
     """
 
-    def value_and_gradient(self, parameters: dict[str, Any], policy: Any = None) -> tuple[float, Mapping[str, Any]]:
+    def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
         """The loss, and its gradient by the names and in the shapes of the parameters."""
 
 
@@ -32,10 +32,10 @@ class Function:
         kind = type(self.function)
         return str(getattr(self.function, "__qualname__", kind.__qualname__))
 
-    def value_and_gradient(self, parameters: dict[str, Any], policy: Any = None) -> tuple[float, Mapping[str, Any]]:
-        """What the function returns; raises `InputError` where a policy is given, as there is nothing for it to do."""
-        if policy is not None:
-            raise InputError("A policy is given, but must be left out where a function makes its own gradient.")
+    def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
+        """What the function returns; raises `InputError` where an estimator is given: there is nothing for it to do."""
+        if gradient is not None:
+            raise InputError("gradient is given, but must be left out where a function makes its own.")
         return self.function(parameters)
 
 

@@ -32,7 +32,7 @@ def optimise(
     optimiser: Optimiser | str,
     iterations: int,
     bounds: Mapping[str, tuple[Any, Any]] | None = None,
-    policy: Any = None,
+    gradient: Any = None,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
     on_iteration: Callable[[Record], None] | None = None,
@@ -49,7 +49,7 @@ def optimise(
         iterations: greatest number of updates. Adam and gradient descent evaluate once more, to judge the
             last iterate.
         bounds: by name, (lower, upper), each a number, an array of the parameter's shape, or None.
-        policy: how the problem is differentiated, handed to it as it is.
+        gradient: how the problem is differentiated, handed to it as it is.
         checkpoint: folder for the log of the evaluations, each on the disk before the next begins.
         resume: go on with the run in `checkpoint`, bit for bit as if it had not been interrupted; begin it if
             there is none. `iterations` may then be another number.
@@ -69,11 +69,11 @@ def optimise(
     _require_count(iterations)
     identity = {
         "optimiser": _description(algorithm),
-        "policy": _description(policy),
+        "gradient": _description(gradient),
         "problem": str(getattr(differentiable, "fingerprint", "")),
     }
     with closing(_open_log(checkpoint, resume, packing, identity)) as log:
-        evaluator = _Evaluator(differentiable, policy, packing, start, log, on_iteration)
+        evaluator = _Evaluator(differentiable, gradient, packing, start, log, on_iteration)
         outcome = algorithm.minimise(Search(evaluator, packing, vector, lower, upper, iterations))
     best = min(evaluator.history, key=lambda record: record.loss)
     return Result(
@@ -96,7 +96,7 @@ class _Evaluator:
     """The function of one vector that the optimiser sees; replays the log, then computes and adds to it."""
 
     problem: Differentiable
-    policy: Any
+    estimator: Any
     packing: Packing
     start: Mapping[str, Any]
     log: Log
@@ -138,7 +138,7 @@ class _Evaluator:
         A first evaluation that is refused has a wrong start; later ones, parameters to which the search has come.
         """
         try:
-            found = self.problem.value_and_gradient(self.packing.unpack(vector), policy=self.policy)
+            found = self.problem.value_and_gradient(self.packing.unpack(vector), gradient=self.estimator)
         except InputError as error:
             if not self.history:
                 raise

@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.precision import Precision
-from cortado.render.colour_field import ink_type, node_functions, nodes_type
+from cortado.render.colour_field import node_functions, nodes_type, rgba_type
 from cortado.render.interpolation import interpolation_functions
 from cortado.render.rays import camera_type, ray_functions
 
@@ -59,7 +59,7 @@ def brightness_functions(precision: Precision) -> SimpleNamespace:
 @cache
 def absorption_kernels(precision: Precision) -> SimpleNamespace:
     """Kernels over pixels: ``forward`` and ``adjoint``; and over nodes: ``gather``, of the adjoints of samples."""
-    real, vector, ink, pose = precision.real, precision.vector, ink_type(precision), pose_type(precision)
+    real, vector, ink, pose = precision.real, precision.vector, rgba_type(precision), pose_type(precision)
     nodes_struct, camera_struct = nodes_type(precision), camera_type(precision)
     rays, interpolation = ray_functions(precision), interpolation_functions(precision)
     start, direction, distance = rays.start, rays.direction, rays.distance

@@ -20,7 +20,7 @@ from cortado.device.smoothing import smoothing_functions
 
 
 @cache
-def ink_type(precision: Precision) -> Any:
+def rgba_type(precision: Precision) -> Any:
     """Warp vector type of (P, A): the colour times the coverage, three components, and the coverage."""
     return wp.types.vector(length=4, dtype=precision.real)
 
@@ -85,7 +85,7 @@ def node_functions(precision: Precision) -> SimpleNamespace:
 def colour_field_kernels(discretisation: Discretisation) -> SimpleNamespace:
     """Kernels ``forward``, over nodes, and ``adjoint``, over sorted particles."""
     precision = discretisation.precision
-    real, vector, ink = precision.real, precision.vector, ink_type(precision)
+    real, vector, ink = precision.real, precision.vector, rgba_type(precision)
     nodes_struct, grid_type = nodes_type(precision), cell_grid_type(precision)
     cells, smooth = cell_functions(precision), smoothing_functions(discretisation.smoothing, precision)
     wrap, cell_of, below, above = cells.wrap, cells.cell_of, cells.below, cells.above

@@ -14,8 +14,8 @@ from cortado.device.neighbourhood import Discretisation
 from cortado.device.precision import Precision
 from cortado.errors import InputError
 from cortado.lattice.smoothing import SmoothingKernel
-from cortado.render.colour_field import colour_field_kernels, ink_type, nodes_type
-from cortado.render.phase_colours import colours_type, tint_kernels
+from cortado.render.colour_field import colour_field_kernels, nodes_type, rgba_type
+from cortado.render.phase_colours import colours_type, phase_colour_kernels
 
 MOST_NODES = 2**27
 """Of a colour field: 2 GiB in float32."""
@@ -66,7 +66,7 @@ class ColourField:
     ):
         """Of particles in a region (d,) to (d,) [m]; arguments as those of the `Renderer`."""
         self._particles = particles
-        self._tint = tint_kernels(precision, phases)
+        self._tint = phase_colour_kernels(precision, phases)
         self._field = colour_field_kernels(Discretisation(smoothing, precision))
         self._device = device
         grid = Grid.around(lower, upper, periods, support, MOST_CELLS)
@@ -87,7 +87,7 @@ class ColourField:
         self.nodes = nodes_over(lower, upper, periods, cell, support, precision)
         """The struct that kernels see."""
         require(field_parts(prod(self.nodes.shape), precision.bytes), "take a larger cell", device)
-        self.values = zeros(tuple(self.nodes.shape)[::-1], dtype=ink_type(precision))
+        self.values = zeros(tuple(self.nodes.shape)[::-1], dtype=rgba_type(precision))
         """(nz, ny, nx) colour times coverage, and coverage [-]."""
 
     def gather(self, positions: wp.array, fractions: wp.array, colours: np.ndarray) -> None:

@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import warp as wp
 
 from cortado.device.precision import Precision
-from cortado.render.colour_field import ink_type, nodes_type
+from cortado.render.colour_field import nodes_type, rgba_type
 
 
 @cache
 def interpolation_functions(precision: Precision) -> SimpleNamespace:
     """Warp functions ``value`` at a point, ``slope`` (the gradient of bar . value) and ``share`` (of one node)."""
-    real, vector, ink = precision.real, precision.vector, ink_type(precision)
+    real, vector, ink = precision.real, precision.vector, rgba_type(precision)
     nodes_struct = nodes_type(precision)
 
     @wp.func

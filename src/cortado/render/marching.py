@@ -12,7 +12,7 @@ from cortado.device.memory import field_parts, picture_parts, require, sample_pa
 from cortado.device.precision import Precision
 from cortado.render.absorption import absorption_kernels, pose_type
 from cortado.render.cameras import Camera
-from cortado.render.colour_field import ink_type
+from cortado.render.colour_field import rgba_type
 from cortado.render.rays import camera_type
 from cortado.render.views import View
 
@@ -42,7 +42,7 @@ class RayMarcher:
         self._thickness, self._background = view.extinction * step, precision.vector(*view.background)
         self._kernels = absorption_kernels(precision)
         self._zeros = partial(wp.zeros, device=device)
-        self._ink, self._pose = ink_type(precision), pose_type(precision)
+        self._ink, self._pose = rgba_type(precision), pose_type(precision)
         self.pixels, self._precision, self._device = self._camera.rows * self._camera.columns, precision, device
         require(picture_parts(self.pixels, precision.bytes), "take a smaller resolution", device)
         self.image, self._image_bar = (self._zeros(self.pixels, dtype=precision.vector) for _ in range(2))

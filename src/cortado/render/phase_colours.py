@@ -16,7 +16,7 @@ def colours_type(precision: Precision, phases: int) -> Any:
 
 
 @cache
-def tint_kernels(precision: Precision, phases: int) -> SimpleNamespace:
+def phase_colour_kernels(precision: Precision, phases: int) -> SimpleNamespace:
     """Kernels ``forward`` (which sorts positions besides) and ``adjoint``."""
     vector, fractions = precision.vector, precision.fractions(phases)
     colours_matrix = colours_type(precision, phases)
@@ -39,7 +39,7 @@ def tint_kernels(precision: Precision, phases: int) -> SimpleNamespace:
         colour[i] = wp.transpose(colours[0]) * c_scene[j]
 
     @wp.kernel(module=module, enable_backward=False)
-    def tint_adjoint(
+    def phase_colour_adjoint(
         colours: wp.array(dtype=colours_matrix),
         c_scene: wp.array(dtype=fractions),
         colour_scene_bar: wp.array(dtype=vector),
@@ -53,4 +53,4 @@ def tint_kernels(precision: Precision, phases: int) -> SimpleNamespace:
         c_scene_bar[j] = colours[0] * bar
         colours_bar[j] = wp.outer(c_scene[j], bar)
 
-    return SimpleNamespace(forward=tint, adjoint=tint_adjoint)
+    return SimpleNamespace(forward=tint, adjoint=phase_colour_adjoint)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.launching import Launcher
+from cortado.device.launching import KernelLauncher
 from cortado.device.precision import Precision
 from cortado.device.state import State, padded
 from cortado.lattice.region import TOLERANCE, Region
@@ -55,7 +55,7 @@ class Lost:
 class Containment:
     """What one solver asks at the end of each step."""
 
-    def __init__(self, walled: Walled, precision: Precision, launch: Launcher, first_waiting: int):
+    def __init__(self, walled: Walled, precision: Precision, launch: KernelLauncher, first_waiting: int):
         """``first_waiting``: the first particle, in the scene's order, that may wait in a nozzle."""
         self.walled, self._precision, self._launch = walled, precision, launch
         self._first_waiting = first_waiting

@@ -9,7 +9,7 @@ from typing import Any, Protocol, Self
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.launching import Launcher
+from cortado.device.launching import KernelLauncher
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.state import Parameters, State
 from cortado.device.threads import Turn
@@ -64,7 +64,7 @@ class Solver(Protocol):
     discretisation: Discretisation
     particles: int
     device: Any
-    launch: Launcher
+    launch: KernelLauncher
     turn: Turn
     containment: Containment
     step_number: wp.array

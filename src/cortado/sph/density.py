@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from cortado.device.kernels import Kernels
-from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 
 @cache
@@ -21,13 +21,13 @@ def density_sums(discretisation: Discretisation) -> SimpleNamespace:
     ``weights_adjoint`` (sum_j (r_i + r_j) G_ij + sum_b w_b r_i G_ib: the adjoint of positions for an
     adjoint r of the sum of every particle)."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, weight, gradient = pair.separation, pair.weight, pair.gradient
     vectors, numbers = pair.vectors, pair.numbers
 
     @wp.func
-    def weights(i: int, x: wp.array(dtype=vector), s: surroundings) -> real:
+    def weights(i: int, x: wp.array(dtype=vector), s: neighbourhood) -> real:
         x_i = x[i]
         total = real(0.0)
         for k in range(0, s.fluid_count[i], UNROLL):
@@ -40,7 +40,7 @@ def density_sums(discretisation: Discretisation) -> SimpleNamespace:
         return total
 
     @wp.func
-    def weights_tangent(i: int, x: wp.array(dtype=vector), x_dot: wp.array(dtype=vector), s: surroundings) -> real:
+    def weights_tangent(i: int, x: wp.array(dtype=vector), x_dot: wp.array(dtype=vector), s: neighbourhood) -> real:
         x_i = x[i]
         x_dot_i = x_dot[i]
         total = real(0.0)
@@ -55,7 +55,7 @@ def density_sums(discretisation: Discretisation) -> SimpleNamespace:
         return total
 
     @wp.func
-    def weights_adjoint(i: int, x: wp.array(dtype=vector), r: wp.array(dtype=real), s: surroundings) -> vector:
+    def weights_adjoint(i: int, x: wp.array(dtype=vector), r: wp.array(dtype=real), s: neighbourhood) -> vector:
         x_i = x[i]
         r_i = r[i]
         total = vector()
@@ -76,13 +76,13 @@ def density_sums(discretisation: Discretisation) -> SimpleNamespace:
 def density_kernels(discretisation: Discretisation) -> Kernels:
     """Kernels ``forward``, ``tangent`` and ``adjoint`` of the number density at given positions."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     sums = density_sums(discretisation)
     weights, weights_tangent, weights_adjoint = sums.weights, sums.weights_tangent, sums.weights_adjoint
 
     @wp.kernel(module=discretisation.module(True))
     def density(
-        s: surroundings,
+        s: neighbourhood,
         x: wp.array(dtype=vector),
         # out
         n: wp.array(dtype=real),
@@ -93,7 +93,7 @@ def density_kernels(discretisation: Discretisation) -> Kernels:
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def density_tangent(
-        s: surroundings,
+        s: neighbourhood,
         x: wp.array(dtype=vector),
         x_dot: wp.array(dtype=vector),
         # out
@@ -104,7 +104,7 @@ def density_kernels(discretisation: Discretisation) -> Kernels:
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def density_adjoint(
-        s: surroundings,
+        s: neighbourhood,
         x: wp.array(dtype=vector),
         n_bar: wp.array(dtype=real),
         # in and out

@@ -19,9 +19,9 @@ from typing import Any
 import warp as wp
 
 from cortado.device.kernels import Kernels
-from cortado.device.neighbourhood import Discretisation, surroundings_type
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type
 from cortado.sph.free_energy import FreeEnergy, Mobility
-from cortado.sph.pairwise_laplacian import spreading_functions
+from cortado.sph.pairwise_laplacian import pairwise_laplacian_functions
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
     discretisation, phases = diffusion.discretisation, diffusion.phases
     precision = discretisation.precision
     real, vector, fractions = precision.real, precision.vector, precision.fractions(phases)
-    surroundings = surroundings_type(precision)
-    sums = spreading_functions(discretisation, phases)
+    neighbourhood = neighbourhood_type(precision)
+    sums = pairwise_laplacian_functions(discretisation, phases)
     spread, spread_tangent, spread_adjoint = sums.spread, sums.spread_tangent, sums.spread_adjoint
     energy, form = diffusion.energy.functions(precision, phases), diffusion.mobility.functions(precision, phases)
     energy_slope, energy_bend = energy.slope, energy.bend
@@ -74,7 +74,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
 
     @wp.kernel(module=diffusion.module(True))
     def potential(
-        s: surroundings,
+        s: neighbourhood,
         strength: real,
         interface_width: wp.array(dtype=real),
         mobility: wp.array(dtype=real),
@@ -95,7 +95,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
 
     @wp.kernel(module=diffusion.module(True))
     def flux(
-        s: surroundings,
+        s: neighbourhood,
         substeps: int,
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),
@@ -113,7 +113,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
 
     @wp.kernel(module=diffusion.module(False), enable_backward=False)
     def potential_tangent(
-        s: surroundings,
+        s: neighbourhood,
         strength: real,
         interface_width: wp.array(dtype=real),
         interface_width_dot: wp.array(dtype=real),
@@ -146,7 +146,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
 
     @wp.kernel(module=diffusion.module(False), enable_backward=False)
     def flux_tangent(
-        s: surroundings,
+        s: neighbourhood,
         substeps: int,
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
@@ -173,7 +173,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
 
     @wp.kernel(module=diffusion.module(False), enable_backward=False)
     def scale_adjoint(
-        s: surroundings,
+        s: neighbourhood,
         substeps: int,
         time_step: wp.array(dtype=real),
         m: wp.array(dtype=real),
@@ -187,7 +187,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
 
     @wp.kernel(module=diffusion.module(False), enable_backward=False)
     def flux_adjoint(
-        s: surroundings,
+        s: neighbourhood,
         strength: real,
         time_step: wp.array(dtype=real),
         interface_width: wp.array(dtype=real),
@@ -226,7 +226,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
 
     @wp.kernel(module=diffusion.module(False), enable_backward=False)
     def potential_adjoint(
-        s: surroundings,
+        s: neighbourhood,
         interface_width: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         n: wp.array(dtype=real),

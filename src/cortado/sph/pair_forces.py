@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.neighbourhood import Discretisation, pair_functions, surroundings_type
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 
 
 @dataclass(frozen=True)
@@ -33,29 +33,29 @@ PairForm = Callable[[Discretisation], PairForce]
 def pairwise(discretisation: Discretisation) -> PairForce:
     """phi of the pairwise form: ``force``, ``tangent``, and the transposed derivatives ``adjoint_x``, ``adjoint_v``."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     gradient, hessian_product, size = pair.gradient, pair.hessian_product, pair.size
 
     @wp.func
-    def force(x: vector, v: vector, s: surroundings) -> vector:
+    def force(x: vector, v: vector, s: neighbourhood) -> vector:
         return (wp.dot(v, x) / size(x, s)) * gradient(x, s)
 
     @wp.func
-    def tangent(x: vector, v: vector, x_dot: vector, v_dot: vector, s: surroundings) -> vector:
+    def tangent(x: vector, v: vector, x_dot: vector, v_dot: vector, s: neighbourhood) -> vector:
         d = size(x, s)
         b = wp.dot(v, x) / d
         b_dot = (wp.dot(v_dot, x) + wp.dot(v, x_dot) - real(2.0) * b * wp.dot(x, x_dot)) / d
         return b_dot * gradient(x, s) + b * hessian_product(x, x_dot, s)
 
     @wp.func
-    def adjoint_x(x: vector, v: vector, w: vector, s: surroundings) -> vector:
+    def adjoint_x(x: vector, v: vector, w: vector, s: neighbourhood) -> vector:
         d = size(x, s)
         b = wp.dot(v, x) / d
         return b * hessian_product(x, w, s) + (wp.dot(gradient(x, s), w) / d) * (v - real(2.0) * b * x)
 
     @wp.func
-    def adjoint_v(x: vector, v: vector, w: vector, s: surroundings) -> vector:
+    def adjoint_v(x: vector, v: vector, w: vector, s: neighbourhood) -> vector:
         return (wp.dot(gradient(x, s), w) / size(x, s)) * x
 
     return PairForce(force, tangent, adjoint_x, adjoint_v)
@@ -65,24 +65,24 @@ def pairwise(discretisation: Discretisation) -> PairForce:
 def laminar(discretisation: Discretisation) -> PairForce:
     """phi of the laminar form, as `pairwise`."""
     vector = discretisation.precision.vector
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     factor, factor_gradient = pair.factor, pair.factor_gradient
 
     @wp.func
-    def force(x: vector, v: vector, s: surroundings) -> vector:
+    def force(x: vector, v: vector, s: neighbourhood) -> vector:
         return factor(x, s) * v
 
     @wp.func
-    def tangent(x: vector, v: vector, x_dot: vector, v_dot: vector, s: surroundings) -> vector:
+    def tangent(x: vector, v: vector, x_dot: vector, v_dot: vector, s: neighbourhood) -> vector:
         return factor(x, s) * v_dot + wp.dot(factor_gradient(x, s), x_dot) * v
 
     @wp.func
-    def adjoint_x(x: vector, v: vector, w: vector, s: surroundings) -> vector:
+    def adjoint_x(x: vector, v: vector, w: vector, s: neighbourhood) -> vector:
         return wp.dot(v, w) * factor_gradient(x, s)
 
     @wp.func
-    def adjoint_v(x: vector, v: vector, w: vector, s: surroundings) -> vector:
+    def adjoint_v(x: vector, v: vector, w: vector, s: neighbourhood) -> vector:
         return factor(x, s) * w
 
     return PairForce(force, tangent, adjoint_x, adjoint_v)

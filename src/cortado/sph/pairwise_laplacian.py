@@ -5,15 +5,15 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 
 @cache
-def spreading_functions(discretisation: Discretisation, phases: int) -> SimpleNamespace:
+def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) -> SimpleNamespace:
     """Raw sums of B / V over the neighbours: ``spread``, ``spread_tangent``, ``spread_adjoint``."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     fractions = discretisation.precision.fractions(phases)
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, factor, factor_gradient = pair.separation, pair.factor, pair.factor_gradient
 
@@ -24,7 +24,7 @@ def spreading_functions(discretisation: Discretisation, phases: int) -> SimpleNa
         n: wp.array(dtype=real),
         w: wp.array(dtype=real),
         u: wp.array(dtype=fractions),
-        s: surroundings,
+        s: neighbourhood,
     ) -> fractions:
         x_i = x[i]
         n_i = n[i]
@@ -49,7 +49,7 @@ def spreading_functions(discretisation: Discretisation, phases: int) -> SimpleNa
         w_dot: wp.array(dtype=real),
         u: wp.array(dtype=fractions),
         u_dot: wp.array(dtype=fractions),
-        s: surroundings,
+        s: neighbourhood,
     ) -> fractions:
         x_i = x[i]
         n_i = n[i]
@@ -76,7 +76,7 @@ def spreading_functions(discretisation: Discretisation, phases: int) -> SimpleNa
         w: wp.array(dtype=real),
         u: wp.array(dtype=fractions),
         y: wp.array(dtype=fractions),
-        s: surroundings,
+        s: neighbourhood,
     ):
         """For an adjoint y of the sums: what it gives those of x_i, n_i, w_i and u_i, and y_i times the sum itself."""
         x_i = x[i]

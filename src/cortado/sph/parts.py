@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import warp as wp
 
-from cortado.device.launching import Launcher, Named, add, sum_of
+from cortado.device.launching import KernelLauncher, Named, add, sum_of
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.precision import Precision
 from cortado.device.state import Arrays, Fields, Parameters, zeros
@@ -25,8 +25,8 @@ class StepContext:
     """A step as its parts see it. Kernels find in it, by name, the fields of the particles, the parameters, ``s`` (what
     lies around each particle), ``order`` (sorted -> scene) and ``step`` (1,), the number of the step."""
 
-    launcher: Launcher
-    surroundings: Any
+    launcher: KernelLauncher
+    neighbourhood: Any
     order: wp.array
     step: wp.array
     fields: Fields
@@ -34,7 +34,7 @@ class StepContext:
 
     @cached_property
     def _known(self) -> tuple[Named, ...]:
-        own = {"s": self.surroundings, "order": self.order, "step": self.step}
+        own = {"s": self.neighbourhood, "order": self.order, "step": self.step}
         return own, self.fields.named(), self.parameters.named()
 
     def launch(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:

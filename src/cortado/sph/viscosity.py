@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.kernels import Kernels
-from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 from cortado.sph.pair_forces import PairForm, laminar, pairwise
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 
@@ -26,7 +26,7 @@ from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels:
     """Kernels ``forward``, ``tangent`` and ``adjoint`` of the viscous acceleration with a given pair force phi."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, vectors, numbers = pair.separation, pair.vectors, pair.numbers
     phi = form(discretisation)
@@ -61,7 +61,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         v: wp.array(dtype=vector),
         n: wp.array(dtype=real),
         mu: wp.array(dtype=real),
-        s: surroundings,
+        s: neighbourhood,
     ) -> vector:
         x_i = x[i]
         v_i = v[i]
@@ -94,7 +94,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         n_dot: wp.array(dtype=real),
         mu: wp.array(dtype=real),
         mu_dot: wp.array(dtype=real),
-        s: surroundings,
+        s: neighbourhood,
     ) -> vector:
         x_i = x[i]
         v_i = v[i]
@@ -124,7 +124,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
 
     @wp.kernel(module=discretisation.module(True, name))
     def viscosity(
-        s: surroundings,
+        s: neighbourhood,
         kappa: real,
         friction: real,
         x: wp.array(dtype=vector),
@@ -142,7 +142,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
 
     @wp.kernel(module=discretisation.module(False, name), enable_backward=False)
     def viscosity_tangent(
-        s: surroundings,
+        s: neighbourhood,
         kappa: real,
         friction: real,
         x: wp.array(dtype=vector),
@@ -168,7 +168,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
 
     @wp.kernel(module=discretisation.module(False, name), enable_backward=False)
     def viscosity_adjoint(
-        s: surroundings,
+        s: neighbourhood,
         kappa: real,
         friction: real,
         x: wp.array(dtype=vector),

@@ -14,7 +14,7 @@ from cortado.simulation import Simulation
 from cortado.study.canvas import blank
 from cortado.study.comparison import growth
 from cortado.study.experiment import DeviceSettings, Kind, Progress, SceneSettings, Several
-from cortado.study.sources import ByPolicy, FiniteDifference, Source, Warp
+from cortado.study.sources import ByEstimator, FiniteDifference, Source, Warp
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def measure(settings: ImageHorizon, progress: Progress) -> Table:
 
 def _sources(settings: ImageHorizon) -> dict[str, Source]:
     differences = {_name(step): FiniteDifference(step, Warp()) for step in settings.differences}
-    return {TAPE: ByPolicy(Tape()), ADJOINT: ByPolicy(Exact()), **differences}
+    return {TAPE: ByEstimator(Tape()), ADJOINT: ByEstimator(Exact()), **differences}
 
 
 def _name(step: float) -> str:

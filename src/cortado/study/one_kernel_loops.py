@@ -14,7 +14,7 @@ from functools import cache
 import warp as wp
 
 from cortado.device.kernels import Kernels
-from cortado.device.neighbourhood import Discretisation, pair_functions, surroundings_type
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.gradients import Tape
 from cortado.rollout import Rollout, StepDerivative
 
@@ -43,14 +43,14 @@ def one_kernel_loops(discretisation: Discretisation) -> dict[str, wp.Kernel]:
         discretisation.precision.vector,
         discretisation.precision.pair,
     )
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, weight, gradient = pair.separation, pair.weight, pair.gradient
     module = discretisation.module(True, "one_kernel_loops")
 
     @wp.kernel(module=module)
     def density(
-        s: surroundings,
+        s: neighbourhood,
         x: wp.array(dtype=vector),
         # out
         n: wp.array(dtype=real),
@@ -65,8 +65,8 @@ def one_kernel_loops(discretisation: Discretisation) -> dict[str, wp.Kernel]:
         n[i] = s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
 
     @wp.kernel(module=module)
-    def wall_yield(
-        s: surroundings,
+    def wall_relaxation(
+        s: neighbourhood,
         x: wp.array(dtype=vector),
         # out
         y: wp.array(dtype=real),
@@ -75,12 +75,12 @@ def one_kernel_loops(discretisation: Discretisation) -> dict[str, wp.Kernel]:
         total = vector()
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
-            total += (s.pliancy * s.wall_weights[b]) * gradient(separation(x[i], s.wall_positions[b], s), s)
+            total += (s.response_scale * s.wall_weights[b]) * gradient(separation(x[i], s.wall_positions[b], s), s)
         y[i] = real(1.0) / (real(1.0) + wp.dot(total, total))
 
     @wp.kernel(module=module)
     def pressure(
-        s: surroundings,
+        s: neighbourhood,
         stiffness: real,
         time_step: wp.array(dtype=real),
         n: wp.array(dtype=real),
@@ -111,7 +111,7 @@ def one_kernel_loops(discretisation: Discretisation) -> dict[str, wp.Kernel]:
 
     @wp.kernel(module=module)
     def pressure_force(
-        s: surroundings,
+        s: neighbourhood,
         time_step: wp.array(dtype=real),
         m: wp.array(dtype=real),
         x: wp.array(dtype=vector),
@@ -136,4 +136,4 @@ def one_kernel_loops(discretisation: Discretisation) -> dict[str, wp.Kernel]:
         v_star[i] = velocity
         x_star[i] = x[i] + dt * velocity
 
-    return {"density": density, "walls": wall_yield, "pressure": pressure, "force": pressure_force}
+    return {"density": density, "walls": wall_relaxation, "pressure": pressure, "force": pressure_force}

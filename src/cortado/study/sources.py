@@ -1,6 +1,6 @@
 """Gradients of one problem by many ways, with one interface: ``source(problem, parameters)``.
 
-`ByPolicy` (Warp's tape, the gather adjoint, a smoothed loss, any policy), `WarpTangent`, `ReferenceAdjoint`,
+`ByEstimator` (Warp's tape, the gather adjoint, a smoothed loss, any estimator), `WarpTangent`, `ReferenceAdjoint`,
 `ReferenceTangent` (each precision and method), and `FiniteDifference`, of any step, on either engine.
 """
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cortado import reference
 from cortado.device.state import State
-from cortado.gradients import AdjointNorms, AdjointPolicy, Policy
+from cortado.gradients import AdjointEstimator, AdjointNorms, GradientEstimator
 from cortado.losses import Frames
 from cortado.losses.checked import as_loss
 from cortado.parameters.values import Arrays, Values
@@ -51,17 +51,17 @@ class Source(Protocol):
 
 
 @dataclass(frozen=True)
-class ByPolicy:
-    """A policy of Cortado's: `Exact` is the gather adjoint, `Tape` Warp's own, `Smoothed` the mean of differences."""
+class ByEstimator:
+    """An estimator of Cortado's: `Exact` is the gather adjoint, `Tape` Warp's own."""
 
-    policy: Policy
+    estimator: GradientEstimator
 
     def __call__(self, problem: Problem, parameters: Values) -> Found:
-        if not isinstance(self.policy, AdjointPolicy):
-            estimate = problem.estimate(parameters, self.policy)
+        if not isinstance(self.estimator, AdjointEstimator):
+            estimate = problem.estimate(parameters, self.estimator)
             return Found(estimate.loss, estimate.gradient, None)
         norms = AdjointNorms(problem.simulation.solver, problem.steps)
-        estimate = problem.estimate(parameters, self.policy, norms)
+        estimate = problem.estimate(parameters, self.estimator, norms)
         return Found(estimate.loss, estimate.gradient, Norms(*norms.numpy().T))
 
 

@@ -78,7 +78,7 @@ def _search(made: Assignment, progress: Progress) -> list[Record]:
                 settings.algorithm(),
                 settings.iterations,
                 bounds=made.bounds,
-                policy=tuned(settings.policy.policy(), search, start),
+                gradient=tuned(settings.gradient.estimator(), search, start),
                 on_iteration=note,
             )
             start = found.last_parameters

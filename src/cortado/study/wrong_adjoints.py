@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RIGHT, LINEAR, CLAMP, WALLS = "sums in functions", "linear after the loop", "clamp after it", "wall yield after it"
-WAYS: dict[str, gradients.Policy] = {
+WAYS: dict[str, gradients.GradientEstimator] = {
     RIGHT: gradients.Tape(),
     LINEAR: OneKernelTape(("density", "force")),
     CLAMP: OneKernelTape(("pressure",)),
@@ -66,8 +66,8 @@ def measure(settings: WrongAdjointsSettings, progress: Progress) -> Table:
                 at = {"gravity": np.array(settings.scene.forces.gravity), **state}
                 exact = engine.gradient(at, horizon, reference.FinalPositions(target)).parameters
                 problem = Problem(simulation, horizon, losses.FinalPositions(target))
-                for way, policy in WAYS.items():
-                    _, gradient = problem.value_and_gradient(at, policy)
+                for way, estimator in WAYS.items():
+                    _, gradient = problem.value_and_gradient(at, estimator)
                     for parameter in PARAMETERS:
                         right = exact[parameter].high
                         size = np.linalg.norm(right)

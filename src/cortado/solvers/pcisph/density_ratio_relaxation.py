@@ -17,14 +17,14 @@ from typing import Any
 import warp as wp
 
 from cortado.device.kernels import Kernels
-from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 SOFTNESS = 0.2
 """a [-]"""
 
 
 @dataclass(frozen=True)
-class ContrastKernels(Kernels):
+class DensityRatioKernels(Kernels):
     """The kernels, two of them for the way back."""
 
     factor_adjoint: Any
@@ -32,16 +32,16 @@ class ContrastKernels(Kernels):
 
 
 @cache
-def contrast_kernels(discretisation: Discretisation) -> ContrastKernels:
+def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels:
     """The kernels for a smoothing kernel and a precision."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, weight, gradient = pair.separation, pair.weight, pair.gradient
     a = wp.constant(real(SOFTNESS))
 
     @wp.func
-    def contrast_sum(i: int, x: wp.array(dtype=vector), m: wp.array(dtype=real), s: surroundings) -> real:
+    def density_ratio_sum(i: int, x: wp.array(dtype=vector), m: wp.array(dtype=real), s: neighbourhood) -> real:
         """t_i / V"""
         x_i = x[i]
         m_i = m[i]
@@ -68,7 +68,7 @@ def contrast_kernels(discretisation: Discretisation) -> ContrastKernels:
 
     @wp.kernel(module=discretisation.module(True, "contrast"))
     def contrast(
-        s: surroundings,
+        s: neighbourhood,
         x: wp.array(dtype=vector),
         m: wp.array(dtype=real),
         wall_y: wp.array(dtype=real),
@@ -77,13 +77,13 @@ def contrast_kernels(discretisation: Discretisation) -> ContrastKernels:
         y: wp.array(dtype=real),
     ):
         i = s.first + wp.tid()
-        total = contrast_sum(i, x, m, s)
+        total = density_ratio_sum(i, x, m, s)
         t[i] = s.volume * total
         y[i] = wall_y[i] / (real(1.0) + excess(s.volume * total))
 
     @wp.kernel(module=discretisation.module(False, "contrast"), enable_backward=False)
-    def contrast_tangent(
-        s: surroundings,
+    def density_ratio_tangent(
+        s: neighbourhood,
         x: wp.array(dtype=vector),
         x_dot: wp.array(dtype=vector),
         m: wp.array(dtype=real),
@@ -109,7 +109,7 @@ def contrast_kernels(discretisation: Discretisation) -> ContrastKernels:
 
     @wp.kernel(module=discretisation.module(False, "contrast"), enable_backward=False)
     def factor_adjoint(
-        s: surroundings,
+        s: neighbourhood,
         t: wp.array(dtype=real),
         y: wp.array(dtype=real),
         # in and out
@@ -124,8 +124,8 @@ def contrast_kernels(discretisation: Discretisation) -> ContrastKernels:
         y_bar[i] = y_bar[i] * part
 
     @wp.kernel(module=discretisation.module(False, "contrast"), enable_backward=False)
-    def contrast_adjoint(
-        s: surroundings,
+    def density_ratio_adjoint(
+        s: neighbourhood,
         x: wp.array(dtype=vector),
         m: wp.array(dtype=real),
         t_bar: wp.array(dtype=real),
@@ -148,4 +148,4 @@ def contrast_kernels(discretisation: Discretisation) -> ContrastKernels:
         x_bar[i] = x_bar[i] + s.volume * x_sum
         m_bar[i] = m_bar[i] + s.volume * m_sum / m_i
 
-    return ContrastKernels(contrast, contrast_tangent, contrast_adjoint, factor_adjoint)
+    return DensityRatioKernels(contrast, density_ratio_tangent, density_ratio_adjoint, factor_adjoint)

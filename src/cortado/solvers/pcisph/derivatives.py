@@ -88,7 +88,7 @@ class PcisphAdjoint:
                 self._force,
                 *known,
                 stiffness=solver.lattice.stiffness,
-                y=solver.pressure_yield,
+                y=solver.pressure_relaxation,
                 p_in=it.p[k],
                 p_out=it.p[k + 1],
                 c=it.c[k],
@@ -102,11 +102,11 @@ class PcisphAdjoint:
         for force in reversed(solver.forces):
             force.adjoint(context, self._acceleration_bar, bar)
         if solver.mixture.phases.count > 1:
-            factors = {"t": solver.contrast, "y": solver.pressure_yield, "y_bar": self._y_bar}
+            factors = {"t": solver.contrast, "y": solver.pressure_relaxation, "y_bar": self._y_bar}
             context.launch(kernels.contrast.factor_adjoint, **factors, t_bar=self._t_bar)
             context.launch(kernels.contrast.adjoint, *known, t_bar=self._t_bar)
         if not self._frozen:
-            context.launch(kernels.walls.adjoint, *known, y=solver.wall_yield, y_bar=self._y_bar)
+            context.launch(kernels.walls.adjoint, *known, y=solver.wall_relaxation, y_bar=self._y_bar)
         self._mixture.step(context, bar, new_state_bar.mass_fractions, state_bar.mass_fractions)
         m_scene_bar = bar.parameters["reference_density"]
         context.launch(kernels.integration.collect_masses, *known, m_scene_bar=m_scene_bar)
@@ -164,7 +164,7 @@ class PcisphTangent:
                 kernels.pressure.tangent,
                 *known,
                 stiffness=solver.lattice.stiffness,
-                y=solver.pressure_yield,
+                y=solver.pressure_relaxation,
                 y_dot=self._y_dot,
                 x_star=it.x_star[k],
                 x_star_dot=self._x_star_dot,
@@ -194,7 +194,7 @@ class PcisphTangent:
         solver, kernels = self._solver, self._solver.kernels
         several = solver.mixture.phases.count > 1
         y_dot = self._wall_y_dot if several else self._y_dot
-        context.launch(kernels.walls.tangent, *known, y=solver.wall_yield, y_dot=y_dot)
+        context.launch(kernels.walls.tangent, *known, y=solver.wall_relaxation, y_dot=y_dot)
         if several:
-            factors = {"t": solver.contrast, "y": solver.pressure_yield, "wall_y_dot": y_dot, "y_dot": self._y_dot}
+            factors = {"t": solver.contrast, "y": solver.pressure_relaxation, "wall_y_dot": y_dot, "y_dot": self._y_dot}
             context.launch(kernels.contrast.tangent, *known, **factors)

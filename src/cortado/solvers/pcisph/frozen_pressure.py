@@ -8,20 +8,20 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 
 @cache
 def frozen_force_adjoint(discretisation: Discretisation) -> Any:
     """The kernel: the exact one, but for what it adds to the adjoints of positions and densities."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, gradient, vectors, numbers = pair.separation, pair.gradient, pair.vectors, pair.numbers
 
     @wp.kernel(module=discretisation.module(False, "frozen_pressure"), enable_backward=False)
     def adjoint(
-        s: surroundings,
+        s: neighbourhood,
         stiffness: real,
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),

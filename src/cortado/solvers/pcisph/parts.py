@@ -8,7 +8,7 @@ import warp as wp
 from cortado.device.kernels import Kernels
 from cortado.device.neighbourhood import Discretisation
 from cortado.solvers.pcisph.convergence import ConvergenceKernels, convergence_kernels
-from cortado.solvers.pcisph.density_ratio_relaxation import ContrastKernels, contrast_kernels
+from cortado.solvers.pcisph.density_ratio_relaxation import DensityRatioKernels, density_ratio_kernels
 from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
 from cortado.solvers.pcisph.wall_relaxation import wall_kernels
 from cortado.sph.density import density_kernels
@@ -33,7 +33,7 @@ class PcisphKernels:
 
     density: Kernels
     walls: Kernels
-    contrast: ContrastKernels
+    contrast: DensityRatioKernels
     pressure: Kernels
     force: Kernels
     integration: IntegrationKernels
@@ -45,7 +45,7 @@ class PcisphKernels:
         return cls(
             density_kernels(discretisation),
             wall_kernels(discretisation),
-            contrast_kernels(discretisation),
+            density_ratio_kernels(discretisation),
             pressure_kernels(discretisation),
             pressure_force_kernels(discretisation),
             integration_kernels(discretisation.precision),

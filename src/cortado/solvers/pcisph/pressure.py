@@ -17,7 +17,7 @@ from functools import cache
 import warp as wp
 
 from cortado.device.kernels import Kernels
-from cortado.device.neighbourhood import UNROLL, Discretisation, pair_functions, surroundings_type
+from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 from cortado.sph.density import density_sums
 from cortado.sph.integration import prediction_share
 
@@ -30,14 +30,14 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         discretisation.precision.vector,
         discretisation.precision.pair,
     )
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     sums = density_sums(discretisation)
     weights, weights_tangent, weights_adjoint = sums.weights, sums.weights_tangent, sums.weights_adjoint
     adjoin_prediction = prediction_share(discretisation.precision)
 
     @wp.kernel(module=discretisation.module(True))
     def pressure(
-        s: surroundings,
+        s: neighbourhood,
         stiffness: real,
         time_step: wp.array(dtype=real),
         n: wp.array(dtype=real),
@@ -66,7 +66,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def pressure_tangent(
-        s: surroundings,
+        s: neighbourhood,
         stiffness: real,
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
@@ -103,7 +103,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def pressure_adjoint(
-        s: surroundings,
+        s: neighbourhood,
         time_step: wp.array(dtype=real),
         m: wp.array(dtype=real),
         v: wp.array(dtype=vector),
@@ -134,13 +134,13 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
 def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     """Kernels ``forward``, ``tangent``, ``adjoint`` of the pressure force and the prediction that follows it."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, gradient, hessian_product = pair.separation, pair.gradient, pair.hessian_product
     vectors, numbers = pair.vectors, pair.numbers
 
     @wp.func
-    def force_sum(i: int, x: wp.array(dtype=vector), c: wp.array(dtype=real), s: surroundings) -> vector:
+    def force_sum(i: int, x: wp.array(dtype=vector), c: wp.array(dtype=real), s: neighbourhood) -> vector:
         x_i = x[i]
         c_i = c[i]
         total = vector()
@@ -161,7 +161,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         x_dot: wp.array(dtype=vector),
         c: wp.array(dtype=real),
         c_dot: wp.array(dtype=real),
-        s: surroundings,
+        s: neighbourhood,
     ) -> vector:
         x_i = x[i]
         x_dot_i = x_dot[i]
@@ -183,7 +183,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
 
     @wp.kernel(module=discretisation.module(True))
     def pressure_force(
-        s: surroundings,
+        s: neighbourhood,
         time_step: wp.array(dtype=real),
         m: wp.array(dtype=real),
         x: wp.array(dtype=vector),
@@ -204,7 +204,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def pressure_force_tangent(
-        s: surroundings,
+        s: neighbourhood,
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
         m: wp.array(dtype=real),
@@ -234,7 +234,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def pressure_force_adjoint(
-        s: surroundings,
+        s: neighbourhood,
         stiffness: real,
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),

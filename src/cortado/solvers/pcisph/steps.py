@@ -9,8 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.launching import Launcher, sum_and_maximum
-from cortado.device.neighbourhood import Discretisation, surroundings_type
+from cortado.device.launching import KernelLauncher, sum_and_maximum
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type
 from cortado.device.neighbours import NeighbourSearch
 from cortado.device.state import Fields, Parameters, State
 from cortado.device.threads import Turn
@@ -50,7 +50,7 @@ class PcisphSteps:
         self.discretisation, self.lattice, self.search = discretisation, lattice, search
         self.particles, self.device = particles, device
         self.forces, self.pressure, self.periods = tuple(forces), pressure, tuple(periods)
-        self.launch = Launcher(particles, device, record_tape=requires_grad)
+        self.launch = KernelLauncher(particles, device, record_tape=requires_grad)
         self.turn = Turn(device)
         """Whose arrays these are now."""
         self.mixture = Mixture(phases, precision, particles, device, requires_grad)
@@ -69,8 +69,8 @@ class PcisphSteps:
         def numbers() -> wp.array:
             return wp.zeros(particles, dtype=precision.real, device=device, requires_grad=requires_grad)
 
-        self.wall_yield, self.contrast = numbers(), numbers()
-        self.pressure_yield = numbers() if phases.count > 1 else self.wall_yield
+        self.wall_relaxation, self.contrast = numbers(), numbers()
+        self.pressure_relaxation = numbers() if phases.count > 1 else self.wall_relaxation
         """(n,) what delta is multiplied with [-]: beside walls, and with several phases among lighter neighbours."""
         self.accelerations = [vectors() for _ in range(len(self.forces) + 1)]
         """``accelerations[t]``: of the first t forces; the first is 0 and never written."""
@@ -92,7 +92,7 @@ class PcisphSteps:
             self.search.allocate(capacity)
             self.generation += 1
         search, lattice, precision = self.search, self.lattice, self.discretisation.precision
-        s = surroundings_type(precision)()
+        s = neighbourhood_type(precision)()
         s.neighbours, s.fluid_count, s.filling, s.count = (
             search.neighbours,
             search.fluid_count,
@@ -102,8 +102,8 @@ class PcisphSteps:
         s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
         s.support, s.reach = lattice.support, (1.0 + SKIN) * lattice.support
         s.normalisation = lattice.normalisation
-        s.self_weight, s.volume, s.pliancy = lattice.self_weight, lattice.volume, lattice.rigidity**-0.5
-        s.evenness = lattice.evenness
+        s.self_weight, s.volume, s.response_scale = lattice.self_weight, lattice.volume, lattice.response**-0.5
+        s.laplacian_correction = lattice.laplacian_correction
         s.periodic = int(any(self.periods))
         s.period = precision.vector(*self.periods)
         s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in self.periods))
@@ -207,9 +207,11 @@ class PcisphSteps:
         self.search.fill(self._surroundings, f["x"])
         context.launch(kernels.density.forward)
         self.mixture.diffuse(context, state.mass_fractions)
-        context.launch(kernels.walls.forward, y=self.wall_yield)
+        context.launch(kernels.walls.forward, y=self.wall_relaxation)
         if self.mixture.phases.count > 1:
-            context.launch(kernels.contrast.forward, wall_y=self.wall_yield, t=self.contrast, y=self.pressure_yield)
+            context.launch(
+                kernels.contrast.forward, wall_y=self.wall_relaxation, t=self.contrast, y=self.pressure_relaxation
+            )
         for t, force in enumerate(self.forces):
             force.accelerate(context, self.accelerations[t], self.accelerations[t + 1])
         first = {"x_star": it.x_star[0], "v_star": it.v_star[0]}
@@ -250,7 +252,7 @@ class PcisphSteps:
         context.launch(
             kernels.pressure.forward,
             stiffness=self.lattice.stiffness,
-            y=self.pressure_yield,
+            y=self.pressure_relaxation,
             x_star=it.x_star[before],
             p_in=it.p[0] if k == 0 else it.p[max(slot - 1, 1)],
             p_out=it.p[max(slot, 1)],

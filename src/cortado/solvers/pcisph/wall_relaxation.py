@@ -17,36 +17,38 @@ from functools import cache
 import warp as wp
 
 from cortado.device.kernels import Kernels
-from cortado.device.neighbourhood import Discretisation, pair_functions, surroundings_type
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 
 
 @cache
 def wall_kernels(discretisation: Discretisation) -> Kernels:
     """Kernels ``forward``, ``tangent`` and ``adjoint`` of the yield."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
-    surroundings = surroundings_type(discretisation.precision)
+    neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, gradient, hessian_product = pair.separation, pair.gradient, pair.hessian_product
 
     @wp.func
-    def wall_gradient(i: int, x: wp.array(dtype=vector), s: surroundings) -> vector:
+    def wall_gradient(i: int, x: wp.array(dtype=vector), s: neighbourhood) -> vector:
         total = vector()
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
-            total += (s.pliancy * s.wall_weights[b]) * gradient(separation(x[i], s.wall_positions[b], s), s)
+            total += (s.response_scale * s.wall_weights[b]) * gradient(separation(x[i], s.wall_positions[b], s), s)
         return total
 
     @wp.func
-    def wall_hessian_product(i: int, x: wp.array(dtype=vector), u: vector, s: surroundings) -> vector:
+    def wall_hessian_product(i: int, x: wp.array(dtype=vector), u: vector, s: neighbourhood) -> vector:
         total = vector()
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
-            total += (s.pliancy * s.wall_weights[b]) * hessian_product(separation(x[i], s.wall_positions[b], s), u, s)
+            total += (s.response_scale * s.wall_weights[b]) * hessian_product(
+                separation(x[i], s.wall_positions[b], s), u, s
+            )
         return total
 
     @wp.kernel(module=discretisation.module(True))
-    def wall_yield(
-        s: surroundings,
+    def wall_relaxation(
+        s: neighbourhood,
         x: wp.array(dtype=vector),
         # out
         y: wp.array(dtype=real),
@@ -56,8 +58,8 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
         y[i] = real(1.0) / (real(1.0) + wp.dot(total, total))
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
-    def wall_yield_tangent(
-        s: surroundings,
+    def wall_relaxation_tangent(
+        s: neighbourhood,
         x: wp.array(dtype=vector),
         x_dot: wp.array(dtype=vector),
         y: wp.array(dtype=real),
@@ -70,8 +72,8 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
         y_dot[i] = real(-2.0) * y[i] * y[i] * wp.dot(total, total_dot)
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
-    def wall_yield_adjoint(
-        s: surroundings,
+    def wall_relaxation_adjoint(
+        s: neighbourhood,
         x: wp.array(dtype=vector),
         y: wp.array(dtype=real),
         y_bar: wp.array(dtype=real),
@@ -82,4 +84,4 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
         total_bar = (real(-2.0) * y_bar[i] * y[i] * y[i]) * wall_gradient(i, x, s)
         x_bar[i] = x_bar[i] + wall_hessian_product(i, x, total_bar, s)
 
-    return Kernels(wall_yield, wall_yield_tangent, wall_yield_adjoint)
+    return Kernels(wall_relaxation, wall_relaxation_tangent, wall_relaxation_adjoint)

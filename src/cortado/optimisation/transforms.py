@@ -12,7 +12,7 @@ import numpy as np
 
 from cortado.arrays import as_numbers
 from cortado.errors import InputError
-from cortado.gradients import Estimate, Passage, Policy, estimate
+from cortado.gradients import Estimate, ForwardPass, GradientEstimator, estimate
 from cortado.parameters.values import Arrays
 from cortado.problem import Problem
 from cortado.rollout import Observer, StepDerivative
@@ -21,7 +21,7 @@ SMALLEST = 1e-4
 """Fractions below it are taken as it where coordinates are looked for: that of 0 is infinitely far away."""
 
 
-class Coordinates(Protocol):
+class Bijector(Protocol):
     """A smooth map p(u), with what it does to a gradient."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
@@ -90,10 +90,10 @@ class Knots:
         return self._weights.T @ bar
 
 
-class Reparametrised:
+class Transformed:
     """A problem whose parameters are coordinates; those without any are their own."""
 
-    def __init__(self, problem: Problem, coordinates: Mapping[str, Coordinates]):
+    def __init__(self, problem: Problem, coordinates: Mapping[str, Bijector]):
         self.problem, self.coordinates = problem, dict(coordinates)
         self.simulation = problem.simulation
 
@@ -117,26 +117,30 @@ class Reparametrised:
         """The loss, forward only."""
         return self.problem.value(self.parameters(u))
 
-    def value_and_gradient(self, u: Mapping[str, Any], policy: Policy | None = None) -> tuple[float, Arrays]:
+    def value_and_gradient(
+        self, u: Mapping[str, Any], gradient: GradientEstimator | None = None
+    ) -> tuple[float, Arrays]:
         """The loss and its derivatives with respect to the coordinates."""
-        found = self.estimate(u, policy)
+        found = self.estimate(u, gradient)
         return found.loss, found.gradient
 
-    def estimate(self, u: Mapping[str, Any], policy: Policy | None = None, observe: Observer | None = None) -> Estimate:
-        """The same, with what the policy reports; a spread, of a policy that has one, is that of coordinates."""
-        return estimate(self, u, policy, observe)
+    def estimate(
+        self, u: Mapping[str, Any], gradient: GradientEstimator | None = None, observe: Observer | None = None
+    ) -> Estimate:
+        """The same, with what the estimator reports; a spread, of an estimator that has one, is that of coordinates."""
+        return estimate(self, u, gradient, observe)
 
-    def passage(self, u: Mapping[str, Any]) -> "CoordinatePassage":
-        """A forward run that can be gone back through: what policies work with."""
-        return CoordinatePassage(self.problem.passage(self.parameters(u)), self.coordinates, u)
+    def forward_pass(self, u: Mapping[str, Any]) -> "TransformedPass":
+        """A forward run that can be gone back through: what estimators work with."""
+        return TransformedPass(self.problem.forward_pass(self.parameters(u)), self.coordinates, u)
 
 
-class CoordinatePassage:
+class TransformedPass:
     """A forward run of a problem, and ways back to coordinates."""
 
-    def __init__(self, passage: Passage, coordinates: Mapping[str, Coordinates], u: Mapping[str, Any]):
-        self._passage, self._coordinates, self._u = passage, coordinates, u
-        self.loss, self.rollout, self.derivative = passage.loss, passage.rollout, passage.derivative
+    def __init__(self, forward_pass: ForwardPass, coordinates: Mapping[str, Bijector], u: Mapping[str, Any]):
+        self._passage, self._coordinates, self._u = forward_pass, coordinates, u
+        self.loss, self.rollout, self.derivative = forward_pass.loss, forward_pass.rollout, forward_pass.derivative
 
     def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:
         """The gradient with respect to the coordinates."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cortado import InputError, Problem, Simulation, gradients, losses
-from cortado.optimisation.reparametrisation import SMALLEST, Knots, Logarithm, Reparametrised, Softmax
+from cortado.optimisation.transforms import SMALLEST, Knots, Logarithm, Softmax, Transformed
 from scenes import plane, plane_of_three
 
 STEPS = 6
@@ -125,7 +125,7 @@ def start_of(problem):
 
 @pytest.mark.parametrize("what", ["gravity", "mass_fractions", "viscosity", "time_step", "initial_velocities", "all"])
 def test_the_gradient_in_coordinates_is_the_limit_of_differences(problem, what):
-    search = Reparametrised(problem, COORDINATES)
+    search = Transformed(problem, COORDINATES)
     u = search.coordinate(start_of(problem))
     assert {name: np.shape(value) for name, value in u.items()} == {
         "gravity": (3, 2),
@@ -152,17 +152,17 @@ def test_the_gradient_in_coordinates_is_the_limit_of_differences(problem, what):
 
 def test_without_coordinates_it_is_the_problem_itself(problem):
     point = start_of(problem)
-    search = Reparametrised(problem, {})
+    search = Transformed(problem, {})
     assert search.parameters(point) == point and search.coordinate(point) == point
     (loss, gradient), (wanted, exact) = search.value_and_gradient(point), problem.value_and_gradient(point)
     assert loss == wanted and all(gradient[name].tobytes() == exact[name].tobytes() for name in point)
 
 
-@pytest.mark.parametrize("policy", [gradients.VelocityOnly(), gradients.AdjointSmoothing(0.2, order=2)], ids=repr)
-def test_policies_go_back_to_coordinates(problem, policy):
-    search = Reparametrised(problem, COORDINATES)
+@pytest.mark.parametrize("estimator", [gradients.FrozenGeometry(), gradients.AdjointViscosity(0.2, order=2)], ids=repr)
+def test_policies_go_back_to_coordinates(problem, estimator):
+    search = Transformed(problem, COORDINATES)
     u = search.coordinate(start_of(problem))
-    found, plain = search.estimate(u, policy), problem.estimate(search.parameters(u), policy)
+    found, plain = search.estimate(u, estimator), problem.estimate(search.parameters(u), estimator)
     assert found.loss == plain.loss and found.strength == plain.strength
     for name, gradient in plain.gradient.items():
         wanted = COORDINATES[name].adjoint(u[name], gradient) if name in COORDINATES else gradient
@@ -171,20 +171,20 @@ def test_policies_go_back_to_coordinates(problem, policy):
 
 def test_a_cloud_is_one_of_coordinates(problem):
     """Its gravity has one row a knot, and there are few numbers enough for differences."""
-    search = Reparametrised(problem, COORDINATES)
+    search = Transformed(problem, COORDINATES)
     u = {"gravity": search.coordinate(start_of(problem))["gravity"]}
     _, exact = search.value_and_gradient(u)
-    for policy in (
-        gradients.Smoothed(0.01, disorder=0.0),
-        gradients.Averaged(0.01, disorder=0.0, policy=gradients.Exact()),
+    for estimator in (
+        gradients.RandomizedSmoothing(0.01, disorder=0.0),
+        gradients.EnsembleMean(0.01, disorder=0.0, estimator=gradients.Exact()),
     ):
-        found = search.estimate(u, policy).gradient["gravity"]
+        found = search.estimate(u, estimator).gradient["gravity"]
         assert found.shape == (3, 2)
         assert np.linalg.norm(found - exact["gravity"]) < 0.01 * np.linalg.norm(exact["gravity"])
 
 
 def test_coordinates_of_parameters_that_are_not_given_do_no_harm(problem):
-    search = Reparametrised(problem, COORDINATES)
+    search = Transformed(problem, COORDINATES)
     _, gradient = search.value_and_gradient({"viscosity": np.log(problem.simulation.parameters()["viscosity"])})
     assert gradient.keys() == {"viscosity"}
 
@@ -192,13 +192,13 @@ def test_coordinates_of_parameters_that_are_not_given_do_no_harm(problem):
 def test_fingerprints_tell_coordinates_apart(problem):
     other = Problem(Simulation(plane(), precision="float64"), STEPS, lambda x, v, loss: None)
     searches = [
-        Reparametrised(problem, {}),
-        Reparametrised(problem, {"gravity": Knots(STEPS, 3)}),
-        Reparametrised(problem, {"gravity": Knots(STEPS, 4)}),
-        Reparametrised(problem, {"viscosity": Logarithm()}),
-        Reparametrised(problem, {"time_step": Logarithm()}),
-        Reparametrised(other, {"viscosity": Logarithm()}),
+        Transformed(problem, {}),
+        Transformed(problem, {"gravity": Knots(STEPS, 3)}),
+        Transformed(problem, {"gravity": Knots(STEPS, 4)}),
+        Transformed(problem, {"viscosity": Logarithm()}),
+        Transformed(problem, {"time_step": Logarithm()}),
+        Transformed(other, {"viscosity": Logarithm()}),
     ]
     assert len({search.fingerprint for search in searches}) == len(searches)
     turned = {name: COORDINATES[name] for name in reversed(COORDINATES)}
-    assert Reparametrised(problem, COORDINATES).fingerprint == Reparametrised(problem, turned).fingerprint
+    assert Transformed(problem, COORDINATES).fingerprint == Transformed(problem, turned).fingerprint
