@@ -454,7 +454,7 @@ def test_before_chaos_smoothed_and_exact_agree():
     problem = Problem(simulation, 60, losses.CentreOfMass([0.1, 0.1, 0.1]))
     point = {"gravity": np.array([0.5, -9.81, 0.0])}
     _, exact = problem.value_and_gradient(point)
-    found = problem.estimate(point, gradients.RandomizedSmoothing(0.1, samples=4, disorder=0.001))
+    found = problem.estimate(point, gradients.RandomizedSmoothing(0.1, samples=4, position_noise=0.001))
     assert np.linalg.norm(found.gradient["gravity"] - exact["gravity"]) < 0.02 * np.linalg.norm(exact["gravity"])
 
 
@@ -525,7 +525,7 @@ def test_before_chaos_an_average_and_the_exact_gradient_agree():
     point = {"gravity": np.array([0.5, -9.81, 0.0]), "initial_positions": simulation.positions}
     _, exact = problem.value_and_gradient(point)
     estimator = gradients.EnsembleMean(
-        {"gravity": 0.1, "initial_positions": 1e-6}, disorder=0.001, estimator=gradients.Exact()
+        {"gravity": 0.1, "initial_positions": 1e-6}, position_noise=0.001, estimator=gradients.Exact()
     )
     found = problem.estimate(point, estimator)
     assert found.strength is None and found.gradient["initial_positions"].shape == simulation.positions.shape
@@ -565,8 +565,8 @@ MISTAKES = {
     "samples in words": lambda p: gradients.EnsembleMean(samples="4"),
     "odd samples": lambda p: gradients.EnsembleMean(samples=5),
     "half a sample": lambda p: gradients.RandomizedSmoothing(samples=2.5),
-    "no disorder": lambda p: gradients.RandomizedSmoothing(disorder=None),
-    "endless disorder": lambda p: gradients.EnsembleMean(disorder=np.inf),
+    "no position noise": lambda p: gradients.RandomizedSmoothing(position_noise=None),
+    "endless position noise": lambda p: gradients.EnsembleMean(position_noise=np.inf),
     "negative seed": lambda p: gradients.RandomizedSmoothing(seed=-1),
     "a sample out of range": lambda p: p.estimate(
         {"viscosity": 0.1}, gradients.EnsembleMean(1.0, estimator=gradients.Exact())
@@ -586,7 +586,7 @@ MISTAKES = {
     "an average of one": lambda p: gradients.EnsembleMean(samples=1),
     "an average over no spread": lambda p: p.estimate({"viscosity": 1.0}, gradients.EnsembleMean(0.0)),
     "an average of no estimator": lambda p: gradients.EnsembleMean(estimator=gradients.Exact),
-    "disorder below 0": lambda p: gradients.RandomizedSmoothing(disorder=-0.1),
+    "position noise below 0": lambda p: gradients.RandomizedSmoothing(position_noise=-0.1),
     "spread 0": lambda p: p.estimate({"viscosity": 1.0}, gradients.RandomizedSmoothing(0.0)),
     "spread without a name": lambda p: p.estimate({"viscosity": 1.0}, gradients.RandomizedSmoothing({"gravity": 1.0})),
     "too many numbers": lambda p: p.estimate(

@@ -151,7 +151,7 @@ def test_terms_left_out_are_left_out(problem, truth):
 
 
 def test_a_smoothed_gradient_has_no_history(problem, truth):
-    found = ByEstimator(gradients.RandomizedSmoothing(spread=1e-3, samples=2, disorder=0.0))(problem, PARAMETERS)
+    found = ByEstimator(gradients.RandomizedSmoothing(spread=1e-3, samples=2, position_noise=0.0))(problem, PARAMETERS)
     assert found.history is None and compare(found.gradient, truth.gradient).relative_l2 < 1e-3
 
 

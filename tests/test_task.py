@@ -134,8 +134,8 @@ ESTIMATORS = {
     "smoothing": (SMOOTHING, gradients.AdjointViscosity()),
     "with a strength": ([*SMOOTHING, "optimise.gradient.strength=0.3"], gradients.AdjointViscosity(0.3)),
     "averaged": ([*SMOOTHING, *SEVERAL], gradients.EnsembleMean({"gravity": 0.5}, 4)),
-    "averaged without disorder": (
-        [*SMOOTHING, *SEVERAL, "optimise.gradient.disorder=0"],
+    "averaged without position_noise": (
+        [*SMOOTHING, *SEVERAL, "optimise.gradient.position_noise=0"],
         gradients.EnsembleMean({"gravity": 0.5}, 4, 0.0),
     ),
     "averaged without smoothing": (SEVERAL, gradients.EnsembleMean({"gravity": 0.5}, 4, estimator=gradients.Exact())),

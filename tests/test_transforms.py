@@ -175,8 +175,8 @@ def test_a_cloud_is_one_of_coordinates(problem):
     u = {"gravity": search.coordinate(start_of(problem))["gravity"]}
     _, exact = search.value_and_gradient(u)
     for estimator in (
-        gradients.RandomizedSmoothing(0.01, disorder=0.0),
-        gradients.EnsembleMean(0.01, disorder=0.0, estimator=gradients.Exact()),
+        gradients.RandomizedSmoothing(0.01, position_noise=0.0),
+        gradients.EnsembleMean(0.01, position_noise=0.0, estimator=gradients.Exact()),
     ):
         found = search.estimate(u, estimator).gradient["gravity"]
         assert found.shape == (3, 2)

@@ -26,16 +26,18 @@ class Cloud:
     spread: float | Mapping[str, float] = 0.5
     """Of the parameters, in their units, or by name; sqrt((N + 2) / N) times the standard deviation of a number."""
     samples: int = 8
-    disorder: float = 0.01
+    position_noise: float = 0.01
     """Standard deviation of the perturbations of first positions [spacings]; 0 for none."""
     seed: int = 0
 
     def __post_init__(self) -> None:
         if not _is_whole(self.samples) or self.samples < 2:
             raise InputError(f"samples is {shown(self.samples)}, but must be at least 2, to know how they scatter.")
-        disorder = as_number(self.disorder)
-        if disorder is None or disorder < 0.0:
-            raise InputError(f"disorder is {shown(self.disorder)}, but must be a number of at least 0, in spacings.")
+        position_noise = as_number(self.position_noise)
+        if position_noise is None or position_noise < 0.0:
+            raise InputError(
+                f"position_noise is {shown(self.position_noise)}, but must be a number of at least 0, in spacings."
+            )
         if not _is_whole(self.seed) or self.seed < 0:
             raise InputError(f"seed is {shown(self.seed)}, but must be a whole number of at least 0.")
 
@@ -44,8 +46,8 @@ class Cloud:
         values = {name: as_numbers(f"parameter {name}", value) for name, value in parameters.items()}
         spreads = np.concatenate([np.full(value.size, self._spread(name)) for name, value in values.items()])
         start = problem.simulation.positions
-        disorder = self.disorder * problem.simulation.scene.discretisation.spacing
-        return Sampler(values, spreads, start, disorder, np.random.default_rng(self.seed))
+        position_noise = self.position_noise * problem.simulation.scene.discretisation.spacing
+        return Sampler(values, spreads, start, position_noise, np.random.default_rng(self.seed))
 
     def _spread(self, name: str) -> float:
         if isinstance(self.spread, Mapping) and name not in self.spread:
@@ -66,7 +68,7 @@ class Sampler:
     """(numbers,) of all numbers of the values, one after another."""
     start: np.ndarray
     """(n, d) first positions of the simulation [m]"""
-    disorder: float
+    position_noise: float
     """[m]"""
     random: np.random.Generator
 
@@ -83,12 +85,12 @@ class Sampler:
 
     def displacement(self) -> np.ndarray:
         """(n, d) a random one of the first positions [m]"""
-        return self.disorder * self.random.standard_normal(self.start.shape)
+        return self.position_noise * self.random.standard_normal(self.start.shape)
 
     def at(self, u: np.ndarray, displacement: np.ndarray, made: Callable[[Arrays], Made]) -> Made:
         """What is made of the parameters moved by ``u`` (numbers,), in spreads, and first positions displaced."""
         values = _moved(self.values, self.spreads * u)
-        if self.disorder:
+        if self.position_noise:
             values["initial_positions"] = values.get("initial_positions", self.start) + displacement
         try:
             return made(values)

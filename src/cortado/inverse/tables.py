@@ -154,7 +154,7 @@ class GradientTable(Table):
     """Runs of a cloud that the gradient is the mean of."""
     spread: Annotated[dict[str, Any] | None, Values()] = None
     """Of the cloud: by name a number, in the units of what is searched."""
-    disorder: Annotated[float, Quantity("spacings", least=0.0)] = EnsembleMean.disorder
+    position_noise: Annotated[float, Quantity("spacings", least=0.0)] = EnsembleMean.position_noise
     """Of the first positions in the cloud."""
 
     @model_validator(mode="after")
@@ -167,7 +167,7 @@ class GradientTable(Table):
             raise wrong(("samples",), self.samples, "1, or an even number of at least 4")
         if self.samples > 1 and self.spread is None:
             raise wrong(("spread",), MISSING, "a table of numbers greater than 0, as there are several samples")
-        for name in ("spread", "disorder"):
+        for name in ("spread", "position_noise"):
             if self.samples == 1 and name in self.model_fields_set:
                 raise wrong((name,), Phrase("given"), "left out, as there is one sample")
         for name, number in (self.spread or {}).items():
@@ -187,7 +187,7 @@ class GradientTable(Table):
         if self.spread is None:
             return one
         spread = {name: float(number) for name, number in self.spread.items()}
-        return EnsembleMean(spread, self.samples, self.disorder, estimator=one)
+        return EnsembleMean(spread, self.samples, self.position_noise, estimator=one)
 
 
 class OptimiseTable(Table):

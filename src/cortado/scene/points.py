@@ -77,7 +77,7 @@ def _read_npy(path: str, size: int, dimension: int) -> Any:
 
 
 def _read_apart(path: str, size: int) -> Any:
-    """What another process reads: see `cortado.scene.model.point_reader`."""
+    """What another process reads: see `cortado.scene.point_reader`."""
     limit = SECONDS + size / BYTES_PER_SECOND
     command = [sys.executable, "-P", "-m", "cortado.scene.point_reader", path]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")  # each would reserve memory

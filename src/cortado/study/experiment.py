@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 class Settings(tables.Table):
     """What the file of an experiment holds beside its kind; each kind adds its own. The kinds of values of
-    `cortado.scene.model.fields` make sentences of what is wrong."""
+    `cortado.scene.fields` make sentences of what is wrong."""
 
     title: Annotated[str, Text()]
     """Above the picture."""
