@@ -49,8 +49,8 @@ class Pcisph:
         self.walls, self.wall_weights = walls, wall_weights
         self.viscosity_form = options.get("viscosity", "pairwise")
         self.friction = options.get("friction", 0.0)
-        self.reach, self.response = options["reach"], options["rigidity"]
-        self.laplacian_correction = options.get("evenness", 1.0)
+        self.reach, self.response = options["reach"], options["response"]
+        self.laplacian_correction = options.get("laplacian_correction", 1.0)
 
     def _pairs(self, x, y):
         s = x[:, None, :] - y[None, :, :]

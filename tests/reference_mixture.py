@@ -22,7 +22,7 @@ class Mixture:
         self.alpha, self.mobility, self.eps = options["alpha"], options["mobility"], options["eps"]
         self.form = options.get("form", "constant")
         self.well = options.get("energy", "double_well")
-        self.laplacian_correction = options.get("evenness", 1.0)
+        self.laplacian_correction = options.get("laplacian_correction", 1.0)
 
     def pairs(self, x, n=0.0):
         """F (n, n) and the volumes V / n_i; ``n`` (n,) is what walls add to the number density."""

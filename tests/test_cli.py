@@ -17,6 +17,7 @@ import pytest
 
 import cortado.commands.optimise
 import cortado.commands.run
+import cortado.io.vtkhdf
 from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
 from cortado import Problem, Scene, Trajectory
@@ -467,7 +468,7 @@ def test_a_run_on_a_full_disk_says_so(cortado_command, size):
 @pytest.mark.parametrize("full", ["trajectory.vtkhdf", "metrics.jsonl", "particles.png", "run.mp4", "report.html"])
 def test_frames_stay_when_a_disk_fills_up(cortado_command, monkeypatch, full):
     Path("scene.toml").write_text(TINY_LATTE.partition("[problem]")[0])
-    replace, write = os.replace, cortado.vtkhdf.write_fully
+    replace, write = os.replace, cortado.io.vtkhdf.write_fully
     left = iter(range(20))
 
     def until_full(*arguments):

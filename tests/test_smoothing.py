@@ -351,7 +351,7 @@ def test_pressure_stiffness_answers_an_error_with_its_correction(name, dimension
 @kernels
 @dimensions
 @supports
-def test_wall_rigidity(name, dimension, support):
+def test_wall_response(name, dimension, support):
     """sum_j G_j . G_j, particle by particle."""
     points, middle = block(dimension)
     g = KERNELS[name].gradient(points[middle] - points, support * SPACING)

@@ -61,8 +61,8 @@ def launch(kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, **argum
 class KernelLauncher:
     """Launches kernels with one thread a particle on one device, with arguments by name (see `bound`).
 
-    On a CPU Warp launches in one thread; a kernel that sums over neighbours, which begins with its surroundings, is cut
-    into ranges of particles, several for each core where there are many, and a core that has done one takes the next.
+    On a CPU Warp launches in one thread; a kernel that sums over neighbours, whose first argument is that, is cut into
+    ranges of particles, several for each core where there are many, and a core that has done one takes the next.
     The sums are gathers, so that the bits do not depend on the cut, or on who took what.
     """
 
@@ -121,7 +121,7 @@ class KernelLauncher:
             helper.result()
 
     def _part(self, neighbourhood: Any, number: int) -> Any:
-        """The surroundings as one range sees them."""
+        """The neighbourhood as one range sees them."""
         part = neighbourhood._cls()
         for name in neighbourhood._cls.vars:
             setattr(part, name, getattr(neighbourhood, name))

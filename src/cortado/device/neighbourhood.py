@@ -79,10 +79,10 @@ def neighbourhood_type(precision: Precision) -> Any:
 
 @cache
 def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
-    """Warp functions of a separation in given surroundings.
+    """Warp functions of a separation in given neighbourhood.
 
     ``separation``, ``weight``, ``gradient``, ``hessian_product``; ``size`` (|x|^2 + 0.01 h^2, which covers coincident
-    particles), ``factor`` (F = evenness x . G / size, of second derivatives after Brookshaw 1985) and
+    particles), ``factor`` (F = laplacian_correction x . G / size, of second derivatives after Brookshaw 1985) and
     ``factor_gradient``;
     and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have before any of it is used, so that the
     loads do not wait for one another (on a GPU a tenth of a whole step).

@@ -80,7 +80,7 @@ class PcisphSteps:
         self.step_number = count()
         self._iteration, self._active = count(), count()
         self.containment = Containment(walled, precision, self.launch, nozzle.first if nozzle else particles)
-        self._surroundings: Any = None
+        self._neighbourhood: Any = None
         self._context: StepContext | None = None
         self.generation = 0
         """How often arrays, or the work of a step, were replaced; what was captured before is stale."""
@@ -107,7 +107,7 @@ class PcisphSteps:
         s.periodic = int(any(self.periods))
         s.period = precision.vector(*self.periods)
         s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in self.periods))
-        self._surroundings, self._context = s, None
+        self._neighbourhood, self._context = s, None
 
     def new_state(self, requires_grad: bool = False) -> State:
         """A state of this solver's particles, all 0."""
@@ -195,7 +195,7 @@ class PcisphSteps:
         """The present step as its parts see it."""
         if self._context is None or self._context.parameters is not parameters:
             order, step = self.search.order, self.step_number
-            self._context = StepContext(self.launch, self._surroundings, order, step, self.fields, parameters)
+            self._context = StepContext(self.launch, self._neighbourhood, order, step, self.fields, parameters)
         return self._context
 
     def _begin(self, state: State, parameters: Parameters) -> StepContext:
@@ -204,7 +204,7 @@ class PcisphSteps:
         self.search.sort(state.positions)
         scene = {"x_scene": state.positions, "v_scene": state.velocities, "m_scene": parameters["reference_density"]}
         context.launch(kernels.integration.sort, **scene)
-        self.search.fill(self._surroundings, f["x"])
+        self.search.fill(self._neighbourhood, f["x"])
         context.launch(kernels.density.forward)
         self.mixture.diffuse(context, state.mass_fractions)
         context.launch(kernels.walls.forward, y=self.wall_relaxation)

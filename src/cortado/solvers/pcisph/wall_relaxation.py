@@ -5,11 +5,11 @@ density further, by |S_i|^2 / (2 sum_j G_j . G_j of the prototype) with S_i = su
 the iteration overshoots and kicks it away. A particle that nears a wall within the step meets a steeper one than at the
 step's start, where S_i is taken, so that the answer counts twice. delta is multiplied by the yield
 
-    y_i = 1 / (1 + |S_i|^2 / rigidity),   rigidity = sum_j G_j . G_j,
+    y_i = 1 / (1 + |S_i|^2 / response),   response = sum_j G_j . G_j,
 
 which is 1 away from walls, and smooth. It changes how fast the iteration converges, not what it converges to. Sums are
-multiplied with the pliancy, rigidity^(-1/2), before they are squared: in float32 the square of a gradient overflows
-where spacings are small.
+multiplied with the response scale, response^(-1/2), before they are squared: in float32 the square of a gradient
+overflows where spacings are small.
 """
 
 from functools import cache
