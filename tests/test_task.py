@@ -144,7 +144,7 @@ ESTIMATORS = {
 
 @pytest.mark.parametrize(("overrides", "wanted"), ESTIMATORS.values(), ids=ESTIMATORS)
 def test_a_gradient_is_chosen_by_name(task_file, overrides, wanted):
-    assert load_task(task_file, overrides).optimise.estimator.estimator() == wanted
+    assert load_task(task_file, overrides).optimise.gradient.estimator() == wanted
 
 
 def test_random_values_are_drawn_later(task_file):
