@@ -339,5 +339,5 @@ def test_the_advice():
         both = (*judged, Judged("FrozenGeometry()", cosine, size))
         assert replace(found, agreement=Agreement(0.1, both)).estimator == wanted
     lost = (judged[0], Judged("AdjointViscosity(strength=0.1)", 0.1, 1.0), Judged("FrozenGeometry()", 0.2, 1.0))
-    assert replace(found, agreement=Agreement(0.1, lost)).estimator == "Smoothed()"
+    assert replace(found, agreement=Agreement(0.1, lost)).estimator == "RandomizedSmoothing()"
     assert replace(found, agreement=None).estimator == "AdjointViscosity()"

@@ -33,10 +33,10 @@ LAYERS = """
     discretise.sampling discretise.discrete_scene
     sph sph.density sph.free_energy sph.integration sph.materials sph.nozzle_kernels sph.pair_forces
     sph.pairwise_laplacian sph.diffusion sph.parts sph.gravity sph.mixture sph.nozzle sph.viscosity
-    solvers solvers.containment_kernels solvers.containment solvers.pcisph solvers.solver solvers.pcisph.convergence
-    solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure solvers.pcisph.pressure
-    solvers.pcisph.wall_relaxation solvers.pcisph.parts solvers.pcisph.log solvers.pcisph.steps
-    solvers.pcisph.derivatives solvers.pcisph.solver
+    solvers solvers.containment_kernels solvers.containment solvers.build solvers.pcisph solvers.solver
+    solvers.pcisph.convergence solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure
+    solvers.pcisph.pressure solvers.pcisph.wall_relaxation solvers.pcisph.parts solvers.pcisph.log
+    solvers.pcisph.steps solvers.pcisph.derivatives solvers.pcisph.solver solvers.pcisph.build
     reference.digits reference.engine reference.histories reference.losses reference.simulation reference
     rollout
     parameters.space
@@ -54,8 +54,8 @@ LAYERS = """
     figures.curves figures
     certificate.agreement certificate.changes certificate.twin certificate.course certificate.horizon
     certificate.rightness certificate.text certificate.certificate certificate certificate.figure
-    optimisation optimisation.differentiable optimisation.transforms optimisation.replay_log
-    optimisation.optimisers optimisation.named_optimisers optimisation.result optimisation.optimise
+    optimisation optimisation.differentiable optimisation.replay_log optimisation.optimisers
+    optimisation.named_optimisers optimisation.result optimisation.optimise optimisation.transforms
     io.run_folder io.report
     inverse inverse.tables inverse.task inverse.setup inverse.figures
     study study.canvas study.comparison study.estimates study.lyapunov_spectrum study.one_kernel_loops

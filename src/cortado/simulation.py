@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Mapping
 from hashlib import sha256
-from importlib import import_module
 from os import PathLike
 from typing import Any
 
@@ -12,38 +11,30 @@ import warp as wp
 
 from cortado.device.kernel_cache import start_warp
 from cortado.device.memory import frame_parts, require, simulation_parts
-from cortado.device.neighbourhood import Discretisation
-from cortado.device.neighbours import Grid, NeighbourSearch
 from cortado.device.precision import Precision, precision_named
-from cortado.device.state import State, padded
+from cortado.device.state import State
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.discretise.discrete_scene import DiscreteScene, discretise
-from cortado.discretise.sampling import FluidSample
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.io.trajectory import Trajectory
-from cortado.lattice.calibration import SKIN, diffusion_limit
+from cortado.lattice.calibration import diffusion_limit
 from cortado.parameters.checks import check_sizes
-from cortado.parameters.registry import PARAMETERS
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import scene_values
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
 from cortado.restart import RestartState, RunConstants
 from cortado.rollout import Rollout
-from cortado.scene.containers import NoContainer
 from cortado.scene.scene import Scene, as_scene
-from cortado.solvers.containment import Walled
-from cortado.solvers.pcisph.parts import PressureSolve
-from cortado.solvers.pcisph.solver import Pcisph
-from cortado.sph.diffusion import Diffusion
-from cortado.sph.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
-from cortado.sph.mixture import Phases
-from cortado.sph.nozzle import Nozzle
-from cortado.sph.parts import Force, Setting
+from cortado.solvers.build import first_capacity
+from cortado.solvers.pcisph.build import build_pcisph
+from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy
 from cortado.words import counted
 
 MOST_SUBSTEPS = 10_000
 """Explicit steps of diffusion in a time step; beyond it the mobility is taken for a mistake."""
+SOLVERS = {"pcisph": build_pcisph}
+"""What makes the solver of a scene, by the kind that it names."""
 GREATEST_NUMBER = 10**18
 """Of steps: within a 64-bit number."""
 
@@ -91,7 +82,7 @@ class Simulation:
         self.smoothing = discrete.kernel
         self.walls = discrete.walls.positions
         """(b, d) wall particles [m]."""
-        self.solver = self._solver(discrete)
+        self.solver = SOLVERS[scene.solver.kind](scene, discrete, self.free_energy, self.precision, self.device)
         self.state = self.solver.new_state()
         """The first state on the device."""
         self.state.set(self.positions, self.velocities, self.mass_fractions)
@@ -240,81 +231,6 @@ class Simulation:
             )
         return int(number)
 
-    def _solver(self, discrete: DiscreteScene) -> Pcisph:
-        discretisation, support = Discretisation(discrete.kernel, self.precision), discrete.lattice.support
-        grid = Grid.around(
-            discrete.near.lower,
-            discrete.near.upper,
-            discrete.periods,
-            reach=(1.0 + SKIN) * support,
-            most=max(4 * self.particles, 512),
-        )
-        search = NeighbourSearch(
-            discretisation,
-            grid,
-            padded(self.walls),
-            discrete.walls.weights,
-            self.particles,
-            first_capacity(support / self.scene.discretisation.spacing, self.dimension),
-            self.device,
-        )
-        return Pcisph(
-            discretisation,
-            discrete.lattice,
-            search,
-            self._forces(discretisation, discrete),
-            self._pressure(),
-            [*discrete.periods, *np.zeros(3 - self.dimension)],
-            self._phases(discretisation),
-            self._nozzle(discrete.fluid),
-            self._walled(discrete),
-        )
-
-    def _walled(self, discrete: DiscreteScene) -> Walled:
-        """Walls act through the pressure: without it they hold nothing."""
-        holds = self.scene.container if self.scene.forces.pressure else NoContainer()
-        region = holds.region(self.dimension).opened(discrete.periods)
-        return Walled(region, discrete.near, self.scene.discretisation.spacing)
-
-    def _nozzle(self, fluid: FluidSample) -> Nozzle | None:
-        scene, sample = self.scene, fluid.emitter
-        if scene.emitter is None or sample is None:
-            return None
-        return Nozzle(
-            first=fluid.emitted.start,
-            upstream=sample.upstream,
-            offsets=sample.offsets,
-            direction=np.array(scene.emitter.direction),
-            area=scene.emitter.flow_rate / sample.speed,
-        )
-
-    def _phases(self, discretisation: Discretisation) -> Phases:
-        mixture, count = self.scene.mixture, len(self.scene.phase)
-        if count == 1:
-            return Phases(1, None, 0.0)
-        diffusion = Diffusion(discretisation, count, self.free_energy, MOBILITIES[mixture.mobility_form])
-        return Phases(count, diffusion, mixture.strength)
-
-    def _forces(self, discretisation: Discretisation, discrete: DiscreteScene) -> list[Force]:
-        """Those of the parameters that the scene has, in the order of the registry."""
-        layers, particles, device = discrete.wall_layers, self.particles, self.device
-        setting = Setting(self.scene, discretisation, discrete.lattice, layers, particles, device)
-        modules = [p.force for p in PARAMETERS if p.force is not None and p.present(self.scene)]
-        found = [import_module(name).force(setting) for name in modules]
-        return [force for force in found if force is not None]
-
-    def _pressure(self) -> PressureSolve | None:
-        solver = self.scene.solver
-        if not self.scene.forces.pressure:
-            return None
-        greatest = solver.maximum_density_tolerance
-        return PressureSolve(
-            solver.minimum_iterations,
-            solver.maximum_iterations,
-            solver.density_tolerance,
-            float("inf") if greatest is None else greatest,
-        )
-
 
 def _check_distance(scene: Scene, discrete: DiscreteScene, precision: Precision) -> None:
     """Far from the origin, positions are rounded to coarse steps; raises `InputError`."""
@@ -352,12 +268,6 @@ def whole_number(what: str, value: Any, least: int) -> int:
     if value > GREATEST_NUMBER:
         raise InputError(f"{what} is {shown(value)}, but must be at most {GREATEST_NUMBER:g}.")
     return int(value)
-
-
-def first_capacity(support: float, dimension: int) -> int:
-    """Room for neighbours to begin with: half again as many as the lattice has, for a support in spacings."""
-    filled = np.pi * support**2 if dimension == 2 else 4.0 / 3.0 * np.pi * support**3
-    return int(1.5 * filled) + 6
 
 
 def not_converged_sentence(converged: np.ndarray) -> str:

@@ -89,13 +89,13 @@ class Certificate:
     def estimator(self) -> str:
         """Which to use for these parameters and that many steps, as it is written in Python."""
         if not self.right:
-            return "Smoothed()"
+            return "RandomizedSmoothing()"
         if all(one.lasts for one in self.horizons):
             return "Exact()"
         if self.agreement is None:
             return "AdjointViscosity()"
         best = self.agreement.best
-        return "Smoothed()" if best is None else best.estimator
+        return "RandomizedSmoothing()" if best is None else best.estimator
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""

@@ -6,7 +6,6 @@ the cells divide the period, elsewhere cells that share a number are told apart 
 
 from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -68,8 +67,18 @@ def cell_grid_type(precision: Precision) -> Any:
     return wp.struct(CellGrid)
 
 
+@dataclass(frozen=True)
+class CellFunctions:
+    """Warp functions of a grid of cells."""
+
+    wrap: Any
+    cell_of: Any
+    below: Any
+    above: Any
+
+
 @cache
-def cell_functions(precision: Precision) -> SimpleNamespace:
+def cell_functions(precision: Precision) -> CellFunctions:
     """Warp functions ``wrap`` and ``cell_of``, and ``below`` and ``above``: the cells to visit around one's own."""
     vector = precision.vector
     grid_type = cell_grid_type(precision)
@@ -100,11 +109,19 @@ def cell_functions(precision: Precision) -> SimpleNamespace:
         """Behind the last cell to visit."""
         return wp.where(n > 1, 2, 1)
 
-    return SimpleNamespace(wrap=wrap, cell_of=cell_of, below=below, above=above)
+    return CellFunctions(wrap=wrap, cell_of=cell_of, below=below, above=above)
+
+
+@dataclass(frozen=True)
+class _CellKernels:
+    """The kernels of a sort by cell."""
+
+    number_cells: Any
+    find_starts: Any
 
 
 @cache
-def _cell_kernels(precision: Precision) -> SimpleNamespace:
+def _cell_kernels(precision: Precision) -> _CellKernels:
     vector = precision.vector
     grid_type = cell_grid_type(precision)
     cell_of = cell_functions(precision).cell_of
@@ -133,7 +150,7 @@ def _cell_kernels(precision: Precision) -> SimpleNamespace:
             first = first + 1
         starts[cell] = first
 
-    return SimpleNamespace(number_cells=number_cells, find_starts=find_starts)
+    return _CellKernels(number_cells=number_cells, find_starts=find_starts)
 
 
 class CellSort:

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -77,8 +76,23 @@ def neighbourhood_type(precision: Precision) -> Any:
     return wp.struct(Neighbourhood)
 
 
+@dataclass(frozen=True)
+class PairFunctions:
+    """Warp functions of a pair of particles: see `pair_functions`."""
+
+    separation: Any
+    weight: Any
+    gradient: Any
+    hessian_product: Any
+    size: Any
+    factor: Any
+    factor_gradient: Any
+    vectors: Any
+    numbers: Any
+
+
 @cache
-def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
+def pair_functions(discretisation: Discretisation) -> PairFunctions:
     """Warp functions of a separation in given neighbourhood.
 
     ``separation``, ``weight``, ``gradient``, ``hessian_product``; ``size`` (|x|^2 + 0.01 h^2, which covers coincident
@@ -146,7 +160,7 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
             a[s.neighbours[k, i]], a[s.neighbours[k + 1, i]], a[s.neighbours[k + 2, i]], a[s.neighbours[k + 3, i]]
         )
 
-    return SimpleNamespace(
+    return PairFunctions(
         separation=separation,
         weight=weight,
         gradient=gradient,

@@ -5,8 +5,9 @@
 with q = r / h, s = x / h and f(q) = w'(q) / q.
 """
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -14,7 +15,16 @@ from cortado.device.precision import Precision
 from cortado.lattice.smoothing import CUBIC_SPLINE, WENDLAND_C2, WENDLAND_C4, SmoothingKernel
 
 
-def _cubic_spline(precision: Precision) -> SimpleNamespace:
+@dataclass(frozen=True)
+class RadialFunctions:
+    """Warp functions of a kernel's dimensionless form: w, w' / q and what the Hessian needs."""
+
+    value: Any
+    slope: Any
+    bend: Any
+
+
+def _cubic_spline(precision: Precision) -> RadialFunctions:
     real = precision.real
 
     @wp.func
@@ -38,10 +48,10 @@ def _cubic_spline(precision: Precision) -> SimpleNamespace:
             return real(18.0)
         return real(6.0) * t * (real(2.0) * q + t) / (q * q)
 
-    return SimpleNamespace(value=value, slope=slope, bend=bend)
+    return RadialFunctions(value=value, slope=slope, bend=bend)
 
 
-def _wendland_c2(precision: Precision) -> SimpleNamespace:
+def _wendland_c2(precision: Precision) -> RadialFunctions:
     real = precision.real
 
     @wp.func
@@ -59,10 +69,10 @@ def _wendland_c2(precision: Precision) -> SimpleNamespace:
         t = wp.max(real(1.0) - q, real(0.0))
         return real(60.0) * t * t
 
-    return SimpleNamespace(value=value, slope=slope, bend=bend)
+    return RadialFunctions(value=value, slope=slope, bend=bend)
 
 
-def _wendland_c4(precision: Precision) -> SimpleNamespace:
+def _wendland_c4(precision: Precision) -> RadialFunctions:
     real = precision.real
 
     @wp.func
@@ -83,7 +93,7 @@ def _wendland_c4(precision: Precision) -> SimpleNamespace:
         t_2 = t * t
         return real(560.0) * q * t_2 * t_2
 
-    return SimpleNamespace(value=value, slope=slope, bend=bend)
+    return RadialFunctions(value=value, slope=slope, bend=bend)
 
 
 RADIAL_FUNCTIONS = {
@@ -94,8 +104,17 @@ RADIAL_FUNCTIONS = {
 """By the kernel's name: for a precision, the Warp functions ``value``, ``slope`` and ``bend`` (w, f and f')."""
 
 
+@dataclass(frozen=True)
+class SmoothingFunctions:
+    """Warp functions of W at a separation, of its gradient, and of its Hessian times a vector."""
+
+    weight: Any
+    gradient: Any
+    hessian_product: Any
+
+
 @cache
-def smoothing_functions(kernel: SmoothingKernel, precision: Precision) -> SimpleNamespace:
+def smoothing_functions(kernel: SmoothingKernel, precision: Precision) -> SmoothingFunctions:
     """Warp functions of a separation x [m]: ``weight``, ``gradient`` and ``hessian_product`` (H u).
 
     Each takes the support radius h [m] and the normalisation sigma [1 / m^d].
@@ -120,4 +139,4 @@ def smoothing_functions(kernel: SmoothingKernel, precision: Precision) -> Simple
         radial_part = bend(q) / ((q + tiny) * h * h) * wp.dot(x, u)
         return (sigma / (h * h)) * (slope(q) * u + radial_part * x)
 
-    return SimpleNamespace(weight=weight, gradient=gradient, hessian_product=hessian_product)
+    return SmoothingFunctions(weight=weight, gradient=gradient, hessian_product=hessian_product)

@@ -39,8 +39,8 @@ class RandomizedSmoothing(Cloud):
         loss, numbers = problem.value(cloud.values), len(cloud.spreads)
         if numbers > MOST_NUMBERS:
             raise InputError(
-                f"the parameters are {numbers} numbers, but must be {MOST_NUMBERS} at most, as Smoothed runs the "
-                "simulation twice for each: take fewer, such as one gravity for all steps, or another estimator."
+                f"the parameters are {numbers} numbers, but must be at most {MOST_NUMBERS}, as the simulation "
+                "is run twice for each: take fewer, such as one gravity for all steps, or another estimator."
             )
         found, r = np.zeros((self.samples, numbers)), np.sqrt(numbers)
         for sample in found:

@@ -1,15 +1,24 @@
 """How far particles are from where they should be."""
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from cortado.device.precision import Precision
 
 
+@dataclass(frozen=True)
+class MatchingKernels:
+    """The kernels of distances to targets, particle by particle."""
+
+    squared_distance: Any
+    difference: Any
+
+
 @cache
-def matching_kernels(precision: Precision) -> SimpleNamespace:
+def matching_kernels(precision: Precision) -> MatchingKernels:
     """Kernels ``squared_distance`` (in float64) and ``difference`` (times a factor) of two sets of vectors."""
     real, vector = precision.real, precision.vector
     module = wp.get_module(f"cortado_matching_{precision.name}")
@@ -37,4 +46,4 @@ def matching_kernels(precision: Precision) -> SimpleNamespace:
         i = wp.tid()
         bar[i] = factor * (x[i] - target[i])
 
-    return SimpleNamespace(squared_distance=squared_distance, difference=difference)
+    return MatchingKernels(squared_distance=squared_distance, difference=difference)

@@ -10,8 +10,8 @@ On the way back what comes from behind a sample is the image less what came up t
 samples does, which may be as dark behind as they like.
 """
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -28,8 +28,16 @@ def pose_type(precision: Precision) -> Any:
     return wp.types.vector(length=6, dtype=precision.real)
 
 
+@dataclass(frozen=True)
+class BrightnessFunctions:
+    """Warp functions of what a sample lets through."""
+
+    brightness: Any
+    brightness_slope: Any
+
+
 @cache
-def brightness_functions(precision: Precision) -> SimpleNamespace:
+def brightness_functions(precision: Precision) -> BrightnessFunctions:
     """Warp functions ``brightness`` E(u) and ``brightness_slope`` E'(u); both take exp(-u) besides."""
     real = precision.real
 
@@ -53,11 +61,20 @@ def brightness_functions(precision: Precision) -> SimpleNamespace:
             total = real(1.0) - total * u * real(11 - n) / (real(10 - n) * real(12 - n))
         return real(-0.5) * total
 
-    return SimpleNamespace(brightness=brightness, brightness_slope=brightness_slope)
+    return BrightnessFunctions(brightness=brightness, brightness_slope=brightness_slope)
+
+
+@dataclass(frozen=True)
+class AbsorptionKernels:
+    """The kernels that march along rays, and back."""
+
+    forward: Any
+    adjoint: Any
+    gather: Any
 
 
 @cache
-def absorption_kernels(precision: Precision) -> SimpleNamespace:
+def absorption_kernels(precision: Precision) -> AbsorptionKernels:
     """Kernels over pixels: ``forward`` and ``adjoint``; and over nodes: ``gather``, of the adjoints of samples."""
     real, vector, ink, pose = precision.real, precision.vector, rgba_type(precision), pose_type(precision)
     nodes_struct, camera_struct = nodes_type(precision), camera_type(precision)
@@ -173,4 +190,4 @@ def absorption_kernels(precision: Precision) -> SimpleNamespace:
                     total += share(o + distance(s, camera) * d, x_g, nodes) * samples_bar[s - span[0], pixel]
         field_bar[k, j, i] = total
 
-    return SimpleNamespace(forward=march, adjoint=march_adjoint, gather=gather)
+    return AbsorptionKernels(forward=march, adjoint=march_adjoint, gather=gather)

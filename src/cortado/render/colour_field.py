@@ -7,8 +7,8 @@ Along a periodic axis the images of a particle count like itself.
 Both sums are gathers: of particles, cell by cell, on the way there, of the nodes within the support on the way back.
 """
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -51,8 +51,17 @@ def nodes_type(precision: Precision) -> Any:
     return wp.struct(Nodes)
 
 
+@dataclass(frozen=True)
+class NodeFunctions:
+    """Warp functions of the nodes of a field."""
+
+    place: Any
+    nearest: Any
+    image: Any
+
+
 @cache
-def node_functions(precision: Precision) -> SimpleNamespace:
+def node_functions(precision: Precision) -> NodeFunctions:
     """Warp functions ``place``: where a node is [m]; ``nearest``: a separation from the nearest image; ``image``: where
     one of the images of a particle is that nodes may feel."""
     real, vector = precision.real, precision.vector
@@ -78,11 +87,19 @@ def node_functions(precision: Precision) -> SimpleNamespace:
         q = vector(real(number % n_x), real((number // n_x) % n_y), real(number // (n_x * n_y)))
         return x + wp.cw_mul(q - vector(wp.floor(t[0]), wp.floor(t[1]), wp.floor(t[2])), nodes.period)
 
-    return SimpleNamespace(place=place, nearest=nearest, image=image)
+    return NodeFunctions(place=place, nearest=nearest, image=image)
+
+
+@dataclass(frozen=True)
+class ColourFieldKernels:
+    """The kernel of the field of colours, and its adjoint."""
+
+    forward: Any
+    adjoint: Any
 
 
 @cache
-def colour_field_kernels(discretisation: Discretisation) -> SimpleNamespace:
+def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
     """Kernels ``forward``, over nodes, and ``adjoint``, over sorted particles."""
     precision = discretisation.precision
     real, vector, ink = precision.real, precision.vector, rgba_type(precision)
@@ -180,4 +197,4 @@ def colour_field_kernels(discretisation: Discretisation) -> SimpleNamespace:
         x_scene_bar[order[p]] = volume * x_bar
         colour_scene_bar[order[p]] = volume * vector(ink_bar[0], ink_bar[1], ink_bar[2])
 
-    return SimpleNamespace(forward=colour_field, adjoint=colour_field_adjoint)
+    return ColourFieldKernels(forward=colour_field, adjoint=colour_field_adjoint)

@@ -3,8 +3,9 @@
 So it is continuous everywhere, and a field of one layer (2-D) is a sheet that is one node distance thick.
 """
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -12,8 +13,17 @@ from cortado.device.precision import Precision
 from cortado.render.colour_field import nodes_type, rgba_type
 
 
+@dataclass(frozen=True)
+class InterpolationFunctions:
+    """Warp functions of trilinear interpolation between the nodes of a field."""
+
+    value: Any
+    slope: Any
+    share: Any
+
+
 @cache
-def interpolation_functions(precision: Precision) -> SimpleNamespace:
+def interpolation_functions(precision: Precision) -> InterpolationFunctions:
     """Warp functions ``value`` at a point, ``slope`` (the gradient of bar . value) and ``share`` (of one node)."""
     real, vector, ink = precision.real, precision.vector, rgba_type(precision)
     nodes_struct = nodes_type(precision)
@@ -73,4 +83,4 @@ def interpolation_functions(precision: Precision) -> SimpleNamespace:
         w_z = wp.max(real(1.0) - wp.abs(s[2]), real(0.0))
         return w_x * w_y * w_z
 
-    return SimpleNamespace(value=value, slope=slope, share=share)
+    return InterpolationFunctions(value=value, slope=slope, share=share)

@@ -1,7 +1,7 @@
 """Colours of particles, mixed from the colours of their phases: colour_j = sum_k c_jk colours_k."""
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -15,8 +15,16 @@ def colours_type(precision: Precision, phases: int) -> Any:
     return wp.types.matrix(shape=(phases, 3), dtype=precision.real)
 
 
+@dataclass(frozen=True)
+class PhaseColourKernels:
+    """The kernel of particles' colours, and its adjoint."""
+
+    forward: Any
+    adjoint: Any
+
+
 @cache
-def phase_colour_kernels(precision: Precision, phases: int) -> SimpleNamespace:
+def phase_colour_kernels(precision: Precision, phases: int) -> PhaseColourKernels:
     """Kernels ``forward`` (which sorts positions besides) and ``adjoint``."""
     vector, fractions = precision.vector, precision.fractions(phases)
     colours_matrix = colours_type(precision, phases)
@@ -53,4 +61,4 @@ def phase_colour_kernels(precision: Precision, phases: int) -> SimpleNamespace:
         c_scene_bar[j] = colours[0] * bar
         colours_bar[j] = wp.outer(c_scene[j], bar)
 
-    return SimpleNamespace(forward=tint, adjoint=phase_colour_adjoint)
+    return PhaseColourKernels(forward=tint, adjoint=phase_colour_adjoint)

@@ -6,8 +6,8 @@ width w = half_width + growth z. So one formula holds for parallel rays (growth 
 (half_width 0).
 """
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -42,8 +42,19 @@ def camera_type(precision: Precision) -> Any:
     return wp.struct(Camera)
 
 
+@dataclass(frozen=True)
+class RayFunctions:
+    """Warp functions of a camera's rays."""
+
+    start: Any
+    direction: Any
+    distance: Any
+    samples_within: Any
+    pixels_before: Any
+
+
 @cache
-def ray_functions(precision: Precision) -> SimpleNamespace:
+def ray_functions(precision: Precision) -> RayFunctions:
     """Warp functions ``start`` and ``direction`` of a pixel's ray, ``distance`` of a sample along it,
     ``samples_within`` a box, and ``pixels_before`` a box: the range of pixels whose rays may hit it."""
     real, vector = precision.real, precision.vector
@@ -131,7 +142,7 @@ def ray_functions(precision: Precision) -> SimpleNamespace:
             int(wp.clamp(wp.ceil(bottom) + real(1.0), real(0.0), n_y)),
         )
 
-    return SimpleNamespace(
+    return RayFunctions(
         start=start,
         direction=direction,
         distance=distance,

@@ -6,8 +6,9 @@ V is the rest volume on the lattice and m_i a particle's mass over V. No mass of
 Pajarola 2008): the density of a heavy fluid is not smeared into a light one.
 """
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -15,8 +16,17 @@ from cortado.device.kernels import Kernels
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 
+@dataclass(frozen=True)
+class DensitySums:
+    """Warp functions of the sums over neighbours in the number density."""
+
+    weights: Any
+    weights_tangent: Any
+    weights_adjoint: Any
+
+
 @cache
-def density_sums(discretisation: Discretisation) -> SimpleNamespace:
+def density_sums(discretisation: Discretisation) -> DensitySums:
     """Raw neighbour sums: ``weights`` (sum of W, with what fills the list up), ``weights_tangent`` and
     ``weights_adjoint`` (sum_j (r_i + r_j) G_ij + sum_b w_b r_i G_ib: the adjoint of positions for an
     adjoint r of the sum of every particle)."""
@@ -69,7 +79,7 @@ def density_sums(discretisation: Discretisation) -> SimpleNamespace:
             total += (s.wall_weights[b] * r_i) * gradient(separation(x_i, s.wall_positions[b], s), s)
         return total
 
-    return SimpleNamespace(weights=weights, weights_tangent=weights_tangent, weights_adjoint=weights_adjoint)
+    return DensitySums(weights=weights, weights_tangent=weights_tangent, weights_adjoint=weights_adjoint)
 
 
 @cache

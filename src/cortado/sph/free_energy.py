@@ -16,7 +16,7 @@ excursion. It leaves a pure phase delta / 2, and z <= 1 / 4 for two phases is ha
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -38,7 +38,7 @@ class FreeEnergy:
     curvature: float
     """The greatest eigenvalue of the Hessian of f, without its part along (1, ..., 1), for fractions in [0, 1]: it
     bounds the time step."""
-    functions: Callable[[Precision, int], SimpleNamespace]
+    functions: Callable[[Precision, int], Any]
     """Warp functions of fractions, for a number of phases: ``slope`` (grad f) and ``bend`` (the Hessian times u)."""
 
 
@@ -49,12 +49,20 @@ class Mobility:
     name: str
     greatest: Callable[[int], float]
     """The greatest m of so many phases."""
-    functions: Callable[[Precision, int], SimpleNamespace]
+    functions: Callable[[Precision, int], Any]
     """Warp functions ``value`` and ``slope`` (grad m) of fractions."""
 
 
+@dataclass(frozen=True)
+class EnergyFunctions:
+    """Warp functions of a free energy: grad f, and its Hessian times a vector."""
+
+    slope: Any
+    bend: Any
+
+
 @cache
-def _double_well(precision: Precision, phases: int) -> SimpleNamespace:
+def _double_well(precision: Precision, phases: int) -> EnergyFunctions:
     real, fractions = precision.real, precision.fractions(phases)
 
     @wp.func
@@ -66,11 +74,11 @@ def _double_well(precision: Precision, phases: int) -> SimpleNamespace:
     def bend(c: fractions, u: fractions) -> fractions:
         return u - real(6.0) * wp.cw_mul(c, u) + real(6.0) * wp.cw_mul(wp.cw_mul(c, c), u)
 
-    return SimpleNamespace(slope=slope, bend=bend)
+    return EnergyFunctions(slope=slope, bend=bend)
 
 
 @cache
-def _miscible(precision: Precision, phases: int) -> SimpleNamespace:
+def _miscible(precision: Precision, phases: int) -> EnergyFunctions:
     fractions = precision.fractions(phases)
 
     @wp.func
@@ -81,11 +89,19 @@ def _miscible(precision: Precision, phases: int) -> SimpleNamespace:
     def bend(c: fractions, u: fractions) -> fractions:
         return u
 
-    return SimpleNamespace(slope=slope, bend=bend)
+    return EnergyFunctions(slope=slope, bend=bend)
+
+
+@dataclass(frozen=True)
+class MobilityFunctions:
+    """Warp functions of a mobility: m, and its gradient."""
+
+    value: Any
+    slope: Any
 
 
 @cache
-def _constant(precision: Precision, phases: int) -> SimpleNamespace:
+def _constant(precision: Precision, phases: int) -> MobilityFunctions:
     real, fractions = precision.real, precision.fractions(phases)
 
     @wp.func
@@ -96,11 +112,11 @@ def _constant(precision: Precision, phases: int) -> SimpleNamespace:
     def slope(c: fractions) -> fractions:
         return fractions()
 
-    return SimpleNamespace(value=value, slope=slope)
+    return MobilityFunctions(value=value, slope=slope)
 
 
 @cache
-def _degenerate(precision: Precision, phases: int) -> SimpleNamespace:
+def _degenerate(precision: Precision, phases: int) -> MobilityFunctions:
     real, fractions = precision.real, precision.fractions(phases)
     floor = wp.constant(real(FLOOR))
 
@@ -131,7 +147,7 @@ def _degenerate(precision: Precision, phases: int) -> SimpleNamespace:
             along[k] = t - c[k]
         return (real(0.5) + real(0.5) * z / wp.sqrt(z * z + floor * floor)) * along
 
-    return SimpleNamespace(value=value, slope=slope)
+    return MobilityFunctions(value=value, slope=slope)
 
 
 def _double_well_value(c: np.ndarray) -> np.ndarray:

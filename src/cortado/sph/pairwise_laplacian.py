@@ -1,15 +1,25 @@
 """The one sum over neighbours that diffusion is made of, B of `cortado.sph.diffusion`, and its derivatives."""
 
+from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 
+@dataclass(frozen=True)
+class PairwiseLaplacian:
+    """The pairwise Laplacian as a function of Warp, with its derivatives."""
+
+    spread: Any
+    spread_tangent: Any
+    spread_adjoint: Any
+
+
 @cache
-def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) -> SimpleNamespace:
+def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) -> PairwiseLaplacian:
     """Raw sums of B / V over the neighbours: ``spread``, ``spread_tangent``, ``spread_adjoint``."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     fractions = discretisation.precision.fractions(phases)
@@ -105,4 +115,4 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
                 own += weight * f * wp.dot(u_ij, y_i)
         return x_bar, n_bar / (n_i * n_i), w_bar, u_bar, own
 
-    return SimpleNamespace(spread=spread, spread_tangent=spread_tangent, spread_adjoint=spread_adjoint)
+    return PairwiseLaplacian(spread=spread, spread_tangent=spread_tangent, spread_adjoint=spread_adjoint)

@@ -1,0 +1,82 @@
+"""What any solver of a scene is made of: neighbours, forces, phases, nozzle, and where particles may go."""
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from cortado.device.cells import Grid
+from cortado.device.neighbourhood import Discretisation
+from cortado.device.neighbours import NeighbourSearch
+from cortado.device.state import padded
+from cortado.discretise.discrete_scene import DiscreteScene
+from cortado.lattice.calibration import SKIN
+from cortado.parameters.registry import PARAMETERS
+from cortado.scene.containers import NoContainer
+from cortado.scene.scene import Scene
+from cortado.solvers.containment import Walled
+from cortado.sph.diffusion import Diffusion
+from cortado.sph.free_energy import MOBILITIES, FreeEnergy
+from cortado.sph.mixture import Phases
+from cortado.sph.nozzle import Nozzle
+from cortado.sph.parts import Force, Setting
+
+
+def first_capacity(support: float, dimension: int) -> int:
+    """Room for neighbours to begin with: half again as many as the lattice has, for a support in spacings."""
+    filled = np.pi * support**2 if dimension == 2 else 4.0 / 3.0 * np.pi * support**3
+    return int(1.5 * filled) + 6
+
+
+def search_of(scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, device: Any) -> NeighbourSearch:
+    """The search for neighbours within the support, and a little beyond."""
+    support, particles = discrete.lattice.support, len(discrete.fluid.positions)
+    grid = Grid.around(
+        discrete.near.lower,
+        discrete.near.upper,
+        discrete.periods,
+        reach=(1.0 + SKIN) * support,
+        most=max(4 * particles, 512),
+    )
+    room = first_capacity(support / scene.discretisation.spacing, scene.dimension)
+    walls = discrete.walls
+    return NeighbourSearch(discretisation, grid, padded(walls.positions), walls.weights, particles, room, device)
+
+
+def forces_of(scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, device: Any) -> list[Force]:
+    """Those of the parameters that the scene has, in the order of the registry."""
+    particles, layers = len(discrete.fluid.positions), discrete.wall_layers
+    setting = Setting(scene, discretisation, discrete.lattice, layers, particles, device)
+    modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene)]
+    found = [import_module(name).force(setting) for name in modules]
+    return [force for force in found if force is not None]
+
+
+def phases_of(scene: Scene, discretisation: Discretisation, free_energy: FreeEnergy) -> Phases:
+    """The phases, and how they diffuse into one another."""
+    mixture, count = scene.mixture, len(scene.phase)
+    if count == 1:
+        return Phases(1, None, 0.0)
+    diffusion = Diffusion(discretisation, count, free_energy, MOBILITIES[mixture.mobility_form])
+    return Phases(count, diffusion, mixture.strength)
+
+
+def nozzle_of(scene: Scene, discrete: DiscreteScene) -> Nozzle | None:
+    """The particles that wait in a nozzle; None without an emitter."""
+    fluid, sample = discrete.fluid, discrete.fluid.emitter
+    if scene.emitter is None or sample is None:
+        return None
+    return Nozzle(
+        first=fluid.emitted.start,
+        upstream=sample.upstream,
+        offsets=sample.offsets,
+        direction=np.array(scene.emitter.direction),
+        area=scene.emitter.flow_rate / sample.speed,
+    )
+
+
+def walled_of(scene: Scene, discrete: DiscreteScene) -> Walled:
+    """Where particles may go. Walls act through the pressure: without it they hold nothing."""
+    holds = scene.container if scene.forces.pressure else NoContainer()
+    region = holds.region(scene.dimension).opened(discrete.periods)
+    return Walled(region, discrete.near, scene.discretisation.spacing)
