@@ -19,7 +19,7 @@ LAYERS = """
     io io.files io.folder_lock io.input_files io.interruption io.notebook io.progress io.run_environment io.srgb
     io.terminal io.usage io.video io.vtkhdf_layout io.vtkhdf
     lattice lattice.shapes lattice.pairs lattice.region lattice.smoothing lattice.calibration
-    parameters parameters.reference_density parameters.registry parameters.tilt parameters.values
+    parameters parameters.reference_density parameters.registry parameters.table parameters.tilt parameters.values
     scene scene.fields scene.point_reader scene.points scene.tables scene.fluids scene.emitter scene.mixture
     scene.render scene.toml
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places

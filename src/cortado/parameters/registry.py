@@ -61,6 +61,8 @@ class Parameter:
     name: str
     unit: str
     """In SI; empty for a plain number."""
+    meaning: str
+    """In words, for the documents."""
     axis: Axis
     value: Callable[[Source], Any]
     """What it is in a scene that has it."""
@@ -128,11 +130,14 @@ def _has_emitter(scene: Any) -> bool:
     return scene.emitter is not None
 
 
-def _optional(name: str, unit: str, force: str, longest_step: Limit = lambda scene, values: inf) -> Parameter:
+def _optional(
+    name: str, unit: str, meaning: str, force: str, longest_step: Limit = lambda scene, values: inf
+) -> Parameter:
     """A number of at least 0 that stands in the table [forces] of a scene, and switches a force on."""
     return Parameter(
         name,
         unit,
+        meaning,
         Axis.SCALAR,
         lambda source: getattr(source.scene.forces, name),
         range=Range.NOT_NEGATIVE,
@@ -148,6 +153,7 @@ PARAMETERS = (
     Parameter(
         "gravity",
         "m/s²",
+        "acceleration that acts on all fluid",
         Axis.STEP,
         lambda s: s.scene.forces.gravity,
         components=_vector,
@@ -157,6 +163,7 @@ PARAMETERS = (
     Parameter(
         "tilt",
         "°",
+        "how far the scene's gravity leans, with its size kept; in the place of gravity",
         Axis.STEP,
         lambda s: np.zeros(s.scene.dimension - 1),
         components=lambda dimension, phases: dimension - 1,
@@ -168,6 +175,7 @@ PARAMETERS = (
     Parameter(
         "initial_positions",
         "m",
+        "where particles are at the start",
         Axis.PARTICLE,
         lambda s: s.positions,
         components=_vector,
@@ -177,6 +185,7 @@ PARAMETERS = (
     Parameter(
         "initial_velocities",
         "m/s",
+        "how fast they are",
         Axis.PARTICLE,
         lambda s: s.velocities,
         components=_vector,
@@ -186,6 +195,7 @@ PARAMETERS = (
     Parameter(
         "mass_fractions",
         "",
+        "what they are made of at the start, where there are several phases",
         Axis.PARTICLE,
         lambda s: s.mass_fractions,
         components=lambda dimension, phases: phases,
@@ -194,22 +204,39 @@ PARAMETERS = (
         change=lambda source, value: 0.02,
         acts=_several_phases,
     ),
-    Parameter("rest_density", "kg/m³", Axis.PHASE, _of_phases("rest_density"), range=Range.POSITIVE),
+    Parameter(
+        "rest_density",
+        "kg/m³",
+        "density of the fluid at rest",
+        Axis.PHASE,
+        _of_phases("rest_density"),
+        range=Range.POSITIVE,
+    ),
     Parameter(
         "viscosity",
         "Pa s",
+        "dynamic viscosity",
         Axis.PHASE,
         _of_phases("viscosity"),
         range=Range.NOT_NEGATIVE,
         force="cortado.sph.viscosity",
     ),
-    Parameter("time_step", "s", Axis.SCALAR, lambda s: s.scene.solver.time_step, range=Range.POSITIVE),
     Parameter(
-        "mobility", "m²/s", Axis.SCALAR, lambda s: s.scene.mixture.mobility, range=Range.NOT_NEGATIVE, acts=_diffuses
+        "time_step", "s", "length of a step", Axis.SCALAR, lambda s: s.scene.solver.time_step, range=Range.POSITIVE
+    ),
+    Parameter(
+        "mobility",
+        "m²/s",
+        "how fast phases diffuse into one another",
+        Axis.SCALAR,
+        lambda s: s.scene.mixture.mobility,
+        range=Range.NOT_NEGATIVE,
+        acts=_diffuses,
     ),
     Parameter(
         "interface_width",
         "m",
+        "width of the interface between phases",
         Axis.SCALAR,
         lambda s: s.scene.mixture.width(s.scene.discretisation.spacing),
         range=Range.POSITIVE,
@@ -218,6 +245,7 @@ PARAMETERS = (
     Parameter(
         "nozzle_path",
         "m",
+        "where the opening of the emitter is after each step",
         Axis.STEP,
         lambda s: s.scene.emitter.outlet,
         components=_vector,
@@ -228,6 +256,7 @@ PARAMETERS = (
     Parameter(
         "flow_rate",
         "m³/s",
+        "volume that the emitter gives in a second, in 2-D area",
         Axis.SCALAR,
         lambda s: s.scene.emitter.flow_rate,
         range=Range.POSITIVE,
@@ -237,6 +266,7 @@ PARAMETERS = (
     Parameter(
         "colours",
         "",
+        "red, green and blue of the phases, linear, from 0 to 1; for losses of images",
         Axis.PHASE,
         _of_phases("colour"),
         components=lambda dimension, phases: 3,

@@ -1,0 +1,47 @@
+"""Arguments of kernels are bound by their names, and a mistake is an error where the launch is written."""
+
+import pytest
+import warp as wp
+
+from cortado.device.launching import KernelLauncher, bound, launch
+from cortado.device.precision import FLOAT64
+from cortado.sph.integration import integration_kernels
+
+CPU = wp.get_device("cpu")
+PREDICT = integration_kernels(FLOAT64).predict
+NAMES = ("time_step", "x", "v", "acceleration", "x_star", "v_star")
+
+
+def test_arguments_come_in_the_order_of_the_kernel():
+    given = {name: name.upper() for name in reversed(NAMES)}
+    assert bound(PREDICT, (), given) == [name.upper() for name in NAMES]
+
+
+def test_what_is_given_comes_before_groups_and_groups_in_their_order():
+    first, second = {"x": 1, "v": 2, "other": 0}, {"x": 10, "v": 20, "time_step": 30, "x_star": 40, "v_star": 50}
+    found = bound(PREDICT, (first, second), {"v": 3, "acceleration": 4})
+    assert found == [30, 1, 3, 4, 40, 50]
+
+
+@pytest.mark.parametrize("missing", NAMES)
+def test_a_missing_argument_is_named(missing):
+    given = {name: 0 for name in NAMES if name != missing}
+    with pytest.raises(TypeError, match=f"argument '{missing}' of kernel .*predict.* is missing; it has time_step, x"):
+        bound(PREDICT, (), given)
+
+
+def test_a_misspelt_argument_is_named():
+    with pytest.raises(TypeError, match="has no argument 'xstar'; it has time_step, x, v, acceleration, x_star"):
+        bound(PREDICT, (), {**dict.fromkeys(NAMES, 0), "xstar": 0})
+
+
+@pytest.mark.parametrize("by", ["launch", "launcher"])
+def test_launches_compute_what_kernels_say(by):
+    arrays = {name: wp.full(3, wp.vec3d(2.0, 3.0, 4.0), dtype=wp.vec3d, device=CPU) for name in NAMES[1:]}
+    arrays["time_step"] = wp.full(1, 0.5, dtype=wp.float64, device=CPU)
+    if by == "launch":
+        launch(PREDICT, 3, CPU, arrays)
+    else:
+        KernelLauncher(3, CPU, record_tape=False)(PREDICT, arrays)
+    assert arrays["v_star"].numpy().tolist() == [[3.0, 4.5, 6.0]] * 3
+    assert arrays["x_star"].numpy().tolist() == [[3.5, 5.25, 7.0]] * 3
