@@ -511,11 +511,11 @@ def test_averaged_and_smoothed_differentiate_the_same_loss():
 
 
 def test_an_average_finds_its_strength_once(chaotic):
-    point, cloud = {"gravity": np.array([0.5, -9.81, 0.0])}, {"spread": 0.1, "samples": 4}
-    found = chaotic.estimate(point, gradients.EnsembleMean(**cloud))
+    point, ensemble = {"gravity": np.array([0.5, -9.81, 0.0])}, {"spread": 0.1, "samples": 4}
+    found = chaotic.estimate(point, gradients.EnsembleMean(**ensemble))
     smoothing = gradients.AdjointViscosity(order=2).tuned(chaotic, point)
     assert found.strength == smoothing.strength > 0.0
-    again = chaotic.estimate(point, gradients.EnsembleMean(**cloud, estimator=smoothing))
+    again = chaotic.estimate(point, gradients.EnsembleMean(**ensemble, estimator=smoothing))
     assert found.gradient["gravity"].tobytes() == again.gradient["gravity"].tobytes()
 
 

@@ -11,7 +11,7 @@ from bad_tasks import GOOD_TASK, PLANE_PICTURE, TINY_LATTE
 from cortado import optimise
 from cortado.cli import main
 from cortado.errors import SceneError
-from cortado.inverse.setup import assignment
+from cortado.inverse.setup import setup
 from cortado.inverse.task import load_task
 from cortado.losses.image_losses import psnr
 from cortado.optimisation.optimisers import Adam
@@ -45,7 +45,7 @@ def test_a_layer_is_as_opaque_as_its_spacing_is_thick(file, monkeypatch, finenes
     """How fine the nodes are does not change how opaque the plane is; shares of the extinction do."""
     monkeypatch.setitem(cortado.render.scene_renderer.FINENESS, 2, fineness)
     task = load_task(file, [STAGED, "render.extinction=20.0", "problem.distance=squared_difference"])
-    made = assignment(task, "cpu", "float64")
+    made = setup(task, "cpu", "float64")
     x = made.problem.simulation.positions
     thin, full = (covering(image, [0.3, 0.2, 0.1], [0.9, 0.8, 0.7]) for image in images(made, {"initial_positions": x}))
     middle = (slice(10, 13), slice(4, 7))  # of the fluid, whose coverage there is 1 within 5 %
@@ -58,7 +58,7 @@ def test_other_views_become_thinner_too(tmp_path, view):
     (tmp_path / "task.toml").write_text(TINY_LATTE)
     options = ["position=[0.0, 0.2, 0.2]", "look_at=[0.0, 0.0, 0.0]"] if view == "volume" else []
     overrides = [f"render.{entry}" for entry in [f"view={view}", *options]]
-    made = assignment(load_task(tmp_path / "task.toml", [*overrides, STAGED]), "cpu", "float32")
+    made = setup(load_task(tmp_path / "task.toml", [*overrides, STAGED]), "cpu", "float32")
     thin, full = (next(iter(s.problem.loss.losses.values())).renderer.view.extinction for s in made.searches)
     assert thin == pytest.approx(0.25 * full)
     assert made.renderer.view.extinction == full
@@ -67,7 +67,7 @@ def test_other_views_become_thinner_too(tmp_path, view):
 def test_a_hidden_run_is_seen_through_the_same_fluid(tmp_path):
     """The thinner picture of the answer is the thinner target, so that every search has the same answer."""
     (tmp_path / "task.toml").write_text(TINY_LATTE)
-    made = assignment(load_task(tmp_path / "task.toml", [STAGED]), "cpu", "float32")
+    made = setup(load_task(tmp_path / "task.toml", [STAGED]), "cpu", "float32")
     assert len(made.searches) == 2
     for search in made.searches:
         assert search.problem.value(made.task.hidden) == pytest.approx(0.0, abs=1e-12)
@@ -89,7 +89,7 @@ def test_each_search_begins_where_the_last_one_ended(file):
     main(["optimise", "task.toml", "--set", STAGED, "--out", "run"])
     metrics = [json.loads(line) for line in Path("run/metrics.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in metrics] == list(range(10))  # 4 updates and the last iterate, twice
-    made = assignment(load_task(file, [STAGED]), "cpu", "float32")
+    made = setup(load_task(file, [STAGED]), "cpu", "float32")
     assert metrics[0]["loss"] == pytest.approx(made.searches[0].value(made.start), rel=1e-6)
     assert metrics[5]["loss"] != pytest.approx(made.searches[1].value(made.start), rel=1e-2)
     assert metrics[5]["loss"] > metrics[9]["loss"]
@@ -126,7 +126,7 @@ def test_thin_fluid_first_gathers_what_thick_fluid_leaves_behind(file):
 
 def _reached(file, overrides):
     """Peak signal-to-noise ratio [dB] after 180 iterations in all."""
-    made = assignment(load_task(file, overrides), "cpu", "float32")
+    made = setup(load_task(file, overrides), "cpu", "float32")
     found = made.start
     for search in made.searches:
         found = optimise(search, found, Adam(0.012), 180 // len(made.searches), made.bounds).last_parameters

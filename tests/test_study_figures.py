@@ -13,7 +13,7 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_LATTE
 from cortado.cli import main
 from cortado.gradients import Exact, FrozenGeometry
-from cortado.inverse.setup import assignment
+from cortado.inverse.setup import setup
 from cortado.inverse.task import load_task
 from cortado.optimisation.optimise import optimise
 from cortado.optimisation.optimisers import Adam
@@ -98,7 +98,7 @@ def test_a_task_is_searched_with_its_own_gradient(tmp_path):
     for name, estimator in (("frozen_geometry", FrozenGeometry()), ("exact", Exact())):
         overrides = [f"optimise.gradient.name={name}"]
         settings = TaskSettings(title="a cup", task=str(file), overrides=overrides)
-        made = assignment(load_task(file, overrides), "cpu", "float32")
+        made = setup(load_task(file, overrides), "cpu", "float32")
         wanted = optimise(made.search, made.start, Adam(0.5), 3, gradient=estimator)
         losses[name] = TASK.measure(settings, no_progress).where(picture="")["loss"]
         np.testing.assert_array_equal(losses[name], [record.loss for record in wanted.history])

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from cortado.errors import ComputationError, DivergedError
 from cortado.gradients import GradientEstimator, tuned
 from cortado.inverse.figures import task_figures
-from cortado.inverse.setup import Assignment, assignment
+from cortado.inverse.setup import Setup, setup
 from cortado.inverse.task import Task, load_task
 from cortado.io.folder_lock import locked
 from cortado.io.interruption import keeping
@@ -51,7 +51,7 @@ def optimise_task(
     command: list[str],
 ) -> str:
     """Optimise, write the run folder, and return a sentence that says where the results are."""
-    made = assignment(load_task(task_file, overrides), device, precision)
+    made = setup(load_task(task_file, overrides), device, precision)
     if resume:
         RunFolder.open(out)
     with locked(out):
@@ -60,7 +60,7 @@ def optimise_task(
             return _solved(made, folder, resume)
 
 
-def _run_folder(made: Assignment, out: Path, resume: bool, overwrite: bool, command: list[str]) -> RunFolder:
+def _run_folder(made: Setup, out: Path, resume: bool, overwrite: bool, command: list[str]) -> RunFolder:
     """A new one, or the one that is there; a search goes on with other iterations and another check if so wished."""
     task, simulation = made.task, made.problem.simulation
     settings = {
@@ -79,7 +79,7 @@ def _kept(folder: RunFolder) -> str:
     return f"the evaluations so far are in {folder.checkpoint}" if folder.read_metrics() else ""
 
 
-def _solved(made: Assignment, folder: RunFolder, resume: bool) -> str:
+def _solved(made: Setup, folder: RunFolder, resume: bool) -> str:
     """Search, judge, and write what came out; returns the sentence about it."""
     try:
         result, estimator = _search(made, folder, resume)
@@ -138,7 +138,7 @@ def _distance(found: ArrayLike, hidden: ArrayLike) -> float:
     return float(np.linalg.norm(found - hidden) / (np.linalg.norm(hidden) or 1.0))
 
 
-def _search(made: Assignment, folder: RunFolder, resume: bool) -> tuple[Result, GradientEstimator]:
+def _search(made: Setup, folder: RunFolder, resume: bool) -> tuple[Result, GradientEstimator]:
     """What came out, and the estimator of the last search as it was tuned."""
     settings = made.task.optimise
     known = len(folder.read_metrics()) if resume else 0
@@ -170,7 +170,7 @@ def _search(made: Assignment, folder: RunFolder, resume: bool) -> tuple[Result, 
     return replace(result, history=tuple(history), evaluations=len(history)), estimator
 
 
-def _summary(made: Assignment, result: Result, verdict: Verdict) -> str:
+def _summary(made: Setup, result: Result, verdict: Verdict) -> str:
     reached = [f"{name} within {100 * error:.3g}% of the hidden one" for name, error in verdict.errors.items()]
     if verdict.psnr is not None:
         reached.insert(0, f"the image is matched to {verdict.psnr:.3g} dB")
@@ -180,7 +180,7 @@ def _summary(made: Assignment, result: Result, verdict: Verdict) -> str:
 
 
 def _rows(
-    made: Assignment, found: dict[str, np.ndarray], result: Result, verdict: Verdict, estimator: GradientEstimator
+    made: Setup, found: dict[str, np.ndarray], result: Result, verdict: Verdict, estimator: GradientEstimator
 ) -> Rows:
     rows: Rows = [
         ("particles", made.problem.simulation.particles),

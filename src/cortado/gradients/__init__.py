@@ -2,7 +2,7 @@
 
 `Exact` is the derivative of the discrete map, `Tape` the same by other means. Where neighbouring trajectories separate
 it says less and less, and others take its place: `AdjointViscosity`, `FrozenGeometry`, `Damped`, or the mean of theirs
-over a cloud, `EnsembleMean`. `RandomizedSmoothing`, from forward runs alone, is what they are measured by.
+over an ensemble, `EnsembleMean`. `RandomizedSmoothing`, from forward runs alone, is what they are measured by.
 """
 
 from cortado.gradients.adjoint_filters import AdjointNorms

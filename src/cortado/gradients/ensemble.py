@@ -1,4 +1,4 @@
-"""The gradient of a loss averaged over a cloud, from forward runs alone or from gradients that stay small."""
+"""The gradient of a loss averaged over an ensemble, from forward runs alone or from gradients that stay small."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ MOST_NUMBERS = 64
 
 @dataclass(frozen=True)
 class RandomizedSmoothing(Cloud):
-    """Central differences, averaged over a cloud of parameters and first states: the reference beyond chaos.
+    """Central differences, averaged over an ensemble of parameters and first states: the reference beyond chaos.
 
     Formula: for parameters u of N numbers, each in units of its spread h,
 
@@ -35,8 +35,8 @@ class RandomizedSmoothing(Cloud):
     """
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        cloud = self.around(problem, parameters)
-        loss, numbers = problem.value(cloud.values), len(cloud.spreads)
+        ensemble = self.around(problem, parameters)
+        loss, numbers = problem.value(ensemble.values), len(ensemble.spreads)
         if numbers > MOST_NUMBERS:
             raise InputError(
                 f"the parameters are {numbers} numbers, but must be at most {MOST_NUMBERS}, as the simulation "
@@ -44,19 +44,19 @@ class RandomizedSmoothing(Cloud):
             )
         found, r = np.zeros((self.samples, numbers)), np.sqrt(numbers)
         for sample in found:
-            for q in cloud.rotation():
-                displacement = cloud.displacement()
-                ahead, behind = (cloud.at(side * q, displacement, problem.value) for side in (r, -r))
+            for q in ensemble.rotation():
+                displacement = ensemble.displacement()
+                ahead, behind = (ensemble.at(side * q, displacement, problem.value) for side in (r, -r))
                 sample += (ahead - behind) / (2.0 * r) * q
-        gradient, error = (cloud.named(one / cloud.spreads) for one in _mean_and_error(found))
+        gradient, error = (ensemble.named(one / ensemble.spreads) for one in _mean_and_error(found))
         return Estimate(loss, gradient, standard_error=error)
 
 
 @dataclass(frozen=True)
 class EnsembleMean(Cloud):
-    """Gradients of another estimator, averaged over a cloud of parameters and first states: an ensemble mean.
+    """Gradients of another estimator, averaged over an ensemble of parameters and first states: an ensemble mean.
 
-    Formula: g = mean over points of the cloud of the estimator's gradient there. It is the gradient of the loss that
+    Formula: g = mean over points of the ensemble of the estimator's gradient there. It is the gradient of the loss that
     `RandomizedSmoothing` differentiates, as far as the estimator's are right, for any number of parameters. Of `Exact`
     gradients beyond chaos the mean is useless, as few of them drown the rest.
 
@@ -77,15 +77,15 @@ class EnsembleMean(Cloud):
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         """``observe`` is given the adjoints of one point after the other."""
-        cloud = self.around(problem, parameters)
-        loss, estimator = problem.value(cloud.values), tuned(self.estimator, problem, cloud.values)
+        ensemble = self.around(problem, parameters)
+        loss, estimator = problem.value(ensemble.values), tuned(self.estimator, problem, ensemble.values)
         made = partial(estimator.estimate, problem, observe=observe)
         pairs = []
         for _ in range(self.samples // 2):
-            u, displacement = cloud.offset(), cloud.displacement()
-            pairs.append([cloud.at(side * u, side * displacement, made) for side in (1.0, -1.0)])
-        means = [np.mean([_numbers(one.gradient, cloud.values) for one in pair], axis=0) for pair in pairs]
-        gradient, error = (cloud.named(one) for one in _mean_and_error(np.array(means)))
+            u, displacement = ensemble.offset(), ensemble.displacement()
+            pairs.append([ensemble.at(side * u, side * displacement, made) for side in (1.0, -1.0)])
+        means = [np.mean([_numbers(one.gradient, ensemble.values) for one in pair], axis=0) for pair in pairs]
+        gradient, error = (ensemble.named(one) for one in _mean_and_error(np.array(means)))
         return Estimate(loss, gradient, pairs[-1][-1].strength, error)
 
     def tuned(self, problem: Differentiable, parameters: Values) -> "EnsembleMean":

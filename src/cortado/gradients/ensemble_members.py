@@ -61,7 +61,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Sampler:
-    """A cloud around the parameters of a problem, and the random numbers that samples are drawn by."""
+    """An ensemble around the parameters of a problem, and the random numbers that samples are drawn by."""
 
     values: Arrays
     spreads: np.ndarray
@@ -96,7 +96,7 @@ class Sampler:
             return made(values)
         except InputError as error:
             advice = "Take a smaller spread, or a logarithm (cortado.optimisation.transforms)."
-            raise InputError(f"A sample of the cloud does not fit: {error} {advice}") from error
+            raise InputError(f"A sample of the ensemble does not fit: {error} {advice}") from error
 
     def named(self, numbers: np.ndarray) -> Arrays:
         """Numbers one after another, as arrays by the parameters' names."""

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from cortado.figures import curve, images, loss_curve, parameters, particles
-from cortado.inverse.setup import Assignment
+from cortado.inverse.setup import Setup
 from cortado.io.report import Figures
 from cortado.io.video import MOST_FRAMES, write_video
 from cortado.optimisation.optimise import Result
@@ -20,7 +20,7 @@ MOMENTS = 6
 """Images on the way."""
 
 
-def task_figures(made: Assignment, result: Result, folder: Path) -> Figures:
+def task_figures(made: Setup, result: Result, folder: Path) -> Figures:
     """Draw them into a folder; (caption, path) of each."""
     losses = [record.loss for record in result.history]
     label = "loss [m²]" if made.renderer is None else "loss"
@@ -34,14 +34,14 @@ def task_figures(made: Assignment, result: Result, folder: Path) -> Figures:
     return figures
 
 
-def _particles(made: Assignment, result: Result, folder: Path) -> tuple[str, Path]:
+def _particles(made: Setup, result: Result, folder: Path) -> tuple[str, Path]:
     before, after = (made.problem.end(made.search.parameters(u)).positions for u in (made.start, result.parameters))
     target = made.targets[made.problem.steps]
     path = particles([before, after, target], ["start", "found", "target"], folder / "particles.png")
     return "Where the fluid ends: with the first guess, with the parameters found, and the target.", path
 
 
-def _images(made: Assignment, result: Result, folder: Path) -> Figures:
+def _images(made: Setup, result: Result, folder: Path) -> Figures:
     last, target = max(made.targets.items())
 
     def image(u: dict[str, np.ndarray]) -> np.ndarray:
@@ -64,7 +64,7 @@ def _images(made: Assignment, result: Result, folder: Path) -> Figures:
     return figures
 
 
-def _parameter(made: Assignment, result: Result, name: str, folder: Path) -> Figures:
+def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
     """A small parameter over the iterations, one over time as it was found."""
     found, hidden = made.search.parameters(result.parameters)[name], made.hidden(name)
     if name in OVER_TIME and np.ndim(found) == 2:

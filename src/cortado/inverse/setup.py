@@ -23,7 +23,7 @@ DRAWN = {"heart": heart, "rosetta": rosetta}
 
 
 @dataclass(frozen=True)
-class Assignment:
+class Setup:
     """What `cortado.optimise` is given, and what its result is held against."""
 
     task: Task
@@ -54,7 +54,7 @@ class Assignment:
         return self.task.hidden.get(name)
 
 
-def assignment(task: Task, device: str, precision: str) -> Assignment:
+def setup(task: Task, device: str, precision: str) -> Setup:
     """The task on a device; raises `InputError` for a picture that cannot be read."""
     simulation = Simulation(task.scene, device, precision)
     start = {name: _start(name, value, simulation) for name, value in task.start.items()}
@@ -69,7 +69,7 @@ def assignment(task: Task, device: str, precision: str) -> Assignment:
     coordinates = searches[-1].coordinate(start)
     for name, (lower, upper) in bounds.items():
         coordinates[name] = np.clip(coordinates[name], lower, upper)  # what is random, or a little outside by round-off
-    return Assignment(task, problem, tuple(searches), coordinates, bounds, renderer, targets)
+    return Setup(task, problem, tuple(searches), coordinates, bounds, renderer, targets)
 
 
 def _frames(task: Task, targets: dict[int, np.ndarray], renderer: Renderer | None) -> Frames:

@@ -151,11 +151,11 @@ class GradientTable(Table):
     strength: Annotated[float | None, Quantity(above=0.0, most=1.0)] = None
     """Of adjoint smoothing; None: found at the start of a search."""
     samples: Annotated[int, Count(1, 10_000)] = 1
-    """Runs of a cloud that the gradient is the mean of."""
+    """Runs of an ensemble that the gradient is the mean of."""
     spread: Annotated[dict[str, Any] | None, Values()] = None
-    """Of the cloud: by name a number, in the units of what is searched."""
+    """Of the ensemble: by name a number, in the units of what is searched."""
     position_noise: Annotated[float, Quantity("spacings", least=0.0)] = EnsembleMean.position_noise
-    """Of the first positions in the cloud."""
+    """Of the first positions in the ensemble."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

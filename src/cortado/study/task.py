@@ -9,7 +9,7 @@ from pydantic import ValidationInfo, field_validator
 from cortado.errors import InputError
 from cortado.figures.canvas import PALETTE, whole_numbers
 from cortado.gradients import tuned
-from cortado.inverse.setup import Assignment, assignment
+from cortado.inverse.setup import Setup, setup
 from cortado.inverse.task import load_task
 from cortado.io.srgb import to_srgb
 from cortado.losses.image_losses import psnr
@@ -49,7 +49,7 @@ class TaskSettings(DeviceSettings):
 
 def measure(settings: TaskSettings, progress: Progress) -> Table:
     """Rows of losses, with no picture and no pixel, and of the pixels of pictures, with no loss."""
-    made = assignment(load_task(settings.task, settings.overrides), settings.device, settings.precision)
+    made = setup(load_task(settings.task, settings.overrides), settings.device, settings.precision)
     if made.renderer is None:
         raise InputError(f'{settings.task}: problem.loss is "positions", but must be "image" to be drawn.')
     history = _search(made, progress)
@@ -63,7 +63,7 @@ def measure(settings: TaskSettings, progress: Progress) -> Table:
     return Table.joined([{"picture": "", **losses, **none}, *(_pixels(name, made) for name, made in pictures.items())])
 
 
-def _search(made: Assignment, progress: Progress) -> list[Record]:
+def _search(made: Setup, progress: Progress) -> list[Record]:
     settings, history, start = made.task.optimise, [], made.start
     with progress(len(made.searches) * (settings.iterations + 1)) as advance:
 

@@ -1,4 +1,4 @@
-"""Assignments: targets, starts, coordinates and bounds of a task, on a device."""
+"""Setups: targets, starts, coordinates and bounds of a task, on a device."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, LATTE_PARTICLES, PARTICLES, PLANE_PICTURE, TINY_LATTE
 from cortado import InputError, optimise
-from cortado.inverse.setup import assignment
+from cortado.inverse.setup import setup
 from cortado.inverse.task import load_task
 from cortado.io.pictures import heart, rosetta, write_picture
 from cortado.losses.image_losses import Pyramid, SquaredDifference
@@ -17,11 +17,11 @@ from cortado.parameters.tilt import Tilt
 
 @pytest.fixture
 def made(tmp_path):
-    """Makes the assignment of a text with values replaced."""
+    """Makes the setup of a text with values replaced."""
 
     def make(text, *overrides, precision="float64"):
         (tmp_path / "task.toml").write_text(text)
-        return assignment(load_task(tmp_path / "task.toml", overrides), "cpu", precision)
+        return setup(load_task(tmp_path / "task.toml", overrides), "cpu", precision)
 
     return make
 
