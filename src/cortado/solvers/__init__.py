@@ -1,0 +1,1 @@
+"""Algorithms for a step: what a solver is, what all of them are made of, and PCISPH."""
