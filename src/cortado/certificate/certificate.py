@@ -54,7 +54,7 @@ class Certificate:
     def __repr__(self) -> str:
         verdict = f"right, horizon {self.horizon}" if self.right else f"WRONG for {', '.join(self.wrong)}"
         size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}"
-        return f"Certificate({size}, {verdict}, use estimators.{self.estimator})"
+        return f"Certificate({size}, {verdict}, use gradients.{self.estimator})"
 
     def __str__(self) -> str:
         """As tables and sentences."""
@@ -68,7 +68,7 @@ class Certificate:
             horizon_table(self.horizons),
             *([] if self.agreement is None else [gradient_table(self.agreement)]),
             f"Up to step {self.horizon} of {self.steps} the exact gradient means something. For {self.steps} steps use "
-            f"estimators.{self.estimator}.",
+            f"gradients.{self.estimator}.",
         ]
         return "\n".join(lines)
 
