@@ -263,8 +263,8 @@ class ForwardPass:
         """
         if self._evaluation != self.rollout.evaluation:
             raise InputError(
-                "The problem was evaluated again after this passage was made, but a passage can be gone back through "
-                "only until then: make another one with passage()."
+                "The problem was evaluated again after this forward pass, but a forward pass can be gone back through "
+                "only until then: make another one with forward_pass()."
             )
         bars, values = self._bars, self._values
         first = self.rollout.backward(derivative, {step: bar.state for step, bar in bars.items()}, observe)

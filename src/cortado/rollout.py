@@ -1,8 +1,8 @@
 """The only time loop: run forward, keep checkpoints, go back.
 
 Steps are launched in chunks without a host read in between; at the end of a chunk the host looks whether the
-neighbour lists were long enough (if not, they grow and the chunk is repeated) and whether a particle was lost.
-On a GPU a step is a captured graph.
+neighbour lists were long enough (if not, they grow and the chunk is repeated) and whether a particle was lost. A chunk
+is one step on a CPU. A step is a captured graph on a GPU, and on a CPU where launches take one thread.
 """
 
 from collections.abc import Callable, Mapping
@@ -30,7 +30,7 @@ Observer = Callable[[int, State], None]
 
 
 class StepDerivative(Protocol):
-    """How one step is gone back through; made by an estimator for one rollout."""
+    """The way back through one step, made by an `AdjointEstimator` of `cortado.gradients` for one rollout."""
 
     capturable: bool
     """Whether a step may be captured as a graph."""

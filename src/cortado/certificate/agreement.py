@@ -22,7 +22,7 @@ class Judged:
     """An estimator's gradient beside the smoothed one, every number in units of its meaningful change."""
 
     estimator: str
-    """As it is written in Python, after ``estimators.``"""
+    """As it is written in Python, after ``gradients.``"""
     cosine: float
     size: float
     """Over that of the smoothed gradient."""

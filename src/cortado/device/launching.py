@@ -61,8 +61,9 @@ def launch(kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, **argum
 class KernelLauncher:
     """Launches kernels with one thread a particle on one device, with arguments by name (see `bound`).
 
-    On a CPU Warp launches in one thread; a kernel that sums over neighbours, whose first argument is that, is cut into
-    ranges of particles, several for each core where there are many, and a core that has done one takes the next.
+    On a CPU Warp launches in one thread. A kernel whose first argument is the neighbourhood ``s`` is cut into ranges of
+    particles there, several for each core where there are many, and a core that has done one takes the next: such a
+    kernel works on particle ``s.first + wp.tid()``, and not on a number of threads of its own.
     The sums are gathers, so that the bits do not depend on the cut, or on who took what.
     """
 

@@ -65,14 +65,15 @@ fractions (n, phases); or as Warp arrays."""
 class Loss(Protocol):
     """A differentiable number of the end of a trajectory.
 
-    A loss of your own may have a method ``adjoint(end)`` in the place of `value_and_adjoint`.
+    A loss of your own may have a method ``adjoint(end)``, of the derivatives alone, in the place of
+    `value_and_adjoint`.
     """
 
     def value(self, end: Snapshot) -> float:
         """The loss."""
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """The loss and its derivatives, which share what both need."""
+        """The loss and its derivatives, in one call as they often share work."""
 
 
 class Frames:

@@ -51,7 +51,7 @@ class Source(Protocol):
 
 
 Limit = Callable[[Any, Mapping[str, Any]], float]
-"""A time step [s] of a scene, with values of parameters that replace the scene's."""
+"""A time step [s] of a scene, with values of parameters that replace the scene's; there may be none of these."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,8 @@ def _has_emitter(scene: Any) -> bool:
 def _optional(
     name: str, unit: str, meaning: str, force: str, longest_step: Limit = lambda scene, values: inf
 ) -> Parameter:
-    """A number of at least 0 that stands in the table [forces] of a scene, and switches a force on."""
+    """A number of at least 0 that may stand in the table [forces] of a scene, and switches a force on: ``force`` is the
+    module that makes it, ``longest_step`` the largest time step at which it is likely to be stable."""
     return Parameter(
         name,
         unit,

@@ -58,8 +58,8 @@ class StepAdjoint(Protocol):
 
 
 class Solver(Protocol):
-    """The solver of one set of particles on one device. Rollouts share it; nothing here reads from the device, but for
-    `make_room`."""
+    """The solver of one set of particles on one device, which rollouts share. Of its methods `make_room` alone
+    waits for the device and reads from it."""
 
     discretisation: Discretisation
     particles: int

@@ -38,7 +38,11 @@ class StepContext:
         return own, self.fields.named(), self.parameters.named()
 
     def launch(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
-        """Launch a kernel over the particles; what is not among ``arguments`` and ``groups`` is the step's."""
+        """Launch a kernel over the particles; what is not among ``arguments`` and ``groups`` is the step's.
+
+        A kernel that takes ``s`` takes it first and works on particle ``s.first + wp.tid()``, as its launch may be cut
+        into ranges of particles; ``threads`` is for kernels without it.
+        """
         self.launcher(kernel, *groups, *self._known, threads=threads, **arguments)
 
 
@@ -85,7 +89,8 @@ class Adjoints:
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
-        """For kernels: ``x_bar`` and so on; ``viscosity_bar`` is that of the shares where these have it."""
+        """For kernels: ``x_bar`` and so on; ``viscosity_bar`` is (n,), of particles' shares, where a part names the
+        viscosity among its ``shares``, and the sum (phases,) elsewhere."""
         whole = {
             name: array
             for name, array in self.parameters.named("_bar").items()
@@ -111,7 +116,8 @@ class Force(Protocol):
     """An explicit force. A step adds up the accelerations [m / s2] of its forces, one after the other."""
 
     shares: tuple[str, ...]
-    """Parameters, numbers or those of phases, in whose adjoints every particle has a share."""
+    """Parameters, numbers or those of phases, to whose adjoints every particle adds a share: an adjoint kernel sees
+    these adjoints with an entry for each particle, (n,), and those of all other parameters as sums, such as (1,)."""
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         """``after`` = ``before`` + this force's acceleration, both (n,) vectors."""
