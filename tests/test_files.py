@@ -2,26 +2,14 @@
 
 import errno
 import os
-import resource
 import stat
-from contextlib import contextmanager
 
 import pytest
 
 import cortado.io.files
 from cortado.errors import ComputationError, InputError
 from cortado.io.files import unfinished, write_atomically
-
-
-@contextmanager
-def largest_file(size):
-    """No file may grow beyond so many bytes, as on a disk that is full."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+from full_disk import largest_file
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
@@ -48,7 +36,7 @@ def test_a_full_disk_is_told_from_a_wrong_path(tmp_path, monkeypatch):
 
 def test_a_link_under_the_temporary_name_is_not_followed(tmp_path, monkeypatch):
     (tmp_path / "precious").write_text("mine")
-    monkeypatch.setattr(cortado.files.secrets, "token_hex", lambda count: "guessed")
+    monkeypatch.setattr(cortado.io.files.secrets, "token_hex", lambda count: "guessed")
     unfinished(tmp_path / "a").symlink_to(tmp_path / "precious")
     with pytest.raises(InputError, match="cannot be written"):
         write_atomically(tmp_path / "a", "theirs")
