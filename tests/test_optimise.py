@@ -226,10 +226,10 @@ from cortado.optimisation.optimisers import Adam
 from rosenbrock_valley import Rosenbrock, rosenbrock
 
 class Killed(Rosenbrock):
-    def value_and_gradient(self, parameters, estimator=None):
+    def value_and_gradient(self, parameters, gradient=None):
         if self.evaluations == 17:
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().value_and_gradient(parameters, estimator)
+        return super().value_and_gradient(parameters, gradient)
 
 rosenbrock(Adam(learning_rate=0.05), problem=Killed(), checkpoint={folder!r})
 """
@@ -293,7 +293,7 @@ def test_other_settings_are_refused_and_leave_the_log(tmp_path):
     before = (tmp_path / FILE_NAME).read_bytes()
     with pytest.raises(InputError, match=r"learning_rate=0.05.* now given optimiser = .*learning_rate=0.06"):
         rosenbrock(replace(optimiser, learning_rate=0.06), 5, checkpoint=tmp_path, resume=True)
-    with pytest.raises(InputError, match="estimator = None and is now given estimator = 'exact'"):
+    with pytest.raises(InputError, match="gradient = None and is now given gradient = 'exact'"):
         rosenbrock(optimiser, 5, checkpoint=tmp_path, resume=True, gradient="exact")
     with pytest.raises(InputError, match=r"names = \[.a., .b.\] and is now given names = \[.c.\]"):
         optimise(Quadratic({"c": 0.0}), {"c": 1.0}, optimiser, 5, checkpoint=tmp_path, resume=True)
@@ -583,5 +583,5 @@ def test_what_cannot_be_optimised_is_refused():
         rosenbrock(LBFGS(), problem=3)
     with pytest.raises(InputError, match=r"^What is optimised is the class Rosenbrock, but must be an object"):
         rosenbrock(LBFGS(), problem=Rosenbrock)
-    with pytest.raises(InputError, match=r"^An estimator is given, but must be left out"):
+    with pytest.raises(InputError, match=r"^gradient is given, but must be left out"):
         rosenbrock(LBFGS(), problem=lambda parameters: (0.0, {}), gradient=object())
