@@ -11,6 +11,7 @@ import json
 import mmap
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 ADDRESS = 0x5000_0000_0000
@@ -120,6 +121,27 @@ class Planter(ast.NodeTransformer):
         number = self.first + len(self.found)
         self.found.append((self._function, text))
         return ast.BinOp(ast.parse(f"_sign({number})", mode="eval").body, ast.Mult(), node)
+
+
+def qualified(node: ast.AST, outer: str = "") -> Iterator[tuple[str, ast.FunctionDef]]:
+    """All functions below a node by their names, with those around them; without methods, which define no terms."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.FunctionDef):
+            yield outer + child.name, child
+            yield from qualified(child, f"{outer}{child.name}.")
+        elif not isinstance(child, ast.ClassDef):
+            yield from qualified(child, outer)
+
+
+def adjoints(package: Path) -> dict[str, set[str]]:
+    """Functions by module that have the word adjoint in their name, without those that only make such functions."""
+    found: dict[str, set[str]] = {}
+    for path in sorted(package.rglob("*.py")):
+        for name, function in qualified(ast.parse(path.read_text())):
+            maker = any(isinstance(statement, ast.FunctionDef) for statement in function.body)
+            if "adjoint" in function.name.split("_") and not maker:
+                found.setdefault(".".join(path.relative_to(package).with_suffix("").parts), set()).add(name)
+    return found
 
 
 def _name(target: ast.expr) -> str:

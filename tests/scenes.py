@@ -62,3 +62,22 @@ def plane_of_three(**changes: Any) -> Scene:
     phases = [scene().phase[0].model_dump(), OIL, HONEY]
     mixture = {**MIXING, "mobility": 0.03, "mobility_form": "constant"}
     return plane(**{"name": "plane of three", "phase": phases, "fluid": blocks, "mixture": mixture, **changes})
+
+
+def jet(**changes: Any) -> Scene:
+    """In the plane: 3 particles abreast shot into a pool of 48."""
+    slot = {"phase": "water", "outlet": [0.3, 0.26], "radius": 0.075, "length": 0.3, "flow_rate": 0.3}
+    pool = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.2], "phase": "water"}
+    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.8]}
+    return plane(**{"name": "jet", "fluid": [pool], "container": room, "emitter": slot, **changes})
+
+
+def pour(**changes: Any) -> Scene:
+    """Oil that is poured aslant on water and mixes with it, 4 particles in a layer."""
+    outlet = {"outlet": [0.09, 0.17, 0.12], "direction": [0.3, -1.0, 0.1]}
+    nozzle = {"phase": "oil", "radius": 0.06, "length": 0.2, "flow_rate": 0.015, **outlet}
+    pool = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.25, 0.1, 0.25], "phase": "water"}
+    room = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.25, 0.5, 0.25]}
+    phases = [scene().phase[0].model_dump(), OIL]
+    tables = {"name": "pour", "phase": phases, "fluid": [pool], "container": room, "mixture": MIXING}
+    return scene(**{**tables, "emitter": nozzle, **changes})

@@ -19,8 +19,7 @@ from cortado.problem import ForwardPass
 from cortado.render.scene_renderer import scene_renderer
 from cortado.scene.scene import load_scene
 from cortado.sph.free_energy import FREE_ENERGIES
-from scenes import plane, plane_of_three, scene, splash, two_layers
-from test_emitter import jet, pour
+from scenes import jet, plane, plane_of_three, pour, scene, splash, two_layers
 
 SPLINES = {name: {"spacing": 0.05, "support": 2.6, "kernel": name} for name in ("wendland_c2", "wendland_c4")}
 RIGHT = {

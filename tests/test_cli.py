@@ -20,13 +20,13 @@ import cortado.commands.run
 import cortado.io.vtkhdf
 from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
+from compiling_notice import without_compiling
 from cortado import Problem, Scene, Trajectory
 from cortado.cli import main
 from cortado.io.folder_lock import locked
 from cortado.io.pictures import heart, rosetta, write_picture
 from cortado.io.run_folder import FIGURES, RunFolder
-from test_files import largest_file
-from test_silence import with_kernels
+from full_disk import largest_file
 
 RUN_FILES = {"scene.json", "environment.json", "metrics.jsonl", "trajectory.vtkhdf", "figures", "report.html"}
 OPTIMISE_FILES = {"scene.json", "environment.json", "metrics.jsonl", "checkpoint", "figures", "report.html"}
@@ -53,7 +53,7 @@ def cortado_command(capfd):
         except SystemExit as end:
             code = end.code
         out, err = capfd.readouterr()
-        return code, out, with_kernels(err)
+        return code, out, without_compiling(err)
 
     return run
 

@@ -16,8 +16,7 @@ from cortado.lattice.region import Region
 from cortado.lattice.shapes import corners
 from cortado.scene.containers import CylinderContainer
 from cortado.solvers.containment import Containment, Walled
-from scenes import plane, scene
-from test_emitter import jet
+from scenes import jet, plane, scene
 
 SUPPORTS = {"cubic_spline": 2.0, "wendland_c2": 2.6, "wendland_c4": 3.0}
 

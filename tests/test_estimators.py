@@ -11,9 +11,8 @@ from cortado import InputError, Problem, Simulation, gradients, losses
 from cortado.gradients.adjoint_filters import Average
 from cortado.gradients.strength import LADDER, MOST_GROWTH, growth, sufficient
 from reference import complex_step
-from scenes import plane, plane_of_three, scene, splash
-from test_emitter import jet, pour
-from test_step import twin
+from scenes import jet, plane, plane_of_three, pour, scene, splash
+from twins import twin
 
 DROPS = [
     {"shape": "box", "lower": lower, "upper": upper, "phase": "water"}

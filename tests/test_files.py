@@ -2,26 +2,14 @@
 
 import errno
 import os
-import resource
 import stat
-from contextlib import contextmanager
 
 import pytest
 
 import cortado.io.files
 from cortado.errors import ComputationError, InputError
 from cortado.io.files import unfinished, write_atomically
-
-
-@contextmanager
-def largest_file(size):
-    """No file may grow beyond so many bytes, as on a disk that is full."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+from full_disk import largest_file
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):

@@ -16,29 +16,9 @@ from cortado.optimisation.named_optimisers import BY_NAME
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent
 from cortado.optimisation.replay_log import FILE_NAME
+from rosenbrock_valley import Interrupted, Rosenbrock, rosenbrock
 
 OPTIMISERS = [Adam(learning_rate=0.05), GradientDescent(learning_rate=1e-3, momentum=0.5), LBFGS()]
-
-
-class Interrupted(Exception):
-    """Stands for whatever ends a process."""
-
-
-class Rosenbrock:
-    """(1 - a)^2 + 100 (b - a^2)^2 of two scalars, with its minimum 0 at (1, 1); counts its evaluations."""
-
-    def __init__(self, fail_at: int = -1) -> None:
-        self.evaluations = 0
-        self.fail_at = fail_at
-
-    def value_and_gradient(self, parameters, gradient=None):
-        if self.evaluations == self.fail_at:
-            raise Interrupted
-        self.evaluations += 1
-        a, b = float(parameters["a"]), float(parameters["b"])
-        loss = (1.0 - a) ** 2 + 100.0 * (b - a**2) ** 2
-        slope_a = -2.0 * (1.0 - a) - 400.0 * a * (b - a**2)
-        return loss, {"a": np.asarray(slope_a), "b": np.asarray(200.0 * (b - a**2))}
 
 
 class Quadratic:
@@ -64,10 +44,6 @@ def bits(result: Result) -> list[bytes]:
     for record in result.history:
         numbers += [record.iteration, record.loss, record.gradient_norm, *record.parameters.values()]
     return [np.asarray(number).tobytes() for number in numbers]
-
-
-def rosenbrock(optimiser, iterations=30, problem=None, **options) -> Result:
-    return optimise(problem or Rosenbrock(), {"a": -1.2, "b": 1.0}, optimiser, iterations, **options)
 
 
 # Convergence
@@ -246,7 +222,8 @@ def test_finished_run_resumes_to_more_and_to_fewer_iterations(optimiser, tmp_pat
 KILLED = """
 import os, signal, sys
 sys.path.insert(0, {tests!r})
-from test_optimise import Adam, Rosenbrock, rosenbrock
+from cortado.optimisation.optimisers import Adam
+from rosenbrock_valley import Rosenbrock, rosenbrock
 
 class Killed(Rosenbrock):
     def value_and_gradient(self, parameters, gradient=None):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cortado import InputError, Simulation, Trajectory
-from scenes import plane, plane_of_three, two_layers
-from test_emitter import jet, pour
+from scenes import jet, plane, plane_of_three, pour, two_layers
 
 FIRST, REST = 17, 24
 MAKERS = {"plane": plane, "two layers": two_layers, "plane of three": plane_of_three, "jet": jet, "pour": pour}

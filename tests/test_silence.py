@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from compiling_notice import COMPILING
+
 FIRST = """
 import warp as wp
 BEFORE
@@ -14,12 +16,6 @@ simulation = cortado.Simulation("docs/figures/dam_break_plane.toml")
 simulation.run(2)
 print("level", wp.config.log_level)
 """
-COMPILING = "Compiling kernels for the first time, which may take half a minute; they are kept in "
-
-
-def with_kernels(err):
-    """What stderr would have if all kernels came from the cache, for tests that may be the first to need one."""
-    return "".join(line for line in err.splitlines(keepends=True) if not line.startswith(COMPILING))
 
 
 @pytest.fixture(scope="module")

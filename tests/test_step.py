@@ -9,8 +9,8 @@ from cortado import Simulation
 from cortado.gradients import Exact
 from cortado.lattice.smoothing import KERNELS
 from cortado.parameters.space import ParameterSpace
-from cortado.sph.viscosity import Viscosity
 from scenes import plane, plane_of_three, scene, two_layers
+from twins import twin
 
 GRAVITY, STEPS, ITERATIONS = np.array([0.3, -9.81, 0.1]), 3, 5
 ONE = {"rest_density": 1000.0, "viscosity": 5.0, "time_step": 0.0021}
@@ -36,26 +36,6 @@ def point_of(simulation, seed=0):
         point |= {name: point[name][:phases] for name in ("rest_density", "viscosity")}
         point["mass_fractions"] = random.dirichlet(np.full(phases, 0.5), len(simulation.positions))
     return {name: np.asarray(value, dtype=np.float64) for name, value in point.items()}
-
-
-def twin(simulation):
-    """The slow twin of a simulation's solver, in the simulation's own dimension."""
-    lattice, search, d = simulation.solver.lattice, simulation.solver.search, simulation.dimension
-    viscous = [force for force in simulation.solver.forces if isinstance(force, Viscosity)]
-    return reference.Pcisph(
-        simulation.solver.discretisation.smoothing,
-        d,
-        lattice.support,
-        lattice.volume,
-        lattice.stiffness,
-        search.wall_positions.numpy()[:, :d].astype(np.float64),
-        search.wall_weights.numpy().astype(np.float64),
-        viscosity=simulation.scene.forces.viscosity,
-        friction=viscous[0].friction if viscous else 0.0,
-        reach=1.03 * lattice.support,
-        response=lattice.response,
-        laplacian_correction=lattice.laplacian_correction,
-    )
 
 
 def twins_steps(simulation, substeps):

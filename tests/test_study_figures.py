@@ -11,6 +11,7 @@ from PIL import Image
 
 from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_LATTE
+from compiling_notice import without_compiling
 from cortado.cli import main
 from cortado.gradients import Exact, FrozenGeometry
 from cortado.inverse.setup import setup
@@ -28,7 +29,6 @@ from cortado.study.tables import Table
 from cortado.study.task import TASK, TaskSettings
 from cortado.study.term_sizes import term_sizes
 from scenes import scene
-from test_silence import with_kernels
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 FIGURES = ["figure_1", "figure_2_small", "figure_3_small", "figure_4", "figure_5", "figure_6", "figure_7"]
@@ -46,7 +46,7 @@ def command(capfd):
         except SystemExit as end:
             code = end.code
         out, err = capfd.readouterr()
-        return code, out, with_kernels(err)
+        return code, out, without_compiling(err)
 
     return run
 

@@ -17,7 +17,7 @@ import cortado.io.vtkhdf
 from cortado.errors import ComputationError, InputError
 from cortado.io.trajectory import Trajectory
 from cortado.io.vtkhdf import TrajectoryWriter, read
-from test_files import largest_file
+from full_disk import largest_file
 
 WRITER = """
 import sys

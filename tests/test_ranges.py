@@ -1,0 +1,131 @@
+"""Every kernel that sums over neighbours gives the same bits in several ranges of particles as in one."""
+
+import ast
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado import Problem, Simulation, gradients
+from cortado.device import launching
+from cortado.device.launching import KernelLauncher
+from scenes import MIXING, jet, plane_of_three, scene, splash, two_layers
+
+ROOT = Path(cortado.__file__).parent
+APART = "study/one_kernel_loops.py"
+"""Kernels of a study of Warp's tape, which is never cut."""
+LAMINAR = {"gravity": [1.0, -9.81], "viscosity": "laminar"}
+CASES = {
+    "one phase, iterations by tolerance": lambda: splash(minimum_iterations=2, maximum_iterations=20),
+    "no viscosity, free space": lambda: scene(
+        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "none"}, container={"shape": "none"}
+    ),
+    "laminar, no slip, diffusion of two phases": lambda: two_layers(
+        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "laminar"},
+        container={"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"},
+    ),
+    "pairwise, diffusion of three phases, a constant mobility": plane_of_three,
+    "laminar, diffusion of three phases, miscible": lambda: plane_of_three(
+        forces=LAMINAR, mixture={**MIXING, "free_energy": "miscible"}
+    ),
+    "a nozzle": jet,
+}
+ESTIMATORS = {
+    "exact": gradients.Exact(),
+    "adjoint viscosity": gradients.AdjointViscosity(strength=0.3),
+    "frozen geometry": gradients.FrozenGeometry(),
+}
+CORES_AND_PARTS = ((2, 2), (2, 8), (5, 5))
+STEPS = 4
+
+
+class Weighed:
+    """A linear loss of positions, velocities and fractions, with random weights."""
+
+    def __init__(self, simulation):
+        random, shape = np.random.default_rng(8), simulation.positions.shape
+        self.weights = [random.standard_normal(each) for each in (shape, shape, simulation.mass_fractions.shape)]
+
+    def value(self, end):
+        fields = (end.positions, end.velocities, end.mass_fractions)
+        return sum(float((w * field).sum()) for w, field in zip(self.weights, fields, strict=True))
+
+    def adjoint(self, end):
+        return tuple(self.weights)
+
+
+def results(make) -> dict[str, bytes]:
+    """Bits of a short run of a disturbed start, of tangents, and of gradients by every estimator."""
+    simulation = Simulation(make(), precision="float64")
+    problem, random = Problem(simulation, STEPS, Weighed(simulation)), np.random.default_rng(2)
+    point = simulation.parameters()
+    for name, size in (("initial_positions", 0.002), ("initial_velocities", 0.3)):
+        point[name] = point[name] + size * random.standard_normal(point[name].shape)
+    if "mass_fractions" in point:
+        c = point["mass_fractions"]
+        point["mass_fractions"] = 0.8 * c + 0.2 * random.dirichlet(np.ones(c.shape[1]), len(c))
+    directions = {name: random.standard_normal(np.shape(value)) for name, value in point.items()}
+    found = {"value": problem.value(point), "tangent": problem.tangent(point, directions)}
+    for label, estimator in ESTIMATORS.items():
+        _, gradient = problem.value_and_gradient(point, estimator)
+        found |= {f"{label}, {name}": array for name, array in gradient.items()}
+    return {name: np.asarray(array).tobytes() for name, array in found.items()}
+
+
+def set_parts(monkeypatch, cores, parts, particles):
+    """Launches over so many particles are cut into so many ranges from now on."""
+    monkeypatch.setattr(launching, "LEAST_PART", particles // parts)
+    monkeypatch.setattr(launching, "LEAST_SHARED_PART", particles // parts if parts > cores else particles)
+    monkeypatch.setattr(launching.os, "sched_getaffinity", lambda _: range(cores), raising=False)
+    launcher = KernelLauncher(particles, launching.wp.get_device("cpu"), record_tape=False)
+    assert launcher.parts == parts
+
+
+@cache
+def once_and_cut(name):
+    """Results of a case in one range, those in several, and the names of kernels that were launched range by range."""
+    particles, cut, launch_parts = Simulation(CASES[name]()).particles, set(), KernelLauncher._launch_parts
+
+    def keep(self, kernel, inputs):
+        cut.add(kernel.key.split("__locals__")[-1])
+        launch_parts(self, kernel, inputs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(KernelLauncher, "_launch_parts", keep)
+        set_parts(patch, 1, 1, particles)
+        once = results(CASES[name])
+        assert not cut
+        several = []
+        for cores, parts in CORES_AND_PARTS:
+            set_parts(patch, cores, parts, particles)
+            several.append(results(CASES[name]))
+    return once, several, cut
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_any_number_of_ranges_gives_the_same_bits(name):
+    once, several, _ = once_and_cut(name)
+    assert all(any(once[what]) for what in ("value", "tangent", *(f"{e}, initial_velocities" for e in ESTIMATORS)))
+    for found in several:
+        assert [what for what in once if found[what] != once[what]] == []
+
+
+def sums_over_neighbours() -> set[str]:
+    """Names of all kernels whose first argument is what lies around a particle."""
+    names = set()
+    for path in ROOT.rglob("*.py"):
+        if path.relative_to(ROOT).as_posix() == APART:
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and any("wp.kernel" in ast.unparse(d) for d in node.decorator_list):
+                first = node.args.args[0].annotation if node.args.args else None
+                if first is not None and ast.unparse(first) == "neighbourhood":
+                    names.add(node.name)
+    return names
+
+
+def test_every_sum_over_neighbours_is_cut_in_some_case():
+    wanted, cut = sums_over_neighbours(), set().union(*(once_and_cut(name)[2] for name in CASES))
+    assert len(wanted) >= 30 and wanted <= cut, wanted - cut

@@ -1,0 +1,26 @@
+"""Slow twins of simulations."""
+
+import numpy as np
+
+import reference
+from cortado.sph.viscosity import Viscosity
+
+
+def twin(simulation):
+    """The slow twin of a simulation's solver, in the simulation's own dimension."""
+    lattice, search, d = simulation.solver.lattice, simulation.solver.search, simulation.dimension
+    viscous = [force for force in simulation.solver.forces if isinstance(force, Viscosity)]
+    return reference.Pcisph(
+        simulation.solver.discretisation.smoothing,
+        d,
+        lattice.support,
+        lattice.volume,
+        lattice.stiffness,
+        search.wall_positions.numpy()[:, :d].astype(np.float64),
+        search.wall_weights.numpy().astype(np.float64),
+        viscosity=simulation.scene.forces.viscosity,
+        friction=viscous[0].friction if viscous else 0.0,
+        reach=1.03 * lattice.support,
+        response=lattice.response,
+        laplacian_correction=lattice.laplacian_correction,
+    )
