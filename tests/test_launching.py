@@ -3,9 +3,11 @@
 import pytest
 import warp as wp
 
+from cortado import Simulation
 from cortado.device.launching import KernelLauncher, bound, launch
 from cortado.device.precision import FLOAT64
 from cortado.sph.integration import integration_kernels
+from scenes import plane
 
 CPU = wp.get_device("cpu")
 PREDICT = integration_kernels(FLOAT64).predict
@@ -45,3 +47,10 @@ def test_launches_compute_what_kernels_say(by):
         KernelLauncher(3, CPU, record_tape=False)(PREDICT, arrays)
     assert arrays["v_star"].numpy().tolist() == [[3.0, 4.5, 6.0]] * 3
     assert arrays["x_star"].numpy().tolist() == [[3.5, 5.25, 7.0]] * 3
+
+
+def test_a_sum_over_neighbours_has_a_thread_for_each_particle():
+    search = Simulation(plane()).solver
+    kernels, context = search.kernels, search.context(search.new_parameters(1))
+    with pytest.raises(TypeError, match="sums over neighbours, and has one thread for each particle"):
+        context.launch(kernels.density.forward, threads=1)

@@ -58,4 +58,34 @@ def test_a_rollout_does_not_go_back_through_states_of_other_parameters():
     rollout = simulation.rollout(3)
     rollout.forward(keep=False)
     with pytest.raises(InputError, match="run forward first, with keep=True"):
-        rollout.backward(derivative, {})
+        rollout.backward(Exact().derivative(rollout), {})
+
+
+def test_a_rollout_takes_derivatives_of_its_own_alone():
+    simulation = Simulation(plane())
+    one, other = (Problem(simulation, 3, losses.FinalPositions(simulation.positions + k)) for k in (0.1, 0.2))
+    first, second = one.forward_pass({"viscosity": 0.1}), other.forward_pass({"viscosity": 0.1})
+    with pytest.raises(InputError, match="was made for another rollout"):
+        first.back(second.derivative(Exact()))
+    rollout = simulation.rollout(3)
+    with pytest.raises(InputError, match="cannot go along a tangent"):
+        rollout.tangent(simulation.solver.new_state(), simulation.solver.new_parameters(3), lambda step, dot: None)
+    rollout.forward()
+    with pytest.raises(InputError, match="bars has the state 7, but must have states from 0 to 3"):
+        rollout.backward(Exact().derivative(rollout), {7: simulation.state})
+
+
+@pytest.mark.parametrize("given", [None, [1.0], 3, "gravity"])
+def test_parameters_are_a_table(given):
+    simulation = Simulation(plane())
+    problem = Problem(simulation, 3, losses.FinalPositions(simulation.positions))
+    with pytest.raises(InputError, match=r"parameters are .*, but must be a table of values by name"):
+        problem.value(given)
+
+
+def test_a_part_that_forgets_its_shares_is_an_error():
+    """Its kernel would write (n,) numbers into the one of the parameter."""
+    solver = Simulation(plane_of_three()).solver
+    bar = solver.adjoint(2).bar
+    known = {name for group in bar.named for name in group}
+    assert {"x_bar", "gravity_bar", "viscosity_bar", "time_step_bar"} <= known and "flow_rate_bar" not in known

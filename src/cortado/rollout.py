@@ -34,6 +34,8 @@ class StepDerivative(Protocol):
 
     capturable: bool
     """Whether a step may be captured as a graph."""
+    rollout: "Rollout"
+    """That it was made for."""
     solver: Solver
     """Whose fields hold the replayed step after `step`."""
 
@@ -82,7 +84,8 @@ class Rollout:
         self._forget_stale_graphs()
         self.evaluation = 0
         """How often the first state and the parameters were replaced: a way back belongs to one evaluation."""
-        self._kept = -1
+        self._kept = self._run = -1
+        """The evaluations that states were kept of, and that the last run was of."""
 
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
@@ -100,7 +103,7 @@ class Rollout:
     def forward(self, observe: Observer | None = None, keep: bool = True) -> State:
         """Run all steps and return the last state. ``observe`` is given every state; ``keep`` checkpoints for a way
         back. Raises `DivergedError` after the good states were observed."""
-        self._states, self._kept = {0: self.initial}, -1
+        self._states, self._kept, self._run = {0: self.initial}, -1, -1
         state, step = self.initial, 0
         self.solver.begin(self.elapsed, self.substeps)
         self._forget_stale_graphs()
@@ -126,6 +129,7 @@ class Rollout:
                 state, step = chunk[-1], last
         finally:
             self.log.read(step)
+        self._run = self.evaluation
         if keep:
             self._kept = self.evaluation
         return state
@@ -169,9 +173,13 @@ class Rollout:
 
         ``observe`` is given the adjoint of every state, from the last to the first; the next step overwrites it. Raises
         `InputError` unless `forward` has run to its end since the first state or the parameters were replaced, and has
-        kept states.
+        kept states. The next way back overwrites what is returned.
         """
-        self._require_states("backward")
+        if derivative.rollout is not self:
+            raise InputError("The derivative was made for another rollout, but must be one of this rollout's own.")
+        if beyond := [step for step in bars if step not in range(self.steps + 1)]:
+            raise InputError(f"bars has the state {beyond[0]}, but must have states from 0 to {self.steps}.")
+        self._require("backward", self._kept)
         self.solver.begin(self.elapsed, self.substeps)
         derivative.begin()
         self._forget_stale_graphs()
@@ -203,6 +211,7 @@ class Rollout:
     def tangent(self, dot: State, parameters_dot: Parameters, observe: Observer) -> None:
         """From ``dot``, the tangent of the first state, to that of every state, given to ``observe``; `forward` has
         run with these parameters."""
+        self._require("along a tangent", self._run)
         solver = self.solver
         solver.begin(self.elapsed, self.substeps)
         derivative = solver.tangent(parameters_dot)
@@ -217,11 +226,12 @@ class Rollout:
             solver.write_state(counts, self.parameters, state)
             observe(n + 1, dot)
 
-    def _require_states(self, what: str) -> None:
-        if self._kept != self.evaluation:
+    def _require(self, what: str, evaluation: int) -> None:
+        """Whether a forward run was of the present evaluation; raises `InputError`."""
+        if evaluation != self.evaluation:
             raise InputError(
-                f"The rollout cannot go {what}, as its states are of other parameters, or were not kept: run forward "
-                "first, with keep=True."
+                f"The rollout cannot go {what}, as it has not gone forward with these parameters, or has kept no "
+                "states: run forward first, with keep=True."
             )
 
     def _restore(self, n: int) -> State:

@@ -28,7 +28,11 @@ def point(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
         raise InputError(f"parameter {unknown[0]!r} is unknown, but must be one of {', '.join(values)}.")
     if not parameters:
         raise InputError(f"parameters is empty, but must have at least one of {', '.join(values)}.")
-    return ParameterSpace(simulation, problem.steps).checked({name: values[name] for name in parameters})
+    found = ParameterSpace(simulation, problem.steps).checked({name: values[name] for name in parameters})
+    for name, value in found.items():
+        if BY_NAME[name].range is Range.NOT_NEGATIVE and not (value > 0.0).all():
+            raise InputError(f"parameter {name} is 0, but must be greater than 0, so that it can be moved both ways.")
+    return found
 
 
 def everything(problem: Problem, chosen: Arrays) -> Arrays:

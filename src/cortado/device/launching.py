@@ -88,13 +88,14 @@ class KernelLauncher:
 
     def __call__(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
         inputs = bound(kernel, groups, arguments)
-        if not self.capturable and hasattr(inputs[0], "neighbours"):
-            if kernel in self._compiled:
-                self._launch_parts(kernel, inputs)
-                return
-            self._compiled.add(kernel)  # by the one launch that follows
-        threads = threads or self.particles
-        wp.launch(kernel, threads, inputs=inputs, device=self.device, record_tape=self._record_tape)
+        sums = hasattr(inputs[0], "neighbours")
+        if sums and threads is not None:
+            raise TypeError(f"kernel {kernel.key} sums over neighbours, and has one thread for each particle.")
+        if sums and not self.capturable and kernel in self._compiled:
+            self._launch_parts(kernel, inputs)
+            return
+        wp.launch(kernel, threads or self.particles, inputs=inputs, device=self.device, record_tape=self._record_tape)
+        self._compiled.add(kernel)  # only now: an interrupted launch has compiled nothing
 
     def _launch_parts(self, kernel: wp.Kernel, inputs: Sequence[Any]) -> None:
         if self._whole is not inputs[0]:

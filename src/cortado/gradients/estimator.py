@@ -105,7 +105,7 @@ class Filtered:
     """The backward step of another estimator, and then a filter of the adjoint."""
 
     def __init__(self, base: StepDerivative):
-        self._base, self.solver, self.capturable = base, base.solver, base.capturable
+        self._base, self.rollout, self.solver, self.capturable = base, base.rollout, base.solver, base.capturable
 
     def begin(self) -> None:
         self._base.begin()

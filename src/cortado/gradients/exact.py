@@ -60,7 +60,7 @@ class _AdjointStep:
 
     def __init__(self, rollout: Rollout, frozen_geometry: bool):
         solver = rollout.solver
-        self.solver, self._parameters = solver, rollout.parameters
+        self.rollout, self.solver, self._parameters = rollout, solver, rollout.parameters
         self._adjoint = solver.adjoint(rollout.steps, frozen_geometry)
 
     def begin(self) -> None:
@@ -79,7 +79,7 @@ class _TapeStep:
 
     def __init__(self, rollout: Rollout):
         solver = rollout.solver
-        self._given, self._parameters = solver, rollout.parameters
+        self.rollout, self._given, self._parameters = rollout, solver, rollout.parameters
         self.solver = solver.differentiable()
         self._before, self._after = (self.solver.new_state(requires_grad=True) for _ in range(2))
         self._own = self.solver.new_parameters(rollout.steps, requires_grad=True)

@@ -4,7 +4,7 @@ n counts fluid particles in the order in which the scene lists them, d is the sc
 """
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cortado.device.precision import Precision
 from cortado.device.state import Parameters, State
 from cortado.device.threads import WARP
-from cortado.errors import CortadoWarning, InputError
+from cortado.errors import CortadoWarning, InputError, shown
 from cortado.parameters.checks import check_places, check_sizes, check_state, unstable_sentence
 from cortado.parameters.reference_density import (
     reference_density,
@@ -69,6 +69,8 @@ class ParameterSpace:
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
         """Values as float64 arrays; raises `InputError` in a sentence. A ``what`` of "direction" may be negative."""
+        if not isinstance(values, Mapping):
+            raise InputError(f"{what}s are {shown(values)}, but must be a table of values by name.")
         if "tilt" in values and "gravity" in values:
             raise InputError(f"{what} gravity is given, but must be left out, as the tilt says where it points.")
         found = {name: self._checked(name, value, what) for name, value in values.items()}

@@ -92,9 +92,9 @@ class Adjoints:
         """For kernels: ``x_bar`` and so on; ``viscosity_bar`` is (n,), of particles' shares, where a part names the
         viscosity among its ``shares``, and the sum (phases,) elsewhere."""
         whole = {
-            name: array
-            for name, array in self.parameters.named("_bar").items()
-            if name.removesuffix("_bar") not in self.shares.names
+            f"{name}_bar": self.parameters[name]
+            for name in self.parameters.names
+            if name not in BY_NAME or BY_NAME[name].axis is Axis.STEP
         }
         return self.fields.named("_bar"), self.shares.named("_bar"), whole
 
