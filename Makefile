@@ -1,10 +1,11 @@
-# make demo: set up and run the main job on the CPU; make test: set up and run lint, types and tests;
+# make demo: set up and run the main job on the CPU; make test: set up and run lint, types and all tests;
+# make unit, make slow, make validation: one tier of the tests;
 # make sanitize: check the C++ engine with sanitizers; make fuzz: an hour of hostile input, MINUTES=10 for a part of it.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test lint types unit sanitize fuzz clean
+.PHONY: setup demo test lint types tests unit validation slow sanitize fuzz clean
 
 setup: $(VENV)/.ready
 
@@ -18,7 +19,7 @@ $(VENV)/.ready: pyproject.toml $(shell find cpp -type f)
 demo: setup
 	$(BIN)/cortado optimise examples/latte_art_small.toml --out runs/demo --overwrite
 
-test: lint types unit
+test: lint types tests
 
 lint: setup
 	$(BIN)/ruff check .
@@ -26,8 +27,17 @@ lint: setup
 types: setup
 	$(BIN)/mypy
 
-unit: setup
+tests: setup
 	$(BIN)/pytest
+
+unit: setup
+	$(BIN)/pytest -m 'not slow and not validation'
+
+validation: setup
+	$(BIN)/pytest -m validation
+
+slow: setup
+	$(BIN)/pytest -m slow
 
 sanitize: setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check cmeel-eigen

@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 from cortado import Problem, Simulation, gradients, losses
+from finite_differences import decades, distance
 from scenes import plane, scene, splash
 
 SCALES = {
@@ -39,18 +40,6 @@ def disturbed(positions):
     return positions + 0.001 * np.random.default_rng(3).standard_normal(positions.shape)
 
 
-def best_difference(problem, point, directions, derivative):
-    """Relative distance of the derivative from the nearest central difference."""
-    found = []
-    for h in 10.0 ** -np.arange(2.0, 9.1, 0.5):
-        ahead, behind = (
-            problem.value({name: value + sign * h * directions[name] for name, value in point.items()})
-            for sign in (1, -1)
-        )
-        found.append(abs((ahead - behind) / (2 * h) - derivative) / abs(derivative))
-    return min(found)
-
-
 ITERATIONS = {"fixed": {}, "tolerance": {"minimum_iterations": 2, "maximum_iterations": 40, "density_tolerance": 0.001}}
 
 
@@ -72,7 +61,7 @@ def test_splash(what, steps, iterations):
     tangent = problem.tangent(point, directions)
     assert abs(adjoint - tangent) < 1e-10 * abs(tangent)
     limit = 1e-3 if steps == 200 else 1e-6  # at 200 steps chaos limits the difference
-    assert best_difference(problem, point, directions, tangent) < limit
+    assert distance(problem.value, point, directions, tangent, decades(2.0, 11.0, apart=0.25), enough=limit) < limit
 
 
 SHAPES = {
@@ -122,7 +111,7 @@ def test_all_parameters_at_once(made):
     adjoint = sum((gradient[name] * directions[name]).sum() for name in point)
     tangent = problem.tangent(point, directions)
     assert abs(adjoint - tangent) < 1e-10 * abs(tangent)
-    assert best_difference(problem, point, directions, tangent) < 1e-6
+    assert distance(problem.value, point, directions, tangent, decades(2.0, 11.0, apart=0.25), enough=1e-6) < 1e-6
 
 
 def test_checkpoints_under_a_budget_give_the_same_bits():

@@ -12,6 +12,7 @@ from cortado.losses.image_losses import Pyramid, SquaredDifference
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
 from cortado.render.views import TopView
+from finite_differences import decades, distance
 from scenes import plane_of_three, two_layers
 
 RESOLUTION = [20, 16]
@@ -73,20 +74,6 @@ def directions_of(point, chosen, seed=4):
     return found
 
 
-def differences(value, point, directions, derivative, steps, enough):
-    """Relative distance of the derivative from the nearest central difference; stops where that is small enough."""
-    found = []
-    for h in steps:
-        ahead, behind = (
-            value({name: array + sign * h * directions.get(name, 0.0) for name, array in point.items()})
-            for sign in (1, -1)
-        )
-        found.append(abs((ahead - behind) / (2.0 * h) - derivative) / abs(derivative))
-        if found[-1] < enough:
-            break
-    return min(found)
-
-
 @scenes
 @pytest.mark.parametrize("what", [*SIZES, "all"])
 def test_gradient_equals_tangent_and_differences(name, what):
@@ -100,8 +87,7 @@ def test_gradient_equals_tangent_and_differences(name, what):
     adjoint = sum((gradient[k] * direction).sum() for k, direction in directions.items())
     tangent = problem.tangent(point, directions)
     assert abs(adjoint - tangent) <= 1e-10 * abs(tangent)
-    steps = 10.0 ** -np.arange(2.0, 6.1, 0.5)
-    assert differences(problem.value, point, directions, tangent, steps, enough=1e-7) < 1e-6
+    assert distance(problem.value, point, directions, tangent, decades(2.0, 6.0), enough=1e-7) < 1e-6
 
 
 @scenes
@@ -254,5 +240,4 @@ def test_the_whole_chain_from_gravity_to_the_picture(over_time):
     tangent = problem.tangent(point, directions)
     assert loss > 1e-4 and abs(tangent) > 1e-6
     assert abs(adjoint - tangent) <= 1e-10 * abs(tangent)
-    steps = 10.0 ** -np.arange(2.0, 7.1)
-    assert differences(problem.value, point, directions, adjoint, steps, enough=1e-6) < 1e-5
+    assert distance(problem.value, point, directions, adjoint, decades(2.0, 7.0), enough=1e-6) < 1e-5

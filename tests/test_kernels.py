@@ -36,6 +36,7 @@ from cortado.sph.integration import integration_kernels
 from cortado.sph.materials import mixture_kernels
 from cortado.sph.pair_forces import laminar, pairwise
 from cortado.sph.viscosity import viscosity_kernels
+from finite_differences import central_difference, decades, plateau
 
 N, WALLS = 60, 40
 SUPPORT = 1.0
@@ -661,14 +662,14 @@ def test_tangent_is_the_limit_of_central_differences(operation, name, where):
     tangent = op.tangent(op.start, directions)
     for output in op.outputs:
         size = norm(tangent, [output])
-        found = []
-        for h in 10.0 ** -np.arange(3.5, 6.6, 0.5):
-            ahead, behind = (
-                op.forward({k: v + sign * h * directions.get(k, 0.0) for k, v in op.start.items()})[output]
-                for sign in (1, -1)
+        found = [
+            np.linalg.norm(
+                central_difference(lambda values, k=output: op.forward(values)[k], op.start, directions, h)
+                - tangent[output]
             )
-            found.append(np.linalg.norm((ahead - behind) / (2 * h) - tangent[output]))
-        assert min(found) < 1e-7 * size or max(found) == size == 0.0, f"{output}: {min(found) / size:.1e}"
+            for h in decades(3.5, 6.5)
+        ]
+        assert plateau(found) < 1e-7 * size or max(found) == size == 0.0, f"{output}: {plateau(found) / size:.1e}"
 
 
 @clouds

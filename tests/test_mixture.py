@@ -10,6 +10,7 @@ import warp as wp
 from cortado import InputError, Problem, Simulation, Trajectory, gradients, losses
 from cortado.parameters.reference_density import reference_density
 from cortado.sph.free_energy import FreeEnergy
+from finite_differences import decades, distance
 from scenes import MIXING, OIL, plane, plane_of_three, scene, two_layers
 
 MAKERS = {"two layers": two_layers, "plane of three": plane_of_three}
@@ -73,20 +74,6 @@ def directions_of(point, seed=5):
     return found
 
 
-def best_difference(problem, point, directions, derivative):
-    """Relative distance of the derivative from the nearest central difference."""
-    found = []
-    for h in (1e-5, 1e-6, 3e-7, 1e-7, 1e-4, 1e-3):
-        ahead, behind = (
-            problem.value({name: value + sign * h * directions.get(name, 0.0) for name, value in point.items()})
-            for sign in (1, -1)
-        )
-        found.append(abs((ahead - behind) / (2 * h) - derivative) / abs(derivative))
-        if found[-1] < 1e-6:
-            break
-    return min(found)
-
-
 @cache
 def case(name):
     """A problem with its point, directions, and gradient in all parameters together."""
@@ -103,7 +90,7 @@ def test_gradient_equals_tangent_and_differences(name, what):
     adjoint = sum((gradient[key] * value).sum() for key, value in chosen.items())
     tangent = problem.tangent(point, chosen)
     assert abs(adjoint - tangent) <= 1e-10 * abs(tangent)
-    assert best_difference(problem, point, chosen, tangent) < 1e-6
+    assert distance(problem.value, point, chosen, tangent, decades(3.0, 7.0), enough=1e-6) < 1e-6
 
 
 @scenes
@@ -253,7 +240,7 @@ def test_a_free_energy_of_ones_own():
     directions = directions_of(point)
     tangent = problem.tangent(point, directions)
     assert sum((gradient[key] * directions[key]).sum() for key in SIZES) == pytest.approx(tangent, rel=1e-10)
-    assert best_difference(problem, point, directions, tangent) < 1e-6
+    assert distance(problem.value, point, directions, tangent, decades(3.0, 7.0), enough=1e-6) < 1e-6
 
 
 def test_a_loss_of_several_frames():
@@ -264,7 +251,7 @@ def test_a_loss_of_several_frames():
     directions = directions_of(point)
     tangent = problem.tangent(point, directions)
     assert sum((gradient[key] * directions[key]).sum() for key in SIZES) == pytest.approx(tangent, rel=1e-10)
-    assert best_difference(problem, point, directions, tangent) < 1e-6
+    assert distance(problem.value, point, directions, tangent, decades(3.0, 7.0), enough=1e-6) < 1e-6
     alone = [Problem(simulation, step, one).value_and_gradient(point) for step, one in frames.items()]
     assert loss == pytest.approx(sum(value for value, _ in alone), rel=1e-14)
     for key in SIZES:

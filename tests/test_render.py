@@ -13,6 +13,7 @@ from cortado.lattice.smoothing import CUBIC_SPLINE, KERNELS, WENDLAND_C2, Smooth
 from cortado.render.cameras import Camera, Orthographic, Perspective
 from cortado.render.renderer import RenderAdjoint, Renderer
 from cortado.render.views import TopView, View, Volume
+from finite_differences import decades, plateau
 
 SPACING, SUPPORT, N, PHASES = 0.1, 0.2, 200, 3
 LOWER, UPPER = np.array([-0.31, 0.02, -0.23]), np.array([0.3, 0.47, 0.27])
@@ -241,10 +242,8 @@ def check_gradient(view: View, values: dict[str, np.ndarray], names: list[str], 
 
     for name in names:
         wanted = float((found[name] * along[name]).sum())
-        misses = [
-            abs((function(name, h) - function(name, -h)) / (2 * h) - wanted) for h in 10.0 ** -np.arange(4.0, 7.6, 0.5)
-        ]
-        assert min(misses) < 1e-6 * abs(wanted) and wanted != 0.0, f"{name}: {min(misses) / abs(wanted):.1e}"
+        misses = [abs((function(name, h) - function(name, -h)) / (2 * h) - wanted) for h in decades(4.0, 7.5)]
+        assert plateau(misses) < 1e-6 * abs(wanted) and wanted != 0.0, f"{name}: {plateau(misses) / abs(wanted):.1e}"
 
 
 EVERYTHING = ["positions", "fractions", "colours", "translation", "rotation"]

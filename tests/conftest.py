@@ -1,0 +1,157 @@
+"""Which tier a test belongs to: validation, slow, or else the unit tier, which is neither.
+
+A whole file is named, or tests of a file by their names. A test is slow if all of its cases together took at least 3 s
+where a core was shared by about three processes; a few are left in the unit tier as nothing else there guards the same.
+"""
+
+import pytest
+
+VALIDATION = {
+    "test_containment",
+    "test_plants",
+    "test_study_figures",
+    "test_study_growth",
+    "test_validation",
+    "test_validation_mixture",
+    "test_validation_rayleigh_taylor",
+}
+"""Files: physics against published data and closed forms, studies, walls that hold, and every plant."""
+SLOW = {
+    "test_docs",
+    "test_examples",
+    "test_kernel_cache",
+    "test_memory",
+    "test_readme",
+    "test_silence",
+    "test_terminal",
+}
+"""Files: processes that compile kernels, examples, documents' code."""
+SLOW_TESTS = {
+    "test_certificate": {
+        "test_a_sign_flipped_is_found_in_float32",
+        "test_beyond_the_horizon_another_estimator_is_advised",
+        "test_right_gradients_are_found_right",
+        "test_right_gradients_are_found_right_in_float32",
+    },
+    "test_cli": {
+        "test_a_changed_task_is_not_resumed",
+        "test_a_cup_is_swung_until_it_looks_as_it_should",
+        "test_a_finished_optimisation_goes_on",
+        "test_a_killed_optimisation_resumes_bit_for_bit",
+        "test_a_planted_error_fails_the_check",
+        "test_a_process_of_its_own_says_no_more_than_the_sentence",
+        "test_a_run_is_rendered_as_its_scene_asks",
+        "test_a_run_on_a_full_disk_says_so",
+        "test_a_run_that_diverges_says_where_and_keeps_its_frames",
+        "test_a_search_on_a_full_disk_says_so_and_goes_on",
+        "test_an_earlier_run_is_kept_unless_overwritten",
+        "test_an_image_that_is_not_matched_fails_and_keeps_its_files",
+        "test_an_interrupted_optimisation_resumes_bit_for_bit",
+        "test_an_optimisation_of_images_resumes_bit_for_bit",
+        "test_another_image_is_not_resumed",
+        "test_another_precision_or_picture_is_not_resumed",
+        "test_frames_stay_when_a_disk_fills_up",
+        "test_other_parameters_are_optimised_and_drawn",
+        "test_other_tasks_of_images",
+        "test_places_are_found_for_a_picture",
+        "test_run_writes_its_folder",
+        "test_the_check_writes_a_figure",
+    },
+    "test_estimators": {
+        "test_a_mistake_is_a_sentence",
+        "test_an_average_finds_its_strength_once",
+        "test_auto_takes_so_many_times_the_smallest_sufficient_strength",
+        "test_gradients_equal_those_of_the_twin",
+        "test_the_same_bits_twice_and_float32_is_near",
+        "test_velocity_only_grows_at_most_linearly",
+        "test_without_strength_an_estimator_is_exact_bit_for_bit",
+    },
+    "test_extinctions": {
+        "test_thin_fluid_first_gathers_what_thick_fluid_leaves_behind",
+    },
+    "test_fuzz": {
+        "test_one_case_by_its_command",
+    },
+    "test_gradients": {
+        "test_splash",
+    },
+    "test_image_loss": {
+        "test_gradient_equals_tangent_and_differences",
+        "test_the_whole_chain_from_gravity_to_the_picture",
+    },
+    "test_layers": {
+        "test_the_discretisation_is_without_warp",
+    },
+    "test_mixture": {
+        "test_a_parameter_alone_has_the_gradient_that_it_has_among_all",
+        "test_gradient_equals_tangent_and_differences",
+    },
+    "test_neighbours": {
+        "test_random_clouds",
+    },
+    "test_optimise": {
+        "test_interrupted_run_resumes_bit_for_bit",
+        "test_killed_process_resumes_bit_for_bit",
+        "test_rosenbrock_converges",
+    },
+    "test_packaging": {
+        "test_without_a_compiler_the_wheel_is_pure_python",
+    },
+    "test_physics": {
+        "test_any_number_of_threads_gives_the_same_bits",
+    },
+    "test_public_face": {
+        "test_types_are_checked_where_cortado_is_used",
+    },
+    "test_reference": {
+        "test_a_mistake_gives_a_sentence",
+        "test_derivatives_are_those_of_the_warp_engine",
+        "test_float32_is_as_near_to_float64_as_the_warp_engine_is",
+        "test_methods_agree_in_float128",
+        "test_methods_agree_in_float64",
+        "test_positions_are_those_of_the_warp_engine",
+        "test_precisions_agree",
+        "test_same_bits_with_any_number_of_threads",
+        "test_the_adjoint_is_the_transpose_of_the_tangent",
+        "test_the_tangent_is_the_limit_of_differences_in_float128",
+        "test_without_the_extension_module_there_is_one_sentence",
+    },
+    "test_restart": {
+        "test_a_restart_has_the_bits_of_a_run_that_did_not_stop",
+    },
+    "test_scene": {
+        "test_any_change_loads_or_is_a_sentence",
+    },
+    "test_scene_points": {
+        "test_positions_are_read_from_vtk",
+    },
+    "test_smoothing": {
+        "test_the_pressure_iteration_converges_on_the_lattice",
+    },
+    "test_threads": {
+        "test_forks_after_use_and_while_others_compute",
+    },
+    "test_tilt": {
+        "test_a_problem_takes_a_tilt_in_the_place_of_gravity",
+    },
+    "test_walls": {
+        "test_the_side_of_a_cup_stops_a_particle_alone",
+        "test_water_that_fills_a_box_has_the_rest_density_everywhere",
+        "test_water_that_fills_a_cup_starts_nowhere_compressed",
+    },
+}
+"""Tests of files whose others are in the unit tier."""
+
+
+def tier(file: str, test: str) -> str:
+    """Of a test by its name, without parameters, in a file by its name, without ending."""
+    if file in VALIDATION:
+        return "validation"
+    return "slow" if file in SLOW or test in SLOW_TESTS.get(file, ()) else "unit"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        found = tier(item.path.stem, getattr(item, "originalname", item.name))
+        if found != "unit":
+            item.add_marker(getattr(pytest.mark, found))
