@@ -11,6 +11,7 @@ VALIDATION = {
     "test_plants",
     "test_study_figures",
     "test_study_growth",
+    "test_surface_tension",
     "test_validation",
     "test_validation_mixture",
     "test_validation_rayleigh_taylor",

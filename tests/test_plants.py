@@ -19,7 +19,11 @@ from scenes import HONEY, MIXING, OIL, plane, scene
 
 ROOT = Path(cortado.__file__).parent
 
-UNNAMED = {"sph.integration": {"integration_kernels.collect_masses"}, "sph.nozzle_kernels": {"nozzle_kernels.collect"}}
+UNNAMED = {
+    "sph.integration": {"integration_kernels.collect_masses"},
+    "sph.nozzle_kernels": {"nozzle_kernels.collect"},
+    "sph.surface_tension": {"tension_functions.stress_slope"},
+}
 """Functions of adjoints, by module, whose names do not say so."""
 SHARED = {
     "device.neighbourhood": {"pair_functions.factor_gradient"},
@@ -30,12 +34,17 @@ SHARED = {
     "render.interpolation": {"interpolation_functions.share"},
     "solvers.pcisph.density_ratio_relaxation": {"density_ratio_kernels.excess_slope"},
     "sph.free_energy": {"_double_well.bend", "_miscible.bend", "_degenerate.slope"},
+    "sph.surface_tension": {
+        "tension_functions.arrow_change",
+        "tension_functions.pull_slope",
+        "normal_kernels.change",
+    },
     "sph.viscosity": {"viscosity_kernels.share"},
 }
 """Derivatives that forward mode uses too, and those of pictures, so that only differences can tell."""
 ELSEWHERE = {"solvers.pcisph.frozen_pressure": "an estimator that is not exact: tests/test_estimators.py"}
 """Modules with adjoints that no plant is in, and why."""
-FEWEST = {"functions": 42, "plants": 210}
+FEWEST = {"functions": 48, "plants": 246}
 """There have been so many; more are planted as the source has more."""
 
 ADJOINTS = {module: names for module, names in adjoints(ROOT).items() if module not in ELSEWHERE}
@@ -87,6 +96,7 @@ SCENES = {
         "everything",
     ),
     "one phase": (small("pairwise", phase=[HONEY], fluid=[{**POOL, "phase": "honey"}], emitter=None), "positions"),
+    "surface tension": (small("pairwise", forces={"gravity": [1.0, -9.81], "surface_tension": 3.0}), "everything"),
     "a picture of the plane": (small("pairwise", render={"view": "plane", "resolution": [8, 12]}), "pyramid"),
     "a picture of a volume": (VOLUME, "squares"),
 }

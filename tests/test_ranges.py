@@ -31,6 +31,10 @@ CASES = {
         forces=LAMINAR, mixture={**MIXING, "free_energy": "miscible"}
     ),
     "a nozzle": jet,
+    "surface tension": lambda: scene(
+        forces={"gravity": [0.0, -9.81, 0.0], "surface_tension": 0.5},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 2.0}],
+    ),
 }
 ESTIMATORS = {
     "exact": gradients.Exact(),
