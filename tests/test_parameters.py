@@ -89,3 +89,10 @@ def test_a_part_that_forgets_its_shares_is_an_error():
     bar = solver.adjoint(2).bar
     known = {name for group in bar.named for name in group}
     assert {"x_bar", "gravity_bar", "viscosity_bar", "time_step_bar"} <= known and "flow_rate_bar" not in known
+
+
+@pytest.mark.parametrize("budget", ["8GB", -1, 1.5, None])
+def test_a_memory_budget_is_a_number_of_bytes(budget):
+    simulation = Simulation(plane())
+    with pytest.raises(InputError, match=r"memory_budget is .* must be a whole number of at least 0"):
+        Problem(simulation, 3, losses.FinalPositions(simulation.positions), memory_budget=budget)

@@ -202,7 +202,7 @@ def test_a_free_energy_that_does_not_fit_is_a_sentence(simulation):
         Simulation(simulation.scene, free_energy=MISCIBLE)
 
 
-def test_a_passage_ends_with_the_next_evaluation(problem, simulation):
+def test_a_forward_pass_ends_with_the_next_evaluation(problem, simulation):
     point = {**GRAVITY, "viscosity": 0.1}
     _, wanted = problem.value_and_gradient(point)
     forward_pass = problem.forward_pass(point)

@@ -20,7 +20,7 @@ from cortado.losses.loss import Adjoint
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import NAMES, UNITS, Arrays, Values
 from cortado.rollout import MEMORY_BUDGET, Observer, Rollout, StepDerivative
-from cortado.simulation import Simulation, check_steps
+from cortado.simulation import Simulation, check_steps, whole_number
 from cortado.words import counted
 
 __all__ = ["NAMES", "UNITS", "Problem"]
@@ -60,14 +60,14 @@ class Problem:
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is a {type(simulation).__name__}, but must be a cortado.Simulation.")
         self.simulation, self.steps, self.loss = simulation, check_steps(steps, least=0), loss
-        self.memory_budget = memory_budget
+        self.memory_budget = whole_number("memory_budget", memory_budget, 0)
         by_step = loss.losses if isinstance(loss, Frames) else {self.steps: loss}
         for step in by_step:
             if step not in range(self.steps + 1):
                 raise InputError(f"losses has the frame {step!r}, but must have frames from 0 to {self.steps}.")
         self._losses: dict[int, Loss] = {step: as_loss(one) for step, one in by_step.items()}
         self._space = ParameterSpace(simulation, self.steps)
-        self._rollout = Rollout(simulation.solver, self.steps, memory_budget)
+        self._rollout = Rollout(simulation.solver, self.steps, self.memory_budget)
         self._derivatives: dict[AdjointEstimator, StepDerivative] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:

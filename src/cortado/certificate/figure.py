@@ -25,7 +25,7 @@ def gradient_check(certificate: Certificate, path: str | Path) -> Path:
         _differences(differences, certificate)
         _growth(growth, certificate)
         _horizon(horizon, min(certificate.horizons, key=lambda one: one.measured, default=None))
-        _policies(estimators, certificate.agreement)
+        _estimators(estimators, certificate.agreement)
         verdict = "right" if certificate.right else "WRONG"
         figure.suptitle(
             f"The adjoint is {verdict}; {certificate.particles} particles, {certificate.steps} steps", weight="bold"
@@ -77,7 +77,7 @@ def _horizon(axes: Any, horizon: Horizon | None) -> None:
     axes.legend(loc="lower right", fontsize=9, frameon=True, framealpha=1.0, edgecolor="none")
 
 
-def _policies(axes: Any, agreement: Agreement | None) -> None:
+def _estimators(axes: Any, agreement: Agreement | None) -> None:
     if agreement is None:
         _empty(axes, "no smoothed gradient to compare with")
         return

@@ -139,12 +139,12 @@ class TransformedPass:
     """A forward run of a problem, and ways back to coordinates."""
 
     def __init__(self, forward_pass: ForwardPass, coordinates: Mapping[str, Bijector], u: Mapping[str, Any]):
-        self._passage, self._coordinates, self._u = forward_pass, coordinates, u
+        self._pass, self._coordinates, self._u = forward_pass, coordinates, u
         self.loss, self.rollout, self.derivative = forward_pass.loss, forward_pass.rollout, forward_pass.derivative
 
     def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:
         """The gradient with respect to the coordinates."""
-        gradient = self._passage.back(derivative, observe)
+        gradient = self._pass.back(derivative, observe)
         for name, coordinates in self._coordinates.items():
             if name in gradient:
                 gradient[name] = coordinates.adjoint(np.asarray(self._u[name]), gradient[name])
