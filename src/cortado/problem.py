@@ -39,6 +39,7 @@ class Problem:
     - with several phases the first ``mass_fractions`` (n, phases), ``mobility`` [m2 / s], ``interface_width`` [m];
     - with an emitter ``nozzle_path`` (d,) or (steps, d), where its opening is after each step [m], and ``flow_rate``
       [m3 / s];
+    - in a scene with surface tension ``surface_tension`` [N / m];
     - with a loss of images ``colours`` (phases, 3).
 
     What is not given is the scene's. n counts fluid particles in the order in which the scene lists them.

@@ -30,7 +30,7 @@ def point(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
         raise InputError(f"parameters is empty, but must have at least one of {', '.join(values)}.")
     found = ParameterSpace(simulation, problem.steps).checked({name: values[name] for name in parameters})
     for name, value in found.items():
-        if BY_NAME[name].range is Range.NOT_NEGATIVE and not (value > 0.0).all():
+        if not _moves_both_ways(name, value):
             raise InputError(f"parameter {name} is 0, but must be greater than 0, so that it can be moved both ways.")
     return found
 
@@ -45,11 +45,16 @@ def everything(problem: Problem, chosen: Arrays) -> Arrays:
         over_time = parameter.axis is Axis.STEP
         idle = over_time and problem.steps == 0
         idle = idle or (name == "gravity" and "tilt" in chosen)
-        idle = idle or (parameter.range is Range.NOT_NEGATIVE and not (value > 0.0).all())
+        idle = idle or not _moves_both_ways(name, value)
         if idle or not parameter.acts(problem.simulation, values):
             continue
         found[name] = np.broadcast_to(value, (problem.steps, value.shape[-1])).copy() if over_time else value
     return found
+
+
+def _moves_both_ways(name: str, value: np.ndarray) -> bool:
+    """Whether no number of a parameter is at the end of its range."""
+    return BY_NAME[name].range is not Range.NOT_NEGATIVE or bool((value > 0.0).all())
 
 
 def scales(problem: Problem, values: Arrays, change: float = CHANGE) -> Arrays:

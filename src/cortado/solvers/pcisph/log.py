@@ -18,13 +18,16 @@ class IterationLog:
         self.errors = wp.zeros(max(steps, 1), dtype=precision.pair, device=device)
         """(steps,) average and greatest compression, on the device."""
         self._solve = solve
-        self.diagnostics: dict[str, NDArray] = {}
-        self.read(0)
+        self.diagnostics = self._named(np.zeros(0, dtype=int), np.zeros((0, 2)))
 
     def read(self, steps: int) -> None:
-        average, greatest = self.errors.numpy()[:steps].astype(np.float64).T
-        self.diagnostics = {
-            "iterations": self.iterations.numpy()[:steps].astype(int),
+        iterations, errors = self.iterations.numpy()[:steps], self.errors.numpy()[:steps]
+        self.diagnostics = self._named(iterations.astype(int), errors.astype(np.float64))
+
+    def _named(self, iterations: NDArray, errors: NDArray) -> dict[str, NDArray]:
+        average, greatest = errors.T
+        return {
+            "iterations": iterations,
             "density_errors": average,
             "greatest_density_errors": greatest,
             "converged": self._converged(average, greatest),
