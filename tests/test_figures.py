@@ -30,7 +30,8 @@ def trajectory_of(steps: int) -> Trajectory:
     frames = np.zeros((1, 4, 2))
     converged = np.arange(steps) % 5 != 3
     errors = 0.01 + 0.001 * np.arange(steps)
-    return Trajectory(np.zeros(1), np.zeros(1, int), frames, frames, np.full(steps, 5), errors, converged)
+    diagnostics = {"iterations": np.full(steps, 5), "density_errors": errors, "converged": converged}
+    return Trajectory(np.zeros(1), np.zeros(1, int), frames, frames, diagnostics)
 
 
 @pytest.mark.parametrize(

@@ -26,13 +26,13 @@ LAYERS = """
     discretise.walls.weights
     scene.containers scene.model scene.stability
     device device.kernels device.memory device.precision device.reduction device.silence device.kernel_cache
-    device.smoothing device.neighbourhood device.state device.threads device.launching device.cells
-    device.neighbours
+    device.smoothing device.neighbourhood device.arrays device.fields device.state device.threads device.launching
+    device.cells device.neighbours
     scene.checks scene.scene
     parameters.checks
     discretise.sampling discretise.discrete_scene
-    sph sph.density sph.free_energy sph.integration sph.materials sph.nozzle_kernels sph.pair_forces
-    sph.pairwise_laplacian sph.diffusion sph.parts sph.gravity sph.mixture sph.nozzle sph.surface_tension
+    sph sph.density sph.free_energy sph.integration sph.materials sph.emitter_kernels sph.pair_forces
+    sph.pairwise_laplacian sph.diffusion sph.parts sph.emitter sph.gravity sph.mixture sph.surface_tension
     sph.viscosity
     solvers solvers.containment_kernels solvers.containment solvers.build solvers.pcisph solvers.solver
     solvers.pcisph.convergence solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure

@@ -31,7 +31,7 @@ def test_momentum_is_kept_in_free_space(make):
     made = make(**FREE, forces={"gravity": gravity, "viscosity": "pairwise"})
     simulation = Simulation(made, precision="float64")
     rollout = simulation.rollout(200)
-    rollout.initial.set(simulation.positions, stirred(simulation), simulation.mass_fractions)
+    rollout.initial.set({"positions": simulation.positions, "velocities": stirred(simulation)})
     x_0, v_0, _ = rollout.initial.numpy(simulation.dimension)
     x, v, _ = rollout.forward().numpy(simulation.dimension)
     assert np.linalg.norm(v - v_0) > 0.05 * np.linalg.norm(v_0)  # forces did act
@@ -134,7 +134,7 @@ def test_a_lost_particle_ends_the_run():
     rollout = simulation.rollout(40)
     velocities = np.zeros_like(simulation.positions)
     velocities[17] = [1e9, 0.0, 0.0]
-    rollout.initial.set(simulation.positions, velocities, simulation.mass_fractions)
+    rollout.initial.set({"positions": simulation.positions, "velocities": velocities})
     with pytest.raises(DivergedError) as caught:
         rollout.forward()
     assert (caught.value.step, caught.value.particle) == (1, 17)

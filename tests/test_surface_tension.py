@@ -69,7 +69,8 @@ class Watch:
         if step % 5:
             return
         d, solver = self.scene.dimension, self.simulation.solver
-        x, v, _ = state.numpy(d)
+        fields = state.numpy(d)
+        x, v = fields["positions"], fields["velocities"]
         x = x - x.mean(axis=0)
         inside = np.linalg.norm(x, axis=1) < 0.5 * self.radius
         pressure = np.zeros(len(x))
@@ -190,8 +191,8 @@ def test_a_drop_across_a_periodic_boundary():
     )
     shift = {"initial_positions": across.positions + [2.0 * RADIUS, 0.0]}
     shift["initial_positions"][:, 0] -= np.where(shift["initial_positions"][:, 0] > 2.0 * RADIUS, 4.0 * RADIUS, 0.0)
-    here = free.rollout(50).forward(keep=False).numpy(2)[0]
-    there = across.rollout(50, shift).forward(keep=False).numpy(2)[0]
+    here = free.rollout(50).forward(keep=False).numpy(2)["positions"]
+    there = across.rollout(50, shift).forward(keep=False).numpy(2)["positions"]
     offset = there - here - [2.0 * RADIUS, 0.0]
     offset[:, 0] -= np.rint(offset[:, 0] / (4.0 * RADIUS)) * 4.0 * RADIUS
     assert np.abs(offset).max() < 1e-9 * RADIUS
@@ -199,7 +200,8 @@ def test_a_drop_across_a_periodic_boundary():
 
 def test_float32_follows_float64():
     runs = [
-        Simulation(drop(2, 12), precision=p).rollout(20).forward(keep=False).numpy(2)[0] for p in ("float32", "float64")
+        Simulation(drop(2, 12), precision=p).rollout(20).forward(keep=False).numpy(2)["positions"]
+        for p in ("float32", "float64")
     ]
     assert np.abs(runs[0] - runs[1]).max() < 1e-4 * RADIUS
 

@@ -63,7 +63,7 @@ def watched(
     frames = [first]
 
     def observe(step: int, state: Any) -> None:
-        frames.append(state.numpy(2)[2])
+        frames.append(state.numpy(2)["mass_fractions"])
         if advance is not None:
             advance()
 

@@ -16,7 +16,7 @@ from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator, est
 from cortado.io.trajectory import Trajectory
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, fingerprint
 from cortado.losses.checked import as_loss
-from cortado.losses.loss import Adjoint
+from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import NAMES, UNITS, Arrays, Values
 from cortado.rollout import MEMORY_BUDGET, Observer, Rollout, StepDerivative
@@ -141,7 +141,7 @@ class Problem:
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> float:
         """The derivative of the loss along ``directions`` (any of the parameters), by forward mode."""
-        dots: dict[int, tuple[np.ndarray, ...]] = {}
+        dots: dict[int, Arrays] = {}
 
         def observe(step: int, dot: State) -> None:
             if step in self._losses:
@@ -154,8 +154,8 @@ class Problem:
             colours_dot = np.asarray(directions["colours"], dtype=np.float64)
             terms = [np.sum(bar.colours * colours_dot) for bar in bars.values()]
         for step in sorted(dots):
-            pairs = zip(bars[step].state.numpy(3), dots[step], strict=True)
-            terms += [(bar.astype(np.float64) * d).sum() for bar, d in pairs]
+            bar = bars[step].state.numpy(3)
+            terms += [(bar[name].astype(np.float64) * d).sum() for name, d in dots[step].items()]
         return float(sum(terms))
 
     @in_turn
@@ -198,13 +198,10 @@ class Problem:
 
         def observe(step: int, state: State) -> None:
             if step in wanted:
-                ends[step] = Snapshot(state, self.simulation.dimension, colours)
+                ends[step] = Snapshot(state.copy(), self.simulation.dimension, colours)
 
         self._space.begin(self._rollout, values, varied)
-        if 0 in wanted:
-            first = self._rollout.initial.like()
-            first.assign(self._rollout.initial)
-            observe(0, first)  # a copy, as the next evaluation overwrites the rollout's
+        observe(0, self._rollout.initial)
         self._rollout.forward(observe, keep)
         return ends
 
@@ -223,9 +220,8 @@ class Problem:
         no_colours = np.zeros_like(end.colours)
         if isinstance(bar, State):
             return SnapshotAdjoint(bar, no_colours)
-        positions, velocities, *rest = bar
         state = self.simulation.solver.new_state()
-        state.set(positions, velocities, *rest or [np.zeros_like(end.mass_fractions)])
+        state.set(dict(zip(ADJOINT_FIELDS, bar, strict=False)))
         return SnapshotAdjoint(state, no_colours)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.device.fields import first_values
 from cortado.device.kernel_cache import start_warp
 from cortado.device.memory import frame_parts, require, simulation_parts
 from cortado.device.precision import Precision, precision_named
@@ -23,7 +24,7 @@ from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import scene_values
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
-from cortado.restart import RestartState, RunConstants
+from cortado.restart import RestartState
 from cortado.rollout import Rollout
 from cortado.scene.scene import Scene, as_scene
 from cortado.solvers.build import first_capacity
@@ -85,7 +86,7 @@ class Simulation:
         self.solver = SOLVERS[scene.solver.kind](scene, discrete, self.free_energy, self.precision, self.device)
         self.state = self.solver.new_state()
         """The first state on the device."""
-        self.state.set(self.positions, self.velocities, self.mass_fractions)
+        self.state.set(first_values(self.state.fields, self.parameters()))
         for array in (self.positions, self.velocities, self.mass_fractions):
             array.setflags(write=False)
         check_sizes(self.parameters(), self.precision)
@@ -143,40 +144,41 @@ class Simulation:
         numbers_in_frame = self.particles * (2 * self.dimension + len(self.scene.phase))
         parts = frame_parts(2 + rollout.steps // record_every, 2 * numbers_in_frame, self.precision.bytes)
         require(parts, "take a larger record_every or fewer steps")
-        frames = [(0, *rollout.initial.numpy(self.dimension))]
+        steps, frames = [0], [self.frame(rollout.initial)]
 
         def keep(step: int, state: State) -> None:
             if step % record_every == 0 or step == rollout.steps:
-                frames.append((step, *state.numpy(self.dimension)))
+                steps.append(step)
+                frames.append(self.frame(state))
 
         rollout.forward(keep, keep=False)
         converged = rollout.diagnostics["converged"]
         if not converged.all():
             warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=5)
-        numbers, positions, velocities, fractions = (np.array(column) for column in zip(*frames, strict=True))
+        fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
         return Trajectory(
-            times=rollout.elapsed.times(numbers, rollout.time_step),
-            steps=rollout.elapsed.steps + numbers,
-            positions=positions,
-            velocities=velocities,
-            mass_fractions=fractions if len(self.scene.phase) > 1 else None,
-            iterations=rollout.diagnostics["iterations"],
-            density_errors=rollout.diagnostics["density_errors"],
-            converged=converged,
+            times=rollout.clock.times(np.array(steps), rollout.time_step),
+            steps=rollout.clock.steps + np.array(steps),
+            positions=fields.pop("positions"),
+            velocities=fields.pop("velocities"),
+            diagnostics=rollout.diagnostics,
+            mass_fractions=fields.pop("mass_fractions", None),
+            others=fields,
+            constants=self.constants(rollout),
             substeps=rollout.substeps,
-            constants=self.constants(rollout, numbers),
         )
 
-    def constants(self, rollout: Rollout, frames: np.ndarray) -> RunConstants:
-        """What a restart needs besides the frames, which are after so many steps (frames,) of the rollout."""
-        parameters, elapsed = rollout.parameters, rollout.elapsed
-        density = parameters["reference_density"].numpy()
-        if self.scene.emitter is None:
-            return RunConstants(density, rollout.time_step)
-        path = parameters["nozzle_path"].numpy()[:, : self.dimension]
-        first = path[:1] if elapsed.outlet is None else elapsed.outlet[None]
-        outlets = np.concatenate([first, path]).astype(path.dtype)[frames]
-        return RunConstants(density, rollout.time_step, rollout.flow_rate, outlets)
+    def frame(self, state: State) -> dict[str, np.ndarray]:
+        """What a trajectory records of a state: the fields that steps change, but for the fractions of one phase."""
+        fields = state.numpy(self.dimension, constants=False)
+        if len(self.scene.phase) == 1:
+            del fields["mass_fractions"]
+        return fields
+
+    def constants(self, rollout: Rollout) -> dict[str, np.ndarray]:
+        """The fields of a rollout's states that no step changes."""
+        fields = rollout.initial.fields
+        return {field.name: rollout.initial[field.name].numpy().copy() for field in fields if field.is_constant}
 
     @in_turn
     def rollout(

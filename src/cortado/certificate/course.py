@@ -11,6 +11,7 @@ from cortado.device.state import State
 from cortado.errors import DivergedError
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint
 from cortado.losses.checked import as_loss
+from cortado.losses.loss import Adjoint, adjoint_arrays
 from cortado.parameters.values import Arrays
 from cortado.problem import Problem
 
@@ -92,7 +93,7 @@ class Course:
 
     def tangent(self, parameters: Arrays, along: Arrays) -> Tangent:
         """Derivatives along a direction, which names all or some of the parameters."""
-        dots: dict[int, tuple[np.ndarray, ...]] = {}
+        dots: dict[int, Arrays] = {}
 
         def observe(step: int, dot: State) -> None:
             if step in self._losses:
@@ -103,7 +104,7 @@ class Course:
         for step, loss in self._losses.items():
             _, bar = loss.value_and_adjoint(ends[step])
             slopes.append(_product(bar, dots[step]) + _of_colours(bar, along))
-            strain.append(_strain(ends[step].positions, dots[step][0]))
+            strain.append(_strain(ends[step].positions, dots[step]["positions"]))
         return Tangent(self._judged(ends), self._total(slopes), np.array(strain))
 
     def _judged(self, ends: dict[int, Snapshot]) -> np.ndarray:
@@ -120,17 +121,15 @@ def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
     order and has no round-off of the loss in it."""
     ends = (before, after)
     old, new = (end.state.numpy(end.dimension) for end in ends)
-    distance, colours = tuple(b - a for a, b in zip(old, new, strict=True)), {"colours": after.colours - before.colours}
+    distance, colours = {name: new[name] - old[name] for name in new}, {"colours": after.colours - before.colours}
     bars = [loss.value_and_adjoint(end)[1] for end in ends]
     return 0.5 * sum(_product(bar, distance) + _of_colours(bar, colours) for bar in bars)
 
 
-def _product(bar: State | SnapshotAdjoint | tuple[np.ndarray, ...], dot: tuple[np.ndarray, ...]) -> float:
+def _product(bar: Adjoint, dot: Arrays) -> float:
     """The adjoint of a state times its tangent."""
-    if isinstance(bar, SnapshotAdjoint):
-        return _product(bar.state, dot)
-    arrays = bar.numpy(dot[0].shape[1]) if isinstance(bar, State) else bar
-    return float(sum((a.astype(np.float64) * b).sum() for a, b in zip(arrays, dot, strict=False)))
+    arrays = adjoint_arrays(bar, dot["positions"].shape[1])
+    return float(sum((array.astype(np.float64) * dot[name]).sum() for name, array in arrays.items()))
 
 
 def _of_colours(bar: object, along: Arrays) -> float:

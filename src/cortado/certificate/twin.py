@@ -14,7 +14,7 @@ from cortado.losses import (
     SnapshotAdjoint,
 )
 from cortado.losses.checked import as_loss
-from cortado.losses.loss import Adjoint
+from cortado.losses.loss import Adjoint, adjoint_arrays
 from cortado.problem import Problem
 from cortado.render.renderer import Renderer
 from cortado.simulation import Simulation
@@ -62,15 +62,13 @@ class Rounded:
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
         value, bar = self._loss.value_and_adjoint(self._rounded(end))
-        if isinstance(bar, State):
-            return value, bar.numpy(end.dimension)
-        if isinstance(bar, SnapshotAdjoint):
-            state = end.state.like()
-            state.set(*bar.state.numpy(end.dimension))
-            return value, SnapshotAdjoint(state, bar.colours)
-        return value, bar
+        if not isinstance(bar, (State, SnapshotAdjoint)):
+            return value, bar
+        state = end.state.like()
+        state.set(adjoint_arrays(bar, end.dimension))
+        return value, SnapshotAdjoint(state, bar.colours) if isinstance(bar, SnapshotAdjoint) else state
 
     def _rounded(self, end: Snapshot) -> Snapshot:
         state = self._single.solver.new_state()
-        state.set(end.positions, end.velocities, end.mass_fractions)
+        state.set(end.state.numpy(end.dimension))
         return Snapshot(state, end.dimension, end.colours)

@@ -14,9 +14,8 @@ from cortado.io.interruption import keeping
 from cortado.io.progress import track
 from cortado.io.report import Figures, write_report
 from cortado.io.run_folder import RunFolder
-from cortado.io.trajectory import Trajectory, fraction_fields, fraction_names
+from cortado.io.trajectory import Trajectory, append_frame, frame_writer
 from cortado.io.video import MOST_FRAMES, write_video
-from cortado.io.vtkhdf import TrajectoryWriter
 from cortado.rollout import Rollout
 from cortado.scene.scene import Scene, load_scene
 from cortado.simulation import Simulation, check_steps, not_converged_sentence
@@ -63,40 +62,26 @@ def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record
 def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:
     steps = rollout.steps
     recorded = np.array([*range(0, steps, record_every), steps])
+    times, first = rollout.clock.times(recorded, rollout.time_step), simulation.frame(rollout.initial)
+    constants = simulation.constants(rollout)
     with (
-        TrajectoryWriter(
-            folder.trajectory,
-            times=rollout.elapsed.times(recorded, rollout.time_step),
-            particles=simulation.particles,
-            dimension=simulation.dimension,
-            precision=simulation.precision.name,  # type: ignore[arg-type]
-            steps=steps,
-            scalars=fraction_names(len(simulation.scene.phase)),
-            constants=simulation.constants(rollout, recorded).arrays(),
-        ) as writer,
+        frame_writer(folder.trajectory, times, first, constants, steps, rollout.diagnostics) as writer,
         track(steps, "run") as advance,
     ):
 
-        def write(step: int, state: State) -> None:
-            positions, velocities, fractions = state.numpy(simulation.dimension)
-            writer.append(positions, velocities, step=step, **fraction_fields(fractions))
-
         def observe(step: int, state: State) -> None:
             if step % record_every == 0 or step == steps:
-                write(step, state)
+                append_frame(writer, simulation.frame(state), step)
             advance()
 
-        write(0, rollout.initial)
-
+        append_frame(writer, first, 0)
         try:
             rollout.forward(observe, keep=False)
         finally:
             found = rollout.diagnostics
-            iterations, errors = found["iterations"], found["density_errors"]
-            writer.append_steps(iterations, errors, found["converged"])
-            rows = zip(iterations, errors, found["greatest_density_errors"], strict=True)
-            for step, (count, error, greatest) in enumerate(rows, 1):
-                folder.append_metrics(step=step, iterations=count, density_error=error, greatest_density_error=greatest)
+            writer.append_steps(**found)
+            for step, row in enumerate(zip(*found.values(), strict=True), 1):
+                folder.append_metrics(step=step, **dict(zip(found, row, strict=True)))
 
 
 def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], folder: Path) -> Figures:
@@ -135,7 +120,7 @@ def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder, rem
     ]
     if scene.render is not None:
         figures += _rendered(simulation, trajectory, shown, folder.figures)
-    if len(trajectory.density_errors) and scene.forces.pressure:
+    if len(trajectory.converged) and "density_errors" in trajectory.diagnostics and scene.forces.pressure:
         path = folder.figures / "density_errors.png"
         density_errors(trajectory, path, tolerance=scene.solver.density_tolerance)
         figures.append(("Average density error of each step, and the tolerance asked.", path))
@@ -145,7 +130,7 @@ def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder, rem
         ("particles", simulation.particles),
         *([("substeps of diffusion in each step", substeps)] if substeps else []),
         ("wall particles", len(simulation.walls)),
-        ("steps", len(trajectory.iterations)),
+        ("steps", len(trajectory.converged)),
         ("simulated time [s]", f"{trajectory.times[-1]:.4g}"),
         ("precision", simulation.precision.name),
     ]

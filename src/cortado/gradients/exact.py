@@ -68,7 +68,7 @@ class _AdjointStep:
 
     def step(self, state: State, counts: Counts, bar: State) -> None:
         self.solver.replay(state, self._parameters, counts)
-        self._adjoint.step(counts, bar, bar, self._parameters)
+        self._adjoint.step(counts, bar, self._parameters)
 
     def parameters(self) -> Parameters:
         return self._adjoint.collect()
@@ -81,7 +81,8 @@ class _TapeStep:
         solver = rollout.solver
         self.rollout, self._given, self._parameters = rollout, solver, rollout.parameters
         self.solver = solver.differentiable()
-        self._before, self._after = (self.solver.new_state(requires_grad=True) for _ in range(2))
+        self._before = self.solver.new_state(requires_grad=True)
+        self._after = self._before.following()
         self._own = self.solver.new_parameters(rollout.steps, requires_grad=True)
 
     def begin(self) -> None:

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from cortado.device.arrays import padded
 from cortado.device.cells import Grid
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.neighbours import NeighbourSearch
-from cortado.device.state import padded
 from cortado.discretise.discrete_scene import DiscreteScene
 from cortado.lattice.calibration import SKIN
 from cortado.parameters.registry import PARAMETERS
@@ -16,9 +16,9 @@ from cortado.scene.containers import NoContainer
 from cortado.scene.scene import Scene
 from cortado.solvers.containment import Walled
 from cortado.sph.diffusion import Diffusion
+from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy
 from cortado.sph.mixture import Phases
-from cortado.sph.nozzle import Nozzle
 from cortado.sph.parts import Force, Setting
 
 

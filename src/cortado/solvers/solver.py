@@ -13,7 +13,6 @@ from cortado.device.launching import KernelLauncher
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.state import Parameters, State
 from cortado.device.threads import Turn
-from cortado.restart import Elapsed
 from cortado.solvers.containment import Containment
 from cortado.sph.parts import StepContext
 
@@ -40,8 +39,8 @@ class StepLog(Protocol):
 class StepTangent(Protocol):
     """Forward mode of a step that a solver has replayed, along tangents of the parameters."""
 
-    def step(self, counts: Counts, state_dot: State, new_state_dot: State, parameters: Parameters) -> None:
-        """From the tangent of the step's state to that of its result, which may be the same arrays."""
+    def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
+        """Replace the tangent of the step's state by that of its result."""
 
 
 class StepAdjoint(Protocol):
@@ -50,8 +49,8 @@ class StepAdjoint(Protocol):
     def begin(self) -> None:
         """Forget the adjoints of the parameters of an earlier way back."""
 
-    def step(self, counts: Counts, new_state_bar: State, state_bar: State, parameters: Parameters) -> None:
-        """From the adjoint of the step's result to that of its state, which may be the same arrays."""
+    def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
+        """Replace the adjoint of the step's result by that of its state."""
 
     def collect(self) -> Parameters:
         """The adjoints of the parameters, of all steps since `begin`."""
@@ -81,9 +80,8 @@ class Solver(Protocol):
     def new_log(self, steps: int) -> StepLog:
         """Room for what is noted of so many steps."""
 
-    def begin(self, elapsed: Elapsed, substeps: int) -> None:
-        """What to know of a run before any of its steps: what went before it, and how many explicit substeps of
-        diffusion each step has."""
+    def set_substeps(self, substeps: int) -> None:
+        """Take so many explicit substeps of diffusion in each step from now on."""
 
     def reset(self) -> None:
         """Forget the counts and flags of an earlier run, also of one that was interrupted."""

@@ -125,7 +125,8 @@ class WarpTangent(Forward):
         norms = np.zeros((2, problem.steps + 1))
 
         def observe(step: int, dot: State) -> None:
-            norms[:, step] = [np.linalg.norm(array) for array in dot.numpy(problem.simulation.dimension)[:2]]
+            fields = dot.numpy(problem.simulation.dimension)
+            norms[:, step] = [np.linalg.norm(fields[name]) for name in ("positions", "velocities")]
 
         problem.tangents(parameters, directions, observe)
         return Along(problem.value(parameters), problem.tangent(parameters, directions), Norms(*norms))

@@ -2,13 +2,14 @@
 
 import warp as wp
 
+from cortado.device.arrays import Fields
 from cortado.device.launching import Named
-from cortado.device.state import Fields, Parameters, State
+from cortado.device.state import Parameters, State
 from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.pcisph.steps import PcisphSteps
 from cortado.solvers.solver import Counts
+from cortado.sph.emitter import EmitterAdjoint
 from cortado.sph.mixture import MixtureAdjoint, MixtureTangent
-from cortado.sph.nozzle import EmitterAdjoint
 from cortado.sph.parts import Adjoints, Shares, StepContext, Tangents
 
 
@@ -57,9 +58,9 @@ class PcisphAdjoint:
         self.bar.shares.collect(self.bar.parameters)
         return self.bar.parameters
 
-    def step(self, counts: Counts, new_state_bar: State, state_bar: State, parameters: Parameters) -> None:
-        """From the adjoint of the replayed step's result to that of its state, which may be the same arrays; adjoints
-        of the parameters are added to ``bar``."""
+    def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
+        """Replace the adjoint of the replayed step's result by that of its state; adjoints of the parameters are added
+        to ``bar``."""
         (iterations,) = counts
         solver, b, it, kernels, bar = (
             self._solver,
@@ -70,9 +71,9 @@ class PcisphAdjoint:
         )
         context, known, push_bar = solver.context(parameters), self.bar.named, self._push_bar
         pressure_bar = {"y_bar": self._y_bar, "p_bar": self._p_bar}
-        free_bar = new_state_bar
+        free_bar = state_bar
         if self._emitter:
-            self._emitter.step(context, new_state_bar, bar.parameters)
+            self._emitter.step(context, state_bar, bar.parameters)
             free_bar = self._emitter.free
         context.launch(
             kernels.integration.begin_adjoint,
@@ -107,9 +108,8 @@ class PcisphAdjoint:
             context.launch(kernels.contrast.adjoint, *known, t_bar=self._t_bar)
         if not self._frozen:
             context.launch(kernels.walls.adjoint, *known, y=solver.wall_relaxation, y_bar=self._y_bar)
-        self._mixture.step(context, bar, new_state_bar.mass_fractions, state_bar.mass_fractions)
-        m_scene_bar = bar.parameters["reference_density"]
-        context.launch(kernels.integration.collect_masses, *known, m_scene_bar=m_scene_bar)
+        self._mixture.step(context, bar, state_bar.mass_fractions)
+        context.launch(kernels.integration.collect_masses, *known, m_scene_bar=state_bar["reference_density"])
         order, v_scene = solver.search.order, state_bar.velocities
         if self._frozen:
             unsorted = {"x_scene": push_bar, "v_scene": v_scene}
@@ -134,8 +134,8 @@ class PcisphTangent:
         self._zero_pressure, *self._p_dot, self._c_dot, self._y_dot, self._wall_y_dot = scalars
         self._mixture = MixtureTangent(solver.mixture)
 
-    def step(self, counts: Counts, state_dot: State, new_state_dot: State, parameters: Parameters) -> None:
-        """From the tangent of the replayed step's state to that of its result; may be the same arrays."""
+    def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
+        """Replace the tangent of the replayed step's state by that of its result."""
         (iterations,) = counts
         solver, dot, it, kernels = self._solver, self._dot, self._solver.iterates, self._solver.kernels
         context, known, order, d = solver.context(parameters), self._dot.named, solver.search.order, self._dot.fields
@@ -144,7 +144,7 @@ class PcisphTangent:
             order=order,
             x_scene=state_dot.positions,
             v_scene=state_dot.velocities,
-            m_scene=dot.parameters["reference_density"],
+            m_scene=state_dot["reference_density"],
             x=d["x"],
             v=d["v"],
             m=d["m"],
@@ -182,12 +182,12 @@ class PcisphTangent:
             order=order,
             x=self._x_star_dot,
             v=self._v_star_dot,
-            x_scene=new_state_dot.positions,
-            v_scene=new_state_dot.velocities,
+            x_scene=state_dot.positions,
+            v_scene=state_dot.velocities,
         )
-        self._mixture.result(context, new_state_dot.mass_fractions)
+        self._mixture.result(context, state_dot.mass_fractions)
         if solver.emitter:
-            solver.emitter.tangent(context, dot.parameters, new_state_dot)
+            solver.emitter.tangent(context, dot.parameters, state_dot)
 
     def _yields(self, known: tuple[Named, ...], context: StepContext) -> None:
         """The tangent of what delta is multiplied with."""

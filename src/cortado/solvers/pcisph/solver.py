@@ -2,7 +2,6 @@
 
 from cortado.device.memory import gradient_parts
 from cortado.device.state import Parameters
-from cortado.restart import Elapsed
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint, PcisphTangent
 from cortado.solvers.pcisph.log import IterationLog
 from cortado.solvers.pcisph.steps import PcisphSteps
@@ -28,7 +27,7 @@ class Pcisph(PcisphSteps):
 
     def match(self, other: "Pcisph") -> None:
         self.resize(other.search.capacity)
-        self.begin(Elapsed(), other.mixture.substeps)
+        self.set_substeps(other.mixture.substeps)
 
     def tangent(self, parameters_dot: Parameters) -> PcisphTangent:
         return PcisphTangent(self, parameters_dot)

@@ -9,20 +9,21 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.arrays import Fields
+from cortado.device.fields import POSITIONS, VELOCITIES
 from cortado.device.launching import KernelLauncher, sum_and_maximum
 from cortado.device.neighbourhood import Discretisation, neighbourhood_type
 from cortado.device.neighbours import NeighbourSearch
-from cortado.device.state import Fields, Parameters, State
+from cortado.device.state import Layout, Parameters, State
 from cortado.device.threads import Turn
 from cortado.discretise.discrete_scene import Lattice
 from cortado.lattice.calibration import SKIN
-from cortado.restart import Elapsed
 from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.pcisph.log import IterationLog
 from cortado.solvers.pcisph.parts import Iterates, PcisphKernels, PressureSolve
 from cortado.solvers.solver import Counts
+from cortado.sph.emitter import Emitter, Nozzle
 from cortado.sph.mixture import Mixture, Phases
-from cortado.sph.nozzle import Emitter, Nozzle
 from cortado.sph.parts import Force, StepContext
 
 
@@ -63,7 +64,11 @@ class PcisphSteps:
         def count() -> wp.array:
             return wp.zeros(1, dtype=wp.int32, device=device)
 
-        self.emitter = Emitter(nozzle, precision, device, self.new_state(requires_grad)) if nozzle else None
+        self._layout = Layout(particles, phases.count, precision, device)
+        self.emitter = Emitter(nozzle, self._layout, requires_grad) if nozzle else None
+        parts = [self.mixture, *([self.emitter] if self.emitter else [])]
+        self.state_fields = (POSITIONS, VELOCITIES, *(field for part in parts for field in part.fields))
+        """What a state consists of."""
         self.fields = Fields.zeros(particles, precision, device, requires_grad)
 
         def numbers() -> wp.array:
@@ -111,24 +116,19 @@ class PcisphSteps:
 
     def new_state(self, requires_grad: bool = False) -> State:
         """A state of this solver's particles, all 0."""
-        phases, search = self.mixture.phases.count, self.search
-        return State.zeros(search.particles, phases, self.discretisation.precision, search.device, requires_grad)
+        return self._layout.state(self.state_fields, requires_grad)
 
     def new_parameters(self, steps: int, requires_grad: bool = False) -> Parameters:
         """Parameters of a run of so many steps, all 0."""
-        phases, search = self.mixture.phases.count, self.search
-        precision, device = self.discretisation.precision, search.device
-        return Parameters.zeros(steps, search.particles, phases, precision, device, requires_grad)
+        return self._layout.parameters(steps, requires_grad)
 
     def new_log(self, steps: int) -> IterationLog:
         return IterationLog(steps, self.pressure, self.discretisation.precision, self.device)
 
-    def begin(self, elapsed: Elapsed, substeps: int) -> None:
+    def set_substeps(self, substeps: int) -> None:
         if substeps != self.mixture.substeps:
             self.mixture.reserve(substeps)
             self.generation += 1
-        if self.emitter:
-            self.emitter.go_on(elapsed)
 
     def make_room(self) -> bool:
         needed, capacity = self.search.needed, self.search.capacity
@@ -175,7 +175,7 @@ class PcisphSteps:
             self._iterate(k, k + 1, context)
 
     def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
-        """The last prediction, in the scene's order, but for particles that a nozzle leads."""
+        """The last prediction, in the scene's order, but for particles that the emitter prescribes."""
         (iterations,) = counts
         it, context = self.iterates, self.context(parameters)
         free = self.emitter.free if self.emitter else new_state
@@ -189,7 +189,7 @@ class PcisphSteps:
         )
         self.mixture.result(context, new_state.mass_fractions)
         if self.emitter:
-            self.emitter.lead(context, new_state)
+            self.emitter.prescribe(context, new_state)
 
     def context(self, parameters: Parameters) -> StepContext:
         """The present step as its parts see it."""
@@ -201,8 +201,10 @@ class PcisphSteps:
     def _begin(self, state: State, parameters: Parameters) -> StepContext:
         """Neighbours, density, mixture, explicit forces, and the first prediction."""
         f, it, kernels, context = self.fields, self.iterates, self.kernels, self.context(parameters)
+        if self.emitter:
+            self.emitter.begin(context, state)
         self.search.sort(state.positions)
-        scene = {"x_scene": state.positions, "v_scene": state.velocities, "m_scene": parameters["reference_density"]}
+        scene = {"x_scene": state.positions, "v_scene": state.velocities, "m_scene": state["reference_density"]}
         context.launch(kernels.integration.sort, **scene)
         self.search.fill(self._neighbourhood, f["x"])
         context.launch(kernels.density.forward)
