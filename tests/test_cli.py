@@ -196,7 +196,7 @@ def test_an_interrupted_run_keeps_its_frames(cortado_command, folder, monkeypatc
 def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command, monkeypatch, command):
     for module in (cortado.commands.run, cortado.commands.optimise):
         monkeypatch.setattr(module, "track", interrupting(after=-1))
-    monkeypatch.setattr(cortado.commands.run, "TrajectoryWriter", interrupting(after=-1))
+    monkeypatch.setattr(cortado.commands.run, "frame_writer", interrupting(after=-1))
     assert cortado_command(*command, "--out", "dam") == (130, "", "Interrupted.\n")
 
 
