@@ -53,8 +53,8 @@ LAYERS = """
     simulation
     problem
     figures.curves figures
-    certificate.agreement certificate.changes certificate.twin certificate.course certificate.horizon
-    certificate.rightness certificate.text certificate.certificate certificate certificate.figure
+    certificate.alignment certificate.perturbations certificate.twin certificate.loss_history certificate.horizon
+    certificate.consistency certificate.text certificate.certificate certificate certificate.figure
     optimisation optimisation.differentiable optimisation.replay_log optimisation.optimisers
     optimisation.named_optimisers optimisation.result optimisation.optimise optimisation.transforms
     io.run_folder io.report
