@@ -366,7 +366,7 @@ def wait_for_metrics(run, lines, process):
 
 
 def assert_same_optimisation(one, other):
-    for name in ("metrics.jsonl", "checkpoint/evaluations.log"):
+    for name in ("metrics.jsonl", "checkpoint/replay.log"):
         assert (Path(one) / name).read_bytes() == (Path(other) / name).read_bytes()
 
 

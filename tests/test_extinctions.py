@@ -99,11 +99,11 @@ def test_searches_resume_bit_for_bit(file):
     """Even when interrupted in the second one; and with other extinctions they are refused."""
     main(["optimise", "task.toml", "--set", STAGED, "--out", "whole"])
     main(["optimise", "task.toml", "--set", STAGED, "--out", "cut"])
-    log, metrics = Path("cut/checkpoint/1/evaluations.log"), Path("cut/metrics.jsonl")
+    log, metrics = Path("cut/checkpoint/1/replay.log"), Path("cut/metrics.jsonl")
     log.write_bytes(log.read_bytes()[: int(0.6 * log.stat().st_size)])
     metrics.write_text("".join(metrics.read_text().splitlines(keepends=True)[:7]))
     main(["optimise", "task.toml", "--set", STAGED, "--out", "cut", "--resume"])
-    for name in ("metrics.jsonl", "checkpoint/evaluations.log", "checkpoint/1/evaluations.log"):
+    for name in ("metrics.jsonl", "checkpoint/replay.log", "checkpoint/1/replay.log"):
         assert (Path("cut") / name).read_bytes() == (Path("whole") / name).read_bytes()
     with pytest.raises(SystemExit) as end:
         main(["optimise", "task.toml", "--set", "optimise.extinctions=[0.5, 1.0]", "--out", "cut", "--resume"])

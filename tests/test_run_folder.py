@@ -62,8 +62,8 @@ def test_a_folder_with_a_run_is_refused_unless_overwritten(tmp_path):
     (folder.figures / "holiday.png").write_text("mine")
     (folder.figures / "loss.png").write_text("")
     (folder.checkpoint / "1").mkdir(parents=True)
-    (folder.checkpoint / "evaluations.log").write_text("")
-    (folder.checkpoint / "1" / "evaluations.log").write_text("")
+    (folder.checkpoint / "replay.log").write_text("")
+    (folder.checkpoint / "1" / "replay.log").write_text("")
     with pytest.raises(InputError, match=r"--out, or replace it with --overwrite\.$"):
         new_run(folder.path)
     with pytest.raises(InputError, match=r"--overwrite\.$"):
