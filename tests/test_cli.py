@@ -550,7 +550,7 @@ def test_a_cup_is_swung_until_it_looks_as_it_should(cortado_command):
     code, out, err = cortado_command("optimise", "task.toml", "--out", "found")
     assert (code, err) == (0, "") and "gravity within " in out and "the image is matched to " in out
     wanted = {"loss.png", "images.png", "progress.png", "gravity.png"}
-    assert figures("found") == wanted | ({"found.mp4"} if find_spec("av") else set())
+    assert figures("found") == wanted | ({"estimate.mp4"} if find_spec("av") else set())
     page = Path("found/report.html").read_text()
     assert page.count("<img") == 4 and page.count("<video") == (1 if find_spec("av") else 0)
     assert len(metrics("found")) == 4

@@ -70,7 +70,7 @@ def test_a_hidden_run_is_seen_through_the_same_fluid(tmp_path):
     made = setup(load_task(tmp_path / "task.toml", [STAGED]), "cpu", "float32")
     assert len(made.searches) == 2
     for search in made.searches:
-        assert search.problem.value(made.task.hidden) == pytest.approx(0.0, abs=1e-12)
+        assert search.problem.value(made.task.true_parameters) == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("shares", ["[]", "[0.5]", "[1.0, 1.0]", "[0.5, 0.25, 1.0]", "[0.0, 1.0]", '["a", 1.0]', "1.0"])

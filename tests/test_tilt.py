@@ -122,11 +122,11 @@ def test_it_is_searched_between_knots():
     problem = problem_of(plane())
     knots = Knots(STEPS, 3)
     search = Transformed(problem, {"tilt": knots})
-    hidden = {"tilt": np.array([[10.0], [-15.0], [5.0]])}
-    target = problem.end(search.parameters(hidden)).positions
+    truth = {"tilt": np.array([[10.0], [-15.0], [5.0]])}
+    target = problem.end(search.parameters(truth)).positions
     search = Transformed(Problem(problem.simulation, STEPS, losses.FinalPositions(target)), {"tilt": knots})
     found = cortado.optimise(search, {"tilt": np.zeros((3, 1))}, cortado.optimisers.LBFGS(scale=5.0), 25)
-    np.testing.assert_allclose(found.parameters["tilt"], hidden["tilt"], atol=0.1)
+    np.testing.assert_allclose(found.parameters["tilt"], truth["tilt"], atol=0.1)
 
 
 def test_gradients_with_respect_to_it_are_certified():

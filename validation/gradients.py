@@ -33,7 +33,7 @@ DISORDER = 0.01
 """Of the first positions [spacings], of a seed and again of the reference's cloud."""
 SPREAD = 0.5
 """Of the reference's gravities [m/s2]."""
-TILT, HIDDEN = 3.0, 1.0
+TILT, TRUE_SPREAD = 3.0, 1.0
 """How far the target's gravities lean to a side, and their standard deviation [m/s2]."""
 LOSSES = ("centre of mass", "density grid", "picture, pyramid", "picture", "particles")
 ESTIMATORS: dict[str, gradients.GradientEstimator] = {
@@ -100,10 +100,10 @@ class Case:
         self.simulation, self.steps, self.blocks = simulation, steps, blocks
         self.gravity = np.tile(GRAVITY, (blocks, 1))
         self.start = simulation.positions + DISORDER * SPACING * random.standard_normal(simulation.positions.shape)
-        hidden = self.gravity + [random.choice([-TILT, TILT]), 0.0]
-        hidden += HIDDEN * random.standard_normal(hidden.shape)
+        true_gravity = self.gravity + [random.choice([-TILT, TILT]), 0.0]
+        true_gravity += TRUE_SPREAD * random.standard_normal(true_gravity.shape)
         self.problem = Problem(simulation, steps, losses.CentreOfMass([0.0, 0.0]))
-        target = self.problem.end(self.parameters({"gravity": hidden}))
+        target = self.problem.end(self.parameters({"gravity": true_gravity}))
         renderer = scene_renderer(simulation)
         picture = renderer.render(target.state.positions, target.state.mass_fractions, target.colours)
         made: list[Any] = [

@@ -49,9 +49,9 @@ class Setup:
         assert self.renderer is not None
         return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
 
-    def hidden(self, name: str) -> np.ndarray | None:
-        """The parameter that made the target, None where a picture is the target."""
-        return self.task.hidden.get(name)
+    def true_parameter(self, name: str) -> np.ndarray | None:
+        """The parameter's value in the run that made the target; None where a picture is the target."""
+        return self.task.true_parameters.get(name)
 
 
 def setup(task: Task, device: str, precision: str) -> Setup:
@@ -89,7 +89,7 @@ def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> d
         return {steps[-1]: _picture(task, renderer)}
     nothing = FinalPositions(simulation.positions)
     try:
-        ends = Problem(simulation, task.problem.steps, nothing).states(task.hidden, steps)
+        ends = Problem(simulation, task.problem.steps, nothing).states(task.true_parameters, steps)
     except DivergedError as error:
         advice = f"this is the run with the parameters of problem.target, so change those, or {error.advice}"
         raise error.with_advice(advice) from None

@@ -95,7 +95,7 @@ def _is_numeric(value: Any) -> bool:
 
 
 class ProblemTable(Table):
-    """[problem]: a number of steps, and a target: what a run with hidden parameters makes, or a picture."""
+    """[problem]: a number of steps, and a target: the end of a run with true parameters, or a picture."""
 
     steps: Annotated[int, Count(0, 10_000_000)]
     """Time steps; 0 for a loss of the first state."""
@@ -106,7 +106,7 @@ class ProblemTable(Table):
     frames: Annotated[int, Count(1, 10_000)] = 1
     """How many states are compared, evenly spaced up to the last one."""
     target: Annotated[dict[str, Any] | None, Values()] = None
-    """Hidden parameters: the target is what their run makes."""
+    """The true parameters: the target is what a run with them makes."""
     picture: Annotated[str | None, Text()] = None
     """"heart", "rosetta", or a file with a picture, beside the task's own."""
 
@@ -138,9 +138,9 @@ class CheckTable(Table):
     loss_reduction: Annotated[float, Quantity(least=1.0)] = 1.0
     """First loss / best loss."""
     parameter_error: Annotated[float, Quantity(above=0.0)] = 1e50
-    """Largest relative distance (L2) of a found parameter from the hidden one."""
+    """Largest relative distance (L2) of an estimated parameter from its true value."""
     psnr: Annotated[float, Quantity("dB", least=0.0)] = 0.0
-    """Peak signal-to-noise ratio of the found image to the target."""
+    """Peak signal-to-noise ratio of the image of the estimate to the target."""
 
 
 class GradientTable(Table):

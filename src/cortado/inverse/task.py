@@ -27,8 +27,8 @@ class Task:
     scene: Scene
     problem: ProblemTable
     optimise: OptimiseTable
-    hidden: Arrays
-    """Parameters that made the target; none for a picture."""
+    true_parameters: Arrays
+    """Those of the run that made the target; none where the target is a picture."""
     start: dict[str, Any]
     """Parameters to begin with; arrays, or the word "random"."""
     folder: Path = Path()
@@ -44,18 +44,18 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
         with sentences():
             tables = TaskTables.model_validate({key: data[key] for key in TaskTables.model_fields if key in data})
         problem, optimise = tables.problem, tables.optimise
-        hidden, steps = problem.target or {}, problem.steps
+        true, steps = problem.target or {}, problem.steps
         for name in optimise.start:
-            if problem.picture is None and name not in hidden:
+            if problem.picture is None and name not in true:
                 raise SceneError(None, f"problem.target.{name}", MISSING, "given, as optimise.start has it")
-        hidden = _resolved("problem.target", hidden, scene, steps)
+        true = _resolved("problem.target", true, scene, steps)
         start = _resolved("optimise.start", optimise.start, scene, steps)
         _check_options(problem, optimise, start)
         for name, pair in (optimise.bounds or {}).items():
             _check_bounds(name, pair, optimise, start, scene)
     except SceneError as error:
         raise error.in_file(file) from None
-    return Task(scene, problem, optimise, hidden, start, Path(file).parent)
+    return Task(scene, problem, optimise, true, start, Path(file).parent)
 
 
 def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int) -> dict[str, Any]:
@@ -123,7 +123,7 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
     if problem.loss != "image" and "psnr" in given:
         raise SceneError(None, "optimise.check.psnr", optimise.check.psnr, "left out, as positions are compared")
     if problem.picture is not None and "parameter_error" in given:
-        wanted = "left out, as the target is a picture and no parameter is hidden"
+        wanted = "left out, as the target is a picture, not a run with true parameters"
         raise SceneError(None, "optimise.check.parameter_error", optimise.check.parameter_error, wanted)
 
 

@@ -30,8 +30,8 @@ class ImageHorizon(DeviceSettings, SceneSettings):
 
     horizons: Annotated[tuple[int, ...], Several(Count(1, 1_000_000))]
     """Numbers of steps, growing."""
-    hidden: Annotated[tuple[float, ...], Components(Quantity("m/s2"))]
-    """(d,) the gravity whose picture is the target [m / s2]; the gradient is taken at the scene's own."""
+    true_gravity: Annotated[tuple[float, ...], Components(Quantity("m/s2"))]
+    """(d,) the true gravity, whose picture is the target [m / s2]; the gradient is taken at the scene's own."""
     differences: Annotated[tuple[float, ...], Several(Quantity("m/s2", above=0.0))]
     """Steps of finite differences [m / s2]."""
     precision: Annotated[str, Choice(("float32", "float64"))] = "float32"
@@ -63,9 +63,11 @@ def _name(step: float) -> str:
 
 
 def _problem(simulation: Simulation, horizon: int, settings: ImageHorizon) -> Problem:
-    """The squared difference from the picture that the hidden gravity makes after so many steps."""
+    """The squared difference from the picture that the true gravity makes after so many steps."""
     renderer = scene_renderer(simulation)
-    end = Problem(simulation, horizon, FinalPositions(simulation.positions)).end({"gravity": np.array(settings.hidden)})
+    end = Problem(simulation, horizon, FinalPositions(simulation.positions)).end(
+        {"gravity": np.array(settings.true_gravity)}
+    )
     target = renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
     return Problem(simulation, horizon, Image(renderer, target))
 
