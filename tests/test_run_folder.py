@@ -124,7 +124,10 @@ def test_a_damaged_folder_is_a_sentence(tmp_path, name, damage):
 
 
 def test_a_refused_resume_names_the_setting(tmp_path):
-    settings = {"problem": {"steps": 20, "target": {"gravity": np.array([0.0, -9.5])}}, "extinctions": (0.5, 1.0)}
+    settings = {
+        "problem": {"steps": 20, "target": {"gravity": np.array([0.0, -9.5])}},
+        "extinction_schedule": (0.5, 1.0),
+    }
     folder = new_run(tmp_path / "a", kind="optimise", settings=settings)
     RunFolder.resume(folder.path, SCENE, COMMAND, kind="optimise", settings=settings)
     settings["problem"]["target"] = {"gravity": np.array([0.0, -9.8])}

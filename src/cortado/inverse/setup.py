@@ -29,7 +29,7 @@ class Setup:
     task: Task
     problem: Problem
     searches: tuple[Transformed, ...]
-    """One after the other, through thicker and thicker fluid, in the same coordinates; the last is the task's own."""
+    """One for each entry of the extinction schedule, in the same coordinates; the last is the scene's own."""
     start: Arrays
     """Coordinates to begin with."""
     bounds: dict[str, tuple[Any, Any]]
@@ -60,8 +60,8 @@ def setup(task: Task, device: str, precision: str) -> Setup:
     start = {name: _start(name, value, simulation) for name, value in task.start.items()}
     found = _coordinates(task, start)
     searches = []
-    for share in task.optimise.extinctions:
-        renderer = scene_renderer(simulation, share) if task.problem.loss == "image" else None
+    for factor in task.optimise.extinction_schedule:
+        renderer = scene_renderer(simulation, factor) if task.problem.loss == "image" else None
         targets = _targets(task, simulation, renderer)
         problem = Problem(simulation, task.problem.steps, _frames(task, targets, renderer))
         searches.append(Transformed(problem, found))

@@ -73,18 +73,18 @@ class Names(Kind):
 
 
 @dataclass(frozen=True)
-class Shares(Kind):
-    """Numbers that grow to 1."""
+class Schedule(Kind):
+    """A continuation schedule: factors that grow to 1."""
 
     wanted = "a list of numbers greater than 0, each greater than the one before, the last of them 1"
 
     def check(self, value: Any) -> tuple[float, ...]:
         numbers = [as_number(entry) for entry in as_sequence(value) or ()]
-        shares = [number for number in numbers if number is not None and number > 0.0]
-        growing = all(a < b for a, b in pairwise(shares))
-        if not shares or len(shares) < len(numbers) or not growing or shares[-1] != 1.0:
+        factors = [number for number in numbers if number is not None and number > 0.0]
+        growing = all(a < b for a, b in pairwise(factors))
+        if not factors or len(factors) < len(numbers) or not growing or factors[-1] != 1.0:
             raise wrong((), value, self.wanted)
-        return tuple(shares)
+        return tuple(factors)
 
 
 def _is_numeric(value: Any) -> bool:
@@ -201,9 +201,9 @@ class OptimiseTable(Table):
     """Parameters that are changed by factors."""
     bounds: Annotated[dict[str, Any] | None, Values()] = None
     """By name: two entries, the lower and the upper bound."""
-    extinctions: Annotated[tuple[float, ...], Shares()] = (1.0,)
-    """Of one search after the other, each from where the last one ended, relative to the scene's: through thinner fluid
-    a picture tells how much there is, and particles that hide behind each other have to part."""
+    extinction_schedule: Annotated[tuple[float, ...], Schedule()] = (1.0,)
+    """A continuation schedule: one search for each factor, which starts where the last one ended and sees the fluid with
+    the scene's extinction times that factor. A picture of thinner fluid shows how much of it is behind its surface."""
     optimiser: Annotated[str, Choice(tuple(OPTIMISERS))] = "adam"
     """Name of the algorithm."""
     learning_rate: Annotated[float, Quantity(above=0.0)]

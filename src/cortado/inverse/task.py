@@ -117,9 +117,9 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
         wanted, found = ("given, as it is searched", MISSING) if name in start else ("left out", Phrase("given"))
         raise SceneError(None, f"optimise.gradient.spread.{name}", found, wanted)
     given = optimise.check.model_fields_set
-    if problem.loss != "image" and len(optimise.extinctions) > 1:
+    if problem.loss != "image" and len(optimise.extinction_schedule) > 1:
         wanted = "left out, as positions are compared"
-        raise SceneError(None, "optimise.extinctions", list(optimise.extinctions), wanted)
+        raise SceneError(None, "optimise.extinction_schedule", list(optimise.extinction_schedule), wanted)
     if problem.loss != "image" and "psnr" in given:
         raise SceneError(None, "optimise.check.psnr", optimise.check.psnr, "left out, as positions are compared")
     if problem.picture is not None and "parameter_error" in given:

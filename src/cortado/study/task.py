@@ -124,7 +124,7 @@ def draw(table: Table, settings: TaskSettings) -> "Figure":
 def verdict(table: Table, settings: TaskSettings) -> list[str]:
     losses, pictures = table.where(picture="")["loss"], _pictures(table)
     *way, target = pictures.values()
-    searches = load_task(settings.task, settings.overrides).optimise.extinctions
+    searches = load_task(settings.task, settings.overrides).optimise.extinction_schedule
     begun = len(losses) // len(searches) * (len(searches) - 1)
     found = [f"The picture comes from {psnr(way[0], target):.1f} to {psnr(way[-1], target):.1f} dB of the target."]
     if len(searches) > 1:
