@@ -11,7 +11,7 @@ from cortado.inverse.task import load_task
 from cortado.io.pictures import heart, rosetta, write_picture
 from cortado.losses.image_losses import Pyramid, SquaredDifference
 from cortado.optimisation.optimisers import LBFGS, Adam
-from cortado.optimisation.transforms import Knots, Logarithm, Softmax
+from cortado.optimisation.transforms import Logarithm, Softmax, TimeInterpolation
 from cortado.parameters.tilt import Tilt
 
 
@@ -165,7 +165,7 @@ def test_coordinates_are_those_that_the_task_asks_for(made):
         "optimise.bounds.viscosity=[[0.01,0.02],[0.1,0.2]]",
         "optimise.bounds.gravity=[-20,20]",
     )
-    assert ready.search.coordinates == {"gravity": Knots(6, 3), "viscosity": Logarithm()}
+    assert ready.search.coordinates == {"gravity": TimeInterpolation(6, 3), "viscosity": Logarithm()}
     np.testing.assert_allclose(ready.start["viscosity"], np.log([0.03, 0.03]))
     np.testing.assert_allclose(ready.start["gravity"], np.tile([0.0, -9.81, 0.0], (3, 1)), atol=1e-14)
     np.testing.assert_allclose(ready.bounds["viscosity"], np.log([[0.01, 0.02], [0.1, 0.2]]))
@@ -176,7 +176,7 @@ def test_a_tilt_is_hidden_searched_and_bounded(made):
     text = TINY_LATTE.replace("[[0.0, -9.81, 4.0], [4.0, -9.81, 0.0]]", "[[0.0, 20.0], [20.0, 0.0]]")
     text = text.replace("[[0.0, -9.81, 0.0], [0.0, -9.81, 0.0]]", "[[0.0, 0.0], [0.0, 0.0]]").replace("gravity", "tilt")
     ready = made(text, "optimise.bounds.tilt=[-15,15]")
-    assert ready.search.coordinates == {"tilt": Knots(6, 3)} and ready.start["tilt"].shape == (3, 2)
+    assert ready.search.coordinates == {"tilt": TimeInterpolation(6, 3)} and ready.start["tilt"].shape == (3, 2)
     gravity = Tilt((0.0, -9.81, 0.0)).gravity(ready.true_parameter("tilt"))
     np.testing.assert_allclose(np.linalg.norm(gravity, axis=1), 9.81, rtol=1e-14)
     end = ready.problem.states({"gravity": gravity}, [6])[6]

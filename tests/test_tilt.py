@@ -5,7 +5,7 @@ import pytest
 
 import cortado
 from cortado import InputError, Problem, Simulation, losses
-from cortado.optimisation.transforms import Knots, Transformed
+from cortado.optimisation.transforms import TimeInterpolation, Transformed
 from cortado.parameters.tilt import SMALL, Tilt
 from finite_differences import decades, distance, plateau
 from scenes import plane, scene, splash
@@ -120,7 +120,7 @@ def test_one_tilt_may_vary_where_there_is_a_row_for_each_step():
 
 def test_it_is_searched_between_knots():
     problem = problem_of(plane())
-    knots = Knots(STEPS, 3)
+    knots = TimeInterpolation(STEPS, 3)
     search = Transformed(problem, {"tilt": knots})
     truth = {"tilt": np.array([[10.0], [-15.0], [5.0]])}
     target = problem.end(search.parameters(truth)).positions

@@ -10,7 +10,7 @@ from cortado.inverse.tables import DISTANCES, RANDOM
 from cortado.inverse.task import Task
 from cortado.io.pictures import heart, read_picture, rosetta
 from cortado.losses import FinalPositions, Frames, Image, Loss, Snapshot
-from cortado.optimisation.transforms import Bijector, Knots, Logarithm, Softmax, Transformed
+from cortado.optimisation.transforms import Bijector, Logarithm, Softmax, TimeInterpolation, Transformed
 from cortado.parameters.registry import BY_NAME, Range
 from cortado.parameters.values import OVER_TIME, Arrays
 from cortado.problem import Problem
@@ -141,7 +141,7 @@ def _coordinates(task: Task, start: Arrays) -> dict[str, Bijector]:
         if name == "mass_fractions":
             found[name] = Softmax()
         elif name in OVER_TIME and value.ndim == 2 and task.optimise.knots is not None:
-            found[name] = Knots(task.problem.steps, task.optimise.knots)
+            found[name] = TimeInterpolation(task.problem.steps, task.optimise.knots)
     return found
 
 

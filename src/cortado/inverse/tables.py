@@ -202,8 +202,8 @@ class OptimiseTable(Table):
     bounds: Annotated[dict[str, Any] | None, Values()] = None
     """By name: two entries, the lower and the upper bound."""
     extinction_schedule: Annotated[tuple[float, ...], Schedule()] = (1.0,)
-    """A continuation schedule: one search for each factor, which starts where the last one ended and sees the fluid with
-    the scene's extinction times that factor. A picture of thinner fluid shows how much of it is behind its surface."""
+    """A continuation schedule: one search for each factor, which starts where the last one ended and sees the fluid
+    with the scene's extinction times that factor. A picture of thinner fluid shows how much of it is behind its surface."""
     optimiser: Annotated[str, Choice(tuple(OPTIMISERS))] = "adam"
     """Name of the algorithm."""
     learning_rate: Annotated[float, Quantity(above=0.0)]

@@ -11,7 +11,7 @@ import numpy as np
 from cortado.discretise.sampling import fluid_particles
 from cortado.errors import Phrase, SceneError
 from cortado.inverse.tables import OptimiseTable, ProblemTable, TaskTables
-from cortado.optimisation.transforms import Knots
+from cortado.optimisation.transforms import TimeInterpolation
 from cortado.parameters.registry import BY_NAME, Range
 from cortado.parameters.values import OVER_TIME, SUM_TOLERANCE, Arrays, is_too_small
 from cortado.scene.fields import MISSING
@@ -74,7 +74,7 @@ def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int) -
             continue
         shapes = _shapes(name, scene, steps)
         if name in OVER_TIME and array.ndim == 2 and 2 <= len(array) <= steps and array.shape[1:] == shapes[0]:
-            array = Knots(steps, len(array)).parameter(array)
+            array = TimeInterpolation(steps, len(array)).parameter(array)
         if array.shape not in shapes:
             wanted = _in_words(shapes)
             if name in OVER_TIME and steps > 1:
