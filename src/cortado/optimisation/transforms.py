@@ -69,7 +69,7 @@ class Softmax:
 
 @dataclass(frozen=True)
 class TimeInterpolation:
-    """p (steps, d) interpolated linearly in time between knots u (k, d) at even times, from the first step to the last."""
+    """p (steps, d) interpolated linearly in time between knots u (k, d) at even times from first to last step."""
 
     steps: int
     knots: int

@@ -11,7 +11,7 @@ from cortado.reference import Terms
 from cortado.scene.fields import Choice, Count, Quantity
 from cortado.study.canvas import blank
 from cortado.study.comparison import growth
-from cortado.study.experiment import Kind, Progress, SceneSettings, Several
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Several
 from cortado.study.gravity_tangents import COST, LABEL, along_gravity, row
 from cortado.study.scenes import varied
 from cortado.study.sources import ReferenceTangent
@@ -143,4 +143,4 @@ def _free_fall(table: Table) -> float:
     return float(np.abs(norms / norms[-1] * expected[-1] / expected - 1.0).max())
 
 
-FORCES = Kind("forces", Forces, measure, draw, verdict)
+FORCES = ExperimentType("forces", Forces, measure, draw, verdict)

@@ -8,7 +8,7 @@ import numpy as np
 from cortado.figures.canvas import DASHED, FAINT, PALETTE
 from cortado.scene.fields import Choice, Count, Quantity
 from cortado.study.canvas import blank
-from cortado.study.experiment import Kind, Progress, SceneSettings, Several
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Several
 from cortado.study.gravity_tangents import COST, LABEL, along_gravity
 from cortado.study.sources import ReferenceTangent
 from cortado.study.tables import Table
@@ -99,4 +99,4 @@ def _distance(table: Table, method: str, precision: str, truth: str) -> np.ndarr
     return np.abs(found / expected - 1.0)
 
 
-GRAVITY_AND_PRECISION = Kind("gravity_and_precision", GravityAndPrecision, measure, draw, verdict)
+GRAVITY_AND_PRECISION = ExperimentType("gravity_and_precision", GravityAndPrecision, measure, draw, verdict)

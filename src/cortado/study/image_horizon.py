@@ -13,7 +13,7 @@ from cortado.scene.fields import Choice, Components, Count, Quantity
 from cortado.simulation import Simulation
 from cortado.study.canvas import blank
 from cortado.study.comparison import growth
-from cortado.study.experiment import DeviceSettings, Kind, Progress, SceneSettings, Several
+from cortado.study.experiment import DeviceSettings, ExperimentType, Progress, SceneSettings, Several
 from cortado.study.sources import ByEstimator, FiniteDifference, Source, Warp
 from cortado.study.tables import Table
 
@@ -128,4 +128,4 @@ def verdict(table: Table, settings: ImageHorizon) -> list[str]:
     return sentences
 
 
-IMAGE_HORIZON = Kind("image_horizon", ImageHorizon, measure, draw, verdict)
+IMAGE_HORIZON = ExperimentType("image_horizon", ImageHorizon, measure, draw, verdict)

@@ -20,9 +20,9 @@ from cortado.reference import History, Simulation
 from cortado.scene.fields import Components, Count, Quantity
 from cortado.study import spatial_scales
 from cortado.study.canvas import blank
+from cortado.study.ensembles import perturbed, side_by_side
 from cortado.study.estimates import Estimate, growth_rate
-from cortado.study.experiment import Kind, Progress, SceneSettings
-from cortado.study.starts import perturbed, side_by_side
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -202,4 +202,4 @@ def _rate(inside: Table, vector: str, quantity: str) -> Estimate:
     return Estimate.of([growth_rate(one["step"], one["value"]) for _, one in rows.groups("seed")])
 
 
-LOCALITY = Kind("locality", LocalitySettings, measure, draw, verdict)
+LOCALITY = ExperimentType("locality", LocalitySettings, measure, draw, verdict)

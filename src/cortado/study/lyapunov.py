@@ -10,7 +10,7 @@ import numpy as np
 from cortado.figures.canvas import INK, PALETTE
 from cortado.study.canvas import blank
 from cortado.study.estimates import Estimate, Line
-from cortado.study.experiment import Kind
+from cortado.study.experiment import ExperimentType
 from cortado.study.lyapunov_exponents import LyapunovSettings, measure, window_steps
 from cortado.study.tables import Table
 
@@ -180,4 +180,4 @@ def _numbers(rows: Table) -> tuple[float, float]:
     return estimate.value, np.nan_to_num(estimate.error) if np.isfinite(estimate.value) else np.nan
 
 
-LYAPUNOV = Kind("lyapunov", LyapunovSettings, measure, draw, verdict)
+LYAPUNOV = ExperimentType("lyapunov", LyapunovSettings, measure, draw, verdict)

@@ -18,11 +18,11 @@ from cortado.reference import Simulation, Terms
 from cortado.scene import tables
 from cortado.scene.fields import Choice, Components, Count, Quantity, Tables, Text
 from cortado.scene.scene import Scene
+from cortado.study.ensembles import perturbed, side_by_side
 from cortado.study.estimates import growth_rate, norms
 from cortado.study.experiment import Progress, SceneSettings, Several
 from cortado.study.lyapunov_spectrum import growth_by_segment
 from cortado.study.scenes import varied
-from cortado.study.starts import perturbed, side_by_side
 from cortado.study.tables import Table
 
 Term = Choice(("viscosity", "pressure", "hessian", "density"))

@@ -12,7 +12,7 @@ from cortado.reference import Terms
 from cortado.scene.fields import Choice, Count
 from cortado.study.canvas import blank
 from cortado.study.comparison import growth
-from cortado.study.experiment import Kind, Progress, SceneSettings, Several
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Several
 from cortado.study.gravity_tangents import COST, LABEL, along_gravity, row
 from cortado.study.sources import ReferenceTangent
 from cortado.study.tables import Table
@@ -100,4 +100,4 @@ def verdict(table: Table, settings: PressureTerms) -> list[str]:
     return sentences
 
 
-PRESSURE_TERMS = Kind("pressure_terms", PressureTerms, measure, draw, verdict)
+PRESSURE_TERMS = ExperimentType("pressure_terms", PressureTerms, measure, draw, verdict)

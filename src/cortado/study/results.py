@@ -29,7 +29,7 @@ class Results:
         self._make_folder()
         started = time.perf_counter()
         progress = partial(track, description=experiment.name)
-        table = experiment.kind.measure(experiment.settings, progress)
+        table = experiment.type.measure(experiment.settings, progress)
         table.write_csv(self.data)
         return self._show(experiment, table, time.perf_counter() - started)
 
@@ -47,9 +47,9 @@ class Results:
         return self._recorded()["verdict"]
 
     def _show(self, experiment: Experiment, table: Table, seconds: float | None) -> list[str]:
-        kind, settings = experiment.kind, experiment.settings
-        save(lambda: kind.draw(table, settings), self.picture)
-        verdict = kind.verdict(table, settings)
+        own, settings = experiment.type, experiment.settings
+        save(lambda: own.draw(table, settings), self.picture)
+        verdict = own.verdict(table, settings)
         record = {**_identity(experiment), "reduced": experiment.reduced, "seconds": seconds, "verdict": verdict}
         write_atomically(self.sentences, "".join(f"{sentence}\n" for sentence in [settings.title, *verdict]))
         write_atomically(self.record, json.dumps(record, indent=2) + "\n")
@@ -70,4 +70,4 @@ class Results:
 
 
 def _identity(experiment: Experiment) -> dict[str, Any]:
-    return {"kind": experiment.kind.name, "settings": experiment.settings.identity()}
+    return {"kind": experiment.type.name, "settings": experiment.settings.identity()}

@@ -17,9 +17,9 @@ from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE
 from cortado.reference import Digits, History, Simulation
 from cortado.scene.fields import Choice, Components, Count, Quantity
 from cortado.study.canvas import blank
+from cortado.study.ensembles import perturbed, side_by_side
 from cortado.study.estimates import Estimate, Line, growth_rate, norms
-from cortado.study.experiment import Kind, Progress, SceneSettings, Several
-from cortado.study.starts import perturbed, side_by_side
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Several
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -187,4 +187,4 @@ def _rate(table: Table, settings: RoundOffSettings) -> Estimate:
     return Estimate.of([growth_rate(rows["step"], rows["size"]) for _, rows in inside.groups("seed")])
 
 
-ROUND_OFF = Kind("round_off", RoundOffSettings, measure, draw, verdict)
+ROUND_OFF = ExperimentType("round_off", RoundOffSettings, measure, draw, verdict)

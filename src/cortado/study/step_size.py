@@ -17,10 +17,10 @@ from cortado.figures.canvas import DASHED, FAINT, INK
 from cortado.reference import Simulation
 from cortado.scene.fields import Components, Count, Quantity
 from cortado.study.canvas import blank
+from cortado.study.ensembles import perturbed, side_by_side
 from cortado.study.estimates import Estimate, Line, norms
-from cortado.study.experiment import Kind, Progress, SceneSettings, Several
-from cortado.study.shades import shades
-from cortado.study.starts import perturbed, side_by_side
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Several
+from cortado.study.palette import palette
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def draw(table: Table, settings: StepSizeSettings) -> Figure:
     sizes, errors, law = figure.subplots(1, 3)
     figure.suptitle(settings.title)
     horizons, differences = table.values("horizon"), table.values("difference")
-    for difference, shade in zip(differences, shades(len(differences)), strict=True):
+    for difference, shade in zip(differences, palette(len(differences)), strict=True):
         found = [_mean(table.where(difference=difference, horizon=horizon)["size"]) for horizon in horizons]
         sizes.semilogy(horizons, found, "o-", color=shade, label=f"step {difference:.0e}", **THIN)
         rows = table.where(difference=difference)
@@ -101,7 +101,7 @@ def draw(table: Table, settings: StepSizeSettings) -> Figure:
     sizes.semilogy(horizons, exact, color=INK, label="exact", **DASHED)
     sizes.set(title="Size over the horizon", xlabel="steps", ylabel="|dx / dg| [s²]")
     sizes.legend(fontsize=8)
-    for horizon, shade in zip(horizons, shades(len(horizons)), strict=True):
+    for horizon, shade in zip(horizons, palette(len(horizons)), strict=True):
         values = [_mean(table.where(difference=difference, horizon=horizon)["error"]) for difference in differences]
         errors.loglog(differences, values, "o-", color=shade, label=f"{horizon} steps", **THIN)
     errors.axhline(AGREES, **DASHED, color=FAINT)
@@ -169,4 +169,4 @@ def _mean(values: np.ndarray) -> float:
     return float(np.exp(np.log(np.maximum(values, 1e-300)).mean()))
 
 
-STEP_SIZE = Kind("step_size", StepSizeSettings, measure, draw, verdict)
+STEP_SIZE = ExperimentType("step_size", StepSizeSettings, measure, draw, verdict)

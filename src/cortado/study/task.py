@@ -16,7 +16,7 @@ from cortado.losses.image_losses import psnr
 from cortado.optimisation.optimise import Record, optimise
 from cortado.scene.fields import Choice, Text
 from cortado.study.canvas import blank
-from cortado.study.experiment import DeviceSettings, Kind, Progress, Several
+from cortado.study.experiment import DeviceSettings, ExperimentType, Progress, Several
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -140,4 +140,4 @@ def verdict(table: Table, settings: TaskSettings) -> list[str]:
     return found
 
 
-TASK = Kind("task", TaskSettings, measure, draw, verdict)
+TASK = ExperimentType("task", TaskSettings, measure, draw, verdict)

@@ -17,10 +17,10 @@ from cortado.problem import Problem
 from cortado.scene.fields import Count, Quantity
 from cortado.simulation import Simulation
 from cortado.study.canvas import blank
+from cortado.study.ensembles import perturbed
 from cortado.study.estimates import Estimate, growth_rate
-from cortado.study.experiment import DeviceSettings, Kind, Progress, SceneSettings, Several
+from cortado.study.experiment import DeviceSettings, ExperimentType, Progress, SceneSettings, Several
 from cortado.study.one_kernel_loops import OneKernelTape
-from cortado.study.starts import perturbed
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -152,4 +152,4 @@ def _mean(values: np.ndarray) -> float:
     return float(np.exp(np.log(np.maximum(values, 1e-300)).mean()))
 
 
-WRONG_ADJOINTS = Kind("wrong_adjoints", WrongAdjointsSettings, measure, draw, verdict)
+WRONG_ADJOINTS = ExperimentType("wrong_adjoints", WrongAdjointsSettings, measure, draw, verdict)

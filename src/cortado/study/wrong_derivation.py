@@ -15,9 +15,9 @@ from cortado.figures.canvas import DASHED, INK, PALETTE
 from cortado.reference import History, Simulation
 from cortado.scene.fields import Components, Count, Quantity
 from cortado.study.canvas import blank
+from cortado.study.ensembles import perturbed, side_by_side
 from cortado.study.estimates import Estimate, growth_rate, norms
-from cortado.study.experiment import Kind, Progress, SceneSettings
-from cortado.study.starts import perturbed, side_by_side
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -174,4 +174,4 @@ def _percent(found: Estimate) -> str:
     return f"{Estimate(100.0 * found.value, 100.0 * found.error)} %"
 
 
-WRONG_DERIVATION = Kind("wrong_derivation", WrongDerivationSettings, measure, draw, verdict)
+WRONG_DERIVATION = ExperimentType("wrong_derivation", WrongDerivationSettings, measure, draw, verdict)
