@@ -156,9 +156,9 @@ class ParameterSpace:
         if not values.keys().isdisjoint(("mass_fractions", "rest_density")):
             bar = parameters["reference_density"].numpy().astype(np.float64)
             bars = reference_density_adjoint(*self._composition(values), bar)
-            for name, share in zip(("mass_fractions", "rest_density"), bars, strict=True):
+            for name, own_bar in zip(("mass_fractions", "rest_density"), bars, strict=True):
                 if name in found:
-                    found[name] = found[name] + share
+                    found[name] = found[name] + own_bar
         return {name: found[name].reshape(values[name].shape) for name in values if name in found}
 
     def _check(self, values: Arrays) -> None:

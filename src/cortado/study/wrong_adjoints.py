@@ -26,7 +26,7 @@ from cortado.study.tables import Table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-RIGHT, LINEAR, CLAMP, WALLS = "sums in functions", "linear after the loop", "clamp after it", "wall yield after it"
+RIGHT, LINEAR, CLAMP, WALLS = "sums in functions", "linear after the loop", "clamp after it", "wall relaxation after it"
 WAYS: dict[str, gradients.GradientEstimator] = {
     RIGHT: gradients.Tape(),
     LINEAR: OneKernelTape(("density", "force")),
