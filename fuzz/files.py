@@ -36,7 +36,7 @@ def prepare(folder: Path) -> list[Outcome]:
     """One good file for every reader."""
     block = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "water"}
     (folder / "scene.toml").write_text(to_toml({**PLANE, "fluid": [block]}))
-    (folder / "task.toml").write_text(to_toml(bases.tasks()["cloud_search"]))
+    (folder / "task.toml").write_text(to_toml(bases.tasks()["ensemble_search"]))
     experiment = (bases.ROOT / "experiments" / "lyapunov.toml").read_text()
     scene = bases.ROOT / "experiments" / "scenes" / "splash.toml"
     (folder / "experiment.toml").write_text(experiment.replace("scenes/splash.toml", str(scene)))

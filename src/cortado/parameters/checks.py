@@ -29,8 +29,8 @@ def check_sizes(values: Arrays, precision: Precision) -> None:
 
 
 def check_places(values: Arrays, scene: Scene, free: int) -> None:
-    """Fluid starts inside of the container, and a nozzle stays there; raises `InputError`. Only the first ``free``
-    particles do not wait in the nozzle, where they may be outside."""
+    """Fluid starts inside of the container, and the opening of the emitter stays there; raises `InputError`. Only the
+    first ``free`` particles do not wait in the emitter, where they may be outside."""
     spacing = scene.discretisation.spacing
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
@@ -48,7 +48,7 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
 
 def check_state(state: RestartState, scene: Scene, shape: tuple[int, int], free: int) -> None:
     """A state to go on from is one of the scene, with positions of a shape (n, d); raises `InputError`. Only the first
-    ``free`` particles never waited in the nozzle."""
+    ``free`` particles never waited in the emitter."""
     if not isinstance(state, RestartState):
         raise InputError(f"state is {shown(state)}, but must be a RestartState, such as trajectory.last_state.")
     parts: dict[str, tuple[Any, tuple[int, ...]]] = {

@@ -47,7 +47,7 @@ class Simulated(Source, Protocol):
 
     @property
     def free_particles(self) -> int:
-        """How many particles, the first ones, do not wait in a nozzle."""
+        """How many particles, the first ones, do not wait in an emitter."""
 
     def substeps(self, time_step: NDArray, mobility: NDArray, interface_width: NDArray, rest_density: NDArray) -> int:
         """Explicit steps of diffusion within a time step that are stable with these parameters."""
@@ -112,13 +112,13 @@ class ParameterSpace:
         """Whether a state is one of this simulation, and ``values`` go with it; raises `InputError`."""
         for name in (*STATE, "rest_density"):
             if name in values:
-                raise InputError(f"control {name} is given, but must be left out with a state, which has its own.")
+                raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
         check_state(state, self._simulation.scene, self._simulation.positions.shape, self._simulation.free_particles)
         if self._simulation.scene.emitter is not None:
             for name in ("time_step", "flow_rate"):
                 before, now = getattr(state.constants, name), float(values.get(name, self._scene[name]))
                 if now != before:
-                    wanted = f"{before} with this state, whose nozzle ran with that"
+                    wanted = f"{before} with this state, whose emitter ran with that"
                     raise InputError(f"{name} is {now:g}, but must be {wanted}.")
 
     @WARP

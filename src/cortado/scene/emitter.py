@@ -1,4 +1,4 @@
-"""Fluid that comes out of a nozzle: a column of particles that waits upstream of an opening."""
+"""An emitter: a column of particles that waits upstream of an opening, and comes out of it with one speed."""
 
 import math
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class EmitterSample:
 
 
 class Emitter(Body):
-    """A nozzle: a disc, or a line in 2-D, out of which a column of fluid comes with one speed."""
+    """An opening, a disc or in 2-D a line, out of which a column of fluid comes with one speed."""
 
     outlet: Annotated[tuple[float, ...], Components(LENGTH)]
     """(d,) centre of the opening [m]"""

@@ -108,7 +108,7 @@ class SceneTables(Table):
     fluid: Annotated[tuple[AnyFluid, ...], Tables("fluid")]
     """The bodies of fluid; particles come in this order."""
     emitter: Emitter | None = None
-    """Fluid that comes out of a nozzle; its particles come after those of all fluids."""
+    """An emitter, out of which fluid comes; its particles come after those of all fluids."""
     container: AnyContainer = Field(default=NoContainer(), validate_default=True)
     """What holds the fluid."""
     mixture: Mixture = Mixture()

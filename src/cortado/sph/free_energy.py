@@ -1,6 +1,6 @@
 """Helmholtz free energies F(c) = alpha f(c) of a mixture, and how mobile its phases are (Yang et al. 2015).
 
-    double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: phases part, into pure ones (Lee and Kim 2015)
+    double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: phases separate, into pure ones (Lee and Kim 2015)
     miscible     f = sum_k c_k^2 / 2: phases mix, by Fick's law
 
     constant     m = 1

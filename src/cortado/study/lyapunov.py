@@ -117,7 +117,7 @@ def verdict(table: Table, settings: LyapunovSettings) -> list[str]:
     holds = tangents.value > 3.0 * tangents.error and agreeing > len(ratios) / 2
     sentences.append(
         f"Chaos: {'true' if holds else 'not confirmed'}: the exact derivative grows by {tangents} a step, at which "
-        f"neighbouring runs part that no derivative was taken of ({pairs})."
+        f"neighbouring runs diverge of which no derivative was taken ({pairs})."
     )
     return sentences
 

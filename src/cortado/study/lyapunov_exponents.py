@@ -163,7 +163,7 @@ def _growth(
 def _parting(
     settings: LyapunovSettings, simulation: Simulation, start: np.ndarray, first: int, last: int, seed: int
 ) -> float:
-    """The rate at which two runs part, as long as they are close; nan where that is too short."""
+    """The rate at which two runs diverge, as long as they are close; nan where that is too short."""
     offset = settings.separation * np.random.default_rng((seed, 2)).normal(size=start.shape)
     one, other = (simulation.run(last, {"initial_positions": at}) for at in (start, start + offset))
     apart = norms(other.positions - one.positions)

@@ -1,7 +1,7 @@
 """How long a precision lasts: the tangent of each one's own run, against that of the most precise one.
 
 If errors of rounding were amplified by the arithmetic of the derivative, a tangent in low precision along a given
-trajectory would leave the exact one. If it is the trajectories that part, it does so only along its own, and after a
+trajectory would leave the exact one. If it is the trajectories that diverge, it does so only along its own, and after a
 time of (digits of the precision) / (growth rate): the first is tried too, by taking every step in low precision from
 the state of the most precise run.
 """
