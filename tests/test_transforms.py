@@ -153,7 +153,7 @@ def test_without_coordinates_it_is_the_problem_itself(problem):
 
 
 @pytest.mark.parametrize("estimator", [gradients.FrozenGeometry(), gradients.AdjointViscosity(0.2, order=2)], ids=repr)
-def test_policies_go_back_to_coordinates(problem, estimator):
+def test_estimators_go_back_to_coordinates(problem, estimator):
     search = Transformed(problem, COORDINATES)
     u = search.coordinate(start_of(problem))
     found, plain = search.estimate(u, estimator), problem.estimate(search.parameters(u), estimator)

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TAPE, ADJOINT = "autograd (Warp's tape)", "adjoint by gathers"
-AGREEMENT = 0.1
-"""A difference is taken for the gradient as long as it is no farther from it, relative."""
+SAME = 0.1
+"""Relative distance up to which a difference counts as equal to the gradient."""
 
 
 class ImageHorizon(DeviceSettings, SceneSettings):
@@ -35,7 +35,7 @@ class ImageHorizon(DeviceSettings, SceneSettings):
     differences: Annotated[tuple[float, ...], Several(Quantity("m/s2", above=0.0))]
     """Steps of finite differences [m / s2]."""
     precision: Annotated[str, Choice(("float32", "float64"))] = "float32"
-    """Of the simulation."""
+    """Precision of the simulation."""
 
 
 def measure(settings: ImageHorizon, progress: Progress) -> Table:
@@ -101,12 +101,12 @@ def verdict(table: Table, settings: ImageHorizon) -> list[str]:
     norms = np.linalg.norm(exact, axis=1)
     off = np.linalg.norm(tape - exact, axis=1) / norms
     fine = _gradients(table, _name(min(settings.differences)))
-    near = np.linalg.norm(exact - fine, axis=1) <= AGREEMENT * norms
+    near = np.linalg.norm(exact - fine, axis=1) <= SAME * norms
     left = int(horizons[~near][0]) if not near.all() else None
     sentences = [
         f"Autograd and the adjoint by gathers, which share no code, agree to {np.median(off):.1e} (median; at most "
         f"{off.max():.1e}) in {settings.precision}: what grows is no fault of automatic differentiation.",
-        f"Finite differences of step {min(settings.differences):g} m/s² are within {AGREEMENT:.0%} of the gradient "
+        f"Finite differences of step {min(settings.differences):g} m/s² are within {SAME:.0%} of the gradient "
         + (f"until they leave it at {left} steps." if left else f"at all horizons up to {horizons[-1]} steps."),
     ]
     if left:

@@ -1,4 +1,4 @@
-"""The folder of an experiment: its numbers, its picture, and what they say."""
+"""The folder of an experiment: its numbers, its picture and its verdict."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Results:
         return self._show(experiment, table, time.perf_counter() - started)
 
     def redraw(self, experiment: Experiment) -> list[str]:
-        """Draw and judge the numbers that are there; returns the verdict."""
+        """Draw and judge numbers that were measured before; returns the verdict."""
         return self._show(experiment, Table.read_csv(self.data), self._recorded().get("seconds"))
 
     def has(self, experiment: Experiment) -> bool:
@@ -43,7 +43,7 @@ class Results:
         return {key: recorded.get(key) for key in ("kind", "settings")} == _identity(experiment)
 
     def verdict(self) -> list[str]:
-        """The sentences of what is there."""
+        """The verdict that was written before."""
         return self._recorded()["verdict"]
 
     def _show(self, experiment: Experiment, table: Table, seconds: float | None) -> list[str]:
