@@ -52,13 +52,13 @@ class TensionFunctions:
     """Its derivative along a vector, which is symmetric."""
     pull: Any
     """s (1 - s)^2"""
-    pull_slope: Any
+    pull_derivative: Any
     """Its derivative by |x|^2 / 2, times h^2."""
     stress: Any
     """S(n) x"""
     stress_change: Any
     """Its derivative along a change of n."""
-    stress_slope: Any
+    stress_derivative: Any
     """The derivative of w . S(n) x by n."""
 
 
@@ -85,7 +85,7 @@ def tension_functions(discretisation: Discretisation) -> TensionFunctions:
         return s * d * d
 
     @wp.func
-    def pull_slope(x: vector, h2: real) -> real:
+    def pull_derivative(x: vector, h2: real) -> real:
         s = wp.dot(x, x) / h2
         d = wp.max(one - s, real(0.0))
         return two * d * (d - two * s)
@@ -101,12 +101,12 @@ def tension_functions(discretisation: Discretisation) -> TensionFunctions:
         return turn / wp.sqrt(size) - (wp.dot(n, n_dot) / size) * stress(n, x)
 
     @wp.func
-    def stress_slope(n: vector, w: vector, x: vector) -> vector:
+    def stress_derivative(n: vector, w: vector, x: vector) -> vector:
         size = one + wp.dot(n, n)
         turn = two * wp.dot(w, x) * n - part * (wp.dot(n, w) * x + wp.dot(n, x) * w)
         return turn / wp.sqrt(size) - (wp.dot(w, stress(n, x)) / size) * n
 
-    return TensionFunctions(arrow, arrow_change, pull, pull_slope, stress, stress_change, stress_slope)
+    return TensionFunctions(arrow, arrow_change, pull, pull_derivative, stress, stress_change, stress_derivative)
 
 
 @cache
@@ -189,8 +189,8 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair, functions = pair_functions(discretisation), tension_functions(discretisation)
     separation, vectors, numbers = pair.separation, pair.vectors, pair.numbers
-    pull, pull_slope = functions.pull, functions.pull_slope
-    stress, stress_change, stress_slope = functions.stress, functions.stress_change, functions.stress_slope
+    pull, pull_derivative = functions.pull, functions.pull_derivative
+    stress, stress_change, stress_derivative = functions.stress, functions.stress_change, functions.stress_derivative
 
     @wp.func
     def pulls(i: int, x: wp.array(dtype=vector), normals: wp.array(dtype=vector), s: neighbourhood) -> vector:
@@ -224,8 +224,8 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
                 j = s.neighbours[k + u, i]
                 x_ij = separation(x_i, x[j], s)
                 x_dot_ij = x_dot[i] - x_dot[j]
-                slope = pull_slope(x_ij, h2) * wp.dot(x_ij, x_dot_ij) / h2
-                total += slope * (stress(n_i, x_ij) + stress(normals[j], x_ij))
+                pull_dot = pull_derivative(x_ij, h2) * wp.dot(x_ij, x_dot_ij) / h2
+                total += pull_dot * (stress(n_i, x_ij) + stress(normals[j], x_ij))
                 turn = stress_change(n_i, normals_dot[i], x_ij) + stress_change(normals[j], normals_dot[j], x_ij)
                 total += pull(x_ij, h2) * (turn + stress(n_i, x_dot_ij) + stress(normals[j], x_dot_ij))
         return total
@@ -305,8 +305,8 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
                 g = pull(x_ij, h2)
                 total += g * force
                 x_sum += g * (stress(n_i, w_ij) + stress(n_j[u], w_ij))
-                x_sum += (pull_slope(x_ij, h2) * wp.dot(force, w_ij) / h2) * x_ij
-                n_sum += g * stress_slope(n_i, w_ij, x_ij)
+                x_sum += (pull_derivative(x_ij, h2) * wp.dot(force, w_ij) / h2) * x_ij
+                n_sum += g * stress_derivative(n_i, w_ij, x_ij)
         sigma = surface_tension[0]
         work = scale * wp.dot(total, w_i)
         x_bar[i] = x_bar[i] - (scale * sigma) * x_sum
