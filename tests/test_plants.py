@@ -22,7 +22,7 @@ ROOT = Path(cortado.__file__).parent
 UNNAMED = {
     "sph.integration": {"integration_kernels.collect_masses"},
     "sph.nozzle_kernels": {"nozzle_kernels.collect"},
-    "sph.surface_tension": {"tension_functions.stress_derivative"},
+    "sph.surface_stress": {"tension_functions.stress_derivative"},
 }
 """Functions of adjoints, by module, whose names do not say so."""
 SHARED = {
@@ -34,7 +34,7 @@ SHARED = {
     "render.interpolation": {"interpolation_functions.trilinear_weight"},
     "solvers.pcisph.density_ratio_relaxation": {"density_ratio_kernels.excess_derivative"},
     "sph.free_energy": {"_double_well.hessian_product", "_miscible.hessian_product", "_degenerate.gradient"},
-    "sph.surface_tension": {
+    "sph.surface_stress": {
         "tension_functions.arrow_change",
         "tension_functions.pull_derivative",
         "normal_kernels.change",
