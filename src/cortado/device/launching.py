@@ -8,6 +8,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.lanes import lanes_of
 from cortado.device.precision import Precision
 from cortado.device.reduction import add_kernel, sum_and_maximum_kernel, sum_kernel
 from cortado.device.threads import MOST_CORES, WARP, helpers
@@ -94,7 +95,8 @@ class KernelLauncher:
         if sums and not self.capturable and kernel in self._compiled:
             self._launch_parts(kernel, inputs)
             return
-        wp.launch(kernel, threads or self.particles, inputs=inputs, device=self.device, record_tape=self._record_tape)
+        count = threads or self.particles * lanes_of(kernel)
+        wp.launch(kernel, count, inputs=inputs, device=self.device, record_tape=self._record_tape)
         self._compiled.add(kernel)  # only now: an interrupted launch has compiled nothing
 
     def _launch_parts(self, kernel: wp.Kernel, inputs: Sequence[Any]) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.cells import CellSort, Grid, cell_functions, cell_grid_type
+from cortado.device.lanes import lane_functions
 from cortado.device.launching import MOST_PARTS, KernelLauncher
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
@@ -28,6 +29,9 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
     cells = cell_functions(precision)
     wrap, cell_of, below, above = cells.wrap, cells.cell_of, cells.below, cells.above
     separation = pair_functions(discretisation).separation
+    LANES = discretisation.lanes
+    lanes = lane_functions(precision, LANES)
+    lane, vote, ones, before = lanes.lane, lanes.vote, lanes.ones, lanes.before
 
     @wp.func
     def scan(
@@ -44,12 +48,17 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
         capacity = s.neighbours.shape[0]
         total = found
         limit = s.reach * s.reach
-        for j in range(first, last):
-            x_ij = separation(x_i, positions[j], s)
-            if wp.dot(x_ij, x_ij) < limit and j != own:
-                if total < capacity:
-                    s.neighbours[total, i] = j
-                total = total + 1
+        for candidate in range(first, last, LANES):
+            j = candidate + lane()
+            near = False
+            if j < last and j != own:
+                x_ij = separation(x_i, positions[j], s)
+                near = wp.dot(x_ij, x_ij) < limit
+            votes = vote(near)
+            place = total + before(votes)
+            if near and place < capacity:
+                s.neighbours[place, i] = j
+            total = total + ones(votes)
         return total
 
     @wp.func
@@ -75,7 +84,7 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
                 total = scan(i, own, grid.starts[cell], grid.starts[cell + 1], total, x_i, positions, s)
         return total
 
-    @wp.kernel(module=discretisation.module(False, "neighbours"), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, "neighbours", LANES), enable_backward=False)
     def fill(
         s: neighbourhood,
         grid: grid_type,
@@ -88,7 +97,7 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
         needed: wp.array(dtype=wp.int32),
     ):
         """``needed``, for each range, becomes the longest list, also where that is more than there is room for."""
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         x_i = x[i]
         c = cell_of(x_i, grid)
         n_y = grid.shape[1]
@@ -100,16 +109,19 @@ def _fill_kernel(discretisation: Discretisation) -> Any:
                 row = (wrap(c[2] + o_z, n_z) * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]
                 found = scan_row(i, i, row, c[0], found, x_i, x, grid, s)
         filled = (found + wp.static(UNROLL - 1)) // wp.static(UNROLL) * wp.static(UNROLL)
-        for k in range(found, wp.min(filled, capacity)):
+        for k in range(found + lane(), wp.min(filled, capacity), LANES):
             s.neighbours[k, i] = i
-        filling[i] = filled - found
+        to_fill = filled - found
         found = filled
-        fluid_count[i] = wp.min(found, capacity)
         if s.wall_positions.shape[0] > 0:
             for o_z in range(below(n_z), above(n_z)):
                 for o_y in range(below(n_y), above(n_y)):
                     row = (wrap(c[2] + o_z, n_z) * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]
                     found = scan_row(i, -1, row, c[0], found, x_i, s.wall_positions, wall_grid, s)
+        if lane() > 0:
+            return
+        filling[i] = to_fill
+        fluid_count[i] = wp.min(filled, capacity)
         count[i] = wp.min(found, capacity)
         if found > needed[s.part]:
             wp.atomic_max(needed, s.part, found)

@@ -13,6 +13,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.kernels import Kernels
+from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 
@@ -35,49 +36,52 @@ def density_sums(discretisation: Discretisation) -> DensitySums:
     pair = pair_functions(discretisation)
     separation, weight, gradient = pair.separation, pair.weight, pair.gradient
     vectors, numbers = pair.vectors, pair.numbers
+    LANES = discretisation.lanes
+    lanes = lane_functions(discretisation.precision, LANES)
+    lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
 
     @wp.func
     def weights(i: int, x: wp.array(dtype=vector), s: neighbourhood) -> real:
         x_i = x[i]
         total = real(0.0)
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             for u in range(UNROLL):
                 total += weight(separation(x_i, x_j[u], s), s)
-        for k in range(s.fluid_count[i], s.count[i]):
+        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
             b = s.neighbours[k, i]
             total += s.wall_weights[b] * weight(separation(x_i, s.wall_positions[b], s), s)
-        return total
+        return add_up(total)
 
     @wp.func
     def weights_tangent(i: int, x: wp.array(dtype=vector), x_dot: wp.array(dtype=vector), s: neighbourhood) -> real:
         x_i = x[i]
         x_dot_i = x_dot[i]
         total = real(0.0)
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             for u in range(UNROLL):
                 j = s.neighbours[k + u, i]
                 total += wp.dot(gradient(separation(x_i, x[j], s), s), x_dot_i - x_dot[j])
-        for k in range(s.fluid_count[i], s.count[i]):
+        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
             b = s.neighbours[k, i]
             g_ib = gradient(separation(x_i, s.wall_positions[b], s), s)
             total += s.wall_weights[b] * wp.dot(g_ib, x_dot_i)
-        return total
+        return add_up(total)
 
     @wp.func
     def weights_adjoint(i: int, x: wp.array(dtype=vector), r: wp.array(dtype=real), s: neighbourhood) -> vector:
         x_i = x[i]
         r_i = r[i]
         total = vector()
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             r_j = numbers(r, k, i, s)
             for u in range(UNROLL):
                 total += (r_i + r_j[u]) * gradient(separation(x_i, x_j[u], s), s)
-        for k in range(s.fluid_count[i], s.count[i]):
+        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
             b = s.neighbours[k, i]
             total += (s.wall_weights[b] * r_i) * gradient(separation(x_i, s.wall_positions[b], s), s)
-        return total
+        return add_up_vectors(total)
 
     return DensitySums(weights=weights, weights_tangent=weights_tangent, weights_adjoint=weights_adjoint)
 
@@ -89,19 +93,23 @@ def density_kernels(discretisation: Discretisation) -> Kernels:
     neighbourhood = neighbourhood_type(discretisation.precision)
     sums = density_sums(discretisation)
     weights, weights_tangent, weights_adjoint = sums.weights, sums.weights_tangent, sums.weights_adjoint
+    LANES = discretisation.lanes
+    lane = lane_functions(discretisation.precision, LANES).lane
 
-    @wp.kernel(module=discretisation.module(True))
+    @wp.kernel(module=discretisation.module(True, lanes=LANES))
     def density(
         s: neighbourhood,
         x: wp.array(dtype=vector),
         # out
         n: wp.array(dtype=real),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = weights(i, x, s)
+        if lane() > 0:
+            return
         n[i] = s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
     def density_tangent(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -109,10 +117,13 @@ def density_kernels(discretisation: Discretisation) -> Kernels:
         # out
         n_dot: wp.array(dtype=real),
     ):
-        i = s.first + wp.tid()
-        n_dot[i] = s.volume * weights_tangent(i, x, x_dot, s)
+        i = s.first + wp.tid() // LANES
+        total = weights_tangent(i, x, x_dot, s)
+        if lane() > 0:
+            return
+        n_dot[i] = s.volume * total
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
     def density_adjoint(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -120,7 +131,10 @@ def density_kernels(discretisation: Discretisation) -> Kernels:
         # in and out
         x_bar: wp.array(dtype=vector),
     ):
-        i = s.first + wp.tid()
-        x_bar[i] = x_bar[i] + s.volume * weights_adjoint(i, x, n_bar, s)
+        i = s.first + wp.tid() // LANES
+        total = weights_adjoint(i, x, n_bar, s)
+        if lane() > 0:
+            return
+        x_bar[i] = x_bar[i] + s.volume * total
 
     return Kernels(density, density_tangent, density_adjoint)

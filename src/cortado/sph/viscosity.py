@@ -17,6 +17,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.kernels import Kernels
+from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 from cortado.sph.pair_forces import PairForm, laminar, pairwise
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
@@ -31,6 +32,9 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
     separation, vectors, numbers = pair.separation, pair.vectors, pair.numbers
     phi = form(discretisation)
     phi_force, phi_tangent, phi_adjoint_x, phi_adjoint_v = phi.force, phi.tangent, phi.adjoint_x, phi.adjoint_v
+    LANES = discretisation.lanes
+    lanes = lane_functions(discretisation.precision, LANES)
+    lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
     name = form.__name__  # a module for each form: their functions have the same names
 
     @wp.func
@@ -67,7 +71,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         v_i = v[i]
         mu_i = mu[i]
         total = vector()
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             v_j = vectors(v, k, i, s)
             n_j = numbers(n, k, i, s)
@@ -76,11 +80,11 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
                 weight = pair_viscosity(mu_i, mu_j[u]) * s.volume / n_j[u]
                 total += weight * phi_force(separation(x_i, x_j[u], s), v_i - v_j[u], s)
         if friction != real(0.0):
-            for k in range(s.fluid_count[i], s.count[i]):
+            for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
                 b = s.neighbours[k, i]
                 x_ib = separation(x_i, s.wall_positions[b], s)
                 total += (mu_i * friction * s.volume * s.wall_weights[b]) * phi_force(x_ib, v_i, s)
-        return total
+        return add_up_vectors(total)
 
     @wp.func
     def force_sum_tangent(
@@ -103,7 +107,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         v_dot_i = v_dot[i]
         mu_dot_i = mu_dot[i]
         total = vector()
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             for u in range(UNROLL):
                 j = s.neighbours[k + u, i]
                 x_ij = separation(x_i, x[j], s)
@@ -115,15 +119,15 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
                 total += volume_j * (mu_dot_ij - mu_ij * n_dot[j] / n[j]) * phi_force(x_ij, v_ij, s)
                 total += (volume_j * mu_ij) * phi_tangent(x_ij, v_ij, x_dot_i - x_dot[j], v_dot_i - v_dot[j], s)
         if friction != real(0.0):
-            for k in range(s.fluid_count[i], s.count[i]):
+            for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
                 b = s.neighbours[k, i]
                 x_ib = separation(x_i, s.wall_positions[b], s)
                 wall_volume = friction * s.volume * s.wall_weights[b]
                 total += (wall_volume * mu_dot_i) * phi_force(x_ib, v_i, s)
                 total += (wall_volume * mu_i) * phi_tangent(x_ib, v_i, x_dot_i, v_dot_i, s)
-        return total
+        return add_up_vectors(total)
 
-    @wp.kernel(module=discretisation.module(True, name))
+    @wp.kernel(module=discretisation.module(True, name, LANES))
     def viscosity(
         s: neighbourhood,
         kappa: real,
@@ -137,11 +141,13 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         # out
         acceleration: wp.array(dtype=vector),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = force_sum(i, friction, x, v, n, mu, s)
+        if lane() > 0:
+            return
         acceleration[i] = acceleration_in[i] + (kappa / (m[i] * n[i])) * total
 
-    @wp.kernel(module=discretisation.module(False, name), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, name, LANES), enable_backward=False)
     def viscosity_tangent(
         s: neighbourhood,
         kappa: real,
@@ -160,14 +166,16 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         # out
         acceleration_dot: wp.array(dtype=vector),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = force_sum(i, friction, x, v, n, mu, s)
         total_dot = force_sum_tangent(i, friction, x, x_dot, v, v_dot, n, n_dot, mu, mu_dot, s)
+        if lane() > 0:
+            return
         factor = kappa / (m[i] * n[i])
         change = m_dot[i] / m[i] + n_dot[i] / n[i]
         acceleration_dot[i] = acceleration_in_dot[i] + factor * (total_dot - change * total)
 
-    @wp.kernel(module=discretisation.module(False, name), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, name, LANES), enable_backward=False)
     def viscosity_adjoint(
         s: neighbourhood,
         kappa: real,
@@ -186,7 +194,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         mu_bar: wp.array(dtype=real),
     ):
         """Gathers alone: the pair (i, j) adds to i what it adds to j, seen from i."""
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         x_i = x[i]
         v_i = v[i]
         mu_i = mu[i]
@@ -196,7 +204,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         work = real(0.0)
         own_work = real(0.0)
         mu_work = real(0.0)
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             v_j = vectors(v, k, i, s)
             n_j = numbers(n, k, i, s)
@@ -217,7 +225,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
                 own_work += weight * wp.dot(force, w_i)
                 mu_work += volume_j * pair_viscosity_derivative(mu_i, mu_j[u]) * force_work
         if friction != real(0.0):
-            for k in range(s.fluid_count[i], s.count[i]):
+            for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
                 b = s.neighbours[k, i]
                 x_ib = separation(x_i, s.wall_positions[b], s)
                 wall_volume = friction * s.volume * s.wall_weights[b]
@@ -227,6 +235,13 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
                 work += mu_i * wall_work
                 own_work += mu_i * wall_work
                 mu_work += wall_work
+        x_sum = add_up_vectors(x_sum)
+        v_sum = add_up_vectors(v_sum)
+        work = add_up(work)
+        own_work = add_up(own_work)
+        mu_work = add_up(mu_work)
+        if lane() > 0:
+            return
         factor = kappa / n[i]
         x_bar[i] = x_bar[i] + factor * x_sum
         v_bar[i] = v_bar[i] + factor * v_sum

@@ -17,6 +17,7 @@ from functools import cache
 import warp as wp
 
 from cortado.device.kernels import Kernels
+from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 from cortado.sph.density import density_sums
 from cortado.sph.integration import prediction_share
@@ -34,8 +35,10 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     sums = density_sums(discretisation)
     weights, weights_tangent, weights_adjoint = sums.weights, sums.weights_tangent, sums.weights_adjoint
     adjoin_prediction = prediction_share(discretisation.precision)
+    LANES = discretisation.lanes
+    lane = lane_functions(discretisation.precision, LANES).lane
 
-    @wp.kernel(module=discretisation.module(True))
+    @wp.kernel(module=discretisation.module(True, lanes=LANES))
     def pressure(
         s: neighbourhood,
         stiffness: real,
@@ -52,8 +55,10 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         error: wp.array(dtype=pair_of),
     ):
         """``error``: the compression (rho* - rho_0)+ / rho_0 of a particle, twice (for a sum and a maximum)."""
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = weights(i, x_star, s)
+        if lane() > 0:
+            return
         excess = m[i] * s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - rho_0[i]
         delta = y[i] * stiffness / (time_step[0] * time_step[0])
         p_i = p_in[i] + delta * excess
@@ -64,7 +69,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         c[i] = p_i / (n[i] * n[i])
         error[i] = pair_of(compression, compression)
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
     def pressure_tangent(
         s: neighbourhood,
         stiffness: real,
@@ -87,8 +92,10 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         p_out_dot: wp.array(dtype=real),
         c_dot: wp.array(dtype=real),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = weights_tangent(i, x_star, x_star_dot, s)
+        if lane() > 0:
+            return
         p_i = p_out[i]
         p_dot_i = real(0.0)
         if p_i > real(0.0):
@@ -101,7 +108,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         p_out_dot[i] = p_dot_i
         c_dot[i] = (p_dot_i - real(2.0) * p_i / n_i * n_dot[i]) / (n_i * n_i)
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
     def pressure_adjoint(
         s: neighbourhood,
         time_step: wp.array(dtype=real),
@@ -118,8 +125,10 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         push_bar: wp.array(dtype=vector),
     ):
         """From the adjoint r of n* to that of x*, and on to what x* was predicted from."""
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         x_star_bar = s.volume * weights_adjoint(i, x_star, r, s)
+        if lane() > 0:
+            return
         dt = time_step[0]
         speed_bar = dt * x_star_bar
         x_bar[i] = x_bar[i] + x_star_bar
@@ -138,21 +147,24 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     pair = pair_functions(discretisation)
     separation, gradient, hessian_product = pair.separation, pair.gradient, pair.hessian_product
     vectors, numbers = pair.vectors, pair.numbers
+    LANES = discretisation.lanes
+    lanes = lane_functions(discretisation.precision, LANES)
+    lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
 
     @wp.func
     def force_sum(i: int, x: wp.array(dtype=vector), c: wp.array(dtype=real), s: neighbourhood) -> vector:
         x_i = x[i]
         c_i = c[i]
         total = vector()
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             c_j = numbers(c, k, i, s)
             for u in range(UNROLL):
                 total += (c_i + c_j[u]) * gradient(separation(x_i, x_j[u], s), s)
-        for k in range(s.fluid_count[i], s.count[i]):
+        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
             b = s.neighbours[k, i]
             total += (s.wall_weights[b] * c_i) * gradient(separation(x_i, s.wall_positions[b], s), s)
-        return total
+        return add_up_vectors(total)
 
     @wp.func
     def force_sum_tangent(
@@ -168,20 +180,20 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         c_i = c[i]
         c_dot_i = c_dot[i]
         total = vector()
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             for u in range(UNROLL):
                 j = s.neighbours[k + u, i]
                 x_ij = separation(x_i, x[j], s)
                 total += (c_dot_i + c_dot[j]) * gradient(x_ij, s)
                 total += (c_i + c[j]) * hessian_product(x_ij, x_dot_i - x_dot[j], s)
-        for k in range(s.fluid_count[i], s.count[i]):
+        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
             b = s.neighbours[k, i]
             x_ib = separation(x_i, s.wall_positions[b], s)
             total += (s.wall_weights[b] * c_dot_i) * gradient(x_ib, s)
             total += (s.wall_weights[b] * c_i) * hessian_product(x_ib, x_dot_i, s)
-        return total
+        return add_up_vectors(total)
 
-    @wp.kernel(module=discretisation.module(True))
+    @wp.kernel(module=discretisation.module(True, lanes=LANES))
     def pressure_force(
         s: neighbourhood,
         time_step: wp.array(dtype=real),
@@ -194,15 +206,17 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         x_star: wp.array(dtype=vector),
         v_star: wp.array(dtype=vector),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = force_sum(i, x, c, s)
+        if lane() > 0:
+            return
         dt = time_step[0]
         push = (-s.volume / m[i]) * total
         velocity = v[i] + dt * (acceleration[i] + push)
         v_star[i] = velocity
         x_star[i] = x[i] + dt * velocity
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
     def pressure_force_tangent(
         s: neighbourhood,
         time_step: wp.array(dtype=real),
@@ -222,8 +236,10 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         x_star_dot: wp.array(dtype=vector),
         v_star_dot: wp.array(dtype=vector),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total_dot = force_sum_tangent(i, x, x_dot, c, c_dot, s)
+        if lane() > 0:
+            return
         dt = time_step[0]
         accelerated = (v_star[i] - v[i]) / dt
         push = accelerated - acceleration[i]
@@ -232,7 +248,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         v_star_dot[i] = velocity_dot
         x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[0] * v_star[i]
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
     def pressure_force_adjoint(
         s: neighbourhood,
         stiffness: real,
@@ -259,14 +275,14 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     ):
         """From ``push_bar``, the adjoint of the pressure acceleration over m, to those of c, p and (r) of n*: every
         sum a gather."""
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         x_i = x[i]
         c_i = c[i]
         push_bar_i = push_bar[i]
         divergence = real(0.0)
         hessian_products = vector()
         work = real(0.0)
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             c_j = numbers(c, k, i, s)
             push_bar_j = vectors(push_bar, k, i, s)
@@ -277,7 +293,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
                 divergence += wp.dot(g_ij, u_ij)
                 hessian_products += (c_i + c_j[u]) * hessian_product(x_ij, u_ij, s)
                 work += (c_i + c_j[u]) * wp.dot(g_ij, push_bar_i)
-        for k in range(s.fluid_count[i], s.count[i]):
+        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
             b = s.neighbours[k, i]
             x_ib = separation(x_i, s.wall_positions[b], s)
             weight = s.wall_weights[b]
@@ -285,6 +301,11 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
             divergence += wall_divergence
             hessian_products += (weight * c_i) * hessian_product(x_ib, push_bar_i, s)
             work += c_i * wall_divergence
+        divergence = add_up(divergence)
+        hessian_products = add_up_vectors(hessian_products)
+        work = add_up(work)
+        if lane() > 0:
+            return
         n_i = n[i]
         m_i = m[i]
         p_i = p_out[i]

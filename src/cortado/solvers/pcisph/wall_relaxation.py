@@ -17,6 +17,7 @@ from functools import cache
 import warp as wp
 
 from cortado.device.kernels import Kernels
+from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 
 
@@ -28,36 +29,42 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
     pair = pair_functions(discretisation)
     separation, gradient, hessian_product = pair.separation, pair.gradient, pair.hessian_product
 
+    LANES = discretisation.lanes
+    lanes = lane_functions(discretisation.precision, LANES)
+    lane, add_up_vectors = lanes.lane, lanes.add_up_vectors
+
     @wp.func
     def wall_gradient(i: int, x: wp.array(dtype=vector), s: neighbourhood) -> vector:
         total = vector()
-        for k in range(s.fluid_count[i], s.count[i]):
+        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
             b = s.neighbours[k, i]
             total += (s.response_scale * s.wall_weights[b]) * gradient(separation(x[i], s.wall_positions[b], s), s)
-        return total
+        return add_up_vectors(total)
 
     @wp.func
     def wall_hessian_product(i: int, x: wp.array(dtype=vector), u: vector, s: neighbourhood) -> vector:
         total = vector()
-        for k in range(s.fluid_count[i], s.count[i]):
+        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
             b = s.neighbours[k, i]
             total += (s.response_scale * s.wall_weights[b]) * hessian_product(
                 separation(x[i], s.wall_positions[b], s), u, s
             )
-        return total
+        return add_up_vectors(total)
 
-    @wp.kernel(module=discretisation.module(True))
+    @wp.kernel(module=discretisation.module(True, lanes=LANES))
     def wall_relaxation(
         s: neighbourhood,
         x: wp.array(dtype=vector),
         # out
         y: wp.array(dtype=real),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = wall_gradient(i, x, s)
+        if lane() > 0:
+            return
         y[i] = real(1.0) / (real(1.0) + wp.dot(total, total))
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
     def wall_relaxation_tangent(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -66,12 +73,14 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
         # out
         y_dot: wp.array(dtype=real),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = wall_gradient(i, x, s)
         total_dot = wall_hessian_product(i, x, x_dot[i], s)
+        if lane() > 0:
+            return
         y_dot[i] = real(-2.0) * y[i] * y[i] * wp.dot(total, total_dot)
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
     def wall_relaxation_adjoint(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -80,8 +89,11 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
         # in and out
         x_bar: wp.array(dtype=vector),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total_bar = (real(-2.0) * y_bar[i] * y[i] * y[i]) * wall_gradient(i, x, s)
-        x_bar[i] = x_bar[i] + wall_hessian_product(i, x, total_bar, s)
+        change = wall_hessian_product(i, x, total_bar, s)
+        if lane() > 0:
+            return
+        x_bar[i] = x_bar[i] + change
 
     return Kernels(wall_relaxation, wall_relaxation_tangent, wall_relaxation_adjoint)

@@ -1,0 +1,114 @@
+"""Lanes: several threads of a GPU that share a particle; each takes some of its neighbours, and sums are added up.
+
+One thread a particle leaves a large GPU empty where there are few particles. A kernel that is made for lanes has them
+side by side: thread t is lane t % L of particle t // L. A lane takes `UNROLL` neighbours at a time, and then those L
+times further down the list. What lanes have summed up is added in a butterfly of shuffles, of which every lane gets the
+same bits. On a CPU, and for Warp's tape, L is 1, and all of this is nothing.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.precision import Precision
+
+LANES = ((2_000, 16), (16_000, 8), (48_000, 4))
+"""Up to so many particles a GPU gets so many lanes for each; beyond them one. Measured on an H200."""
+
+
+_OF_MODULES: dict[str, int] = {}
+
+
+def set_lanes(module: Any, lanes: int) -> None:
+    """Make every kernel of a Warp module one of so many lanes."""
+    _OF_MODULES[module.name] = lanes
+
+
+def lanes_of(kernel: wp.Kernel) -> int:
+    """Threads that a kernel has for each particle."""
+    return _OF_MODULES.get(kernel.module.name, 1)
+
+
+def lanes_for(particles: int, device: Any) -> int:
+    """How many lanes a particle gets, for so many particles of one scene."""
+    if device.is_cpu:
+        return 1
+    return next((lanes for most, lanes in LANES if particles <= most), 1)
+
+
+@dataclass(frozen=True)
+class LaneFunctions:
+    """Warp functions for kernels that are made for lanes: see `lane_functions`."""
+
+    lane: Any
+    """The number of a thread's lane."""
+    add_up: Any
+    """The sum over the lanes of a number."""
+    add_up_vectors: Any
+    """The sum over the lanes of a vector."""
+    vote: Any
+    """Bit k is set where lane k says yes."""
+    ones: Any
+    """How many bits of a vote are set."""
+    before: Any
+    """How many bits of a vote are set of the lanes before one's own."""
+
+
+@cache
+def lane_functions(precision: Precision, lanes: int) -> LaneFunctions:
+    """The functions for so many lanes, a power of 2 up to 32."""
+    real, vector = precision.real, precision.vector
+    if lanes == 1:
+
+        @wp.func
+        def only_lane() -> int:
+            return 0
+
+        @wp.func
+        def same(x: real) -> real:
+            return x
+
+        @wp.func
+        def same_vector(x: vector) -> vector:
+            return x
+
+        @wp.func
+        def only_vote(yes: bool) -> int:
+            return wp.where(yes, 1, 0)
+
+        @wp.func
+        def same_vote(votes: int) -> int:
+            return votes
+
+        @wp.func
+        def none_before(votes: int) -> int:
+            return 0
+
+        return LaneFunctions(only_lane, same, same_vector, only_vote, same_vote, none_before)
+
+    first, group = f"(threadIdx.x % 32u / {lanes}u * {lanes}u)", f"{(1 << lanes) - 1}u"
+
+    @wp.func_native(f"return threadIdx.x % {lanes}u;")
+    def lane() -> int: ...
+
+    rounds = " ".join(f"x += __shfl_xor_sync(mask, x, {lanes >> k});" for k in range(1, lanes.bit_length()))
+
+    @wp.func_native(f"unsigned mask = {group} << {first}; {rounds} return x;")
+    def add_up(x: real) -> real: ...
+
+    @wp.func
+    def add_up_vectors(x: vector) -> vector:
+        return vector(add_up(x[0]), add_up(x[1]), add_up(x[2]))
+
+    @wp.func_native(f"return __ballot_sync({group} << {first}, yes) >> {first} & {group};")
+    def vote(yes: bool) -> int: ...
+
+    @wp.func_native("return __popc(votes);")
+    def ones(votes: int) -> int: ...
+
+    @wp.func_native(f"return __popc(votes & ((1u << threadIdx.x % {lanes}u) - 1u));")
+    def before(votes: int) -> int: ...
+
+    return LaneFunctions(lane, add_up, add_up_vectors, vote, ones, before)
