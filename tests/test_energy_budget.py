@@ -38,7 +38,7 @@ class Step:
             "initial_velocities": 0.3 * random.standard_normal(shape) - 1.0,
         }
         rollout = self.simulation.rollout(1, self.point)
-        _, self.new_velocities, _ = rollout.forward().numpy(shape[1])
+        self.new_velocities = rollout.forward().numpy(shape[1])["velocities"]
         """(n, d) in the scene's order [m/s]."""
         self.solver = rollout.solver
         self.whole = self.solver.context(rollout.parameters).neighbourhood

@@ -105,8 +105,8 @@ def test_what_is_hidden_is_seen_where_it_was_found(tmp_path):
     labels = {"title": "", "x_label": "", "y_label": ""}
     found, ink = {"found": [0.0, 1.0, 2.0]}, (0x2B, 0x2A, 0x28)
     alone, both = (
-        pixels(figures.curve([0.0, 1.0, 2.0], found, tmp_path / f"{k}.png", **labels, hidden=hidden))
-        for k, hidden in enumerate([(), ([0.0, 1.0, 2.0],)])
+        pixels(figures.curve([0.0, 1.0, 2.0], found, tmp_path / f"{k}.png", **labels, true=true))
+        for k, true in enumerate([(), ([0.0, 1.0, 2.0],)])
     )
     assert share_of(ink, both) > share_of(ink, alone) + 1e-3
 

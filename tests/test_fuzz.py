@@ -164,7 +164,7 @@ def test_what_is_written_is_read():
 def drawn(seed, number):
     """What a case is made of."""
     case = Case("scenes", number, seed, Path())
-    tables = bases.tasks()["cloud_search"]
+    tables = bases.tasks()["ensemble_search"]
     words = mutate(tables, list(bases.tasks().values()), case.random)
     text = mutate_text(to_toml(tables).encode("utf-8", "surrogatepass"), case.random)
     return words, text, override(case.random), option(case.random)

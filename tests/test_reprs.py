@@ -79,7 +79,7 @@ def test_what_an_estimator_says(problem):
 def test_a_certificate_is_a_table(certificate):
     assert repr(certificate) == "Certificate(64 particles, 4 steps, right, horizon 4, use gradients.Exact())"
     assert re.search(r"│ gravity +│ \d\.\d{3}e-\d\d +│ right +│", str(certificate))
-    assert "array(" not in repr(certificate.comparison) and "array(" not in repr(certificate.horizons)
+    assert "array(" not in repr(certificate.consistency) and "array(" not in repr(certificate.horizons)
     html = certificate._repr_html_()
     assert html.startswith("<pre>") and html.endswith("</pre>") and "│ gravity" in html
 

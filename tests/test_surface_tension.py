@@ -109,7 +109,7 @@ def kicked(dimension: int, across: int, kick: float) -> Watch:
 def test_a_cube_rounds_to_a_sphere(dimension, across, periods):
     """By the smallest over the greatest principal axis, and the isoperimetric ratio of the convex hull, which a
     square has 0.79 of and a cube 0.52."""
-    x = Watch(cube(dimension, across), periods).end[0]
+    x = Watch(cube(dimension, across), periods).end["positions"]
     axes = np.sqrt(np.linalg.eigvalsh(np.cov(x.T)))
     hull = ConvexHull(x)
     if dimension == 2:
@@ -161,7 +161,7 @@ def test_a_long_time_step_is_warned_of():
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_momentum_is_kept(dimension):
     watch = Watch(cube(dimension, 8), periods=0.5)
-    v = watch.end[1]
+    v = watch.end["velocities"]
     assert np.abs(v).max() > 1e-3
     assert np.abs(v.sum(axis=0)).max() < 1e-12 * np.abs(v).sum()
 
@@ -171,7 +171,7 @@ def test_walls_are_not_wetted():
     spacing = RADIUS / 8
     body = {"shape": "box", "lower": [9 * spacing, 0.0], "upper": [21 * spacing, 12 * spacing], "phase": "water"}
     room = {"shape": "box", "lower": [0.0, 0.0], "upper": [30 * spacing, 30 * spacing]}
-    x = Watch(drop(2, 16, fluid=[body], container=room), periods=5.0).end[0]
+    x = Watch(drop(2, 16, fluid=[body], container=room), periods=5.0).end["positions"]
     axes = np.sqrt(np.linalg.eigvalsh(np.cov(x.T)))
     assert axes[0] / axes[1] > 0.95
 

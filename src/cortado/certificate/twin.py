@@ -1,4 +1,4 @@
-"""A problem once more in float64: in float32 round-off is far greater than what a certificate looks for."""
+"""A copy of a problem in float64: in float32 the round-off is far greater than the errors a certificate looks for."""
 
 from typing import Any
 
@@ -26,8 +26,8 @@ ANY_PRECISION = (FinalPositions, CentreOfMass, CentreOfMassAlong)
 def in_float64(problem: Problem) -> Problem:
     """The problem itself where it is one in float64, else the same scene, device, steps and loss in float64.
 
-    A loss of our own looks at states in float64 then. Of any other nobody knows whether it can, so it goes on being
-    asked in float32: see `Rounded`.
+    Losses of this package are computed from states in float64 then. Whether any other loss can be is not known, so it
+    is still computed in float32: see `Rounded`.
     """
     single = problem.simulation
     if single.precision == FLOAT64:
@@ -51,7 +51,7 @@ def _loss_in_float64(loss: Any, single: Simulation) -> Any:
 
 
 class Rounded:
-    """A loss that may know float32 alone, asked about states in float64: its values are as rough as float32 is."""
+    """A loss that may work in float32 alone, given states in float64, which are rounded to float32 for it."""
 
     def __init__(self, loss: Any, single: Simulation):
         """``single``: the simulation in float32 that the loss was made for."""

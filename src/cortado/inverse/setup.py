@@ -10,7 +10,7 @@ from cortado.inverse.tables import DISTANCES, RANDOM
 from cortado.inverse.task import Task
 from cortado.io.pictures import heart, read_picture, rosetta
 from cortado.losses import FinalPositions, Frames, Image, Loss, Snapshot
-from cortado.optimisation.transforms import Bijector, Knots, Logarithm, Softmax, Transformed
+from cortado.optimisation.transforms import Bijector, Logarithm, Softmax, TimeInterpolation, Transformed
 from cortado.parameters.registry import BY_NAME, Range
 from cortado.parameters.values import OVER_TIME, Arrays
 from cortado.problem import Problem
@@ -29,7 +29,7 @@ class Setup:
     task: Task
     problem: Problem
     searches: tuple[Transformed, ...]
-    """One after the other, through thicker and thicker fluid, in the same coordinates; the last is the task's own."""
+    """One for each entry of the extinction schedule, in the same coordinates; the last is the scene's own."""
     start: Arrays
     """Coordinates to begin with."""
     bounds: dict[str, tuple[Any, Any]]
@@ -49,9 +49,9 @@ class Setup:
         assert self.renderer is not None
         return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
 
-    def hidden(self, name: str) -> np.ndarray | None:
-        """The parameter that made the target, None where a picture is the target."""
-        return self.task.hidden.get(name)
+    def true_parameter(self, name: str) -> np.ndarray | None:
+        """The parameter's value in the run that made the target; None where a picture is the target."""
+        return self.task.true_parameters.get(name)
 
 
 def setup(task: Task, device: str, precision: str) -> Setup:
@@ -60,8 +60,8 @@ def setup(task: Task, device: str, precision: str) -> Setup:
     start = {name: _start(name, value, simulation) for name, value in task.start.items()}
     found = _coordinates(task, start)
     searches = []
-    for share in task.optimise.extinctions:
-        renderer = scene_renderer(simulation, share) if task.problem.loss == "image" else None
+    for factor in task.optimise.extinction_schedule:
+        renderer = scene_renderer(simulation, factor) if task.problem.loss == "image" else None
         targets = _targets(task, simulation, renderer)
         problem = Problem(simulation, task.problem.steps, _frames(task, targets, renderer))
         searches.append(Transformed(problem, found))
@@ -89,7 +89,7 @@ def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> d
         return {steps[-1]: _picture(task, renderer)}
     nothing = FinalPositions(simulation.positions)
     try:
-        ends = Problem(simulation, task.problem.steps, nothing).states(task.hidden, steps)
+        ends = Problem(simulation, task.problem.steps, nothing).states(task.true_parameters, steps)
     except DivergedError as error:
         advice = f"this is the run with the parameters of problem.target, so change those, or {error.advice}"
         raise error.with_advice(advice) from None
@@ -141,7 +141,7 @@ def _coordinates(task: Task, start: Arrays) -> dict[str, Bijector]:
         if name == "mass_fractions":
             found[name] = Softmax()
         elif name in OVER_TIME and value.ndim == 2 and task.optimise.knots is not None:
-            found[name] = Knots(task.problem.steps, task.optimise.knots)
+            found[name] = TimeInterpolation(task.problem.steps, task.optimise.knots)
     return found
 
 

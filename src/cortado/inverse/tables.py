@@ -1,4 +1,4 @@
-"""The tables [problem] and [optimise] of a task, with the kinds of values that only they have."""
+"""The tables [problem] and [optimise] of a task, with the field types that only they have."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -8,12 +8,12 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import model_validator
 
-from cortado.errors import Phrase
+from cortado.errors import Words
 from cortado.gradients import AdjointEstimator, AdjointViscosity, EnsembleMean, Exact, FrozenGeometry, GradientEstimator
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, Optimiser
 from cortado.parameters.values import NAMES
-from cortado.scene.fields import MISSING, Choice, Count, Kind, Quantity, Text, as_number, as_sequence, wrong
+from cortado.scene.fields import MISSING, Choice, Count, FieldType, Quantity, Text, as_number, as_sequence, field_error
 from cortado.scene.tables import Table
 
 OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
@@ -33,7 +33,7 @@ CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
 
 
 @dataclass(frozen=True)
-class Values(Kind):
+class Values(FieldType):
     """Parameters by name: a number, or a list, of lists, of numbers."""
 
     random: bool = False
@@ -43,48 +43,48 @@ class Values(Kind):
 
     def check(self, value: Any) -> dict[str, Any]:
         if not isinstance(value, Mapping) or not value:
-            raise wrong((), Phrase("empty") if value == {} else value, self.wanted)
+            raise field_error((), Words("empty") if value == {} else value, self.wanted)
         return {name: self._array(name, entry) for name, entry in value.items()}
 
     def _array(self, name: str, value: Any) -> Any:
         if name not in NAMES:
-            raise wrong((name,), Phrase("unknown"), f"one of {', '.join(NAMES)}")
+            raise field_error((name,), Words("unknown"), f"one of {', '.join(NAMES)}")
         if self.random and name in CAN_BE_RANDOM and value == RANDOM:
             return value
         wanted = "made of finite numbers: one, a list of them, or a list of lists of one length"
         if not _is_numeric(value):
-            raise wrong((name,), value, wanted)
+            raise field_error((name,), value, wanted)
         try:
             return np.array(value, dtype=np.float64)
         except ValueError:
-            raise wrong((name,), value, wanted) from None
+            raise field_error((name,), value, wanted) from None
 
 
 @dataclass(frozen=True)
-class Names(Kind):
+class Names(FieldType):
     """A list of parameters."""
 
     wanted = f"a list of parameters out of {', '.join(NAMES)}"
 
     def check(self, value: Any) -> tuple[str, ...]:
         if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) and name in NAMES for name in value):
-            raise wrong((), value, self.wanted)
+            raise field_error((), value, self.wanted)
         return tuple(value)
 
 
 @dataclass(frozen=True)
-class Shares(Kind):
-    """Numbers that grow to 1."""
+class Schedule(FieldType):
+    """A continuation schedule: factors that grow to 1."""
 
     wanted = "a list of numbers greater than 0, each greater than the one before, the last of them 1"
 
     def check(self, value: Any) -> tuple[float, ...]:
         numbers = [as_number(entry) for entry in as_sequence(value) or ()]
-        shares = [number for number in numbers if number is not None and number > 0.0]
-        growing = all(a < b for a, b in pairwise(shares))
-        if not shares or len(shares) < len(numbers) or not growing or shares[-1] != 1.0:
-            raise wrong((), value, self.wanted)
-        return tuple(shares)
+        factors = [number for number in numbers if number is not None and number > 0.0]
+        growing = all(a < b for a, b in pairwise(factors))
+        if not factors or len(factors) < len(numbers) or not growing or factors[-1] != 1.0:
+            raise field_error((), value, self.wanted)
+        return tuple(factors)
 
 
 def _is_numeric(value: Any) -> bool:
@@ -95,7 +95,7 @@ def _is_numeric(value: Any) -> bool:
 
 
 class ProblemTable(Table):
-    """[problem]: a number of steps, and a target: what a run with hidden parameters makes, or a picture."""
+    """[problem]: a number of steps, and a target: the end of a run with true parameters, or a picture."""
 
     steps: Annotated[int, Count(0, 10_000_000)]
     """Time steps; 0 for a loss of the first state."""
@@ -106,24 +106,26 @@ class ProblemTable(Table):
     frames: Annotated[int, Count(1, 10_000)] = 1
     """How many states are compared, evenly spaced up to the last one."""
     target: Annotated[dict[str, Any] | None, Values()] = None
-    """Hidden parameters: the target is what their run makes."""
+    """The true parameters: the target is what a run with them makes."""
     picture: Annotated[str | None, Text()] = None
     """"heart", "rosetta", or a file with a picture, beside the task's own."""
 
     @model_validator(mode="after")
     def _check_target(self) -> Self:
         if self.picture is None and self.target is None:
-            raise wrong(("target",), MISSING, f"{Values.wanted}, as there is no picture")
+            raise field_error(("target",), MISSING, f"{Values.wanted}, as there is no picture")
         if self.picture is not None and self.target is not None:
-            raise wrong(("picture",), self.picture, "left out, as there is a target")
+            raise field_error(("picture",), self.picture, "left out, as there is a target")
         if self.picture is not None and self.loss != "image":
-            raise wrong(("loss",), self.loss, '"image", as there is a picture')
+            raise field_error(("loss",), self.loss, '"image", as there is a picture')
         if self.picture is not None and self.frames > 1:
-            raise wrong(("frames",), self.frames, "1, as there is a picture, which is one")
+            raise field_error(("frames",), self.frames, "1, as there is a picture, which is one")
         if self.loss != "image" and "distance" in self.model_fields_set:
-            raise wrong(("distance",), self.distance, "left out, as positions are compared")
+            raise field_error(("distance",), self.distance, "left out, as positions are compared")
         if self.frames > max(self.steps, 1):
-            raise wrong(("frames",), self.frames, f"at most {max(self.steps, 1)}, as there are {self.steps} steps")
+            raise field_error(
+                ("frames",), self.frames, f"at most {max(self.steps, 1)}, as there are {self.steps} steps"
+            )
         return self
 
     @property
@@ -138,9 +140,9 @@ class CheckTable(Table):
     loss_reduction: Annotated[float, Quantity(least=1.0)] = 1.0
     """First loss / best loss."""
     parameter_error: Annotated[float, Quantity(above=0.0)] = 1e50
-    """Largest relative distance (L2) of a found parameter from the hidden one."""
+    """Largest relative distance (L2) of an estimated parameter from its true value."""
     psnr: Annotated[float, Quantity("dB", least=0.0)] = 0.0
-    """Peak signal-to-noise ratio of the found image to the target."""
+    """Peak signal-to-noise ratio of the image of the estimate to the target."""
 
 
 class GradientTable(Table):
@@ -160,19 +162,19 @@ class GradientTable(Table):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.strength is not None and self.name != "adjoint_viscosity":
-            raise wrong(("strength",), self.strength, "left out, as nothing is smoothed")
+            raise field_error(("strength",), self.strength, "left out, as nothing is smoothed")
         if self.strength is not None and self.strength * self._order > 1.0:
-            raise wrong(("strength",), self.strength, f"at most {1.0 / self._order:g}, as means are extrapolated")
+            raise field_error(("strength",), self.strength, f"at most {1.0 / self._order:g}, as means are extrapolated")
         if self.samples != 1 and (self.samples % 2 or self.samples < 4):
-            raise wrong(("samples",), self.samples, "1, or an even number of at least 4")
+            raise field_error(("samples",), self.samples, "1, or an even number of at least 4")
         if self.samples > 1 and self.spread is None:
-            raise wrong(("spread",), MISSING, "a table of numbers greater than 0, as there are several samples")
+            raise field_error(("spread",), MISSING, "a table of numbers greater than 0, as there are several samples")
         for name in ("spread", "position_noise"):
             if self.samples == 1 and name in self.model_fields_set:
-                raise wrong((name,), Phrase("given"), "left out, as there is one sample")
+                raise field_error((name,), Words("given"), "left out, as there is one sample")
         for name, number in (self.spread or {}).items():
             if number.ndim or not number > 0.0:
-                raise wrong(("spread", name), number.tolist(), "a number greater than 0")
+                raise field_error(("spread", name), number.tolist(), "a number greater than 0")
         return self
 
     @property
@@ -201,9 +203,9 @@ class OptimiseTable(Table):
     """Parameters that are changed by factors."""
     bounds: Annotated[dict[str, Any] | None, Values()] = None
     """By name: two entries, the lower and the upper bound."""
-    extinctions: Annotated[tuple[float, ...], Shares()] = (1.0,)
-    """Of one search after the other, each from where the last one ended, relative to the scene's: through thinner fluid
-    a picture tells how much there is, and particles that hide behind each other have to part."""
+    extinction_schedule: Annotated[tuple[float, ...], Schedule()] = (1.0,)
+    """A continuation schedule: one search for each factor, which starts where the last one ended and sees the fluid
+    with the scene's extinction times that factor. A picture of thinner fluid shows what is behind its surface."""
     optimiser: Annotated[str, Choice(tuple(OPTIMISERS))] = "adam"
     """Name of the algorithm."""
     learning_rate: Annotated[float, Quantity(above=0.0)]
@@ -220,7 +222,7 @@ class OptimiseTable(Table):
     @model_validator(mode="after")
     def _check_tolerance(self) -> Self:
         if self.tolerance is not None and self.optimiser != "lbfgs":
-            raise wrong(("tolerance",), self.tolerance, 'left out, as only "lbfgs" has one')
+            raise field_error(("tolerance",), self.tolerance, 'left out, as only "lbfgs" has one')
         return self
 
     def algorithm(self) -> Optimiser:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from cortado.errors import InputError, Phrase, shown
+from cortado.errors import InputError, Words, shown
 
 LossFunction = Callable[[dict[str, Any]], tuple[Any, Mapping[str, Any]]]
 """Parameters by name -> the loss, and its gradient by the same names."""
@@ -59,9 +59,9 @@ def loss_and_gradient(returned: Any) -> tuple[Any, Mapping[str, Any]]:
     if pair and isinstance(returned[1], Mapping):
         return returned[0], returned[1]
     if pair:
-        found: Any = Phrase(f"a loss and a gradient of type {type(returned[1]).__name__}")
+        found: Any = Words(f"a loss and a gradient of type {type(returned[1]).__name__}")
     elif isinstance(returned, (tuple, list)):
-        found = Phrase(f"a {type(returned).__name__} of {len(returned)}")
+        found = Words(f"a {type(returned).__name__} of {len(returned)}")
     else:
         found = returned
     raise InputError(

@@ -30,8 +30,8 @@ def check_sizes(values: Arrays, precision: Precision) -> None:
 
 
 def check_places(values: Arrays, scene: Scene, free: int) -> None:
-    """Fluid starts inside of the container, and a nozzle stays there; raises `InputError`. Only the first ``free``
-    particles do not wait in the nozzle, where they may be outside."""
+    """Fluid starts inside of the container, and the opening of the emitter stays there; raises `InputError`. Only the
+    first ``free`` particles do not wait in the emitter, where they may be outside."""
     spacing = scene.discretisation.spacing
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
@@ -49,7 +49,7 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
 
 def check_state(state: RestartState, shapes: Mapping[str, tuple[int, ...]], scene: Scene, free: int) -> None:
     """A state to go on from is one of the scene, whose fields have these shapes; raises `InputError`. Only the first
-    ``free`` particles never waited in the nozzle."""
+    ``free`` particles never waited in the emitter."""
     if not isinstance(state, RestartState):
         raise InputError(f"state is {shown(state)}, but must be a RestartState, such as trajectory.last_state.")
     if state.fields.keys() != shapes.keys():

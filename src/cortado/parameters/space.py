@@ -50,7 +50,7 @@ class Simulated(Source, Protocol):
 
     @property
     def free_particles(self) -> int:
-        """How many particles, the first ones, do not wait in a nozzle."""
+        """How many particles, the first ones, do not wait in an emitter."""
 
     def substeps(self, time_step: NDArray, mobility: NDArray, interface_width: NDArray, rest_density: NDArray) -> int:
         """Explicit steps of diffusion within a time step that are stable with these parameters."""
@@ -113,7 +113,7 @@ class ParameterSpace:
         """Whether a state is one of this simulation, and ``values`` go with it; raises `InputError`."""
         for name in (*STATE, "rest_density"):
             if name in values:
-                raise InputError(f"control {name} is given, but must be left out with a state, which has its own.")
+                raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
         simulation = self._simulation
         shapes = {
             field.name: field.shape(len(simulation.positions), simulation.dimension, self._phases)
@@ -160,9 +160,9 @@ class ParameterSpace:
         if not values.keys().isdisjoint(("mass_fractions", "rest_density")):
             bar = state[DENSITY].numpy().astype(np.float64)
             bars = reference_density_adjoint(*self._composition(values), bar)
-            for name, share in zip(("mass_fractions", "rest_density"), bars, strict=True):
+            for name, own_bar in zip(("mass_fractions", "rest_density"), bars, strict=True):
                 if name in found:
-                    found[name] = found[name] + share
+                    found[name] = found[name] + own_bar
         return {name: found[name].reshape(values[name].shape) for name in values if name in found}
 
     def _check(self, values: Arrays) -> None:

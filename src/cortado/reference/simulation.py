@@ -91,7 +91,7 @@ class Simulation:
     ) -> History:
         """Run from the scene's first state; ``controls`` replace its parameters. Raises `DivergedError` when a
         particle is lost."""
-        at = self._parameters(controls or {}, steps, "control")
+        at = self._parameters(controls or {}, steps, "parameter")
         return self._history(self._engine.run(at, steps, _positive("record_every", record_every), observe))
 
     def tangent(

@@ -1,7 +1,7 @@
-"""The kinds of value that a scene holds.
+"""The types of the fields of a scene.
 
-A kind is put beside the type of a field, ``Annotated[float, Quantity("kg/m3", above=0.0)]``: it checks the value, and
-says what was wanted.
+A field type is put beside the Python type of a field, ``Annotated[float, Quantity("kg/m3", above=0.0)]``: it checks the
+value, and says in words what was wanted.
 """
 
 import math
@@ -14,17 +14,21 @@ import numpy as np
 from pydantic import BaseModel, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from cortado.errors import Phrase
+from cortado.errors import Words
 
 GREATEST = 1e50
 """No number of a scene is larger, as its cube must fit into a float64, and no positive one smaller than its inverse."""
-MISSING = Phrase("missing")
+MISSING = Words("missing")
 FieldPath = Sequence[str | int]
 
 
 @dataclass(frozen=True, repr=False)
-class Trouble:
-    """What a check found. Pydantic takes the text of it, which must not hold the value: that may be of any length."""
+class FieldError:
+    """What is wrong with a field.
+
+    Its ``repr`` does not show the value that was found, as pydantic puts it into messages, and the value may be of any
+    length.
+    """
 
     path: tuple[str | int, ...]
     found: Any
@@ -32,13 +36,13 @@ class Trouble:
     sentence: str | None
 
 
-def wrong(path: FieldPath, found: Any, wanted: str, sentence: str | None = None) -> PydanticCustomError:
-    """What a check raises; the path (names and indices) starts at the model that is being checked."""
-    return PydanticCustomError("scene", "wrong value", {"trouble": Trouble(tuple(path), found, wanted, sentence)})
+def field_error(path: FieldPath, found: Any, wanted: str, sentence: str | None = None) -> PydanticCustomError:
+    """The exception that a check raises; the path (names and indices) starts at the model that is being checked."""
+    return PydanticCustomError("scene", "wrong value", {"error": FieldError(tuple(path), found, wanted, sentence)})
 
 
-class Kind:
-    """A kind of value: checks it, and says what was wanted."""
+class FieldType:
+    """The type of a field: checks a value, and says what was wanted."""
 
     @property
     def wanted(self) -> str:
@@ -46,7 +50,7 @@ class Kind:
         raise NotImplementedError
 
     def check(self, value: Any) -> Any:
-        """The value as it is kept; raises `wrong`."""
+        """The value as it is kept; raises a `field_error`."""
         raise NotImplementedError
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -54,7 +58,7 @@ class Kind:
 
 
 @dataclass(frozen=True)
-class Quantity(Kind):
+class Quantity(FieldType):
     """A finite number with a unit."""
 
     unit: str = ""
@@ -75,17 +79,17 @@ class Quantity(Kind):
     def check(self, value: Any) -> float:
         number = as_number(value)
         if number is None:
-            raise wrong((), value, f"a finite number{'' if self.wanted.startswith('a ') else f', {self.wanted}'}")
+            raise field_error((), value, f"a finite number{'' if self.wanted.startswith('a ') else f', {self.wanted}'}")
         if abs(number) > GREATEST or (self.above == 0.0 and 0.0 < number < 1.0 / GREATEST):
-            raise wrong((), value, f"a number between {1.0 / GREATEST:g} and {GREATEST:g} in size")
+            raise field_error((), value, f"a number between {1.0 / GREATEST:g} and {GREATEST:g} in size")
         low = (self.above is not None and number <= self.above) or (self.least is not None and number < self.least)
         if low or (self.most is not None and number > self.most):
-            raise wrong((), value, self.wanted)
+            raise field_error((), value, self.wanted)
         return number
 
 
 @dataclass(frozen=True)
-class Count(Kind):
+class Count(FieldType):
     """A whole number."""
 
     least: int
@@ -97,14 +101,14 @@ class Count(Kind):
 
     def check(self, value: Any) -> int:
         if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
-            raise wrong((), value, self.wanted)
+            raise field_error((), value, self.wanted)
         if not self.least <= value <= self.most:
-            raise wrong((), value, self.wanted)
+            raise field_error((), value, self.wanted)
         return int(value)
 
 
 @dataclass(frozen=True)
-class Choice(Kind):
+class Choice(FieldType):
     """One of a few names."""
 
     options: tuple[str, ...]
@@ -115,62 +119,62 @@ class Choice(Kind):
 
     def check(self, value: Any) -> str:
         if not isinstance(value, str) or value not in self.options:
-            raise wrong((), value, self.wanted)
+            raise field_error((), value, self.wanted)
         return value
 
 
-class Text(Kind):
+class Text(FieldType):
     """A text that is not empty."""
 
     wanted = "a text that is not empty"
 
     def check(self, value: Any) -> str:
         if not isinstance(value, str) or not value.strip():
-            raise wrong((), value, self.wanted)
+            raise field_error((), value, self.wanted)
         return value
 
 
-class Flag(Kind):
+class Flag(FieldType):
     """Yes or no."""
 
     wanted = "true or false"
 
     def check(self, value: Any) -> bool:
         if not isinstance(value, (bool, np.bool_)):
-            raise wrong((), value, self.wanted)
+            raise field_error((), value, self.wanted)
         return bool(value)
 
 
 @dataclass(frozen=True)
-class Components(Kind):
+class Components(FieldType):
     """One component for each axis: a vector, or flags. Left out, it is () until the scene's dimension is known."""
 
-    kind: Kind
+    component: FieldType
     default: tuple[Any, ...] = ()
 
     @property
     def wanted(self) -> str:
-        return f"a list with one component for each axis, each {self.kind.wanted}"
+        return f"a list with one component for each axis, each {self.component.wanted}"
 
     def check(self, value: Any) -> tuple[Any, ...]:
         components = as_sequence(value)
         if not components:
-            raise wrong((), value, self.wanted)
-        return _check_components(self.kind, components)
+            raise field_error((), value, self.wanted)
+        return _check_components(self.component, components)
 
     def in_dimension(self, path: FieldPath, value: tuple[Any, ...], dimension: int) -> tuple[Any, ...]:
         """The value with as many components as there are dimensions."""
         value = value or self.default[:dimension]
         if len(value) != dimension:
-            raise wrong(path, value, f"a list of {dimension} components, as the scene has {dimension} dimensions")
+            raise field_error(path, value, f"a list of {dimension} components, as the scene has {dimension} dimensions")
         return value
 
 
 @dataclass(frozen=True)
-class Parts(Kind):
+class Parts(FieldType):
     """Components that each have a name, as many in 2-D as in 3-D: a colour."""
 
-    kind: Kind
+    component: FieldType
     names: tuple[str, ...]
 
     @property
@@ -181,12 +185,12 @@ class Parts(Kind):
     def check(self, value: Any) -> tuple[Any, ...]:
         components = as_sequence(value)
         if components is None or len(components) != len(self.names):
-            raise wrong((), value, self.wanted)
-        return _check_components(self.kind, components)
+            raise field_error((), value, self.wanted)
+        return _check_components(self.component, components)
 
 
 @dataclass(frozen=True)
-class Tables(Kind):
+class Tables(FieldType):
     """One table or more, in a list."""
 
     name: str
@@ -197,12 +201,12 @@ class Tables(Kind):
 
     def check(self, value: Any) -> Any:
         if not isinstance(value, (list, tuple)) or not value:
-            raise wrong((), value, self.wanted)
+            raise field_error((), value, self.wanted)
         return value
 
 
 @dataclass(frozen=True)
-class Shaped(Kind):
+class Shaped(FieldType):
     """A table whose key ``shape`` says which of several it is."""
 
     shapes: tuple[str, ...]
@@ -212,26 +216,26 @@ class Shaped(Kind):
         if isinstance(value, Mapping):
             choice = Choice(self.shapes)
             shape = value.get("shape", MISSING)
-            if isinstance(shape, Phrase) or not isinstance(shape, str) or shape not in self.shapes:
-                raise wrong(("shape",), shape, choice.wanted)
+            if isinstance(shape, Words) or not isinstance(shape, str) or shape not in self.shapes:
+                raise field_error(("shape",), shape, choice.wanted)
         elif not isinstance(value, BaseModel):
-            raise wrong((), value, self.wanted)
+            raise field_error((), value, self.wanted)
         return value
 
 
 COLOUR = Parts(Quantity(least=0.0, most=1.0), ("red", "green", "blue"))
 
 
-def _check_components(kind: Kind, values: Sequence[Any]) -> tuple[Any, ...]:
-    return tuple(_check_component(kind, index, value) for index, value in enumerate(values))
+def _check_components(component: FieldType, values: Sequence[Any]) -> tuple[Any, ...]:
+    return tuple(_check_component(component, index, value) for index, value in enumerate(values))
 
 
-def _check_component(kind: Kind, index: int, value: Any) -> Any:
+def _check_component(component: FieldType, index: int, value: Any) -> Any:
     try:
-        return kind.check(value)
+        return component.check(value)
     except PydanticCustomError as error:
-        trouble = (error.context or {})["trouble"]
-        raise wrong((index,), trouble.found, trouble.wanted) from None
+        own = (error.context or {})["error"]
+        raise field_error((index,), own.found, own.wanted) from None
 
 
 def as_sequence(value: Any) -> Sequence[Any] | None:

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationInfo, create_model, field_validator, model
 from cortado.parameters.registry import PARAMETERS
 from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import Emitter
-from cortado.scene.fields import COLOUR, Choice, Components, Count, Flag, Quantity, Tables, Text, wrong
+from cortado.scene.fields import COLOUR, Choice, Components, Count, Flag, Quantity, Tables, Text, field_error
 from cortado.scene.fluids import AnyFluid
 from cortado.scene.mixture import Mixture
 from cortado.scene.render import Render
@@ -93,7 +93,7 @@ class Solver(Table):
     def _check_iterations(self) -> Self:
         if self.minimum_iterations > self.maximum_iterations:
             wanted = f"at most maximum_iterations, {self.maximum_iterations}"
-            raise wrong(("minimum_iterations",), self.minimum_iterations, wanted)
+            raise field_error(("minimum_iterations",), self.minimum_iterations, wanted)
         return self
 
 
@@ -112,7 +112,7 @@ class SceneTables(Table):
     fluid: Annotated[tuple[AnyFluid, ...], Tables("fluid")]
     """The bodies of fluid; particles come in this order."""
     emitter: Emitter | None = None
-    """Fluid that comes out of a nozzle; its particles come after those of all fluids."""
+    """An emitter, out of which fluid comes; its particles come after those of all fluids."""
     container: AnyContainer = Field(default=NoContainer(), validate_default=True)
     """What holds the fluid."""
     mixture: Mixture = Mixture()

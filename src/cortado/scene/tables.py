@@ -1,4 +1,4 @@
-"""The tables of a scene, and how what is wrong in one becomes a sentence.
+"""The tables of a scene, and how an error in one becomes a sentence.
 
 A wrong value ends in a `SceneError`, whether the scene comes from a file or is built in Python.
 """
@@ -11,8 +11,8 @@ from typing import Any, ClassVar, Self
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
-from cortado.errors import LONGEST, Phrase, SceneError, shown
-from cortado.scene.fields import MISSING, Components, FieldPath, Kind, wrong
+from cortado.errors import LONGEST, SceneError, Words, shown
+from cortado.scene.fields import MISSING, Components, FieldPath, FieldType, field_error
 
 SHAPES = ("box", "cylinder", "sphere", "points", "none")
 
@@ -37,30 +37,30 @@ class Table(BaseModel):
         if isinstance(data, cls):
             return data
         if not isinstance(data, Mapping):
-            raise wrong((), data, "a table")
+            raise field_error((), data, "a table")
         for key in data:
             if key not in cls.model_fields:
                 raise _unknown_key(str(key), [*cls.model_fields, *(name for name in cls.beside if name != key)])
         for name, field in cls.model_fields.items():
             if field.is_required() and name not in data:
-                kinds = [kind.wanted for kind in field.metadata if isinstance(kind, Kind)]
-                raise wrong((name,), MISSING, kinds[0] if kinds else "a table")
+                wanted = [one.wanted for one in field.metadata if isinstance(one, FieldType)]
+                raise field_error((name,), MISSING, wanted[0] if wanted else "a table")
         return data
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         """This table, at a path, with its vectors checked, and those left out filled in, for 2 or 3 dimensions."""
         filled = {}
         for name, field in type(self).model_fields.items():
-            for kind in field.metadata:
-                if isinstance(kind, Components):
-                    filled[name] = kind.in_dimension((*path, name), getattr(self, name), dimension)
+            for field_type in field.metadata:
+                if isinstance(field_type, Components):
+                    filled[name] = field_type.in_dimension((*path, name), getattr(self, name), dimension)
         return self.model_copy(update=filled)
 
 
 def _unknown_key(key: str, known: list[str]) -> PydanticCustomError:
     close = get_close_matches(key, known, n=1)
     advice = f"did you mean {close[0]}?" if close else f"its keys are {', '.join(known)}."
-    return wrong((key,), Phrase("unknown"), f"one of {', '.join(known)}", f"is not a key of {{table}}; {advice}")
+    return field_error((key,), Words("unknown"), f"one of {', '.join(known)}", f"is not a key of {{table}}; {advice}")
 
 
 # ---- sentences ---------------------------------------------------------------------------------------------------
@@ -68,7 +68,7 @@ def _unknown_key(key: str, known: list[str]) -> PydanticCustomError:
 
 @contextmanager
 def sentences() -> Iterator[None]:
-    """Turn the first trouble that pydantic reports into a `SceneError`."""
+    """Turn the first error that pydantic reports into a `SceneError`."""
     try:
         yield
     except ValidationError as error:
@@ -92,9 +92,9 @@ def _scene_error(error: ValidationError) -> SceneError:
     path = [part for part in first["loc"] if part not in SHAPES]  # pydantic names the member of a union
     if first["type"] != "scene":
         return SceneError(None, field_name(path), first["input"], f"valid ({first['msg']})")
-    trouble = first["ctx"]["trouble"]
-    path += trouble.path
-    sentence = trouble.sentence
+    own = first["ctx"]["error"]
+    path += own.path
+    sentence = own.sentence
     if sentence:
         sentence = sentence.replace("{table}", f"[{field_name(path[:-1])}]" if path[1:] else "the scene")
-    return SceneError(None, field_name(path), trouble.found, trouble.wanted, sentence)
+    return SceneError(None, field_name(path), own.found, own.wanted, sentence)

@@ -1,4 +1,4 @@
-"""What an experiment is: a kind, which measures, draws and judges, with the settings from a file."""
+"""An experiment: a type of experiment, which measures, draws and judges, with settings from a file."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 from cortado.io.progress import Advance
 from cortado.scene import fields, tables
-from cortado.scene.fields import Text, as_sequence, wrong
+from cortado.scene.fields import Text, as_sequence, field_error
 from cortado.scene.scene import Scene
 from cortado.study.tables import Table
 
@@ -16,14 +16,16 @@ if TYPE_CHECKING:
 
 
 class Settings(tables.Table):
-    """What the file of an experiment holds beside its kind; each kind adds its own. The kinds of values of
-    `cortado.scene.fields` make sentences of what is wrong."""
+    """The settings in the file of an experiment; each type of experiment adds its own.
+
+    Their field types are those of `cortado.scene.fields`, which make sentences of errors.
+    """
 
     title: Annotated[str, Text()]
-    """Above the picture."""
+    """The title of the picture."""
 
     def identity(self) -> dict[str, Any]:
-        """What decides the measurement, for JSON: with the same, it need not be repeated."""
+        """The settings on which the measurement depends, for JSON; with the same ones it is not repeated."""
         return self.model_dump(mode="json")
 
 
@@ -43,37 +45,39 @@ class DeviceSettings(Settings):
 
 
 @dataclass(frozen=True)
-class Several(fields.Kind):
-    """At least one value of a kind, in a list: ``Annotated[tuple[float, ...], Several(Quantity("s", above=0.0))]``."""
+class Several(fields.FieldType):
+    """A list of at least one value: ``Annotated[tuple[float, ...], Several(Quantity("s", above=0.0))]``."""
 
-    kind: fields.Kind
+    entry: fields.FieldType
 
     @property
     def wanted(self) -> str:
-        return f"a list of at least one entry, each {self.kind.wanted}"
+        return f"a list of at least one entry, each {self.entry.wanted}"
 
     def check(self, value: Any) -> tuple[Any, ...]:
         entries = as_sequence(value)
         if not entries:
-            raise wrong((), value, self.wanted)
-        return fields.Components(self.kind).check(entries)
+            raise field_error((), value, self.wanted)
+        return fields.Components(self.entry).check(entries)
 
 
 class Progress(Protocol):
-    """Shows how far a measurement is: ``with progress(total) as advance: ... advance(n)``, in units of your choice that
-    take about the same time each."""
+    """Shows the progress of a measurement: ``with progress(total) as advance: ... advance(n)``.
+
+    The units of ``total`` and ``n`` are free, as long as each takes about the same time.
+    """
 
     def __call__(self, total: int) -> AbstractContextManager[Advance]: ...
 
 
 @dataclass(frozen=True)
-class Kind:
-    """A kind of experiment."""
+class ExperimentType:
+    """A type of experiment: how it is measured, drawn and judged."""
 
     name: str
-    """What files call it."""
+    """The ``kind`` in files of experiments."""
     settings: type[Settings]
-    """What its files hold."""
+    """The settings in these files."""
     measure: Callable[[Any, Progress], Table]
     """Settings -> measurements."""
     draw: Callable[[Table, Any], "Figure"]
@@ -84,11 +88,11 @@ class Kind:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A kind with its settings."""
+    """A type of experiment with the settings from a file."""
 
     name: str
     """The file's, without its ending."""
-    kind: Kind
+    type: ExperimentType
     settings: Settings
     reduced: bool
     """Whether the file's [reduced] settings are in place."""

@@ -16,7 +16,7 @@ from cortado.losses.image_losses import psnr
 from cortado.optimisation.optimise import Record, optimise
 from cortado.scene.fields import Choice, Text
 from cortado.study.canvas import blank
-from cortado.study.experiment import DeviceSettings, Kind, Progress, Several
+from cortado.study.experiment import DeviceSettings, ExperimentType, Progress, Several
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def draw(table: Table, settings: TaskSettings) -> "Figure":
 def verdict(table: Table, settings: TaskSettings) -> list[str]:
     losses, pictures = table.where(picture="")["loss"], _pictures(table)
     *way, target = pictures.values()
-    searches = load_task(settings.task, settings.overrides).optimise.extinctions
+    searches = load_task(settings.task, settings.overrides).optimise.extinction_schedule
     begun = len(losses) // len(searches) * (len(searches) - 1)
     found = [f"The picture comes from {psnr(way[0], target):.1f} to {psnr(way[-1], target):.1f} dB of the target."]
     if len(searches) > 1:
@@ -140,4 +140,4 @@ def verdict(table: Table, settings: TaskSettings) -> list[str]:
     return found
 
 
-TASK = Kind("task", TaskSettings, measure, draw, verdict)
+TASK = ExperimentType("task", TaskSettings, measure, draw, verdict)
