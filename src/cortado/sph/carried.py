@@ -11,6 +11,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.fields import StateField
+from cortado.device.reduction import type_name
 from cortado.device.state import Layout, State
 from cortado.sph.parts import StepContext
 
@@ -26,7 +27,7 @@ class OrderKernels:
 @cache
 def order_kernels(dtype: Any) -> OrderKernels:
     """The kernels for entries of a Warp type."""
-    module = wp.get_module(f"cortado_order_{wp.types.get_type_code(dtype)}")
+    module = wp.get_module(f"cortado_order_{type_name(dtype)}")
 
     @wp.kernel(module=module)
     def sort(

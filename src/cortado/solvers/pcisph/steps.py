@@ -27,8 +27,8 @@ class PcisphSteps(ParticleSolver):
         self.loops = (self.pressure_loop,)
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: IterationLog) -> None:
-        context = self._predict(state, parameters)
-        self.pressure_loop.run(lambda k: self._iterate(k, 0, context))
+        context = self.predict(state, parameters)
+        self.pressure_loop.run(lambda k: self.iterate(k, 0, context))
         self.write_state((0,), parameters, new_state)
         self.end_step(self.iterates.x_star[0], self.iterates.v_star[0], new_state, log)
 
@@ -38,9 +38,9 @@ class PcisphSteps(ParticleSolver):
 
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
         self.reserve(counts)
-        context = self._predict(state, parameters)
+        context = self.predict(state, parameters)
         for k in range(*counts):
-            self._iterate(k, k + 1, context)
+            self.iterate(k, k + 1, context)
 
     def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
         """The last prediction."""
@@ -48,7 +48,7 @@ class PcisphSteps(ParticleSolver):
         it = self.iterates
         self.unsort(self.context(parameters), it.x_star[iterations], it.v_star[iterations], new_state)
 
-    def _predict(self, state: State, parameters: Parameters) -> StepContext:
+    def predict(self, state: State, parameters: Parameters) -> StepContext:
         """Everything but the pressure, and the first prediction."""
         it, kernels, context = self.iterates, self.kernels, self.sort(state, parameters)
         context.launch(kernels.walls.forward, y=self.wall_relaxation)
@@ -60,7 +60,7 @@ class PcisphSteps(ParticleSolver):
         context.launch(self.integration.predict, acceleration=self.accelerate(context), **first)
         return context
 
-    def _iterate(self, k: int, slot: int, context: StepContext) -> None:
+    def iterate(self, k: int, slot: int, context: StepContext) -> None:
         """Iteration k, from the predicted state of the slot before to that of ``slot`` (0: the only one)."""
         it, kernels, before = self.iterates, self.kernels, max(slot - 1, 0)
         context.launch(
