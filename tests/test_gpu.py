@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado import Problem, Simulation, losses
+from cortado import Problem, Simulation, gradients, losses
 from scenes import plane, plane_of_three, splash, two_layers
 
 pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
@@ -54,6 +54,26 @@ def test_the_same_as_the_cpu(made):
 def test_same_bits_twice(made, precision):
     for first, second in zip(*(evaluate(made, "cuda:0", precision) for _ in range(2)), strict=True):
         assert first.tobytes() == second.tobytes()
+
+
+@pytest.mark.parametrize("lanes", [1, 2, 4, 8, 16, 32])
+@pytest.mark.parametrize("name", SCENES)
+def test_any_number_of_lanes_computes_the_same(name, lanes, monkeypatch):
+    wanted = evaluate(SCENES[name], "cpu", steps=20)
+    monkeypatch.setattr("cortado.solvers.build.lanes_for", lambda particles, device: lanes)
+    for found, one in zip(evaluate(SCENES[name], "cuda:0", steps=20), wanted, strict=True):
+        assert np.linalg.norm(found - one) <= 1e-9 * np.linalg.norm(one)
+
+
+@pytest.mark.parametrize("name", ["fixed", "two fluids"])
+def test_the_tape_follows_kernels_of_one_lane(name):
+    simulation = Simulation(SCENES[name], "cuda:0", "float64")
+    problem = Problem(simulation, 10, losses.FinalPositions(simulation.positions))
+    point = {name: value for name, value in simulation.parameters().items() if name != "colours"}
+    exact = problem.value_and_gradient(point)[1]
+    taped = problem.value_and_gradient(point, gradients.Tape())[1]
+    for name, wanted in exact.items():
+        assert np.linalg.norm(taped[name] - wanted) <= 1e-9 * np.linalg.norm(wanted)
 
 
 def test_short_lists_grow():

@@ -25,9 +25,9 @@ LAYERS = """
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights
     scene.containers scene.model scene.stability
-    device device.kernels device.memory device.precision device.reduction device.silence device.kernel_cache
-    device.smoothing device.neighbourhood device.arrays device.fields device.state device.threads device.launching
-    device.cells device.neighbours
+    device device.kernels device.memory device.precision device.lanes device.reduction device.silence
+    device.kernel_cache device.smoothing device.neighbourhood device.arrays device.fields device.state device.threads
+    device.launching device.cells device.neighbours
     scene.checks scene.scene
     parameters.checks
     discretise.sampling discretise.discrete_scene

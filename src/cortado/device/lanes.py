@@ -59,35 +59,42 @@ class LaneFunctions:
 @cache
 def lane_functions(precision: Precision, lanes: int) -> LaneFunctions:
     """The functions for so many lanes, a power of 2 up to 32."""
+    return _of_one(precision) if lanes == 1 else _of_several(precision, lanes)
+
+
+def _of_one(precision: Precision) -> LaneFunctions:
     real, vector = precision.real, precision.vector
-    if lanes == 1:
 
-        @wp.func
-        def only_lane() -> int:
-            return 0
+    @wp.func
+    def lane() -> int:
+        return 0
 
-        @wp.func
-        def same(x: real) -> real:
-            return x
+    @wp.func
+    def add_up(x: real) -> real:
+        return x
 
-        @wp.func
-        def same_vector(x: vector) -> vector:
-            return x
+    @wp.func
+    def add_up_vectors(x: vector) -> vector:
+        return x
 
-        @wp.func
-        def only_vote(yes: bool) -> int:
-            return wp.where(yes, 1, 0)
+    @wp.func
+    def vote(yes: bool) -> int:
+        return wp.where(yes, 1, 0)
 
-        @wp.func
-        def same_vote(votes: int) -> int:
-            return votes
+    @wp.func
+    def ones(votes: int) -> int:
+        return votes
 
-        @wp.func
-        def none_before(votes: int) -> int:
-            return 0
+    @wp.func
+    def before(votes: int) -> int:
+        return 0
 
-        return LaneFunctions(only_lane, same, same_vector, only_vote, same_vote, none_before)
+    return LaneFunctions(lane, add_up, add_up_vectors, vote, ones, before)
 
+
+def _of_several(precision: Precision, lanes: int) -> LaneFunctions:
+    """In CUDA: threads that share a particle are neighbours in one warp, and only they wait for one another."""
+    real, vector = precision.real, precision.vector
     first, group = f"(threadIdx.x % 32u / {lanes}u * {lanes}u)", f"{(1 << lanes) - 1}u"
 
     @wp.func_native(f"return threadIdx.x % {lanes}u;")

@@ -21,7 +21,7 @@ from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_t
 
 
 @cache
-def _fill_kernel(discretisation: Discretisation) -> Any:
+def fill_kernel(discretisation: Discretisation) -> Any:
     precision = discretisation.precision
     vector = precision.vector
     grid_type = cell_grid_type(precision)
@@ -149,7 +149,7 @@ class NeighbourSearch:
         """``walls`` (b, 3) [m], ``wall_weights`` (b,) [-]."""
         precision = discretisation.precision
         self.particles, self.device = particles, device
-        self._fill = _fill_kernel(discretisation)
+        self._fill = fill_kernel(discretisation)
         self._sort = CellSort(grid, particles, precision, device)
         self.order = self._sort.order
         self.fluid_count = wp.zeros(particles, dtype=wp.int32, device=device)

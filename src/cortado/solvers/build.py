@@ -1,5 +1,6 @@
 """What any solver of a scene is made of: neighbours, forces, phases, nozzle, and where particles may go."""
 
+from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from cortado.device.arrays import padded
 from cortado.device.cells import Grid
+from cortado.device.lanes import lanes_for
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.neighbours import NeighbourSearch
 from cortado.device.precision import Precision
@@ -34,18 +36,24 @@ def particle_system(
     scene: Scene, discrete: DiscreteScene, free_energy: FreeEnergy, precision: Precision, device: Any
 ) -> ParticleSystem:
     """A scene that is cut into particles, on a device."""
-    discretisation = Discretisation(discrete.kernel, precision)
-    return ParticleSystem(
-        scene.solver.kind,
-        discretisation,
-        discrete.lattice,
-        _search(scene, discrete, discretisation, device),
-        _forces(scene, discrete, discretisation, device),
-        [*discrete.periods, *[0.0] * (3 - scene.dimension)],
-        _phases(scene, discretisation, free_energy),
-        _nozzle(scene, discrete),
-        _walled(scene, discrete),
-    )
+    shared = Discretisation(discrete.kernel, precision, lanes_for(len(discrete.fluid.positions), device))
+    search = _search(scene, discrete, shared, device)
+
+    def system(discretisation: Discretisation) -> ParticleSystem:
+        return ParticleSystem(
+            scene.solver.kind,
+            discretisation,
+            discrete.lattice,
+            search,
+            _forces(scene, discrete, discretisation, device),
+            [*discrete.periods, *[0.0] * (3 - scene.dimension)],
+            _phases(scene, discretisation, free_energy),
+            _nozzle(scene, discrete),
+            _walled(scene, discrete),
+            of_one_lane=lambda: system(replace(discretisation, lanes=1)),
+        )
+
+    return system(shared)
 
 
 def _search(scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, device: Any) -> NeighbourSearch:

@@ -4,7 +4,7 @@ A solver of this kind is a `ParticleSolver` with loops of its own; `cortado.solv
 for its tangent and its adjoint.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn, Self
 
@@ -48,6 +48,8 @@ class ParticleSystem:
     phases: Phases
     nozzle: Nozzle | None
     walled: Walled
+    of_one_lane: Callable[[], "ParticleSystem"]
+    """The same over the same search for neighbours, with kernels that Warp's tape can differentiate."""
 
 
 class ParticleSolver:

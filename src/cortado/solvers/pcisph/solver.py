@@ -13,7 +13,7 @@ class Pcisph(PcisphSteps):
 
     def differentiable(self) -> Self:
         """The same solver over the same neighbour search, with other arrays."""
-        return type(self)(self.system, self.limits, requires_grad=True)
+        return type(self)(self.system.of_one_lane(), self.limits, requires_grad=True)
 
     def tangent(self, parameters_dot: Parameters) -> StepTangent:
         return PcisphTangent(self, parameters_dot)

@@ -1,0 +1,63 @@
+"""Several threads for one particle: which simulations get them, and that their kernels compile for a GPU.
+
+What they compute is compared with one thread for each particle in `tests/test_gpu.py`.
+"""
+
+import pytest
+import warp as wp
+
+from cortado.device.lanes import LANES, lanes_for, lanes_of
+from cortado.device.neighbourhood import Discretisation
+from cortado.device.neighbours import fill_kernel
+from cortado.device.precision import FLOAT32, FLOAT64
+from cortado.lattice.smoothing import CUBIC_SPLINE, WENDLAND_C4
+from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
+from cortado.solvers.pcisph.wall_relaxation import wall_kernels
+from cortado.sph.density import density_kernels
+from cortado.sph.pair_forces import laminar, pairwise
+from cortado.sph.viscosity import viscosity_kernels
+
+
+class Device:
+    """As much of a device as counts."""
+
+    def __init__(self, is_cpu):
+        self.is_cpu = is_cpu
+
+
+def test_few_particles_get_many_lanes_and_a_cpu_has_one():
+    sizes = [1, *(most for most, _ in LANES), *(most + 1 for most, _ in LANES), 10**7]
+    found = [lanes_for(size, Device(is_cpu=False)) for size in sorted(sizes)]
+    assert found == sorted(found, reverse=True) and found[-1] == 1
+    assert all(32 % lanes == 0 for lanes in found)
+    assert {lanes_for(size, Device(is_cpu=True)) for size in sizes} == {1}
+
+
+def kernels_of(discretisation):
+    """Every kernel that is made for lanes."""
+    families = [
+        density_kernels(discretisation),
+        pressure_kernels(discretisation),
+        pressure_force_kernels(discretisation),
+        wall_kernels(discretisation),
+        viscosity_kernels(discretisation, pairwise),
+        viscosity_kernels(discretisation, laminar),
+    ]
+    kernels = [kernel for family in families for kernel in (family.forward, family.tangent, family.adjoint)]
+    return [fill_kernel(discretisation), *kernels]
+
+
+def compiles(module, folder):
+    try:
+        wp.compile_aot_module(module, arch=90, module_dir=str(folder))
+    except Exception as error:
+        pytest.fail(f"{module.name}: {error}")
+
+
+@pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp cannot compile for a GPU")
+@pytest.mark.parametrize(("smoothing", "precision", "lanes"), [(CUBIC_SPLINE, FLOAT32, 8), (WENDLAND_C4, FLOAT64, 16)])
+def test_kernels_for_lanes_compile_for_a_gpu_that_is_not_there(smoothing, precision, lanes, tmp_path):
+    kernels = kernels_of(Discretisation(smoothing, precision, lanes))
+    assert {lanes_of(kernel) for kernel in kernels} == {lanes}
+    for module in {kernel.module.name: kernel.module for kernel in kernels}.values():
+        compiles(module, tmp_path)
