@@ -13,7 +13,7 @@ from cortado.device.state import State
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import CortadoWarning, InputError
 from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator, estimate
-from cortado.io.trajectory import Trajectory
+from cortado.io.trajectory import Trajectory, noted
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, fingerprint
 from cortado.losses.checked import as_loss
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
@@ -186,8 +186,13 @@ class Problem:
         return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies])
 
     def iterations(self) -> np.ndarray:
-        """(steps,) pressure iterations of the last evaluation."""
-        return self._rollout.diagnostics["iterations"]
+        """(steps,) pressure iterations of the last evaluation, of a solver with one loop; see `diagnostics`."""
+        return noted(self.diagnostics, "iterations")
+
+    @property
+    def diagnostics(self) -> Mapping[str, np.ndarray]:
+        """(steps,) by name, of the last evaluation: ``converged``, and what else the solver notes of each step."""
+        return self._rollout.diagnostics
 
     def _ends(
         self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()

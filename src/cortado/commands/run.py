@@ -17,8 +17,11 @@ from cortado.io.run_folder import RunFolder
 from cortado.io.trajectory import Trajectory, append_frame, frame_writer
 from cortado.io.video import MOST_FRAMES, write_video
 from cortado.rollout import Rollout
-from cortado.scene.scene import Scene, load_scene
+from cortado.scene.scene import load_scene
 from cortado.simulation import Simulation, check_steps, not_converged_sentence
+
+Rows = list[tuple[str, object]]
+"""(label, value) of each row of a report"""
 
 
 def run_scene(
@@ -36,7 +39,7 @@ def run_scene(
     scene = load_scene(scene_file, overrides)
     simulation = Simulation(scene, device, precision)
     rollout = simulation.rollout(check_steps(steps))
-    numbers = simulation.particles * (6 + len(scene.phase))
+    numbers = simulation.numbers_in_frame(components=3)  # as in the file
     frames = frame_parts(2 + steps // record_every, numbers, simulation.precision.bytes)
     require(frames, "take a larger --record-every or fewer steps")
     with locked(out):
@@ -53,10 +56,10 @@ def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record
     try:
         _write_trajectory(simulation, rollout, folder, record_every)
     except DivergedError as error:
-        _write_pictures(simulation.scene, simulation, folder, [("ended early", error)])
+        _write_pictures(simulation, rollout.substeps, folder, [("ended early", error)])
         advice = f"{error.advice}; the frames so far are in {folder.path}"
         raise error.with_advice(advice) from error
-    _write_pictures(simulation.scene, simulation, folder, [])
+    _write_pictures(simulation, rollout.substeps, folder, [])
 
 
 def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:
@@ -100,8 +103,9 @@ def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], 
     return figures
 
 
-def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder, remarks: list[tuple[str, object]]) -> None:
+def _write_pictures(simulation: Simulation, substeps: int, folder: RunFolder, remarks: Rows) -> None:
     """The report with its pictures; ``remarks`` are its first rows."""
+    scene = simulation.scene
     trajectory = Trajectory.load(folder.trajectory)
     shown = sorted({0, len(trajectory.times) // 2, len(trajectory.times) - 1})
     speeds = [np.linalg.norm(trajectory.velocities[frame], axis=1) for frame in shown]
@@ -124,7 +128,6 @@ def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder, rem
         path = folder.figures / "density_errors.png"
         density_errors(trajectory, path, tolerance=scene.solver.density_tolerance)
         figures.append(("Average density error of each step, and the tolerance asked.", path))
-    substeps = simulation.solver.mixture.substeps  # of the run that has just ended
     rows = [
         *remarks,
         ("particles", simulation.particles),

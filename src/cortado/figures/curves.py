@@ -109,12 +109,14 @@ def parameters(
 
 
 def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float | None = None) -> Path:
-    """Density error [%] and pressure iterations of every step; steps that did not converge are marked.
+    """Density error [%] and iterations, of each loop of the solver, of every step; steps that did not converge are
+    marked.
 
     Args:
         tolerance: the solver's, drawn as a line [-].
     """
-    steps = np.arange(1, len(trajectory.iterations) + 1)
+    steps = np.arange(1, len(trajectory.converged) + 1)
+    loops = {name: column for name, column in trajectory.diagnostics.items() if column.dtype.kind == "i"}
     errors = 100.0 * trajectory.density_errors
     failed = ~trajectory.converged
     with drawing(path, height=6.0) as figure:
@@ -128,7 +130,11 @@ def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float
         upper.set_title("Density error and pressure iterations", pad=32)
         upper.set_ylabel("average density\nerror [%]")
         upper.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2)
-        lower.step(steps, trajectory.iterations, color=PALETTE[1], where="mid", linewidth=1.2)
+        for number, (name, iterations) in enumerate(loops.items(), 1):
+            style = {"color": PALETTE[number % len(PALETTE)], "label": name.replace("_", " ")}
+            lower.step(steps, iterations, where="mid", linewidth=1.2, **style)
+        if len(loops) > 1:
+            lower.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
         lower.set(xlabel="step", ylabel="pressure\niterations", ylim=(0, None))
         whole_numbers(lower.xaxis)
         whole_numbers(lower.yaxis)

@@ -151,13 +151,21 @@ class Trajectory:
 
     @property
     def iterations(self) -> NDArray[Any]:
-        """(steps,) [-] pressure iterations of each step."""
-        return self.diagnostics["iterations"]
+        """(steps,) [-] pressure iterations of each step, of a solver with one loop.
+
+        Raises:
+            InputError: the solver notes something else.
+        """
+        return noted(self.diagnostics, "iterations")
 
     @property
     def density_errors(self) -> NDArray[Any]:
-        """(steps,) [-] average (rho - rho_0) / rho_0 at the end of each step."""
-        return self.diagnostics["density_errors"]
+        """(steps,) [-] average (rho - rho_0) / rho_0 at the end of each step.
+
+        Raises:
+            InputError: the solver notes something else.
+        """
+        return noted(self.diagnostics, "density_errors")
 
     @property
     def converged(self) -> NDArray[Any]:
@@ -207,6 +215,13 @@ class Trajectory:
         phases = sum(name.startswith(FRACTION) for name in arrays)
         fractions = np.stack([arrays[name] for name in _fraction_names(phases)], axis=-1) if phases else None
         return cls(**{name: arrays[name] for name in names}, mass_fractions=fractions)
+
+
+def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
+    """(steps,) of that name; raises `InputError` where a solver has other diagnostics."""
+    if name not in diagnostics:
+        raise InputError(f"{name} is no diagnostic of this solver, whose diagnostics are {', '.join(diagnostics)}.")
+    return diagnostics[name]
 
 
 FRACTION = "mass_fraction_"

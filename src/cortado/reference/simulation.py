@@ -62,6 +62,8 @@ class Simulation:
         all cores unless said, or one where there are too few particles. The bits of the results do not depend on them.
         """
         scene = as_scene(scene)
+        if scene.solver.kind != "pcisph":
+            raise InputError(f"solver.kind is {shown(scene.solver.kind)}, but must be pcisph for the reference engine.")
         if len(scene.phase) > 1 or scene.emitter is not None:
             raise InputError("scene has several phases or an emitter, but must have neither for the reference engine.")
         unknown = [p.name for p in BY_NAME.values() if p.is_optional and p.present(scene)]

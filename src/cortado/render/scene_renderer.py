@@ -6,6 +6,7 @@ import numpy as np
 from pydantic import AfterValidator, TypeAdapter
 
 from cortado.device.precision import Precision
+from cortado.discretise.discrete_scene import Lattice
 from cortado.lattice.smoothing import SmoothingKernel
 from cortado.render.cameras import Perspective
 from cortado.render.renderer import Renderer
@@ -34,7 +35,7 @@ class Pictured(Protocol):
     precision: Precision
     device: Any
     smoothing: SmoothingKernel
-    solver: Any
+    lattice: Lattice
 
     @property
     def dimension(self) -> int:
@@ -58,7 +59,7 @@ def scene_renderer(simulation: Pictured, extinction_factor: float = 1.0, **setti
         upper,
         smoothing=simulation.smoothing,
         support=scene.discretisation.support_radius,
-        volume=simulation.solver.lattice.volume,
+        volume=simulation.lattice.volume,
         particles=simulation.particles,
         phases=len(scene.phase),
         precision=simulation.precision,

@@ -69,10 +69,14 @@ Forces: Any = create_model("Forces", __base__=FixedForces, __module__=__name__, 
 """Which forces act: `FixedForces`, and the optional ones of the registry of parameters."""
 
 
+SOLVERS = {"pcisph": "cortado.solvers.pcisph.build"}
+"""By the kind that a scene names, the module whose ``build`` makes the solver of a scene."""
+
+
 class Solver(Table):
     """How a step is solved."""
 
-    kind: Annotated[str, Choice(("pcisph",))] = "pcisph"
+    kind: Annotated[str, Choice(tuple(SOLVERS))] = "pcisph"
     """Name of the algorithm."""
     time_step: Annotated[float, Quantity("s", above=0.0)]
     """[s]"""

@@ -31,6 +31,7 @@ class OneKernelTape(Tape):
         step = super().derivative(rollout)
         loops = one_kernel_loops(rollout.solver.discretisation)
         wrong = {topic: Kernels(loops[topic], None, None) for topic in self.topics}
+        step.solver.density = wrong.pop("density", step.solver.density)
         step.solver.kernels = replace(step.solver.kernels, **wrong)
         return step
 
