@@ -75,7 +75,6 @@ class ParticleAdjoint:
         """Adjoints; those of the parameters are complete after `collect`."""
         self.carried_bar = Carried(solver.carried_fields, solver.layout)
         """Of what the step carries on, once `unsort` has been called."""
-        self._acceleration_bar = solver.vectors()
         self._mixture = MixtureAdjoint(mixture)
         self._emitter = EmitterAdjoint(solver.emitter) if solver.emitter else None
 
@@ -98,13 +97,10 @@ class ParticleAdjoint:
         self._emitter.step(context, state_bar, self.bar.parameters)
         return self._emitter.free
 
-    def accelerate(self, context: StepContext) -> None:
-        """Of `ParticleSolver.accelerate`, where every prediction of the step was one from v + dt a: ``v_bar`` is the
-        adjoint of that."""
-        integration = self._solver.integration
-        context.launch(integration.acceleration_adjoint, *self.bar.named, acceleration_bar=self._acceleration_bar)
+    def accelerate(self, context: StepContext, acceleration_bar: wp.array) -> None:
+        """Of `ParticleSolver.accelerate`, for the adjoint of its accelerations, (n,) vectors."""
         for force in reversed(self._solver.forces):
-            force.adjoint(context, self._acceleration_bar, self.bar)
+            force.adjoint(context, acceleration_bar, self.bar)
 
     def mix(self, context: StepContext, state_bar: State) -> None:
         """Of the mixture, and of the particles' masses, in `ParticleSolver.sort`."""

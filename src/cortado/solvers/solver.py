@@ -1,6 +1,7 @@
 """What a solver is: an algorithm that takes steps, and can take one again, along tangents, and back.
 
-Rollouts, gradients and the certificate know a solver by this protocol; `cortado.solvers.pcisph` is one.
+Rollouts, gradients and the certificate know a solver by this protocol, and so do files and reports of runs.
+`cortado.solvers.particles` has what solvers of particles share; `cortado.solvers.pcisph` is one.
 """
 
 from collections.abc import Mapping
@@ -27,6 +28,7 @@ class StepLog(Protocol):
     def diagnostics(self) -> Mapping[str, NDArray]:
         """(steps,) by name, of the steps that were read. Every solver has ``converged``; PCISPH also ``iterations``,
         ``density_errors``, the average of the compressions (rho* - rho_0)+ / rho_0, and ``greatest_density_errors``.
+        Reports draw ``density_errors``, and whole numbers as the iterations of loops.
         """
 
     def read(self, steps: int) -> None:
@@ -58,7 +60,9 @@ class StepAdjoint(Protocol):
 
 class Solver(Protocol):
     """The solver of one set of particles on one device, which rollouts share. Of its methods `make_room` alone
-    waits for the device and reads from it."""
+    waits for the device and reads from it. `tangent`, `adjoint` and `differentiable` raise `InputError`, one sentence,
+    where a solver has no such derivative.
+    """
 
     discretisation: Discretisation
     particles: int
@@ -90,7 +94,7 @@ class Solver(Protocol):
         """Whether the lists of neighbours were too short; they are longer now, and what used them must be repeated."""
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: Any) -> None:
-        """One step, noted in a log of `new_log`."""
+        """One step, noted in a log of `new_log`. The two states may be one and the same."""
 
     def reserve(self, counts: Counts) -> None:
         """Make room for all intermediate values of a step."""

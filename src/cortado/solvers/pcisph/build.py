@@ -9,10 +9,11 @@ from cortado.scene.scene import Scene
 from cortado.solvers.build import particle_system
 from cortado.solvers.loop import LoopLimits
 from cortado.solvers.pcisph.solver import Pcisph
+from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FreeEnergy
 
 
-def build(scene: Scene, discrete: DiscreteScene, free_energy: FreeEnergy, precision: Precision, device: Any) -> Pcisph:
+def build(scene: Scene, discrete: DiscreteScene, free_energy: FreeEnergy, precision: Precision, device: Any) -> Solver:
     """The solver of a scene that is cut into particles, on a device."""
     return Pcisph(particle_system(scene, discrete, free_energy, precision, device), pressure_limits(scene))
 

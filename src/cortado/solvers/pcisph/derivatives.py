@@ -21,7 +21,7 @@ class PcisphAdjoint(ParticleAdjoint):
         super().__init__(solver, steps)
         self._solver, self._frozen = solver, frozen_geometry
         self._force = frozen_force_adjoint(solver.discretisation) if frozen_geometry else solver.kernels.force.adjoint
-        self._push_bar = solver.vectors()
+        self._push_bar, self._acceleration_bar = solver.vectors(), solver.vectors()
         self._p_bar, self._y_bar, self._r, self._t_bar = (solver.numbers() for _ in range(4))
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
@@ -56,7 +56,8 @@ class PcisphAdjoint(ParticleAdjoint):
             )
             predicted = {"x_star": it.x_star[k], "v_star": it.v_star[k]}
             context.launch(kernels.pressure.adjoint, *known, r=self._r, push_bar=push_bar, **predicted)
-        self.accelerate(context)
+        context.launch(solver.integration.acceleration_adjoint, *known, acceleration_bar=self._acceleration_bar)
+        self.accelerate(context, self._acceleration_bar)
         if solver.mixture.phases.count > 1:
             factors = {"t": solver.contrast, "y": solver.pressure_relaxation, "y_bar": self._y_bar}
             context.launch(kernels.contrast.factor_adjoint, **factors, t_bar=self._t_bar)
