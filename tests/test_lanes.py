@@ -13,6 +13,7 @@ from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.lattice.smoothing import CUBIC_SPLINE, WENDLAND_C4
 from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
 from cortado.solvers.pcisph.wall_relaxation import wall_kernels
+from cortado.sph.carried import order_kernels
 from cortado.sph.density import density_kernels
 from cortado.sph.pair_forces import laminar, pairwise
 from cortado.sph.viscosity import viscosity_kernels
@@ -59,5 +60,6 @@ def compiles(module, folder):
 def test_kernels_for_lanes_compile_for_a_gpu_that_is_not_there(smoothing, precision, lanes, tmp_path):
     kernels = kernels_of(Discretisation(smoothing, precision, lanes))
     assert {lanes_of(kernel) for kernel in kernels} == {lanes}
+    assert lanes_of(order_kernels(precision.vector).sort) == 1
     for module in {kernel.module.name: kernel.module for kernel in kernels}.values():
         compiles(module, tmp_path)

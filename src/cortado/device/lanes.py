@@ -1,9 +1,9 @@
 """Lanes: several threads of a GPU that share a particle; each takes some of its neighbours, and sums are added up.
 
-One thread a particle leaves a large GPU empty where there are few particles. A kernel that is made for lanes has them
-side by side: thread t is lane t % L of particle t // L. A lane takes `UNROLL` neighbours at a time, and then those L
-times further down the list. What lanes have summed up is added in a butterfly of shuffles, of which every lane gets the
-same bits. On a CPU, and for Warp's tape, L is 1, and all of this is nothing.
+One thread a particle leaves a large GPU empty where there are few particles. A kernel that is made for lanes finds its
+particle with `wp.tid() // LANES`, and is launched with so many threads for each. A lane takes `UNROLL` neighbours at a
+time, and then those LANES times further down the list. What lanes have summed up is added in a butterfly of shuffles,
+of which every lane gets the same bits, and the first one writes. On a CPU, and for Warp's tape, there is one lane.
 """
 
 from dataclasses import dataclass
@@ -22,13 +22,14 @@ _OF_MODULES: dict[str, int] = {}
 
 
 def set_lanes(module: Any, lanes: int) -> None:
-    """Make every kernel of a Warp module one of so many lanes."""
+    """Say what LANES is in the kernels of a Warp module."""
     _OF_MODULES[module.name] = lanes
 
 
+@cache
 def lanes_of(kernel: wp.Kernel) -> int:
-    """Threads that a kernel has for each particle."""
-    return _OF_MODULES.get(kernel.module.name, 1)
+    """Threads that a kernel has for each particle: one, unless it divides them by LANES."""
+    return _OF_MODULES.get(kernel.module.name, 1) if "wp.tid() // LANES" in kernel.adj.source else 1
 
 
 def lanes_for(particles: int, device: Any) -> int:

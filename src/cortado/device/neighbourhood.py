@@ -23,16 +23,16 @@ class Discretisation:
     smoothing: SmoothingKernel
     precision: Precision
     lanes: int = 1
-    """Threads for each particle, in kernels that are made for them."""
+    """Threads for each particle, in kernels that are made for them: see `cortado.device.lanes`."""
 
-    def module(self, differentiable: bool, topic: str = "pcisph", lanes: int = 1) -> Any:
-        """The Warp module of these kernels, which have so many threads for each particle; only the forward kernels get
-        Warp's own adjoint, where there is one lane (for `gradients.Tape`)."""
+    def module(self, differentiable: bool, topic: str = "pcisph") -> Any:
+        """The Warp module of these kernels; only the forward kernels get Warp's own adjoint, where there is one lane
+        (for `gradients.Tape`)."""
         kind = "forward" if differentiable else "derivative"
         beside = "" if self.lanes == 1 else f"_{self.lanes}_lanes"
         module = wp.get_module(f"cortado_{topic}_{kind}_{self.smoothing.name}_{self.precision.name}{beside}")
         module.options["enable_backward"] = differentiable and self.lanes == 1
-        set_lanes(module, lanes)
+        set_lanes(module, self.lanes)
         return module
 
 

@@ -84,7 +84,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
                 total = scan(i, own, grid.starts[cell], grid.starts[cell + 1], total, x_i, positions, s)
         return total
 
-    @wp.kernel(module=discretisation.module(False, "neighbours", LANES), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, "neighbours"), enable_backward=False)
     def fill(
         s: neighbourhood,
         grid: grid_type,

@@ -96,7 +96,7 @@ def density_kernels(discretisation: Discretisation) -> Kernels:
     LANES = discretisation.lanes
     lane = lane_functions(discretisation.precision, LANES).lane
 
-    @wp.kernel(module=discretisation.module(True, lanes=LANES))
+    @wp.kernel(module=discretisation.module(True))
     def density(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -109,7 +109,7 @@ def density_kernels(discretisation: Discretisation) -> Kernels:
             return
         n[i] = s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
 
-    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def density_tangent(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -123,7 +123,7 @@ def density_kernels(discretisation: Discretisation) -> Kernels:
             return
         n_dot[i] = s.volume * total
 
-    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def density_adjoint(
         s: neighbourhood,
         x: wp.array(dtype=vector),

@@ -127,7 +127,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
                 total += (wall_volume * mu_i) * phi_tangent(x_ib, v_i, x_dot_i, v_dot_i, s)
         return add_up_vectors(total)
 
-    @wp.kernel(module=discretisation.module(True, name, LANES))
+    @wp.kernel(module=discretisation.module(True, name))
     def viscosity(
         s: neighbourhood,
         kappa: real,
@@ -147,7 +147,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
             return
         acceleration[i] = acceleration_in[i] + (kappa / (m[i] * n[i])) * total
 
-    @wp.kernel(module=discretisation.module(False, name, LANES), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, name), enable_backward=False)
     def viscosity_tangent(
         s: neighbourhood,
         kappa: real,
@@ -175,7 +175,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         change = m_dot[i] / m[i] + n_dot[i] / n[i]
         acceleration_dot[i] = acceleration_in_dot[i] + factor * (total_dot - change * total)
 
-    @wp.kernel(module=discretisation.module(False, name, LANES), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, name), enable_backward=False)
     def viscosity_adjoint(
         s: neighbourhood,
         kappa: real,

@@ -38,7 +38,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     LANES = discretisation.lanes
     lane = lane_functions(discretisation.precision, LANES).lane
 
-    @wp.kernel(module=discretisation.module(True, lanes=LANES))
+    @wp.kernel(module=discretisation.module(True))
     def pressure(
         s: neighbourhood,
         stiffness: real,
@@ -69,7 +69,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         c[i] = p_i / (n[i] * n[i])
         error[i] = pair_of(compression, compression)
 
-    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def pressure_tangent(
         s: neighbourhood,
         stiffness: real,
@@ -108,7 +108,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         p_out_dot[i] = p_dot_i
         c_dot[i] = (p_dot_i - real(2.0) * p_i / n_i * n_dot[i]) / (n_i * n_i)
 
-    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def pressure_adjoint(
         s: neighbourhood,
         time_step: wp.array(dtype=real),
@@ -193,7 +193,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
             total += (s.wall_weights[b] * c_i) * hessian_product(x_ib, x_dot_i, s)
         return add_up_vectors(total)
 
-    @wp.kernel(module=discretisation.module(True, lanes=LANES))
+    @wp.kernel(module=discretisation.module(True))
     def pressure_force(
         s: neighbourhood,
         time_step: wp.array(dtype=real),
@@ -216,7 +216,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         v_star[i] = velocity
         x_star[i] = x[i] + dt * velocity
 
-    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def pressure_force_tangent(
         s: neighbourhood,
         time_step: wp.array(dtype=real),
@@ -248,7 +248,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         v_star_dot[i] = velocity_dot
         x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[0] * v_star[i]
 
-    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def pressure_force_adjoint(
         s: neighbourhood,
         stiffness: real,

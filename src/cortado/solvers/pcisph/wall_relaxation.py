@@ -51,7 +51,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
             )
         return add_up_vectors(total)
 
-    @wp.kernel(module=discretisation.module(True, lanes=LANES))
+    @wp.kernel(module=discretisation.module(True))
     def wall_relaxation(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -64,7 +64,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
             return
         y[i] = real(1.0) / (real(1.0) + wp.dot(total, total))
 
-    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def wall_relaxation_tangent(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -80,7 +80,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
             return
         y_dot[i] = real(-2.0) * y[i] * y[i] * wp.dot(total, total_dot)
 
-    @wp.kernel(module=discretisation.module(False, lanes=LANES), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def wall_relaxation_adjoint(
         s: neighbourhood,
         x: wp.array(dtype=vector),
