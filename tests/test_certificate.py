@@ -60,7 +60,7 @@ def test_right_gradients_are_found_right(name):
     c = found.consistency
     assert found.right, (found.wrong, c.disagreement, c.miss)
     assert c.disagreement < 1e-10 and c.last_converged == 30 and c.miss < 1e-4
-    assert "gravity" in found.shares and found.shares["time_step"] > 0.0
+    assert "gravity" in found.loss_changes and found.loss_changes["time_step"] > 0.0
     assert all(isinstance(value, (int, float, str, list, dict, type(None))) for value in found.as_dict().values())
     json.dumps(found.as_dict(), allow_nan=False)
 

@@ -654,7 +654,7 @@ def test_the_check_speaks_json(cortado_command):
     code, out, _ = cortado_command("gradients", "check", "scene.toml", "--steps", 3, "--json")
     certificate = json.loads(out)
     assert code == 0 and certificate["right"] is True and certificate["wrong"] == []
-    assert certificate["shares"].keys() >= {"gravity", "initial_positions", "viscosity"}
+    assert certificate["loss_changes"].keys() >= {"gravity", "initial_positions", "viscosity"}
     assert certificate["horizon"] == 3 and certificate["estimator"] == "Exact()"
 
 

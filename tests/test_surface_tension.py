@@ -240,7 +240,7 @@ def test_the_certificate(name):
     problem, point = disturbed(SCENES[name](), steps=4, precision="float64")
     certificate = cortado.certify(problem, point)
     assert certificate.right
-    assert certificate.shares["surface_tension"] > 0.0
+    assert certificate.loss_changes["surface_tension"] > 0.0
 
 
 def test_the_tape_agrees():

@@ -131,7 +131,7 @@ def test_it_is_searched_between_knots():
 
 def test_gradients_with_respect_to_it_are_certified():
     found = cortado.certify(problem_of(plane()), {"tilt": [10.0]})
-    assert found.right and found.shares["tilt"] > 0.0 and "gravity" not in found.shares
+    assert found.right and found.loss_changes["tilt"] > 0.0 and "gravity" not in found.loss_changes
     assert found.horizon == STEPS
 
 

@@ -43,7 +43,7 @@ class Certificate:
     particles: int
     steps: int
     loss: float
-    shares: dict[str, float]
+    loss_changes: dict[str, float]
     """For every parameter, by how much a meaningful perturbation of it changes the loss, by the adjoint."""
     consistency: Consistency
     """Of the derivatives with respect to all parameters together."""
@@ -66,7 +66,7 @@ class Certificate:
     def __str__(self) -> str:
         """As tables and sentences."""
         size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}, float64"
-        lines = [size, parameter_table(self.shares, self.wrong)]
+        lines = [size, parameter_table(self.loss_changes, self.wrong)]
         if not self.right:
             return "\n".join([*lines, f"The adjoint is WRONG: {consistency_words(self.consistency)}."])
         lines += [
@@ -159,7 +159,7 @@ def certify(
         particles=problem.simulation.particles,
         steps=problem.steps,
         loss=exact.loss,
-        shares={name: abs(float((exact.gradient[name] * along[name]).sum())) for name in along},
+        loss_changes={name: abs(float((exact.gradient[name] * along[name]).sum())) for name in along},
         consistency=consistency,
         wrong=wrong,
         norms=np.hypot(norms.numpy()[:, 0], norms.numpy()[:, 1] / time),

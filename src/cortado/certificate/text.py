@@ -13,12 +13,12 @@ WIDTH = 110
 """Characters of a table at most."""
 
 
-def parameter_table(shares: Mapping[str, float], wrong: Sequence[str]) -> str:
+def parameter_table(loss_changes: Mapping[str, float], wrong: Sequence[str]) -> str:
     """By how much each parameter changes the loss, and whether its adjoint is right."""
-    verdicts = {name: "WRONG" if name in wrong else "right" for name in shares}
+    verdicts = {name: "WRONG" if name in wrong else "right" for name in loss_changes}
     rows = [
         [name, f"{share:.3e}", verdicts[name] if share or name in wrong else "no effect on this loss"]
-        for name, share in shares.items()
+        for name, share in loss_changes.items()
     ]
     return _table(["parameter", "a perturbation changes the loss by", "adjoint"], rows)
 

@@ -1,4 +1,4 @@
-"""A task made ready: its problem with the target, in the coordinates in which it is searched, from a start."""
+"""The setup of a task on a device: its problem with the target, and its start in the coordinates of the search."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -24,16 +24,16 @@ DRAWN = {"heart": heart, "rosetta": rosetta}
 
 @dataclass(frozen=True)
 class Setup:
-    """What `cortado.optimise` is given, and what its result is held against."""
+    """The arguments for `cortado.optimise`, and the target that its result is compared with."""
 
     task: Task
     problem: Problem
     searches: tuple[Transformed, ...]
     """One for each entry of the extinction schedule, in the same coordinates; the last is the scene's own."""
     start: Arrays
-    """Coordinates to begin with."""
+    """Coordinates with which the search starts."""
     bounds: dict[str, tuple[Any, Any]]
-    """Of coordinates."""
+    """Lower and upper bounds of coordinates."""
     renderer: Renderer | None
     """None where positions are compared."""
     targets: dict[int, np.ndarray]
@@ -41,7 +41,7 @@ class Setup:
 
     @property
     def search(self) -> Transformed:
-        """The last one."""
+        """The last of the searches, that of the task itself."""
         return self.searches[-1]
 
     def image(self, end: Snapshot) -> np.ndarray:
@@ -103,7 +103,8 @@ def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> d
 
 
 def _picture(task: Task, renderer: Renderer) -> np.ndarray:
-    """The picture that a task names; one of ours in the colours of the scene, the last phase on the first."""
+    """The picture that a task names; "heart" and "rosetta" are drawn in the scene's colours, the last phase on the
+    first."""
     name, scene = task.problem.picture, task.scene
     assert name is not None
     rows, columns, _ = renderer.shape
@@ -146,8 +147,11 @@ def _coordinates(task: Task, start: Arrays) -> dict[str, Bijector]:
 
 
 def _bounds(task: Task) -> dict[str, tuple[Any, Any]]:
-    """Bounds hold for knots as they do for what lies between them, and for logarithms after they are taken. A parameter
-    that cannot be negative has 0 as a bound."""
+    """Bounds of coordinates, by name.
+
+    Those of a parameter over time hold for its knots, and so for what is interpolated between them; those of a
+    logarithmic parameter are logarithms. A parameter that cannot be negative has 0 as a lower bound.
+    """
     with_zero = [name for name in task.start if BY_NAME[name].range is Range.NOT_NEGATIVE]
     free = [name for name in with_zero if name not in task.optimise.logarithmic]
     found: dict[str, tuple[Any, Any]] = dict.fromkeys(free, (0.0, None))

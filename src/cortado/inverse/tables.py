@@ -34,7 +34,7 @@ CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
 
 @dataclass(frozen=True)
 class Values(FieldType):
-    """Parameters by name: a number, or a list, of lists, of numbers."""
+    """Parameters by name, each a number, a list of numbers, or a list of lists of numbers."""
 
     random: bool = False
     """Whether `CAN_BE_RANDOM` may be the word "random"."""
@@ -100,11 +100,11 @@ class ProblemTable(Table):
     steps: Annotated[int, Count(0, 10_000_000)]
     """Time steps; 0 for a loss of the first state."""
     loss: Annotated[str, Choice(("positions", "image"))] = "positions"
-    """What is compared: where the particles are, or how they look."""
+    """What is compared with the target: positions of particles, or images."""
     distance: Annotated[str, Choice(tuple(DISTANCES))] = "squared_difference"
     """How images are compared."""
     frames: Annotated[int, Count(1, 10_000)] = 1
-    """How many states are compared, evenly spaced up to the last one."""
+    """Number of states that are compared, evenly spaced up to the last one."""
     target: Annotated[dict[str, Any] | None, Values()] = None
     """The true parameters: the target is what a run with them makes."""
     picture: Annotated[str | None, Text()] = None
@@ -135,7 +135,7 @@ class ProblemTable(Table):
 
 
 class CheckTable(Table):
-    """[optimise.check]: what the run has to reach."""
+    """[optimise.check]: what the estimate has to reach."""
 
     loss_reduction: Annotated[float, Quantity(least=1.0)] = 1.0
     """First loss / best loss."""
@@ -149,15 +149,15 @@ class GradientTable(Table):
     """[optimise.gradient]: which gradient the search follows, see docs/gradients.md."""
 
     name: Annotated[str, Choice(tuple(ESTIMATORS))] = "exact"
-    """What is done on the way back through a run."""
+    """Name of the estimator."""
     strength: Annotated[float | None, Quantity(above=0.0, most=1.0)] = None
-    """Of adjoint smoothing; None: found at the start of a search."""
+    """Strength of `AdjointViscosity`; None: chosen at the start of a search."""
     samples: Annotated[int, Count(1, 10_000)] = 1
-    """Runs of an ensemble that the gradient is the mean of."""
+    """Runs of the ensemble over which the gradient is averaged."""
     spread: Annotated[dict[str, Any] | None, Values()] = None
-    """Of the ensemble: by name a number, in the units of what is searched."""
+    """Width of the ensemble in each parameter, by name, in the units of what is searched."""
     position_noise: Annotated[float, Quantity("spacings", least=0.0)] = EnsembleMean.position_noise
-    """Of the first positions in the ensemble."""
+    """Standard deviation of the perturbations of first positions in the ensemble."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -193,14 +193,14 @@ class GradientTable(Table):
 
 
 class OptimiseTable(Table):
-    """[optimise]: from where, how and how long."""
+    """[optimise]: the start of the search, its algorithm, and its length."""
 
     start: Annotated[dict[str, Any], Values(random=True)]
-    """Parameters to begin with; these are optimised."""
+    """Parameters with which the search starts; these are optimised."""
     knots: Annotated[int | None, Count(2, 10_000_000)] = None
-    """Parameters over time are interpolated between so many free values; None: every step has its own."""
+    """Number of free rows between which parameters over time are interpolated; None: one row for each step."""
     logarithmic: Annotated[tuple[str, ...], Names()] = ()
-    """Parameters that are changed by factors."""
+    """Parameters that are searched by their logarithm."""
     bounds: Annotated[dict[str, Any] | None, Values()] = None
     """By name: two entries, the lower and the upper bound."""
     extinction_schedule: Annotated[tuple[float, ...], Schedule()] = (1.0,)
@@ -211,13 +211,13 @@ class OptimiseTable(Table):
     learning_rate: Annotated[float, Quantity(above=0.0)]
     """In units of the parameters; for L-BFGS the size of its first step."""
     tolerance: Annotated[float | None, Quantity(above=0.0, most=0.5)] = None
-    """Of L-BFGS: it ends where the gradient is this part of the first; None: where round-off stops it."""
+    """L-BFGS ends where the gradient is this part of the first one; None: where round-off stops it."""
     iterations: Annotated[int, Count(1, 10_000_000)]
     """Updates at most, of each search."""
     gradient: GradientTable = GradientTable()
-    """Which gradient it follows."""
+    """The gradient that the search follows."""
     check: CheckTable = CheckTable()
-    """What the run has to reach."""
+    """What the estimate has to reach."""
 
     @model_validator(mode="after")
     def _check_tolerance(self) -> Self:

@@ -22,7 +22,7 @@ from cortado.scene.toml import read_toml
 
 @dataclass(frozen=True)
 class Task:
-    """A scene, what is asked of it, and how to find it. Parameters over time have a row for each step."""
+    """An inverse problem: a scene, a target, and how it is searched. Parameters over time have a row for each step."""
 
     scene: Scene
     problem: ProblemTable
@@ -30,9 +30,9 @@ class Task:
     true_parameters: Arrays
     """Those of the run that made the target; none where the target is a picture."""
     start: dict[str, Any]
-    """Parameters to begin with; arrays, or the word "random"."""
+    """Parameters with which the search starts; arrays, or the word "random"."""
     folder: Path = Path()
-    """Where its other files are looked for."""
+    """The folder of the task's file; paths in the task are relative to it."""
 
 
 def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Task:
@@ -98,7 +98,7 @@ def _check_range(name: str, field: str, array: np.ndarray) -> None:
 
 
 def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mapping[str, Any]) -> None:
-    """Raises `SceneError` for an option that does not fit the others; none is silently left unused."""
+    """Raises `SceneError` for an option that does not fit the others, so that none is silently ignored."""
     over_time = [name for name in OVER_TIME if name in start and start[name].ndim == 2]
     if optimise.knots is not None and not over_time:
         raise SceneError(None, "optimise.knots", optimise.knots, "left out, as nothing that is optimised has rows")

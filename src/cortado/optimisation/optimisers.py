@@ -1,8 +1,8 @@
 """The optimisers: each an object that holds its settings and its algorithm.
 
-An optimiser is deterministic: what it asks for depends on its settings and on the evaluations it was given,
-on nothing else. Resuming (`cortado.optimisation.optimise`) rests on this; an optimiser with random numbers must draw
-them from a seed of its own.
+An optimiser is deterministic: the points at which it evaluates depend on its settings and on the losses and gradients
+before, and on nothing else. Resuming (`cortado.optimisation.optimise`) rests on this; an optimiser with random numbers
+must draw them from a seed of its own.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -23,7 +23,7 @@ PerParameter = float | Mapping[str, float]
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What an optimiser is given."""
+    """The problem that an optimiser is given, as a function of one vector."""
 
     evaluate: Callable[[Vector], tuple[float, Vector]]
     # vector (size,) -> loss, gradient (size,)
@@ -45,7 +45,7 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What an optimiser gives back."""
+    """What an optimiser returns."""
 
     last: Vector
     # (size,), the last iterate, which has been evaluated

@@ -1,8 +1,8 @@
 """Lyapunov exponents of a flow and of its variants, by two methods that share nothing but the forward step.
 
-Tangents are pushed along a run and made orthonormal again and again; and two runs, of which one starts a hair's breadth
-away, part. The second knows nothing of derivatives: where both agree, growth is the fluid's. Tangents can also leave
-out a term of the derivative, which says what each of them does to the growth.
+The first method propagates tangents along a run, and makes them orthonormal at regular steps. The second measures how
+fast two runs diverge whose first states are nearly the same; it uses no derivative, so that growth on which both agree
+is a property of the flow. With a term of the derivative left out, the tangents show what that term contributes.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class LyapunovSettings(SceneSettings):
     """Exponents of the scene and of its variants."""
 
     fall: Annotated[float, Quantity("m", above=0.0)]
-    """Height of the fall: times are counted in the time that it takes, (2 fall / g)^(1/2), so that variants of gravity
-    are seen at the same stage."""
+    """Height of the fall. Times are in units of its duration, (2 fall / g)^(1/2), so that variants with another gravity
+    are compared at the same stage."""
     window: Annotated[tuple[float, ...], Components(Quantity("falls", least=0.0))]
     """Begin and end of the window in which exponents are measured."""
     seeds: Annotated[int, Count(1, 100)]

@@ -1,6 +1,7 @@
 """The report's Figure 7: the derivative of the pressure force with one of its two terms at a time.
 
-Twice: a tangent that is propagated with one term only, and what each term does in one step to the exact tangent.
+It measures a tangent that is propagated with that term only, and the size of each term in one step along the exact
+tangent.
 """
 
 from typing import TYPE_CHECKING, Annotated, Any

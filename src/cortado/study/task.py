@@ -22,7 +22,7 @@ from cortado.study.tables import Table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MOMENTS = 4
+PICTURES = 4
 """Pictures on the way, the first and the last of them included."""
 TARGET = "target"
 
@@ -55,7 +55,7 @@ def measure(settings: TaskSettings, progress: Progress) -> Table:
     history = _search(made, progress)
     last, target = max(made.targets.items())
     pictures = {TARGET: target}
-    for k in np.unique(np.linspace(0, len(history) - 1, MOMENTS).astype(int)).tolist():
+    for k in np.unique(np.linspace(0, len(history) - 1, PICTURES).astype(int)).tolist():
         states = made.problem.states(made.search.parameters(history[k].parameters), [last])
         pictures[f"iteration {k}"] = made.image(states[last])
     none = dict.fromkeys(("row", "column", "red", "green", "blue"), np.nan)

@@ -1,8 +1,8 @@
 """Adjoints that Warp's tape gets silently wrong, compared with right ones over the horizon.
 
-The same step on the tape: with sums in functions, as Cortado has them; with those loops in one kernel that are linear
-after the sum, which must be as right; and with one that is not. All are compared with the gradient of the
-C++ engine, which shares no code with them.
+The same step is put on the tape in several ways: with sums in functions, as in Cortado; with loops in the kernel whose
+sums are used linearly, which must be just as right; and with a loop whose sum is not. All are compared with the
+gradient of the C++ engine, which shares no code with them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The derivative by the report's equations as printed, compared with the corrected one and with finite differences.
 
-Two questions: how wrong is one step of them, from states of the run; and how does their product grow over many, beside
-that of the right one?
+It measures the error of a single step, from states of the run, and the growth over many steps, beside that of the
+corrected derivative.
 """
 
 from __future__ import annotations
