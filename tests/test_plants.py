@@ -21,7 +21,7 @@ ROOT = Path(cortado.__file__).parent
 
 UNNAMED = {
     "sph.integration": {"integration_kernels.collect_masses"},
-    "sph.nozzle_kernels": {"nozzle_kernels.collect"},
+    "sph.emitter_kernels": {"emitter_kernels.collect"},
     "sph.surface_stress": {"tension_functions.stress_derivative"},
 }
 """Functions of adjoints, by module, whose names do not say so."""

@@ -31,7 +31,7 @@ class RestartState(Brief):
     """By the names that the solver declares: positions [m] and velocities [m/s], (n, d); reference_density (n,), the
     mass of a particle over its volume on the rest lattice [kg/m3]; with several phases mass_fractions (n, phases);
     with an emitter outlet (1, d), where its opening is [m], and emitted (1,), the length of fluid that has left it
-    [m]."""
+    [m]; and what else a solver carries from step to step, of which PCISPH has nothing."""
     clock: Clock = field(default_factory=Clock)
     """When the state is."""
 

@@ -11,7 +11,7 @@ from cortado.device.state import State
 from cortado.errors import DivergedError
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint
 from cortado.losses.checked import as_loss
-from cortado.losses.loss import Adjoint, adjoint_arrays
+from cortado.losses.loss import Adjoint, by_field
 from cortado.parameters.values import Arrays
 from cortado.problem import Problem
 
@@ -139,7 +139,7 @@ def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
 
 def _product(bar: Adjoint, dot: Arrays) -> float:
     """The adjoint of a state times its tangent."""
-    arrays = adjoint_arrays(bar, dot["positions"].shape[1])
+    arrays = by_field(bar, dot["positions"].shape[1])
     return float(sum((array.astype(np.float64) * dot[name]).sum() for name, array in arrays.items()))
 
 

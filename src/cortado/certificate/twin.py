@@ -14,7 +14,7 @@ from cortado.losses import (
     SnapshotAdjoint,
 )
 from cortado.losses.checked import as_loss
-from cortado.losses.loss import Adjoint, adjoint_arrays
+from cortado.losses.loss import Adjoint, by_field
 from cortado.problem import Problem
 from cortado.render.renderer import Renderer
 from cortado.simulation import Simulation
@@ -65,7 +65,7 @@ class Rounded:
         if not isinstance(bar, (State, SnapshotAdjoint)):
             return value, bar
         state = end.state.like()
-        state.set(adjoint_arrays(bar, end.dimension))
+        state.set(by_field(bar, end.dimension))
         return value, SnapshotAdjoint(state, bar.colours) if isinstance(bar, SnapshotAdjoint) else state
 
     def _rounded(self, end: Snapshot) -> Snapshot:

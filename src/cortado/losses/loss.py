@@ -65,7 +65,7 @@ Adjoint = State | SnapshotAdjoint | tuple[np.ndarray, ...]
 fractions (n, phases); or as Warp arrays."""
 
 
-def adjoint_arrays(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
+def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
     """An adjoint as arrays by the fields of a state that they are derivatives with respect to, vectors (n, d)."""
     if isinstance(bar, SnapshotAdjoint):
         return bar.state.numpy(dimension)

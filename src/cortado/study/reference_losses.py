@@ -9,7 +9,7 @@ from cortado import losses, reference
 from cortado.errors import InputError
 from cortado.losses import Snapshot
 from cortado.losses.checked import as_loss
-from cortado.losses.loss import adjoint_arrays
+from cortado.losses.loss import by_field
 from cortado.problem import Problem
 from cortado.reference.digits import Digits
 
@@ -32,7 +32,7 @@ class _OnDevice:
 
     def adjoint(self, positions: Digits, velocities: Digits) -> tuple[NDArray[Any], NDArray[Any]]:
         _, bar = self._loss.value_and_adjoint(self._end(positions, velocities))
-        found = adjoint_arrays(bar, self._simulation.dimension)
+        found = by_field(bar, self._simulation.dimension)
         return found["positions"].astype(np.float64), found["velocities"].astype(np.float64)
 
     def _end(self, positions: Digits, velocities: Digits) -> Snapshot:
