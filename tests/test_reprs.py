@@ -58,8 +58,8 @@ def test_what_a_run_leaves(trajectory, problem):
     assert repr(trajectory[-1]) == "Frame(64 particles, t = 0.0084 s)"
     assert repr(problem.end({})) == "Snapshot(64 particles, float32)"
     restart = repr(trajectory.last_state)
-    fields = "positions: array (64, 2), velocities: array (64, 2), reference_density: array (64,)"
-    assert restart.startswith(f"RestartState(fields={{{fields}}}, clock=Clock(steps=4, time=0.0084")
+    names = "positions: array (64, 2), velocities: array (64, 2), mass_fractions: array (64, 1), reference_density: "
+    assert restart.startswith(f"RestartState(fields={{{names}array (64,)}}, clock=Clock(steps=4, time=0.0084")
 
 
 def test_what_a_search_finds(result):

@@ -28,10 +28,10 @@ class RestartState(Brief):
     """The state at the end of a step, whole: `Trajectory.last_state` gives it and `Simulation.run` takes it."""
 
     fields: Mapping[str, NDArray]
-    """By the names that the solver declares: positions [m] and velocities [m/s], (n, d); reference_density (n,), the
-    mass of a particle over its volume on the rest lattice [kg/m3]; with several phases mass_fractions (n, phases);
-    with an emitter outlet (1, d), where its opening is [m], and emitted (1,), the length of fluid that has left it
-    [m]; and what else a solver carries from step to step, of which PCISPH has nothing."""
+    """By the names that the solver declares: positions [m] and velocities [m/s], (n, d); mass_fractions (n, phases);
+    reference_density (n,), the mass of a particle over its volume on the rest lattice [kg/m3]; with an emitter outlet
+    (1, d), where its opening is [m], and emitted (1,), the length of fluid that has left it [m]; and what else a solver
+    carries from step to step, of which PCISPH has nothing."""
     clock: Clock = field(default_factory=Clock)
     """When the state is."""
 

@@ -76,7 +76,7 @@ class Rollout:
         """Of the first state."""
         self.log = solver.new_log(steps)
         """What the solver noted of the steps of the last forward run."""
-        state_bytes = sum(array.capacity for array in self.initial.arrays())
+        state_bytes = sum(self.initial[f.name].capacity for f in self.initial.fields if not f.is_constant)
         self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
         self._states: dict[int, State] = {}
         self._buffer, self._bar = self.initial.following(), self.initial.like()

@@ -170,11 +170,8 @@ class Simulation:
         )
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
-        """What a trajectory records of a state: the fields that steps change, but for the fractions of one phase."""
-        fields = state.numpy(self.dimension, constants=False)
-        if len(self.scene.phase) == 1:
-            del fields["mass_fractions"]
-        return fields
+        """What a trajectory records of a state: the fields that steps change."""
+        return state.numpy(self.dimension, constants=False)
 
     def numbers_in_frame(self, components: int) -> int:
         """How many numbers `frame` records at most, if vectors have so many components."""

@@ -63,7 +63,7 @@ class Trajectory:
     `RestartState`"""
     constants: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """fields that no step changes: ``reference_density`` (n,), a particle's mass over its volume on the rest lattice
-    [kg/m3]"""
+    [kg/m3], and with one phase ``mass_fractions`` (n, 1)"""
     substeps: int = 0
     """[-] explicit steps of diffusion within each step"""
 

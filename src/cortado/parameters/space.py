@@ -118,7 +118,6 @@ class ParameterSpace:
         shapes = {
             field.name: field.shape(len(simulation.positions), simulation.dimension, self._phases)
             for field in simulation.state.fields
-            if field.name != "mass_fractions" or self._phases > 1
         }
         check_state(state, shapes, simulation.scene, simulation.free_particles)
 

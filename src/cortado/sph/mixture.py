@@ -3,7 +3,7 @@
 It comes first in a step, on the particles at rest at x(t); what it makes of a particle holds for the rest of the step.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import warp as wp
@@ -33,11 +33,10 @@ class Phases:
 class Mixture:
     """The composition of the particles of one solver; its arrays are reused by every step."""
 
-    fields = (MASS_FRACTIONS, REFERENCE_DENSITY)
-    """What it carries from step to step."""
-
     def __init__(self, phases: Phases, precision: Precision, particles: int, device: Any, requires_grad: bool = False):
         self.phases = phases
+        self.fields = (replace(MASS_FRACTIONS, is_constant=phases.count == 1), REFERENCE_DENSITY)
+        """What it carries from step to step: one phase stays what it is."""
         self.kernels = mixture_kernels(precision, phases.count)
         self.diffusion = diffusion_kernels(phases.diffusion) if phases.diffusion else None
         self.shares = ("rest_density", "viscosity", *(("mobility", "interface_width") if phases.diffusion else ()))
@@ -81,7 +80,8 @@ class Mixture:
 
     def result(self, step: StepContext, mass_fractions: wp.array) -> None:
         """Write the fractions after the last substep, in the scene's order."""
-        step.launch(self.kernels.unsort, c=self.c[self.substeps], c_scene=mass_fractions)
+        if self.phases.count > 1:
+            step.launch(self.kernels.unsort, c=self.c[self.substeps], c_scene=mass_fractions)
 
 
 class MixtureAdjoint:
@@ -136,5 +136,6 @@ class MixtureTangent:
 
     def result(self, step: StepContext, new_fractions_dot: wp.array) -> None:
         """Write the tangent of the new fractions, in the scene's order."""
-        last = self._c_dot[self._mixture.substeps % 2]
-        step.launch(self._mixture.kernels.unsort, c=last, c_scene=new_fractions_dot)
+        if self._mixture.phases.count > 1:
+            last = self._c_dot[self._mixture.substeps % 2]
+            step.launch(self._mixture.kernels.unsort, c=last, c_scene=new_fractions_dot)
