@@ -51,7 +51,7 @@ class Lattice:
     volume: float
     """Rest volume V_0 of a particle [m^d]."""
     stiffness: float
-    """k [m2]: delta = k / dt^2 [Pa m3 / kg] (report eq. 7, put right) for a filled neighbourhood."""
+    """k [m2]: delta = k / dt^2 [Pa m3 / kg] (Solenthaler and Pajarola 2009) for a filled neighbourhood."""
     response: float
     """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of `cortado.solvers.pcisph.wall_relaxation`."""
     laplacian_correction: float

@@ -34,7 +34,7 @@ def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimensi
 
 
 def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """k = delta dt^2 (report eq. 7, put right; Solenthaler and Pajarola 2009):
+    """k = delta dt^2 (Solenthaler and Pajarola 2009):
 
     delta = 1 / (beta (S . S + sum_j G_ij . G_ij)), beta = 2 m^2 dt^2 / rho_0^2, S = sum_j G_ij,
 

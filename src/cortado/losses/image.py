@@ -28,7 +28,7 @@ class Image:
 
     def __init__(self, renderer: Pictures, target: np.ndarray, distance: ImageLoss | None = None):
         """``target`` (rows, columns, 3), linear RGB; ``distance``: `cortado.image_losses.SquaredDifference`, the
-        default (the report's 6.2.2), or `Pyramid`, whose gradient leads shapes to each other that do not overlap."""
+        default, or `Pyramid`, whose gradient leads shapes to each other that do not overlap."""
         self.renderer, self.distance = renderer, SquaredDifference() if distance is None else distance
         self.target = _target_image(target, getattr(renderer, "shape", None))
         self.target.setflags(write=False)

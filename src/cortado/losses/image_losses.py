@@ -36,7 +36,7 @@ class ImageLoss(Protocol):
 
 @dataclass(frozen=True)
 class SquaredDifference:
-    """Mean over pixels and channels of the squared difference: the report's squared L2 distance for one value.
+    """Mean over pixels and channels of the squared difference: the squared L2 distance for one value.
 
     Shapes that do not overlap do not feel each other; `Pyramid` is for these.
     """

@@ -18,7 +18,7 @@ from cortado.losses.matching import matching_kernels
 
 
 class FinalPositions:
-    """Mean over particles of the squared distance to their targets [m2] (the report's 6.2.2, for one particle)."""
+    """Mean over particles of the squared distance to their targets [m2]."""
 
     def __init__(self, target: np.ndarray):
         """``target`` (n, d) [m], in the scene's order."""

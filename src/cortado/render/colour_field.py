@@ -1,4 +1,4 @@
-"""The colour field: how much fluid there is at the nodes of a regular grid, and of what colour (report section 5.3).
+"""The colour field: how much fluid there is at the nodes of a regular grid, and of what colour.
 
     A_g = V sum_j W(x_g - x_j),    P_g = V sum_j W(x_g - x_j) colour_j
 

@@ -1,4 +1,4 @@
-"""From particles to a picture and back (report section 5.3)."""
+"""From particles to a picture and back."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

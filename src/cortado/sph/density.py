@@ -1,4 +1,4 @@
-"""Density by summation (report eq. 5, with wall particles of calibrated weights), as a number density:
+"""Density by summation, wall particles of calibrated weights included, as a number density:
 
 n_i = V (W(0) + sum_j W_ij + sum_b w_b W_ib),   rho_i = m_i n_i.
 

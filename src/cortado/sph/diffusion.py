@@ -1,4 +1,4 @@
-"""Cahn-Hilliard diffusion between the phases of a mixture (Yang et al. 2015; report eqs. 15 to 19, put right):
+"""Cahn-Hilliard diffusion between the phases of a mixture (after Yang et al. 2015):
 
     chi_k,i = alpha P f'(c_i)_k - (eps^2 / m_i) B(m; c_k)_i,         P u = u - (1 / phases) sum_l u_l
     c'_k,i  = c_k,i + (dt / m_i) B(m M; chi_k)_i,                    M_i = M_0 m(c_i)

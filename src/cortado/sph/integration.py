@@ -1,4 +1,4 @@
-"""Semi-implicit Euler (report eqs. 3 and 4), and the way between scene order and sorted order."""
+"""Semi-implicit Euler, and the way between scene order and sorted order."""
 
 from dataclasses import dataclass
 from functools import cache

@@ -2,7 +2,7 @@
 
     1 / rho_0i = sum_k c_k,i / rho_0k,    ln mu_i = sum_k c_k,i ln mu_k    (Arrhenius 1887)
 
-Masses are constant (Yang et al. 2015 and the report's Algorithm 3 leave open whether mass or volume is; with mass
+Masses are constant (Yang et al. 2015 leave open whether mass or volume is; with mass
 fractions it is the mass), so that a particle's rest volume follows its rest density. The logarithms keep the viscosity
 positive where fractions stray out of [0, 1].
 """

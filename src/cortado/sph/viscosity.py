@@ -2,7 +2,7 @@
 
 a_i = kappa / (m_i n_i) (sum_j (V / n_j) mu_ij phi(x_ij, v_ij) + friction mu_i sum_b V_b phi(x_ib, v_i))
 
-pairwise:  phi = B G,  B = v . x / (|x|^2 + 0.01 h^2),  kappa = 2 (d + 2)     (report eq. 10; Monaghan 2005)
+pairwise:  phi = B G,  B = v . x / (|x|^2 + 0.01 h^2),  kappa = 2 (d + 2)     (Monaghan 2005)
 laminar:   phi = F v,  F = x . G / (|x|^2 + 0.01 h^2),  kappa = 2             (Morris, Fox and Zhu 1997)
 
 mu_ij = 2 mu_i mu_j / (mu_i + mu_j) is the dynamic viscosity of a pair [Pa s] (Cleary and Monaghan 1999: the harmonic

@@ -1,4 +1,4 @@
-"""Tangent and adjoint of a recorded PCISPH step: the report's Algorithm 2, put right, and its transpose."""
+"""The tangent of a replayed PCISPH step, and its transpose, the adjoint."""
 
 import warp as wp
 

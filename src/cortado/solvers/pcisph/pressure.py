@@ -1,4 +1,4 @@
-"""One predictive-corrective iteration (Solenthaler and Pajarola 2009; report eqs. 6 and 9, put right):
+"""One predictive-corrective iteration (Solenthaler and Pajarola 2009):
 
     p_i  = max(p_i + delta y_i (m_i n*_i - rho_0i), 0),   delta = k / dt^2
     c_i  = p_i / n_i^2

@@ -1,4 +1,4 @@
-"""Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009; the report's Algorithms 1 and 3, put right).
+"""Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009).
 
 `PcisphSteps.step` goes on until the density error is small; `PcisphSteps.replay` repeats a step with a known number of
 iterations and keeps every intermediate value, for `cortado.solvers.pcisph.derivatives`.
