@@ -1,19 +1,21 @@
 """The tables [problem] and [optimise] of a task, with the kinds of values that only they have."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from itertools import pairwise
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import AfterValidator, BeforeValidator, WithJsonSchema, model_validator
 
 from cortado.errors import Phrase
 from cortado.gradients import AdjointEstimator, AdjointViscosity, EnsembleMean, Exact, FrozenGeometry, GradientEstimator
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, Optimiser
-from cortado.parameters.values import NAMES
-from cortado.scene.fields import MISSING, Choice, Count, Kind, Quantity, Text, as_number, as_sequence, wrong
+from cortado.parameters.values import NAMES, UNITS
+from cortado.scene.fields import MISSING, OneOf, Several, Text, as_number, count, quantity, wrong
+from cortado.scene.sentences import wanted
 from cortado.scene.tables import Table
 
 OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
@@ -32,59 +34,27 @@ RANDOM = "random"
 CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
 
 
-@dataclass(frozen=True)
-class Values(Kind):
-    """Parameters by name: a number, or a list, of lists, of numbers."""
-
-    random: bool = False
-    """Whether `CAN_BE_RANDOM` may be the word "random"."""
-
-    wanted = f"a table of at least one parameter out of {', '.join(NAMES)}"
-
-    def check(self, value: Any) -> dict[str, Any]:
-        if not isinstance(value, Mapping) or not value:
-            raise wrong((), Phrase("empty") if value == {} else value, self.wanted)
-        return {name: self._array(name, entry) for name, entry in value.items()}
-
-    def _array(self, name: str, value: Any) -> Any:
+def _arrays(values: Any, words: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Values by name as arrays, or as one of the words where a parameter can be random; raises `wrong`."""
+    if not isinstance(values, Mapping) or not values:
+        raise wrong((), Phrase("empty") if values == {} else values, wanted(_VALUES))
+    found = {}
+    for name, value in values.items():
         if name not in NAMES:
             raise wrong((name,), Phrase("unknown"), f"one of {', '.join(NAMES)}")
-        if self.random and name in CAN_BE_RANDOM and value == RANDOM:
-            return value
-        wanted = "made of finite numbers: one, a list of them, or a list of lists of one length"
-        if not _is_numeric(value):
-            raise wrong((name,), value, wanted)
-        try:
-            return np.array(value, dtype=np.float64)
-        except ValueError:
-            raise wrong((name,), value, wanted) from None
+        is_word = name in CAN_BE_RANDOM and isinstance(value, str) and value in words
+        found[name] = value if is_word else _array(name, value)
+    return found
 
 
-@dataclass(frozen=True)
-class Names(Kind):
-    """A list of parameters."""
-
-    wanted = f"a list of parameters out of {', '.join(NAMES)}"
-
-    def check(self, value: Any) -> tuple[str, ...]:
-        if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) and name in NAMES for name in value):
-            raise wrong((), value, self.wanted)
-        return tuple(value)
-
-
-@dataclass(frozen=True)
-class Shares(Kind):
-    """Numbers that grow to 1."""
-
-    wanted = "a list of numbers greater than 0, each greater than the one before, the last of them 1"
-
-    def check(self, value: Any) -> tuple[float, ...]:
-        numbers = [as_number(entry) for entry in as_sequence(value) or ()]
-        shares = [number for number in numbers if number is not None and number > 0.0]
-        growing = all(a < b for a, b in pairwise(shares))
-        if not shares or len(shares) < len(numbers) or not growing or shares[-1] != 1.0:
-            raise wrong((), value, self.wanted)
-        return tuple(shares)
+def _array(name: str, value: Any) -> Any:
+    finite = "made of finite numbers: one, a list of them, or a list of lists of one length"
+    if not _is_numeric(value):
+        raise wrong((name,), value, finite)
+    try:
+        return np.array(value, dtype=np.float64)
+    except ValueError:
+        raise wrong((name,), value, finite) from None
 
 
 def _is_numeric(value: Any) -> bool:
@@ -94,26 +64,49 @@ def _is_numeric(value: Any) -> bool:
     return as_number(value) is not None
 
 
+def _growing(shares: tuple[float, ...]) -> tuple[float, ...]:
+    """Shares that grow to 1; raises `wrong`."""
+    if shares[-1] != 1.0 or any(b <= a for a, b in pairwise(shares)):
+        raise wrong((), shares, "a list of numbers that grow, the last of them 1")
+    return shares
+
+
+_VALUES: Any = {
+    "type": "object",
+    "minProperties": 1,
+    "additionalProperties": False,
+    "properties": {
+        name: {"anyOf": [{"type": "number"}, {"type": "array"}], "unit": unit or "-"} for name, unit in UNITS.items()
+    },
+}
+Values = Annotated[dict[str, Any], BeforeValidator(_arrays), WithJsonSchema(_VALUES)]
+"""Parameters by name: a number, or a list, of lists, of numbers."""
+Start = Annotated[dict[str, Any], BeforeValidator(partial(_arrays, words=(RANDOM,))), WithJsonSchema(_VALUES)]
+"""Values, of which some may be the word "random"."""
+Shares = Annotated[Several[Annotated[float, quantity(gt=0.0, le=1.0)]], AfterValidator(_growing)]
+"""Numbers that grow to 1."""
+
+
 class ProblemTable(Table):
     """[problem]: a number of steps, and a target: what a run with hidden parameters makes, or a picture."""
 
-    steps: Annotated[int, Count(0, 10_000_000)]
+    steps: Annotated[int, count(0, 10_000_000)]
     """Time steps; 0 for a loss of the first state."""
-    loss: Annotated[str, Choice(("positions", "image"))] = "positions"
+    loss: Literal["positions", "image"] = "positions"
     """What is compared: where the particles are, or how they look."""
-    distance: Annotated[str, Choice(tuple(DISTANCES))] = "squared_difference"
+    distance: Annotated[str, OneOf(DISTANCES)] = "squared_difference"
     """How images are compared."""
-    frames: Annotated[int, Count(1, 10_000)] = 1
+    frames: Annotated[int, count(1, 10_000)] = 1
     """How many states are compared, evenly spaced up to the last one."""
-    target: Annotated[dict[str, Any] | None, Values()] = None
+    target: Values | None = None
     """Hidden parameters: the target is what their run makes."""
-    picture: Annotated[str | None, Text()] = None
+    picture: Text | None = None
     """"heart", "rosetta", or a file with a picture, beside the task's own."""
 
     @model_validator(mode="after")
     def _check_target(self) -> Self:
         if self.picture is None and self.target is None:
-            raise wrong(("target",), MISSING, f"{Values.wanted}, as there is no picture")
+            raise wrong(("target",), MISSING, f"{wanted(_VALUES)}, as there is no picture")
         if self.picture is not None and self.target is not None:
             raise wrong(("picture",), self.picture, "left out, as there is a target")
         if self.picture is not None and self.loss != "image":
@@ -135,26 +128,26 @@ class ProblemTable(Table):
 class CheckTable(Table):
     """[optimise.check]: what the run has to reach."""
 
-    loss_reduction: Annotated[float, Quantity(least=1.0)] = 1.0
+    loss_reduction: Annotated[float, quantity(ge=1.0)] = 1.0
     """First loss / best loss."""
-    parameter_error: Annotated[float, Quantity(above=0.0)] = 1e50
+    parameter_error: Annotated[float, quantity(gt=0.0)] = 1e50
     """Largest relative distance (L2) of a found parameter from the hidden one."""
-    psnr: Annotated[float, Quantity("dB", least=0.0)] = 0.0
+    psnr: Annotated[float, quantity("dB", ge=0.0)] = 0.0
     """Peak signal-to-noise ratio of the found image to the target."""
 
 
 class GradientTable(Table):
     """[optimise.gradient]: which gradient the search follows, see docs/gradients.md."""
 
-    name: Annotated[str, Choice(tuple(ESTIMATORS))] = "exact"
+    name: Annotated[str, OneOf(ESTIMATORS)] = "exact"
     """What is done on the way back through a run."""
-    strength: Annotated[float | None, Quantity(above=0.0, most=1.0)] = None
+    strength: Annotated[float, quantity(gt=0.0, le=1.0)] | None = None
     """Of adjoint smoothing; None: found at the start of a search."""
-    samples: Annotated[int, Count(1, 10_000)] = 1
+    samples: Annotated[int, count(1, 10_000)] = 1
     """Runs of an ensemble that the gradient is the mean of."""
-    spread: Annotated[dict[str, Any] | None, Values()] = None
+    spread: Values | None = None
     """Of the ensemble: by name a number, in the units of what is searched."""
-    position_noise: Annotated[float, Quantity("spacings", least=0.0)] = EnsembleMean.position_noise
+    position_noise: Annotated[float, quantity("spacings", ge=0.0)] = EnsembleMean.position_noise
     """Of the first positions in the ensemble."""
 
     @model_validator(mode="after")
@@ -193,24 +186,24 @@ class GradientTable(Table):
 class OptimiseTable(Table):
     """[optimise]: from where, how and how long."""
 
-    start: Annotated[dict[str, Any], Values(random=True)]
+    start: Start
     """Parameters to begin with; these are optimised."""
-    knots: Annotated[int | None, Count(2, 10_000_000)] = None
+    knots: Annotated[int, count(2, 10_000_000)] | None = None
     """Parameters over time are interpolated between so many free values; None: every step has its own."""
-    logarithmic: Annotated[tuple[str, ...], Names()] = ()
+    logarithmic: tuple[Annotated[str, OneOf(NAMES)], ...] = ()
     """Parameters that are changed by factors."""
-    bounds: Annotated[dict[str, Any] | None, Values()] = None
+    bounds: Values | None = None
     """By name: two entries, the lower and the upper bound."""
-    extinctions: Annotated[tuple[float, ...], Shares()] = (1.0,)
+    extinctions: Shares = (1.0,)
     """Of one search after the other, each from where the last one ended, relative to the scene's: through thinner fluid
     a picture tells how much there is, and particles that hide behind each other have to part."""
-    optimiser: Annotated[str, Choice(tuple(OPTIMISERS))] = "adam"
+    optimiser: Annotated[str, OneOf(OPTIMISERS)] = "adam"
     """Name of the algorithm."""
-    learning_rate: Annotated[float, Quantity(above=0.0)]
+    learning_rate: Annotated[float, quantity("units of the parameters", gt=0.0)]
     """In units of the parameters; for L-BFGS the size of its first step."""
-    tolerance: Annotated[float | None, Quantity(above=0.0, most=0.5)] = None
+    tolerance: Annotated[float, quantity(gt=0.0, le=0.5)] | None = None
     """Of L-BFGS: it ends where the gradient is this part of the first; None: where round-off stops it."""
-    iterations: Annotated[int, Count(1, 10_000_000)]
+    iterations: Annotated[int, count(1, 10_000_000)]
     """Updates at most, of each search."""
     gradient: GradientTable = GradientTable()
     """Which gradient it follows."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 from cortado.io.progress import Advance
-from cortado.scene import fields, tables
-from cortado.scene.fields import Text, as_sequence, wrong
+from cortado.scene import tables
+from cortado.scene.fields import Text, components, quantity
 from cortado.scene.scene import Scene
 from cortado.study.tables import Table
 
@@ -19,7 +19,7 @@ class Settings(tables.Table):
     """What the file of an experiment holds beside its kind; each kind adds its own. The kinds of values of
     `cortado.scene.fields` make sentences of what is wrong."""
 
-    title: Annotated[str, Text()]
+    title: Text
     """Above the picture."""
 
     def identity(self) -> dict[str, Any]:
@@ -38,25 +38,11 @@ class SceneSettings(Settings):
 class DeviceSettings(Settings):
     """Settings of an experiment that runs on a device; the others use the reference engine."""
 
-    device: Annotated[str, Text()] = "cpu"
+    device: Text = "cpu"
     """"cpu", or "cuda:0" for the first GPU."""
 
 
-@dataclass(frozen=True)
-class Several(fields.Kind):
-    """At least one value of a kind, in a list: ``Annotated[tuple[float, ...], Several(Quantity("s", above=0.0))]``."""
-
-    kind: fields.Kind
-
-    @property
-    def wanted(self) -> str:
-        return f"a list of at least one entry, each {self.kind.wanted}"
-
-    def check(self, value: Any) -> tuple[Any, ...]:
-        entries = as_sequence(value)
-        if not entries:
-            raise wrong((), value, self.wanted)
-        return fields.Components(self.kind).check(entries)
+Window = Annotated[tuple[Annotated[float, quantity("steps", ge=0.0)], ...], components("first", "last")]
 
 
 class Progress(Protocol):

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from cortado.errors import SceneError
-from cortado.scene.fields import MISSING, Choice
+from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, scene_from_dict
-from cortado.scene.tables import sentences
+from cortado.scene.sentences import sentences, wanted
 from cortado.scene.toml import read_toml
 from cortado.study.experiment import Experiment
 from cortado.study.kinds import KINDS
@@ -31,13 +31,13 @@ def load_experiment(path: str | os.PathLike[str], reduced: bool = False, overrid
     if reduced:
         data |= replaced
     name = data.pop("kind", MISSING)
-    if name not in KINDS:
-        raise SceneError(file, "kind", name, Choice(tuple(KINDS)).wanted)
+    if not isinstance(name, str) or name not in KINDS:
+        raise SceneError(file, "kind", name, wanted({"enum": list(KINDS)}))
     kind = KINDS[name]
     if "scene" in kind.settings.model_fields and "scene" in data:
         data["scene"] = _scene(data["scene"], file)
     try:
-        with sentences():
+        with sentences(kind.settings):
             settings = kind.settings.model_validate(data, context={"folder": Path(file).parent})
     except SceneError as error:
         raise error.in_file(file) from None

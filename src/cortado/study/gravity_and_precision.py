@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from cortado.figures.canvas import DASHED, FAINT, PALETTE
-from cortado.scene.fields import Choice, Count, Quantity
+from cortado.scene.fields import OneOf, Several, count, quantity
 from cortado.study.canvas import blank
-from cortado.study.experiment import Kind, Progress, SceneSettings, Several
+from cortado.study.experiment import Kind, Progress, SceneSettings
 from cortado.study.gravity_tangents import COST, LABEL, along_gravity
 from cortado.study.sources import ReferenceTangent
 from cortado.study.tables import Table
@@ -22,13 +22,13 @@ DIFFERENCES, ANALYTIC = "finite differences", "analytic"
 class GravityAndPrecision(SceneSettings):
     """Settings."""
 
-    steps: Annotated[int, Count(1, 1_000_000)]
+    steps: Annotated[int, count(1, 1_000_000)]
     """After which the gradient is looked at."""
-    gravities: Annotated[tuple[float, ...], Several(Quantity("m/s2", above=0.0))]
+    gravities: Several[Annotated[float, quantity("m/s2", gt=0.0)]]
     """Sizes, along the scene's direction [m / s2]."""
-    precisions: Annotated[tuple[str, ...], Several(Choice(tuple(COST)))]
+    precisions: Several[Annotated[str, OneOf(COST)]]
     """The last one is what the others are held against."""
-    difference: Annotated[float, Quantity("m/s2", above=0.0)]
+    difference: Annotated[float, quantity("m/s2", gt=0.0)]
     """Step of the finite differences [m / s2]."""
 
 

@@ -9,64 +9,64 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from cortado.reference import Simulation, Terms
 from cortado.scene import tables
-from cortado.scene.fields import Choice, Components, Count, Quantity, Tables, Text
+from cortado.scene.fields import Several, Text, components, count, quantity
 from cortado.scene.scene import Scene
 from cortado.study.estimates import growth_rate, norms
-from cortado.study.experiment import Progress, SceneSettings, Several
+from cortado.study.experiment import Progress, SceneSettings
 from cortado.study.lyapunov_spectrum import growth_by_segment
 from cortado.study.scenes import varied
 from cortado.study.starts import perturbed, side_by_side
 from cortado.study.tables import Table
 
-Term = Choice(("viscosity", "pressure", "hessian", "density"))
+Term = Literal["viscosity", "pressure", "hessian", "density"]
 
 
 class Variant(tables.Table):
     """One thing changed in the scene, or in the derivative."""
 
-    panel: Annotated[str, Text()]
+    panel: Text
     """Of the picture, where it belongs."""
-    label: Annotated[str, Text()]
+    label: Text
     """Of a curve in it, or of a bar if there is no ``x``."""
-    x: Annotated[float | None, Quantity()] = None
+    x: Annotated[float, quantity()] | None = None
     """Where on the curve."""
     scene: Mapping[str, Any] = Field(default_factory=dict)
     """What differs from the scene."""
-    without: Annotated[tuple[str, ...], Several(Term)] = ()
+    without: Several[Term] = ()
     """Terms of the tangent that are left out (`cortado.reference.Terms`)."""
 
 
 class LyapunovSettings(SceneSettings):
     """Exponents of the scene and of its variants."""
 
-    fall: Annotated[float, Quantity("m", above=0.0)]
+    fall: Annotated[float, quantity("m", gt=0.0)]
     """Height of the fall: times are counted in the time that it takes, (2 fall / g)^(1/2), so that variants of gravity
     are seen at the same stage."""
-    window: Annotated[tuple[float, ...], Components(Quantity("falls", least=0.0))]
+    window: Annotated[tuple[Annotated[float, quantity("falls", ge=0.0)], ...], components("first", "last")]
     """Two: where exponents are measured."""
-    seeds: Annotated[int, Count(1, 100)]
-    perturbation: Annotated[float, Quantity("spacings", least=0.0)]
+    seeds: Annotated[int, count(1, 100)]
+    perturbation: Annotated[float, quantity("spacings", ge=0.0)]
     """Of the first positions."""
-    vectors: Annotated[int, Count(1, 1000)]
+    vectors: Annotated[int, count(1, 1000)]
     """Tangents of a variant."""
-    spectrum: Annotated[int, Count(1, 10_000)]
+    spectrum: Annotated[int, count(1, 10_000)]
     """Tangents of the scene itself, once."""
-    segment: Annotated[int, Count(1, 1000)]
+    segment: Annotated[int, count(1, 1000)]
     """Steps between two orthonormalisations."""
-    velocity_time: Annotated[float, Quantity("s", above=0.0)]
+    velocity_time: Annotated[float, quantity("s", gt=0.0)]
     """What velocities are multiplied with in the norm of a tangent."""
-    separation: Annotated[float, Quantity("m", above=0.0)]
+    separation: Annotated[float, quantity("m", gt=0.0)]
     """Of two runs at the start, each coordinate about so much."""
-    linear: Annotated[float, Quantity("m", above=0.0)]
+    linear: Annotated[float, quantity("m", gt=0.0)]
     """Distance of two runs, over all particles, up to which they count."""
-    variants: Annotated[tuple[Variant, ...], Tables("variants")]
+    variants: Several[Variant]
 
 
 def window_steps(settings: LyapunovSettings, scene: Scene) -> tuple[int, int]:

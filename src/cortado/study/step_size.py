@@ -15,10 +15,10 @@ import numpy as np
 
 from cortado.figures.canvas import DASHED, FAINT, INK
 from cortado.reference import Simulation
-from cortado.scene.fields import Components, Count, Quantity
+from cortado.scene.fields import Several, Vector, count, quantity
 from cortado.study.canvas import blank
 from cortado.study.estimates import Estimate, Line, norms
-from cortado.study.experiment import Kind, Progress, SceneSettings, Several
+from cortado.study.experiment import Kind, Progress, SceneSettings
 from cortado.study.shades import shades
 from cortado.study.starts import perturbed, side_by_side
 from cortado.study.tables import Table
@@ -36,14 +36,14 @@ THIN: dict[str, Any] = {"markersize": 3.5, "linewidth": 1.4}
 class StepSizeSettings(SceneSettings):
     """Differences of several steps, at several horizons."""
 
-    direction: Annotated[tuple[float, ...], Components(Quantity("m/s2"))]
+    direction: Vector[Annotated[float, quantity("m/s2")]]
     """Of the change of gravity."""
-    differences: Annotated[tuple[float, ...], Several(Quantity("m/s2", above=0.0))]
-    horizons: Annotated[tuple[int, ...], Several(Count(1, 10_000))]
+    differences: Several[Annotated[float, quantity("m/s2", gt=0.0)]]
+    horizons: Several[Annotated[int, count(1, 10_000)]]
     """Steps."""
-    seeds: Annotated[int, Count(2, 100)]
+    seeds: Annotated[int, count(2, 100)]
     """First states; two unrelated ones give the distance."""
-    perturbation: Annotated[float, Quantity("spacings", above=0.0)]
+    perturbation: Annotated[float, quantity("spacings", gt=0.0)]
     """Of the first positions."""
 
 

@@ -14,11 +14,11 @@ import numpy as np
 from cortado import gradients, losses, reference
 from cortado.figures.canvas import DASHED, INK, PALETTE
 from cortado.problem import Problem
-from cortado.scene.fields import Count, Quantity
+from cortado.scene.fields import Several, count, quantity
 from cortado.simulation import Simulation
 from cortado.study.canvas import blank
 from cortado.study.estimates import Estimate, growth_rate
-from cortado.study.experiment import DeviceSettings, Kind, Progress, SceneSettings, Several
+from cortado.study.experiment import DeviceSettings, Kind, Progress, SceneSettings
 from cortado.study.one_kernel_loops import OneKernelTape
 from cortado.study.starts import perturbed
 from cortado.study.tables import Table
@@ -45,12 +45,12 @@ PARAMETERS = ("gravity", "initial_positions")
 class WrongAdjointsSettings(SceneSettings, DeviceSettings):
     """Gradients of the distance to the first state, from a state in the middle of a splash."""
 
-    start: Annotated[int, Count(0, 10_000)]
+    start: Annotated[int, count(0, 10_000)]
     """Steps before the first state."""
-    horizons: Annotated[tuple[int, ...], Several(Count(1, 10_000))]
+    horizons: Several[Annotated[int, count(1, 10_000)]]
     """Steps from there."""
-    seeds: Annotated[int, Count(1, 100)]
-    perturbation: Annotated[float, Quantity("spacings", least=0.0)]
+    seeds: Annotated[int, count(1, 100)]
+    perturbation: Annotated[float, quantity("spacings", ge=0.0)]
     """Of the positions at the very start."""
 
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from cortado.figures.canvas import DASHED, INK, PALETTE
 from cortado.reference import History, Simulation
-from cortado.scene.fields import Components, Count, Quantity
+from cortado.scene.fields import Vector, count, quantity
 from cortado.study.canvas import blank
 from cortado.study.estimates import Estimate, growth_rate, norms
-from cortado.study.experiment import Kind, Progress, SceneSettings
+from cortado.study.experiment import Kind, Progress, SceneSettings, Window
 from cortado.study.starts import perturbed, side_by_side
 from cortado.study.tables import Table
 
@@ -36,19 +36,19 @@ EXACT, DIFFERENCE, *PRINTED = NAMES
 class WrongDerivationSettings(SceneSettings):
     """Tangents by several ways, over many steps and over single ones."""
 
-    direction: Annotated[tuple[float, ...], Components(Quantity("m/s2"))]
+    direction: Vector[Annotated[float, quantity("m/s2")]]
     """Of the change of gravity."""
-    steps: Annotated[int, Count(2, 10_000)]
-    record_every: Annotated[int, Count(1, 1000)]
+    steps: Annotated[int, count(2, 10_000)]
+    record_every: Annotated[int, count(1, 1000)]
     """Steps between two rows, and between two states whose single step is tried."""
-    window: Annotated[tuple[float, ...], Components(Quantity("steps", least=0.0))]
+    window: Window
     """Two: where growth rates are fitted."""
-    seeds: Annotated[int, Count(1, 100)]
-    perturbation: Annotated[float, Quantity("spacings", least=0.0)]
+    seeds: Annotated[int, count(1, 100)]
+    perturbation: Annotated[float, quantity("spacings", ge=0.0)]
     """Of the first positions."""
-    difference: Annotated[float, Quantity("m/s2", above=0.0)]
+    difference: Annotated[float, quantity("m/s2", gt=0.0)]
     """Step of the finite differences over many steps."""
-    single_difference: Annotated[float, Quantity(above=0.0)]
+    single_difference: Annotated[float, quantity(gt=0.0)]
     """The same over one step, in sizes of the tangent there."""
 
 
