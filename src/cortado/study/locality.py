@@ -20,7 +20,7 @@ from cortado.reference import History, Simulation
 from cortado.scene.fields import Vector, count, quantity
 from cortado.study import spatial_scales
 from cortado.study.canvas import blank
-from cortado.study.estimates import Estimate, growth_rate
+from cortado.study.estimates import Estimate, geometric_mean, growth_rate
 from cortado.study.experiment import Kind, Progress, SceneSettings, Window
 from cortado.study.starts import perturbed, side_by_side
 from cortado.study.tables import Table
@@ -194,7 +194,7 @@ def _by_step(table: Table, vector: str, quantity: str) -> Iterator[Table]:
 
 
 def _mean(rows: Table, logarithmic: bool = False) -> float:
-    return float(np.exp(np.log(rows["value"]).mean()) if logarithmic else rows["value"].mean())
+    return geometric_mean(rows["value"]) if logarithmic else float(rows["value"].mean())
 
 
 def _rate(inside: Table, vector: str, quantity: str) -> Estimate:

@@ -17,7 +17,7 @@ from cortado.figures.canvas import DASHED, FAINT, INK
 from cortado.reference import Simulation
 from cortado.scene.fields import Several, Vector, count, quantity
 from cortado.study.canvas import blank
-from cortado.study.estimates import Estimate, Line, norms
+from cortado.study.estimates import Estimate, Line, geometric_mean, norms
 from cortado.study.experiment import Kind, Progress, SceneSettings
 from cortado.study.shades import shades
 from cortado.study.starts import perturbed, side_by_side
@@ -93,16 +93,17 @@ def draw(table: Table, settings: StepSizeSettings) -> Figure:
     figure.suptitle(settings.title)
     horizons, differences = table.values("horizon"), table.values("difference")
     for difference, shade in zip(differences, shades(len(differences)), strict=True):
-        found = [_mean(table.where(difference=difference, horizon=horizon)["size"]) for horizon in horizons]
+        found = [geometric_mean(table.where(difference=difference, horizon=horizon)["size"]) for horizon in horizons]
         sizes.semilogy(horizons, found, "o-", color=shade, label=f"step {difference:.0e}", **THIN)
         rows = table.where(difference=difference)
         law.loglog(_strength(rows), _saturation(rows), "o", markersize=3.5, color=shade, alpha=0.7)
-    exact = [_mean(table.where(horizon=horizon)["exact"]) for horizon in horizons]
+    exact = [geometric_mean(table.where(horizon=horizon)["exact"]) for horizon in horizons]
     sizes.semilogy(horizons, exact, color=INK, label="exact", **DASHED)
     sizes.set(title="Size over the horizon", xlabel="steps", ylabel="|dx / dg| [s²]")
     sizes.legend(fontsize=8)
     for horizon, shade in zip(horizons, shades(len(horizons)), strict=True):
-        values = [_mean(table.where(difference=difference, horizon=horizon)["error"]) for difference in differences]
+        found = [table.where(difference=difference, horizon=horizon)["error"] for difference in differences]
+        values = [geometric_mean(of_seeds) for of_seeds in found]
         errors.loglog(differences, values, "o-", color=shade, label=f"{horizon} steps", **THIN)
     errors.axhline(AGREES, **DASHED, color=FAINT)
     errors.set(title="Error over the step", xlabel="step h [m/s²]", ylabel="relative error")
@@ -134,15 +135,16 @@ def verdict(table: Table, settings: StepSizeSettings) -> list[str]:
         slope = Line.through(np.log(sizes), np.log(ends)).slope
         sentences.append(
             f"The largest step that agrees within {AGREES:.0%} falls as |dx/dg| to the power {slope} (-1 expected): it "
-            f"moves the particles by {_mean(reach):.0e} m in all, times or over {np.exp(np.log(reach).std()):.0f}."
+            f"moves the particles by {geometric_mean(reach):.0e} m in all, times or over "
+            f"{np.exp(np.log(reach).std()):.0f}."
         )
     saturated = table.chosen(_strength(table) > SATURATED)
     if len(saturated) >= 3:
         slope = Line.through(np.log(saturated["difference"]), np.log(saturated["size"])).slope
-        by_seed = [np.exp(np.log(_saturation(rows)).mean()) for _, rows in saturated.groups("seed")]
+        by_seed = [geometric_mean(_saturation(rows)) for _, rows in saturated.groups("seed")]
         factor = Estimate.of(by_seed)
         flat = table.where(difference=max(settings.differences), horizon=last)
-        ratio = _mean(flat["exact"] / flat["size"])
+        ratio = geometric_mean(flat["exact"] / flat["size"])
         sentences.append(
             f"Beyond, differences saturate: their size goes as the step to the power {slope} (-1 expected), and is "
             f"{factor} times D / (2 h) (1 expected), D the distance of two unrelated states. At {last} steps the exact "
@@ -162,11 +164,6 @@ def _strength(table: Table) -> np.ndarray:
 
 def _saturation(table: Table) -> np.ndarray:
     return 2.0 * table["difference"] * table["size"] / table["distance"]
-
-
-def _mean(values: np.ndarray) -> float:
-    """The geometric one."""
-    return float(np.exp(np.log(np.maximum(values, 1e-300)).mean()))
 
 
 STEP_SIZE = Kind("step_size", StepSizeSettings, measure, draw, verdict)

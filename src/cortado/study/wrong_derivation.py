@@ -15,7 +15,7 @@ from cortado.figures.canvas import DASHED, INK, PALETTE
 from cortado.reference import History, Simulation
 from cortado.scene.fields import Vector, count, quantity
 from cortado.study.canvas import blank
-from cortado.study.estimates import Estimate, growth_rate, norms
+from cortado.study.estimates import Estimate, geometric_mean, growth_rate, norms
 from cortado.study.experiment import Kind, Progress, SceneSettings, Window
 from cortado.study.starts import perturbed, side_by_side
 from cortado.study.tables import Table
@@ -146,7 +146,7 @@ def verdict(table: Table, settings: WrongDerivationSettings) -> list[str]:
         rows = late.where(method=method)
         by_seed = Estimate.of([np.median(one["single"]) for _, one in rows.groups("seed")])
         last = rows.where(step=settings.steps)["size"] / late.where(method=EXACT, step=settings.steps)["size"]
-        factor = np.exp(np.log(last).mean())
+        factor = geometric_mean(last)
         name = NAMES[method][0].upper() + NAMES[method][1:]
         times = f"{factor:.1g} times the exact one's" if np.isfinite(factor) else "beyond float64"
         sentences.append(
