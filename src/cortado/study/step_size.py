@@ -102,8 +102,8 @@ def draw(table: Table, settings: StepSizeSettings) -> Figure:
     sizes.set(title="Size over the horizon", xlabel="steps", ylabel="|dx / dg| [s²]")
     sizes.legend(fontsize=8)
     for horizon, shade in zip(horizons, shades(len(horizons)), strict=True):
-        found = [table.where(difference=difference, horizon=horizon)["error"] for difference in differences]
-        values = [geometric_mean(of_seeds) for of_seeds in found]
+        of_seeds = [table.where(difference=size, horizon=horizon)["error"] for size in differences]
+        values = [geometric_mean(one) for one in of_seeds]
         errors.loglog(differences, values, "o-", color=shade, label=f"{horizon} steps", **THIN)
     errors.axhline(AGREES, **DASHED, color=FAINT)
     errors.set(title="Error over the step", xlabel="step h [m/s²]", ylabel="relative error")
