@@ -1,13 +1,21 @@
 """The tables [problem] and [optimise] of a task, with the kinds of values that only they have."""
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, WithJsonSchema, model_validator
+from pydantic import (
+    BeforeValidator,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WithJsonSchema,
+    WrapValidator,
+    model_validator,
+)
 
 from cortado.errors import Phrase
 from cortado.gradients import AdjointEstimator, AdjointViscosity, EnsembleMean, Exact, FrozenGeometry, GradientEstimator
@@ -64,11 +72,14 @@ def _is_numeric(value: Any) -> bool:
     return as_number(value) is not None
 
 
-def _growing(shares: tuple[float, ...]) -> tuple[float, ...]:
+def _growing(value: Any, check: ValidatorFunctionWrapHandler) -> tuple[float, ...]:
     """Shares that grow to 1; raises `wrong`."""
-    if shares[-1] != 1.0 or any(b <= a for a, b in pairwise(shares)):
-        raise wrong((), shares, "a list of numbers that grow, the last of them 1")
-    return shares
+    with suppress(ValidationError):
+        shares = check(value)
+        if shares[-1] == 1.0 and all(a < b for a, b in pairwise(shares)):
+            return shares
+    words = "a list of numbers greater than 0, each greater than the one before, the last of them 1"
+    raise wrong((), value, words)
 
 
 _VALUES: Any = {
@@ -83,7 +94,7 @@ Values = Annotated[dict[str, Any], BeforeValidator(_arrays), WithJsonSchema(_VAL
 """Parameters by name: a number, or a list, of lists, of numbers."""
 Start = Annotated[dict[str, Any], BeforeValidator(partial(_arrays, words=(RANDOM,))), WithJsonSchema(_VALUES)]
 """Values, of which some may be the word "random"."""
-Shares = Annotated[Several[Annotated[float, quantity(gt=0.0, le=1.0)]], AfterValidator(_growing)]
+Shares = Annotated[Several[Annotated[float, quantity(gt=0.0, le=1.0)]], WrapValidator(_growing)]
 """Numbers that grow to 1."""
 
 
