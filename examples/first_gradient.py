@@ -19,8 +19,8 @@ scene = cortado.Scene(
 )
 simulation = cortado.Simulation(scene, precision="float64")
 
-hidden = np.array([1.5, -9.0])  # m/s2
-target = simulation.run(steps=60, controls={"gravity": hidden})[-1].positions
+true_gravity = np.array([1.5, -9.0])  # m/s2
+target = simulation.run(steps=60, controls={"gravity": true_gravity})[-1].positions
 
 # A loss and its gradient, which has the shape of gravity.
 problem = cortado.Problem(simulation, steps=60, loss=cortado.losses.FinalPositions(target))
@@ -33,9 +33,9 @@ step = np.array([1e-5, 0.0])
 slope = (problem.value({"gravity": guess + step}) - problem.value({"gravity": guess - step})) / 2e-5
 assert abs(slope - gradient["gravity"][0]) < 1e-6 * abs(slope), "the gradient is not the slope of the loss"
 
-# Down the gradient, to the gravity that was hidden.
+# Down the gradient, to the true gravity.
 result = cortado.optimise(problem, {"gravity": guess}, "lbfgs", iterations=12)
 print(result)
-found = result.parameters["gravity"]
-assert np.abs(found - hidden).max() < 1e-3, f"gravity is {hidden}, but was found to be {found}"
-print(f"found {found} m/s2")
+estimate = result.parameters["gravity"]
+assert np.abs(estimate - true_gravity).max() < 1e-3, f"gravity is {true_gravity}, but its estimate {estimate}"
+print(f"the estimate is {estimate} m/s2")

@@ -43,7 +43,7 @@ def milk_at(picture):
 
 
 # Fluids mix, but none of a fluid comes or goes; and the picture shows where the milk went.
-density = trajectory.constants.reference_density.astype(float)  # (n,), in proportion to the mass of each particle
+density = trajectory.constants["reference_density"].astype(float)  # (n,), in proportion to the mass of each particle
 milk = np.array([density @ frame.mass_fractions[:, 1] for frame in trajectory])
 coffee_in_milk = trajectory[-1].mass_fractions[trajectory[0].mass_fractions[:, 1] > 0.5, 0].mean()
 print(f"milk is kept to {np.ptp(milk) / milk[0]:.1g}, and goes from {milk_at(before):.2f} to {milk_at(after):.2f}")

@@ -25,7 +25,7 @@ PLANE = {
 READERS = (
     *("points.npy", "points.vtk", "points.vtp", "points.vtkhdf", "trajectory.vtkhdf", "picture.png"),
     *("scene.toml", "task.toml", "experiment.toml"),
-    *("scene.json", "environment.json", "metrics.jsonl", "checkpoint/evaluations.log"),
+    *("scene.json", "environment.json", "metrics.jsonl", "checkpoint/replay.log"),
 )
 """Good files, made by `prepare`; those of the last line are of a search."""
 SEARCH = "search"
@@ -36,7 +36,7 @@ def prepare(folder: Path) -> list[Outcome]:
     """One good file for every reader."""
     block = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "water"}
     (folder / "scene.toml").write_text(to_toml({**PLANE, "fluid": [block]}))
-    (folder / "task.toml").write_text(to_toml(bases.tasks()["cloud_search"]))
+    (folder / "task.toml").write_text(to_toml(bases.tasks()["ensemble_search"]))
     experiment = (bases.ROOT / "experiments" / "lyapunov.toml").read_text()
     scene = bases.ROOT / "experiments" / "scenes" / "splash.toml"
     (folder / "experiment.toml").write_text(experiment.replace("scenes/splash.toml", str(scene)))
@@ -113,13 +113,13 @@ def _resume(case: Case, good: Path, name: str) -> None:
     shutil.copy(good / "task.toml", case.folder)
     out = case.folder / "out"
     shutil.copytree(good / SEARCH, out)
-    wanted = (good / SEARCH / "checkpoint" / "evaluations.log").read_bytes()
+    wanted = (good / SEARCH / "checkpoint" / "replay.log").read_bytes()
     others = [(good / SEARCH / other).read_bytes() for other in READERS[-4:] if other != name]
     content = (out / name).read_bytes()
     (out / name).unlink()
     case.notes += [name, make_hostile(out / name, content, others, case.random)]
     outcome = case.cortado("optimise", "task.toml", "--out", "out", "--resume")
-    if outcome.code == 0 and _content(out / "checkpoint" / "evaluations.log") != wanted:
+    if outcome.code == 0 and _content(out / "checkpoint" / "replay.log") != wanted:
         case.complaints.append("a search with a damaged folder went on with other bits")
 
 

@@ -70,7 +70,7 @@ def kill_search(case: Case) -> None:
         resumed = case.cortado(*words, "--resume", codes=(0, 2))
         if resumed.code == 2:
             case.notes.append("begun again")
-            if (out / "checkpoint" / "evaluations.log").exists():
+            if (out / "checkpoint" / "replay.log").exists():
                 case.complaints.append(f"it has evaluations, but is not resumed: {resumed.err.strip()}")
             case.cortado(*words, "--overwrite", codes=(0,))
     case.complaints += search_complaints(out, finished=True)
@@ -131,5 +131,5 @@ def _seconds(whole: Path) -> float:
 
 
 def _logs(out: Path) -> list[str]:
-    """The logs of evaluations, one for each of several searches."""
-    return sorted(str(path.relative_to(out)) for path in out.glob("checkpoint/**/evaluations.log"))
+    """The replay logs, one for each of several searches."""
+    return sorted(str(path.relative_to(out)) for path in out.glob("checkpoint/**/replay.log"))

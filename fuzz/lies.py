@@ -153,7 +153,7 @@ def _a_line_of_something_else(good: bytes, random: Random) -> bytes:
 
 
 def _another_first_line(good: bytes, random: Random) -> bytes:
-    """A log of evaluations of something else."""
+    """The replay log of something else."""
     first, _, rest = good.partition(b"\n")
     return (
         [b"{}", b"", first.replace(b"1", b"2"), first * 1000, first.replace(b"[", b"[[")][random.integers(5)]

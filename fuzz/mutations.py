@@ -28,7 +28,7 @@ EDGES: Mapping[str, Sequence[Any]] = {
     "samples": (1, 4, 5, 6),
     "iterations": (1, 3, 0),
     "learning_rate": (1e-12, 1.0, 100.0, 1e30),
-    "extinctions": ([0.5, 1.0], [1.0], [1.0, 0.5]),
+    "extinction_schedule": ([0.5, 1.0], [1.0], [1.0, 0.5]),
     "gravity": ([0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1e4], [0.0, -1e4, 0.0]),
     "viscosity": (0.0, 1e3, "none", "laminar", "pairwise", [0.1]),
     "kernel": ("cubic_spline", "wendland_c2", "wendland_c4"),

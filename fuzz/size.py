@@ -26,7 +26,7 @@ def is_large(file: Path, overrides: Sequence[str], steps: int) -> bool:
     runs = 1
     if "problem" in tables and "optimise" in tables:
         optimise, steps = tables["optimise"], tables["problem"]["steps"]
-        searches = len(optimise.get("extinctions", [1.0])) * optimise.get("estimator", {}).get("samples", 1)
+        searches = len(optimise.get("extinction_schedule", [1.0])) * optimise.get("gradient", {}).get("samples", 1)
         runs = 5 * searches * (optimise["iterations"] + 1)
     work = particles * max(steps, 1) * (3 + scene.solver.maximum_iterations) * runs
     return particles > MOST_PARTICLES or pixels > MOST_PIXELS or work > MOST_WORK

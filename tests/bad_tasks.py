@@ -61,7 +61,7 @@ _RANDOM_IN_SPACE = 'start.initial_positions = "random"\nbounds.initial_positions
 
 
 def _both(name: str, value: object, option: str = "") -> str:
-    """The tables with another parameter, hidden and to begin with, and an option of the optimisation."""
+    """The tables with another parameter, its true value and that to begin with, and an option of the optimisation."""
     start = f"start.{name} = {value}\n{option}"
     return _TABLES.replace(_TARGET, f"target.{name} = {value}").replace(_START, start)
 
@@ -145,7 +145,7 @@ BAD_TASKS = [
     ("tilt that is a number", _TABLES, _both("tilt", 1.0), "problem.target.tilt"),
     ("tilt beside gravity", _TARGET, f"{_TARGET}\ntarget.tilt = [5.0]", "problem.target.gravity"),
     ("start with both", _TABLES, _both("tilt", [5.0], "start.gravity = [0.0, -7.0]"), "problem.target.gravity"),
-    ("hidden gravity, sought tilt", _START, "start.tilt = [0.0]", "problem.target.tilt"),
+    ("true gravity, sought tilt", _START, "start.tilt = [0.0]", "problem.target.tilt"),
     ("tilt of nothing", _TABLES, f"[forces]\ngravity = [0.0, 0.0]\n{_both('tilt', [5.0])}", "problem.target.tilt"),
     ("start beyond the bounds of a tilt", _TABLES, _both("tilt", [50.0], "bounds.tilt = [-30.0, 30.0]"),
      "optimise.start.tilt"),
@@ -208,7 +208,7 @@ BAD_TASKS = [
      "optimise.bounds.viscosity"),
     ("noise of positions", "loss_reduction = 2.0", "psnr = 30.0", "optimise.check.psnr"),
     ("negative noise", "loss_reduction = 2.0", "psnr = -3.0", "optimise.check.psnr"),
-    ("hidden parameters of a picture", _TARGET, 'loss = "image"\npicture = "heart"', "optimise.check.parameter_error"),
+    ("true parameters of a picture", _TARGET, 'loss = "image"\npicture = "heart"', "optimise.check.parameter_error"),
 ]  # fmt: skip
 
 PLANE_PICTURE = f"""\

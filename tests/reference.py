@@ -87,8 +87,8 @@ class Pcisph:
         p, push = np.zeros(n, dtype=x.dtype), np.zeros_like(x)
         pull = (self.wall_weights[None, :, None] * near_walls[..., None] * g_walls).sum(1)
         lighter = self.volume * (self.weight(x, x) * near * (mass[:, None] / mass[None, :] - 1)).sum(1)
-        contrast = np.where(lighter.real > 0, lighter**2 / 2 / (lighter + 0.2), 0)
-        delta = self.stiffness / time_step**2 / (1 + (pull * pull).sum(1) / self.response) / (1 + contrast)
+        excess = np.where(lighter.real > 0, lighter**2 / 2 / (lighter + 0.2), 0)
+        delta = self.stiffness / time_step**2 / (1 + (pull * pull).sum(1) / self.response) / (1 + excess)
         for _ in range(iterations):
             v_star = v + time_step * (acceleration + push)
             x_star = x + time_step * v_star

@@ -11,8 +11,8 @@ import warp as wp
 
 import cortado
 from cortado import InputError, Problem, Simulation, losses
-from cortado.certificate import Comparison, certify
-from cortado.certificate.agreement import Agreement, Judged
+from cortado.certificate import Consistency, certify
+from cortado.certificate.alignment import Alignment, Judged
 from cortado.certificate.horizon import Horizon
 from cortado.certificate.twin import in_float64
 from cortado.problem import ForwardPass
@@ -57,10 +57,10 @@ def problem_of(made, steps, loss=None):
 @pytest.mark.parametrize("name", RIGHT)
 def test_right_gradients_are_found_right(name):
     found = certify(problem_of(RIGHT[name](), 30))
-    c = found.comparison
+    c = found.consistency
     assert found.right, (found.wrong, c.disagreement, c.miss)
-    assert c.disagreement < 1e-10 and c.last_believed == 30 and c.miss < 1e-4
-    assert "gravity" in found.shares and found.shares["time_step"] > 0.0
+    assert c.disagreement < 1e-10 and c.last_converged == 30 and c.miss < 1e-4
+    assert "gravity" in found.loss_changes and found.loss_changes["time_step"] > 0.0
     assert all(isinstance(value, (int, float, str, list, dict, type(None))) for value in found.as_dict().values())
     json.dumps(found.as_dict(), allow_nan=False)
 
@@ -81,7 +81,7 @@ def test_beyond_the_horizon_another_estimator_is_advised():
     assert found.right and not horizon.lasts
     assert 0.6 < horizon.predicted / horizon.measured < 1.6
     assert found.growth > 0.02
-    exact, *others = found.agreement.estimators
+    exact, *others = found.alignment.estimators
     best = max(others, key=lambda judged: judged.merit)
     assert found.estimator == best.estimator and best.cosine > 0.9 and 0.1 < best.size < 10.0
     assert exact.size > 3.0
@@ -90,7 +90,7 @@ def test_beyond_the_horizon_another_estimator_is_advised():
 def test_within_the_horizon_the_exact_gradient_is_advised():
     found = certify(problem_of(plane(), 40))
     assert found.estimator == "Exact()" and found.horizon == 40
-    exact, *_ = found.agreement.estimators
+    exact, *_ = found.alignment.estimators
     assert exact.estimator == "Exact()" and exact.cosine > 0.99 and exact.size == pytest.approx(1.0, abs=0.1)
     assert found.horizons[0].predicted is None
 
@@ -156,9 +156,9 @@ def certified_in_single(name):
 @pytest.mark.parametrize("name", IN_SINGLE)
 def test_right_gradients_are_found_right_in_float32(name):
     found = certified_in_single(name)
-    c = found.comparison
+    c = found.consistency
     assert found.right, (found.wrong, c.disagreement, c.miss)
-    assert c.disagreement < 1e-10 and c.last_believed == 8 and c.miss < 1e-4
+    assert c.disagreement < 1e-10 and c.last_converged == 8 and c.miss < 1e-4
     assert found.horizon == 8
 
 
@@ -200,7 +200,7 @@ def test_parameters_may_be_values_and_many_numbers():
     problem = problem_of(plane(), 20)
     velocities = problem.simulation.velocities + [0.3, 0.0]
     found = certify(problem, {"initial_velocities": velocities, "gravity": np.tile([0.5, -9.0], (20, 1))})
-    assert found.right and found.agreement is None
+    assert found.right and found.alignment is None
     assert [horizon.parameter for horizon in found.horizons] == ["initial_velocities", "gravity"]
     assert found.loss == problem.value({"initial_velocities": velocities, "gravity": [0.5, -9.0]})
 
@@ -211,8 +211,8 @@ def test_frames_are_judged_where_they_are():
 
     problem = problem_of(plane(), 15, frames)
     found = certify(problem)
-    assert found.right and found.comparison.moments.tolist() == [5, 9, 12]
-    assert found.comparison.losses[-1] == pytest.approx(found.loss)
+    assert found.right and found.consistency.sample_steps.tolist() == [5, 9, 12]
+    assert found.consistency.losses[-1] == pytest.approx(found.loss)
     slope = problem.tangent({"gravity": [0.0, -9.81]}, {"gravity": [0.0, 1.0]})
     gradient = problem.value_and_gradient({"gravity": np.array([0.0, -9.81])})[1]["gravity"]
     assert slope == pytest.approx(gradient[1])
@@ -230,7 +230,7 @@ def test_a_scene_needs_only_a_number_of_steps():
 
 def test_without_steps_nothing_is_claimed():
     found = certify(problem_of(plane(), 0, lambda simulation: losses.FinalPositions(0.9 * simulation.positions)))
-    assert found.right and found.agreement is None and found.comparison.moments.tolist() == [0]
+    assert found.right and found.alignment is None and found.consistency.sample_steps.tolist() == [0]
 
 
 def test_it_is_part_of_the_public_face():
@@ -245,7 +245,7 @@ def test_it_is_part_of_the_public_face():
         ({"parameters": ["nozzle_path"]}, "parameter 'nozzle_path' is unknown"),
         ({"parameters": {"gravity": [1.0, 2.0, 3.0]}}, r"parameter gravity has shape \(3,\), but must be"),
         ({"steps": 4}, "steps is 4, but must be left out, as the problem has 3 steps."),
-        ({"change": 0.0}, "change is 0.0, but must be greater than 0 and less than 1."),
+        ({"perturbation": 0.0}, "perturbation is 0.0, but must be greater than 0 and less than 1."),
     ],
 )
 def test_wrong_arguments_are_sentences(arguments, words):
@@ -257,8 +257,8 @@ def test_wrong_arguments_are_sentences(arguments, words):
 
 
 def comparison(adjoint=1.0, tangents=(0.5, 1.0), differences=((0.5, 1.0),) * 3, loss=1.0):
-    return Comparison(
-        moments=np.array([1, 2]),
+    return Consistency(
+        sample_steps=np.array([1, 2]),
         losses=np.array([0.5 * loss, loss]),
         adjoint=adjoint,
         size=1e-3 * abs(tangents[-1]),
@@ -336,7 +336,7 @@ def test_the_advice():
         (0.7, 1.0): "AdjointViscosity(strength=0.1)",
     }.items():
         both = (*judged, Judged("FrozenGeometry()", cosine, size))
-        assert replace(found, agreement=Agreement(0.1, both)).estimator == wanted
+        assert replace(found, alignment=Alignment(0.1, both)).estimator == wanted
     lost = (judged[0], Judged("AdjointViscosity(strength=0.1)", 0.1, 1.0), Judged("FrozenGeometry()", 0.2, 1.0))
-    assert replace(found, agreement=Agreement(0.1, lost)).estimator == "RandomizedSmoothing()"
-    assert replace(found, agreement=None).estimator == "AdjointViscosity()"
+    assert replace(found, alignment=Alignment(0.1, lost)).estimator == "RandomizedSmoothing()"
+    assert replace(found, alignment=None).estimator == "AdjointViscosity()"

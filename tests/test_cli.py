@@ -196,7 +196,7 @@ def test_an_interrupted_run_keeps_its_frames(cortado_command, folder, monkeypatc
 def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command, monkeypatch, command):
     for module in (cortado.commands.run, cortado.commands.optimise):
         monkeypatch.setattr(module, "track", interrupting(after=-1))
-    monkeypatch.setattr(cortado.commands.run, "TrajectoryWriter", interrupting(after=-1))
+    monkeypatch.setattr(cortado.commands.run, "frame_writer", interrupting(after=-1))
     assert cortado_command(*command, "--out", "dam") == (130, "", "Interrupted.\n")
 
 
@@ -244,7 +244,7 @@ def test_wrong_arguments_of_run_are_refused(cortado_command, folder, arguments, 
         (["run", "scene.toml", "--no"], "--no is unknown"),
         (["run", "scene.toml", "other.toml"], "other.toml is unknown, or one too many"),
         (["run", "scene.toml", "--seed", "3"], "--seed is no option here; see cortado run --help."),
-        (["gradients", "check", "scene.toml", "--change", "x"], "--change is 'x', but must be a number"),
+        (["gradients", "check", "scene.toml", "--perturbation", "x"], "--perturbation is 'x', but must be a number"),
         (["bench", "--engine", "steam"], "--engine is 'steam', but must be one of 'warp', 'reference'"),
         (["run", "scene.toml", "--set", "name=\udcff"], "must be text in UTF-8"),
     ],
@@ -366,7 +366,7 @@ def wait_for_metrics(run, lines, process):
 
 
 def assert_same_optimisation(one, other):
-    for name in ("metrics.jsonl", "checkpoint/evaluations.log"):
+    for name in ("metrics.jsonl", "checkpoint/replay.log"):
         assert (Path(one) / name).read_bytes() == (Path(other) / name).read_bytes()
 
 
@@ -550,7 +550,7 @@ def test_a_cup_is_swung_until_it_looks_as_it_should(cortado_command):
     code, out, err = cortado_command("optimise", "task.toml", "--out", "found")
     assert (code, err) == (0, "") and "gravity within " in out and "the image is matched to " in out
     wanted = {"loss.png", "images.png", "progress.png", "gravity.png"}
-    assert figures("found") == wanted | ({"found.mp4"} if find_spec("av") else set())
+    assert figures("found") == wanted | ({"estimate.mp4"} if find_spec("av") else set())
     page = Path("found/report.html").read_text()
     assert page.count("<img") == 4 and page.count("<video") == (1 if find_spec("av") else 0)
     assert len(metrics("found")) == 4
@@ -654,7 +654,7 @@ def test_the_check_speaks_json(cortado_command):
     code, out, _ = cortado_command("gradients", "check", "scene.toml", "--steps", 3, "--json")
     certificate = json.loads(out)
     assert code == 0 and certificate["right"] is True and certificate["wrong"] == []
-    assert certificate["shares"].keys() >= {"gravity", "initial_positions", "viscosity"}
+    assert certificate["loss_changes"].keys() >= {"gravity", "initial_positions", "viscosity"}
     assert certificate["horizon"] == 3 and certificate["estimator"] == "Exact()"
 
 
@@ -703,7 +703,7 @@ def test_bench_speaks_json_and_words(cortado_command):
         (["gradients", "check", "scene.toml", "--seed", "-1"], "--seed is -1"),
         (["gradients", "check", "scene.toml", "--loss", "sum"], "--loss is 'sum', but must be one of positions, "),
         (["gradients", "check", "scene.toml", "--parameters", "g"], "parameter 'g' is unknown, but must be one of"),
-        (["gradients", "check", "scene.toml", "--change", "-1"], "change is -1.0, but must be greater than 0"),
+        (["gradients", "check", "scene.toml", "--perturbation", "-1"], "perturbation is -1.0, but must be greater"),
         (["gradients", "check", "scene.toml", "--out", "scene.toml"], "The folder scene.toml cannot be made"),
         (["gradients", "check", "absent.toml"], "cannot be read"),
         (["bench", "--particles", "-5"], "--particles is -5"),

@@ -9,9 +9,11 @@ import warp as wp
 
 from cortado import CortadoWarning, DivergedError, InputError, Problem, Scene, Simulation, Trajectory, losses
 from cortado.commands.bench import dam_break
+from cortado.device.arrays import to_device
+from cortado.device.fields import POSITIONS, VELOCITIES
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import precision_named
-from cortado.device.state import State, to_device
+from cortado.device.state import Layout
 from cortado.lattice.region import Region
 from cortado.lattice.shapes import corners
 from cortado.scene.containers import CylinderContainer
@@ -120,7 +122,7 @@ def test_fluid_that_leaves_the_container_ends_the_run(make, precision):
     rollout = Simulation(made, precision=precision).rollout(40)
     wanted = r"left the container and was at \(.*\) m; try a smaller time step"
     with pytest.raises(DivergedError, match=wanted) as caught:
-        rollout.forward(lambda step, state: frames.append(state.numpy(made.dimension)[0]), keep=False)
+        rollout.forward(lambda step, state: frames.append(state.numpy(made.dimension)["positions"]), keep=False)
     assert len(frames) == caught.value.step - 1  # those before are good
     tolerance = 0.5 * made.discretisation.spacing
     assert made.container.contains(np.concatenate(frames).astype(np.float64), tolerance).all()
@@ -158,8 +160,8 @@ def test_the_device_finds_the_particles_that_numpy_finds(name, precision):
     near = Region.between(np.full(d, -2.0), np.full(d, 3.0))
     containment = Containment(Walled(region, near, spacing), real, KernelLauncher(n, device, record_tape=False), n)
     order = random.permutation(n)
-    state = State.zeros(n, 1, real, device)
-    state.set(after, np.zeros((n, d)), np.ones((n, 1)))
+    state = Layout(n, 1, real, device).state((POSITIONS, VELOCITIES))
+    state.set({"positions": after})
     containment.look(
         wp.array(np.tile(order, 2), dtype=wp.int32, device=device),
         to_device(before[order], real, device),
@@ -191,7 +193,7 @@ def test_what_is_spilled_may_fall_on():
     tables["container"] |= {"lid": False}
     simulation = Simulation(Scene(**tables), precision="float32")
     state = simulation.run(1).last_state
-    state.positions[0] = [5.0, -2e4 * 0.1, 0.0]
+    state["positions"][0] = [5.0, -2e4 * 0.1, 0.0]
     assert simulation.run(2, state=state).positions[-1, 0, 1] <= -2e4 * 0.1
 
 

@@ -1,4 +1,4 @@
-"""The code in the documents runs as printed."""
+"""The code in the documents runs as printed, and what they link to is there."""
 
 import re
 import shutil
@@ -18,6 +18,14 @@ def test_the_code_runs_as_printed(name, tmp_path, monkeypatch):
     shutil.copytree(ROOT / "docs" / "figures", tmp_path / "docs" / "figures")
     monkeypatch.chdir(tmp_path)
     exec(compile("\n".join(CODE[name]), name, "exec"), {"__name__": "__main__"})
+
+
+def test_links_lead_to_files():
+    paths = {*ROOT.glob("*.md"), *(path for name in ("docs", "experiments") for path in (ROOT / name).glob("*.md"))}
+    links = [(path, link) for path in paths for link in re.findall(r"\]\(([^)#]+)", path.read_text(encoding="utf-8"))]
+    assert links
+    missing = [(path.name, link) for path, link in links if "://" not in link and not (path.parent / link).exists()]
+    assert not missing
 
 
 def test_there_is_code():

@@ -13,8 +13,8 @@ import pytest
 import warp as wp
 
 from cortado import Simulation, reference
+from cortado.device.arrays import to_device
 from cortado.device.neighbourhood import neighbourhood_type
-from cortado.device.state import to_device
 from scenes import plane, plane_of_three, scene, two_layers
 
 SUPPORTS = {"cubic_spline": 2.0, "wendland_c2": 2.6}
@@ -38,7 +38,7 @@ class Step:
             "initial_velocities": 0.3 * random.standard_normal(shape) - 1.0,
         }
         rollout = self.simulation.rollout(1, self.point)
-        _, self.new_velocities, _ = rollout.forward().numpy(shape[1])
+        self.new_velocities = rollout.forward().numpy(shape[1])["velocities"]
         """(n, d) in the scene's order [m/s]."""
         self.solver = rollout.solver
         self.whole = self.solver.context(rollout.parameters).neighbourhood
@@ -81,7 +81,7 @@ class Step:
         """(n,) changes of number densities by the displacements [-], from the solver's kernel."""
         solver, n_dot = self.solver, wp.zeros_like(self.solver.fields["n"])
         x_dot = to_device(self.u, solver.discretisation.precision, solver.search.device)
-        solver.launch(solver.kernels.density.tangent, s=neighbourhood, x=solver.fields["x"], x_dot=x_dot, n_dot=n_dot)
+        solver.launch(solver.density.tangent, s=neighbourhood, x=solver.fields["x"], x_dot=x_dot, n_dot=n_dot)
         return n_dot.numpy().astype(np.float64)
 
     def gap(self, forces, compressions):

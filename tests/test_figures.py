@@ -30,7 +30,8 @@ def trajectory_of(steps: int) -> Trajectory:
     frames = np.zeros((1, 4, 2))
     converged = np.arange(steps) % 5 != 3
     errors = 0.01 + 0.001 * np.arange(steps)
-    return Trajectory(np.zeros(1), np.zeros(1, int), frames, frames, np.full(steps, 5), errors, converged)
+    diagnostics = {"iterations": np.full(steps, 5), "density_errors": errors, "converged": converged}
+    return Trajectory(np.zeros(1), np.zeros(1, int), frames, frames, diagnostics)
 
 
 @pytest.mark.parametrize(
@@ -104,8 +105,8 @@ def test_what_is_hidden_is_seen_where_it_was_found(tmp_path):
     labels = {"title": "", "x_label": "", "y_label": ""}
     found, ink = {"found": [0.0, 1.0, 2.0]}, (0x2B, 0x2A, 0x28)
     alone, both = (
-        pixels(figures.curve([0.0, 1.0, 2.0], found, tmp_path / f"{k}.png", **labels, hidden=hidden))
-        for k, hidden in enumerate([(), ([0.0, 1.0, 2.0],)])
+        pixels(figures.curve([0.0, 1.0, 2.0], found, tmp_path / f"{k}.png", **labels, true=true))
+        for k, true in enumerate([(), ([0.0, 1.0, 2.0],)])
     )
     assert share_of(ink, both) > share_of(ink, alone) + 1e-3
 

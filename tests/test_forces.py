@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from cortado import Simulation
-from cortado.device.state import Fields
+from cortado.device.arrays import Fields
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint
 from cortado.sph.gravity import Gravity
 from cortado.sph.parts import Adjoints, Shares

@@ -102,8 +102,7 @@ def test_a_kill_is_a_kill(tmp_path):
 def trajectory_of(positions, at=0.3):
     """Two frames: the particles all in one place, and where they are given."""
     frames = np.array([np.broadcast_to(at, positions.shape), positions])
-    steps = np.zeros(1)
-    return Trajectory(np.arange(2.0), np.arange(2), frames, np.zeros_like(frames), steps, steps, steps > -1.0)
+    return Trajectory(np.arange(2.0), np.arange(2), frames, np.zeros_like(frames), {"converged": np.ones(1, bool)})
 
 
 def test_a_particle_that_leaked_is_found():
@@ -165,7 +164,7 @@ def test_what_is_written_is_read():
 def drawn(seed, number):
     """What a case is made of."""
     case = Case("scenes", number, seed, Path())
-    tables = bases.tasks()["cloud_search"]
+    tables = bases.tasks()["ensemble_search"]
     words = mutate(tables, list(bases.tasks().values()), case.random)
     text = mutate_text(to_toml(tables).encode("utf-8", "surrogatepass"), case.random)
     return words, text, override(case.random), option(case.random)

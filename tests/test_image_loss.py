@@ -217,9 +217,9 @@ def whole_chain():
     simulation = Simulation(cup(), precision="float64")
     renderer = scene_renderer(simulation)
     time = np.linspace(0.0, 1.0, 30)[:, None]
-    hidden = np.array([0.0, -9.81, 0.0]) + 6.0 * np.hstack([np.sin(6.0 * time), 0.0 * time, np.cos(6.0 * time)])
+    truth = np.array([0.0, -9.81, 0.0]) + 6.0 * np.hstack([np.sin(6.0 * time), 0.0 * time, np.cos(6.0 * time)])
     problem = Problem(simulation, 30, losses.FinalPositions(simulation.positions))
-    end = problem.end({"gravity": hidden})
+    end = problem.end({"gravity": truth})
     target = renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
     return Problem(simulation, 30, losses.Image(renderer, target))
 

@@ -51,7 +51,7 @@ class Kernels:
 
     density = density_kernels(DISCRETISATION)
     walls = wall_kernels(DISCRETISATION)
-    contrast = density_ratio_kernels(DISCRETISATION)
+    density_ratio = density_ratio_kernels(DISCRETISATION)
     pressure = pressure_kernels(DISCRETISATION)
     force = pressure_force_kernels(DISCRETISATION)
     integration = integration_kernels(FLOAT64)
@@ -231,8 +231,8 @@ class WallYield(Operation):
         return {"x": launch(Kernels.walls.adjoint, s=self.s, **values, y_bar=bars["y"], **zeros("x_bar"))["x_bar"]}
 
 
-class Contrast(Operation):
-    """What heavy particles among lighter ones make of the yield."""
+class DensityRatio(Operation):
+    """The pressure relaxation of heavy particles among lighter ones."""
 
     inputs, outputs = ("x", "m", "wall_y"), ("y",)
 
@@ -241,16 +241,16 @@ class Contrast(Operation):
         self.start["wall_y"] = self.start.pop("y")
 
     def forward(self, values):
-        return launch(Kernels.contrast.forward, s=self.s, **values, t=np.zeros(N), y=np.zeros(N))
+        return launch(Kernels.density_ratio.forward, s=self.s, **values, t=np.zeros(N), y=np.zeros(N))
 
     def tangent(self, values, dots):
         given = {**values, **dotted(dots), **{name: self.forward(values)[name] for name in ("t", "y")}}
-        return {"y": launch(Kernels.contrast.tangent, s=self.s, **given, y_dot=np.zeros(N))["y_dot"]}
+        return {"y": launch(Kernels.density_ratio.tangent, s=self.s, **given, y_dot=np.zeros(N))["y_dot"]}
 
     def adjoint(self, values, bars):
         given = {**values, **{name: self.forward(values)[name] for name in ("t", "y")}}
-        bar = launch(Kernels.contrast.factor_adjoint, s=self.s, **given, y_bar=bars["y"], t_bar=np.zeros(N))
-        found = launch(Kernels.contrast.adjoint, s=self.s, **given, t_bar=bar["t_bar"], **zeros("x_bar", "m_bar"))
+        bar = launch(Kernels.density_ratio.factor_adjoint, s=self.s, **given, y_bar=bars["y"], t_bar=np.zeros(N))
+        found = launch(Kernels.density_ratio.adjoint, s=self.s, **given, t_bar=bar["t_bar"], **zeros("x_bar", "m_bar"))
         return {"x": found["x_bar"], "m": found["m_bar"], "wall_y": bar["y_bar"]}
 
 
@@ -603,7 +603,7 @@ class FiveIterations(Iterations):
 ADJOINT = [
     Density,
     WallYield,
-    Contrast,
+    DensityRatio,
     Pairwise,
     PairwiseWithFriction,
     Laminar,

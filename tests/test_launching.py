@@ -50,7 +50,7 @@ def test_launches_compute_what_kernels_say(by):
 
 
 def test_a_sum_over_neighbours_has_a_thread_for_each_particle():
-    search = Simulation(plane()).solver
-    kernels, context = search.kernels, search.context(search.new_parameters(1))
+    solver = Simulation(plane()).solver
+    context = solver.context(solver.new_parameters(1))
     with pytest.raises(TypeError, match="sums over neighbours, and has one thread for each particle"):
-        context.launch(kernels.density.forward, threads=1)
+        context.launch(solver.density.forward, threads=1)

@@ -25,19 +25,20 @@ LAYERS = """
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights
     scene.containers scene.model scene.stability
-    device device.kernels device.memory device.precision device.reduction device.silence device.kernel_cache
-    device.smoothing device.neighbourhood device.state device.threads device.launching device.cells
-    device.neighbours
+    device device.cores device.kernels device.memory device.precision device.reduction device.silence
+    device.kernel_cache device.smoothing device.neighbourhood device.arrays device.fields device.state
+    device.threads device.launching device.cells device.neighbours
     scene.checks scene.scene
     parameters.checks
     discretise.sampling discretise.discrete_scene
-    sph sph.density sph.free_energy sph.integration sph.materials sph.nozzle_kernels sph.pair_forces
-    sph.pairwise_laplacian sph.diffusion sph.parts sph.gravity sph.mixture sph.nozzle sph.surface_tension
-    sph.viscosity
-    solvers solvers.containment_kernels solvers.containment solvers.build solvers.pcisph solvers.solver
-    solvers.pcisph.convergence solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure
-    solvers.pcisph.pressure solvers.pcisph.wall_relaxation solvers.pcisph.parts solvers.pcisph.log
-    solvers.pcisph.steps solvers.pcisph.derivatives solvers.pcisph.solver solvers.pcisph.build
+    sph sph.density sph.free_energy sph.integration sph.materials sph.emitter_kernels sph.pair_forces
+    sph.pairwise_laplacian sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter sph.gravity sph.mixture
+    sph.surface_tension sph.viscosity
+    solvers solvers.containment_kernels solvers.containment solvers.solver solvers.convergence solvers.loop
+    solvers.particles solvers.particle_derivatives solvers.build solvers.pcisph
+    solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure solvers.pcisph.pressure
+    solvers.pcisph.wall_relaxation solvers.pcisph.parts solvers.pcisph.steps solvers.pcisph.derivatives
+    solvers.pcisph.solver solvers.pcisph.build
     reference.digits reference.engine reference.histories reference.losses reference.simulation reference
     rollout
     parameters.space
@@ -53,17 +54,17 @@ LAYERS = """
     simulation
     problem
     figures.curves figures
-    certificate.agreement certificate.changes certificate.twin certificate.course certificate.horizon
-    certificate.rightness certificate.text certificate.certificate certificate certificate.figure
+    certificate.alignment certificate.perturbations certificate.twin certificate.loss_history certificate.horizon
+    certificate.consistency certificate.text certificate.certificate certificate certificate.figure
     optimisation optimisation.differentiable optimisation.replay_log optimisation.optimisers
     optimisation.named_optimisers optimisation.result optimisation.optimise optimisation.transforms
     io.run_folder io.report
     inverse inverse.tables inverse.task inverse.setup inverse.figures
     study study.canvas study.comparison study.estimates study.lyapunov_spectrum study.one_kernel_loops
-    study.reference_losses study.scenes study.shades study.sources study.gravity_tangents study.spatial_scales
-    study.starts study.tables study.experiment study.forces study.gravity_and_precision study.image_horizon
+    study.reference_losses study.scenes study.palette study.sources study.gravity_tangents study.spatial_scales
+    study.ensembles study.tables study.experiment study.forces study.gravity_and_precision study.image_horizon
     study.locality study.lyapunov_exponents study.lyapunov study.results study.round_off study.step_size study.task
-    study.term_sizes study.pressure_terms study.wrong_adjoints study.wrong_derivation study.kinds
+    study.term_sizes study.pressure_terms study.wrong_adjoints study.wrong_derivation study.registry
     study.experiment_files
     commands commands.bench commands.check commands.figure commands.optimise commands.run commands.study
     cli

@@ -219,14 +219,14 @@ def quartic_functions(precision, phases):
     real, fractions = precision.real, precision.fractions(phases)
 
     @wp.func
-    def slope(c: fractions) -> fractions:
+    def gradient(c: fractions) -> fractions:
         return wp.cw_mul(wp.cw_mul(c, c), c)
 
     @wp.func
-    def bend(c: fractions, u: fractions) -> fractions:
+    def hessian_product(c: fractions, u: fractions) -> fractions:
         return real(3.0) * wp.cw_mul(wp.cw_mul(c, c), u)
 
-    return SimpleNamespace(slope=slope, bend=bend)
+    return SimpleNamespace(gradient=gradient, hessian_product=hessian_product)
 
 
 QUARTIC = FreeEnergy("quartic", lambda c: 0.25 * (c**4).sum(1), curvature=3.0, functions=quartic_functions)

@@ -29,7 +29,7 @@ def padded(vectors: np.ndarray) -> np.ndarray:
 
 
 def around(search: NeighbourSearch, period: np.ndarray, precision: Precision) -> Any:
-    """What `NeighbourSearch.fill` reads of the neighbourhood, as `PcisphSteps.resize` sets it."""
+    """What `NeighbourSearch.fill` reads of the neighbourhood, as `ParticleSolver.resize` sets it."""
     s = neighbourhood_type(precision)()
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count

@@ -277,7 +277,7 @@ def test_damage_before_the_last_record_is_refused(tmp_path):
 @pytest.mark.parametrize("content", [b"something else\n", b"[" * 100_000, b"\n", b'{"format": 1}\n'])
 def test_a_foreign_file_is_refused(tmp_path, content):
     (tmp_path / FILE_NAME).write_bytes(content)
-    with pytest.raises(InputError, match="no log of evaluations"):
+    with pytest.raises(InputError, match="no replay log"):
         rosenbrock(Adam(0.05), 5, checkpoint=tmp_path, resume=True)
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from cortado import InputError, Problem, Simulation, losses
-from cortado.device.state import Parameters
 from cortado.gradients import Exact
 from cortado.parameters.registry import BY_NAME, PARAMETERS, Role, names
 from cortado.parameters.table import markdown
@@ -21,10 +20,9 @@ def test_the_document_has_the_table_of_the_registry():
 
 
 def test_every_parameter_of_steps_is_on_the_device():
-    simulation = Simulation(plane_of_three())
-    found = Parameters.zeros(7, 64, 3, simulation.precision, simulation.device)
-    assert found.names == (*names(Role.RUN), "reference_density")
-    sizes = {"gravity": 7, "nozzle_path": 7, "rest_density": 3, "viscosity": 3, "reference_density": 64}
+    found = Simulation(plane_of_three()).solver.new_parameters(7)
+    assert found.names == names(Role.RUN)
+    sizes = {"gravity": 7, "nozzle_path": 7, "rest_density": 3, "viscosity": 3}
     assert {name: len(found[name]) for name in found.names} == {name: sizes.get(name, 1) for name in found.names}
 
 

@@ -21,25 +21,25 @@ ROOT = Path(cortado.__file__).parent
 
 UNNAMED = {
     "sph.integration": {"integration_kernels.collect_masses"},
-    "sph.nozzle_kernels": {"nozzle_kernels.collect"},
-    "sph.surface_tension": {"tension_functions.stress_slope"},
+    "sph.emitter_kernels": {"emitter_kernels.collect"},
+    "sph.surface_stress": {"tension_functions.stress_derivative"},
 }
 """Functions of adjoints, by module, whose names do not say so."""
 SHARED = {
     "device.neighbourhood": {"pair_functions.factor_gradient"},
-    "device.smoothing": {"_cubic_spline.bend", "smoothing_functions.hessian_product"},
+    "device.smoothing": {"_cubic_spline.hessian_factor", "smoothing_functions.hessian_product"},
     "losses.image_losses": {"adjoint", "reduce_transposed"},
     "losses.matching": {"matching_kernels.difference"},
-    "render.absorption": {"brightness_functions.brightness_slope", "absorption_kernels.gather"},
-    "render.interpolation": {"interpolation_functions.share"},
-    "solvers.pcisph.density_ratio_relaxation": {"density_ratio_kernels.excess_slope"},
-    "sph.free_energy": {"_double_well.bend", "_miscible.bend", "_degenerate.slope"},
-    "sph.surface_tension": {
+    "render.absorption": {"brightness_functions.brightness_derivative", "absorption_kernels.gather"},
+    "render.interpolation": {"interpolation_functions.trilinear_weight"},
+    "solvers.pcisph.density_ratio_relaxation": {"density_ratio_kernels.excess_derivative"},
+    "sph.free_energy": {"_double_well.hessian_product", "_miscible.hessian_product", "_degenerate.gradient"},
+    "sph.surface_stress": {
         "tension_functions.arrow_change",
-        "tension_functions.pull_slope",
+        "tension_functions.pull_derivative",
         "normal_kernels.change",
     },
-    "sph.viscosity": {"viscosity_kernels.share"},
+    "sph.viscosity": {"viscosity_kernels.pair_viscosity_derivative"},
 }
 """Derivatives that forward mode uses too, and those of pictures, so that only differences can tell."""
 ELSEWHERE = {"solvers.pcisph.frozen_pressure": "an estimator that is not exact: tests/test_estimators.py"}

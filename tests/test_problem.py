@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from cortado import CortadoWarning, InputError, Problem, Simulation, gradients, losses
-from cortado.device.state import State
 from cortado.rollout import checkpoint_interval
 from cortado.sph.free_energy import MISCIBLE
 from scenes import plane_of_three, splash
@@ -73,8 +72,8 @@ def test_an_adjoint_that_a_loss_keeps_is_not_changed(simulation):
 
         def adjoint(self, end):
             if self.kept is None:
-                self.kept = State.zeros(125, 1, end.precision, end.state.positions.device)
-                self.kept.set(np.tile([0.0, 1.0, 0.0], (125, 1)), np.zeros((125, 3)), np.zeros((125, 1)))
+                self.kept = end.state.like()
+                self.kept.set({"positions": np.tile([0.0, 1.0, 0.0], (125, 1))})
             return self.kept
 
     problem = Problem(simulation, 20, Height())

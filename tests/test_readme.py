@@ -37,7 +37,7 @@ def test_the_code_runs_as_printed(capsys):
     shape, ratio, _ = [line for line in capsys.readouterr().out.splitlines() if line[0] in "([0123456789"]
     assert re.fullmatch(r"\(21, \d+, 3\)", shape)
     assert float(ratio) == pytest.approx(1.0, abs=1e-9)
-    np.testing.assert_allclose(names["result"].parameters["tilt"], names["hidden"]["tilt"], atol=0.01)
+    np.testing.assert_allclose(names["result"].parameters["tilt"], names["true_tilt"]["tilt"], atol=0.01)
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -102,27 +102,27 @@ def twin_samples(camera: Camera, step: float) -> np.ndarray:
 
 
 def corners(x: np.ndarray, nodes: np.ndarray, cell: float):
-    """For each of the eight nodes around points (..., 3): its index where there is such a node, and its share."""
+    """For each of the eight nodes around points (..., 3): its index if there is such a node, and its weight."""
     s = (x - nodes[0, 0, 0]) / cell
     base = np.floor(s).astype(int)
     for corner in np.ndindex(2, 2, 2):
-        share = np.prod(np.where(corner, s - base, 1 - s + base), axis=-1)
+        weight = np.prod(np.where(corner, s - base, 1 - s + base), axis=-1)
         index = base + corner
         there = ((index >= 0) & (index < nodes.shape[:3])).all(axis=-1)
-        yield np.where(there[..., None], index, 0), np.where(there, share, 0.0)
+        yield np.where(there[..., None], index, 0), np.where(there, weight, 0.0)
 
 
 def twin_picture(view: View, nodes: np.ndarray, field: np.ndarray, cell: float) -> np.ndarray:
     """Sample by sample from the back, the other way round."""
-    inks = sum(
-        share[..., None] * field[tuple(np.moveaxis(index, -1, 0))]
-        for index, share in corners(twin_samples(view.camera, cell / 2), nodes, cell)
+    layers = sum(
+        weight[..., None] * field[tuple(np.moveaxis(index, -1, 0))]
+        for index, weight in corners(twin_samples(view.camera, cell / 2), nodes, cell)
     )
-    image = np.zeros(inks.shape[1:3] + (3,)) + view.background
-    for ink in inks[::-1]:
-        u = view.extinction * cell / 2 * ink[..., 3:]
+    image = np.zeros(layers.shape[1:3] + (3,)) + view.background
+    for rgba in layers[::-1]:
+        u = view.extinction * cell / 2 * rgba[..., 3:]
         opacity = -np.expm1(-u)
-        colour = np.divide(ink[..., :3], ink[..., 3:], out=np.zeros_like(ink[..., :3]), where=ink[..., 3:] > 0)
+        colour = np.divide(rgba[..., :3], rgba[..., 3:], out=np.zeros_like(rgba[..., :3]), where=rgba[..., 3:] > 0)
         image = image * (1 - opacity) + opacity * colour
     return image
 
@@ -292,12 +292,12 @@ def test_nodes_gather_what_samples_would_scatter(view):
     x = twin_samples(view.camera, cell / 2).reshape(-1, rows * columns, 3)
     wanted, landed = np.zeros((*nodes.shape[:3], 4)), 0.0
     for pixel, (first, last) in enumerate(spans):
-        for index, share in corners(x[first:last, pixel], nodes, cell):
-            np.add.at(wanted, tuple(index.T), share[:, None] * samples_bar[: last - first, pixel])
-            landed += share.sum()
+        for index, weight in corners(x[first:last, pixel], nodes, cell):
+            np.add.at(wanted, tuple(index.T), weight[:, None] * samples_bar[: last - first, pixel])
+            landed += weight.sum()
     found = rays._field_bar.numpy().transpose(2, 1, 0, 3)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-13 * np.abs(wanted).max())
-    everywhere = sum(share.sum() for _, share in corners(x, nodes, cell))
+    everywhere = sum(weight.sum() for _, weight in corners(x, nodes, cell))
     assert landed == pytest.approx(everywhere, rel=1e-12), "a sample in the field lies in no span"
 
 

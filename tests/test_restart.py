@@ -35,6 +35,9 @@ def test_a_restart_has_the_bits_of_a_run_that_did_not_stop(name, precision, tmp_
         rest = simulation.run(REST, later, state=state)
         assert rest.steps.tolist() == list(range(FIRST, FIRST + REST + 1))
         assert rest.times.tobytes() == whole.times[FIRST:].tobytes()
+        assert rest.others.keys() == whole.others.keys()
+        for field, found in rest.others.items():
+            assert found.tobytes() == whole.others[field][FIRST:].tobytes(), field
         for field in ("positions", "velocities", "mass_fractions"):
             found, wanted = getattr(rest, field), getattr(whole, field)
             assert (found is None) == (wanted is None)
@@ -47,20 +50,42 @@ def test_a_restart_has_the_bits_of_a_run_that_did_not_stop(name, precision, tmp_
 def test_states_that_do_not_fit_are_refused():
     simulation = Simulation(pour(), precision="float64")
     state = simulation.run(3).last_state
-    few = replace(state, positions=state.positions[:-1])
-    elsewhere = replace(state, positions=state.positions + [0.0, 0.0, 5.0])
-    weightless = replace(state, constants=replace(state.constants, reference_density=np.zeros(simulation.particles)))
+
+    def other(**fields):
+        return replace(state, fields={**state.fields, **fields})
+
+    emitterless = Simulation(two_layers()).run(1).last_state
     for arguments, what in [
-        ({"state": few}, "state.positions has shape"),
-        ({"state": elsewhere}, "state.positions has particle 0 at .* m, outside the container of this scene"),
-        ({"state": weightless}, "state.constants.reference_density must be greater than 0"),
+        ({"state": other(positions=state["positions"][:-1])}, "state positions has shape"),
+        (
+            {"state": other(positions=state["positions"] + [0.0, 0.0, 5.0])},
+            "state positions has particle 0 at .* m, outside the container of this scene",
+        ),
+        (
+            {"state": other(reference_density=np.zeros(simulation.particles))},
+            "state reference_density must be greater than 0",
+        ),
+        ({"state": other(emitted=np.array([np.nan]))}, "state emitted has a value that is not finite"),
+        ({"state": emitterless}, "state has positions, .*, but must have positions, .*, outlet, emitted in this scene"),
         ({"state": simulation.state}, "must be a RestartState"),
-        ({"state": state, "controls": {"flow_rate": 0.01}}, "flow_rate is 0.01, but must be"),
-        ({"state": state, "controls": {"time_step": 0.001}}, "time_step is 0.001, but must be"),
-        ({"state": state, "controls": {"initial_velocities": state.velocities}}, "must be left out with a state"),
+        ({"state": state, "controls": {"initial_velocities": state["velocities"]}}, "must be left out with a state"),
     ]:
         with pytest.raises(InputError, match=what):
             simulation.run(3, **arguments)
+
+
+def test_an_emitter_goes_on_with_another_flow():
+    """What has left the nozzle is part of the state: particles that are still prescribed do not jump."""
+    simulation = Simulation(jet(), precision="float64")
+    given = simulation.parameters()
+    first = simulation.run(4)
+    faster = {"flow_rate": 1.5 * given["flow_rate"], "time_step": 0.5 * given["time_step"]}
+    later = simulation.run(1, faster, state=first.last_state)
+    waiting = slice(simulation.particles - 3, None)
+    moved = later.positions[1, waiting] - first.positions[-1, waiting]
+    speed = np.linalg.norm(first.velocities[-1, waiting], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 1.5 * 0.5 * given["time_step"] * speed, rtol=1e-9)
+    assert later.times[-1] == pytest.approx(4.5 * given["time_step"])
 
 
 def test_a_run_goes_on_from_a_frame_on_the_way():

@@ -62,8 +62,8 @@ def test_a_folder_with_a_run_is_refused_unless_overwritten(tmp_path):
     (folder.figures / "holiday.png").write_text("mine")
     (folder.figures / "loss.png").write_text("")
     (folder.checkpoint / "1").mkdir(parents=True)
-    (folder.checkpoint / "evaluations.log").write_text("")
-    (folder.checkpoint / "1" / "evaluations.log").write_text("")
+    (folder.checkpoint / "replay.log").write_text("")
+    (folder.checkpoint / "1" / "replay.log").write_text("")
     with pytest.raises(InputError, match=r"--out, or replace it with --overwrite\.$"):
         new_run(folder.path)
     with pytest.raises(InputError, match=r"--overwrite\.$"):
@@ -124,7 +124,10 @@ def test_a_damaged_folder_is_a_sentence(tmp_path, name, damage):
 
 
 def test_a_refused_resume_names_the_setting(tmp_path):
-    settings = {"problem": {"steps": 20, "target": {"gravity": np.array([0.0, -9.5])}}, "extinctions": (0.5, 1.0)}
+    settings = {
+        "problem": {"steps": 20, "target": {"gravity": np.array([0.0, -9.5])}},
+        "extinction_schedule": (0.5, 1.0),
+    }
     folder = new_run(tmp_path / "a", kind="optimise", settings=settings)
     RunFolder.resume(folder.path, SCENE, COMMAND, kind="optimise", settings=settings)
     settings["problem"]["target"] = {"gravity": np.array([0.0, -9.8])}

@@ -9,14 +9,14 @@ from unicodedata import normalize
 import pytest
 from pydantic import ValidationError
 
-import cortado.study.kinds  # noqa: F401  so that the tables of all experiments are there
+import cortado.study.registry  # noqa: F401  so that the tables of all experiments are there
 from cortado.inverse.tables import TaskTables
 from cortado.scene.scene import Scene
 from cortado.scene.tables import Table
 
 
 def _tables(table: type[Table] = Table) -> list[type[Table]]:
-    return [table, *(found for kind in table.__subclasses__() for found in _tables(kind))]
+    return [table, *(found for one in table.__subclasses__() for found in _tables(one))]
 
 
 TABLES = [table for table in _tables() if table.model_fields]
@@ -50,8 +50,8 @@ def test_every_number_has_a_unit_which_is_that_of_its_description(table, name):
         assert number["unit"] and (said is None or normalize("NFKC", number["unit"]).startswith(said[1]))
 
 
-# Extinctions have to grow besides: tests/test_extinctions.py.
-@pytest.mark.parametrize("table, name", [field for field in FIELDS if field.values[1] != "extinctions"])
+# The factors of a continuation schedule also have to grow: tests/test_extinction_schedule.py.
+@pytest.mark.parametrize("table, name", [field for field in FIELDS if field.values[1] != "extinction_schedule"])
 def test_ranges_in_the_schema_are_the_ranges_that_are_refused(table, name):
     schema = schema_of(table, name)
     entry = schema.get("items", {})

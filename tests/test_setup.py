@@ -11,7 +11,7 @@ from cortado.inverse.task import load_task
 from cortado.io.pictures import heart, rosetta, write_picture
 from cortado.losses.image_losses import Pyramid, SquaredDifference
 from cortado.optimisation.optimisers import LBFGS, Adam
-from cortado.optimisation.transforms import Knots, Logarithm, Softmax
+from cortado.optimisation.transforms import Logarithm, Softmax, TimeInterpolation
 from cortado.parameters.tilt import Tilt
 
 
@@ -26,54 +26,54 @@ def made(tmp_path):
     return make
 
 
-def end_of(assigned, parameters):
-    steps = assigned.problem.steps
-    return assigned.problem.states(parameters, [steps])[steps]
+def end_of(ready, parameters):
+    steps = ready.problem.steps
+    return ready.problem.states(parameters, [steps])[steps]
 
 
 # ---- targets -----------------------------------------------------------------------------------------------------
 
 
 def test_positions_are_those_of_the_hidden_run(made):
-    assigned = made(GOOD_TASK, "problem.frames=2")
-    assert assigned.renderer is None and list(assigned.targets) == [2, 5]
-    trajectory = assigned.problem.run({"gravity": [1.5, -9.81]})
-    for step, target in assigned.targets.items():
+    ready = made(GOOD_TASK, "problem.frames=2")
+    assert ready.renderer is None and list(ready.targets) == [2, 5]
+    trajectory = ready.problem.run({"gravity": [1.5, -9.81]})
+    for step, target in ready.targets.items():
         np.testing.assert_array_equal(target, trajectory.positions[step])
-    assert assigned.search.value(assigned.task.hidden) == 0.0
-    np.testing.assert_array_equal(assigned.hidden("gravity"), [1.5, -9.81])
+    assert ready.search.value(ready.task.true_parameters) == 0.0
+    np.testing.assert_array_equal(ready.true_parameter("gravity"), [1.5, -9.81])
 
 
 def test_images_are_those_of_the_hidden_run(made):
-    assigned = made(TINY_LATTE, "problem.frames=2")
-    assert list(assigned.targets) == [3, 6] and all(image.shape == (12, 16, 3) for image in assigned.targets.values())
-    hidden = {name: assigned.hidden(name) for name in assigned.task.hidden}
-    assert hidden["gravity"].shape == (6, 3)
-    np.testing.assert_array_equal(assigned.image(end_of(assigned, hidden)), assigned.targets[6])
-    assert assigned.problem.value(hidden) == 0.0
-    assert assigned.search.value(assigned.start) > 1e-6
+    ready = made(TINY_LATTE, "problem.frames=2")
+    assert list(ready.targets) == [3, 6] and all(image.shape == (12, 16, 3) for image in ready.targets.values())
+    truth = {name: ready.true_parameter(name) for name in ready.task.true_parameters}
+    assert truth["gravity"].shape == (6, 3)
+    np.testing.assert_array_equal(ready.image(end_of(ready, truth)), ready.targets[6])
+    assert ready.problem.value(truth) == 0.0
+    assert ready.search.value(ready.start) > 1e-6
 
 
 def test_hidden_colours_are_in_the_target(made):
     red = [[0.9, 0.1, 0.1], [0.8, 0.2, 0.2]]
-    assigned = made(TINY_LATTE, f"problem.target.colours={red}", f"optimise.start.colours={[[0.5] * 3] * 2}")
-    target = assigned.targets[6]
-    assert assigned.problem.value({**assigned.task.hidden, "colours": np.array(red)}) == 0.0
+    ready = made(TINY_LATTE, f"problem.target.colours={red}", f"optimise.start.colours={[[0.5] * 3] * 2}")
+    target = ready.targets[6]
+    assert ready.problem.value({**ready.task.true_parameters, "colours": np.array(red)}) == 0.0
     assert (target[..., 0] - target[..., 1]).max() > 0.3
 
 
 @pytest.mark.parametrize(("name", "draw"), [("heart", heart), ("rosetta", rosetta)])
 def test_our_pictures_have_the_colours_of_the_scene(made, name, draw):
-    assigned = made(PLANE_PICTURE, f"problem.picture={name}")
+    ready = made(PLANE_PICTURE, f"problem.picture={name}")
     wanted = draw((20, 16), milk=(0.9, 0.8, 0.7), coffee=(0.3, 0.2, 0.1))
-    np.testing.assert_array_equal(assigned.targets[0], wanted)
-    assert assigned.task.hidden == {} and assigned.hidden("initial_positions") is None
+    np.testing.assert_array_equal(ready.targets[0], wanted)
+    assert ready.task.true_parameters == {} and ready.true_parameter("initial_positions") is None
 
 
 def test_a_picture_in_a_round_cup_ends_at_its_wall(made):
     text = TINY_LATTE.replace("target.gravity = [[0.0, -9.81, 4.0], [4.0, -9.81, 0.0]]", 'picture = "heart"')
-    assigned = made(text.replace("parameter_error", "# parameter_error"))
-    target = assigned.targets[6]
+    ready = made(text.replace("parameter_error", "# parameter_error"))
+    target = ready.targets[6]
     np.testing.assert_allclose(target[0, 0], [1.0, 1.0, 1.0])
     np.testing.assert_allclose(target[1, 8], [0.20, 0.09, 0.04])
     np.testing.assert_allclose(target[6, 8], [0.95, 0.92, 0.85])
@@ -83,8 +83,8 @@ def test_a_picture_of_ones_own_is_beside_the_task(made, tmp_path):
     image = np.zeros((32, 40, 3))
     image[:16, :, 0] = 1.0
     write_picture(tmp_path / "mine.png", image)
-    assigned = made(PLANE_PICTURE, "problem.picture=mine.png")
-    target = assigned.targets[0]
+    ready = made(PLANE_PICTURE, "problem.picture=mine.png")
+    target = ready.targets[0]
     assert target.shape == (16, 20, 3)
     np.testing.assert_allclose(target[:7, :, 0], 1.0, atol=1e-6)
     np.testing.assert_allclose(target[9:], 0.0, atol=1e-6)
@@ -116,21 +116,21 @@ def test_random_places_are_the_same_each_time_and_within_the_container(made):
 
 
 def test_random_places_in_a_round_cup(made):
-    assigned = made(
+    ready = made(
         TINY_LATTE.replace("knots = 3", ""),
         "problem.steps=2",  # before fluid that is all in one place leaves the cup
         "problem.target.initial_positions=" + str(np.full((LATTE_PARTICLES, 3), 0.001).tolist()),
         'optimise.start={initial_positions="random"}',
     )
-    x = assigned.start["initial_positions"]
+    x = ready.start["initial_positions"]
     assert np.hypot(x[:, 0], x[:, 2]).max() <= 0.0105 and x[:, 1].min() > 0.0 and np.ptp(x[:, 1]) > 0.01
 
 
 def test_random_places_keep_their_bounds(made):
-    assigned = made(PLANE_PICTURE, "optimise.bounds.initial_positions=[[0.1,0.2],[0.3,0.4]]")
-    x = assigned.start["initial_positions"]
+    ready = made(PLANE_PICTURE, "optimise.bounds.initial_positions=[[0.1,0.2],[0.3,0.4]]")
+    x = ready.start["initial_positions"]
     assert (x >= [0.1, 0.2]).all() and (x <= [0.3, 0.4]).all()
-    optimise(assigned.search, assigned.start, Adam(0.01), 1, bounds=assigned.bounds)
+    optimise(ready.search, ready.start, Adam(0.01), 1, bounds=ready.bounds)
 
 
 def test_random_places_need_a_container(made):
@@ -142,22 +142,22 @@ def test_random_places_need_a_container(made):
 
 def test_random_fractions_add_up_to_1(made):
     even = np.full((LATTE_PARTICLES, 2), 0.5).tolist()
-    assigned = made(
+    ready = made(
         TINY_LATTE.replace("knots = 3", ""),
         f"problem.target.mass_fractions={even}",
         'optimise.start={mass_fractions="random"}',
     )
-    found = assigned.search.parameters(assigned.start)["mass_fractions"]
+    found = ready.search.parameters(ready.start)["mass_fractions"]
     assert found.shape == (LATTE_PARTICLES, 2) and found.min() > 0.0 and found.std() > 0.1
     np.testing.assert_allclose(found.sum(axis=1), 1.0, rtol=1e-14)
-    assert isinstance(assigned.search.coordinates["mass_fractions"], Softmax)
+    assert isinstance(ready.search.coordinates["mass_fractions"], Softmax)
 
 
 # ---- coordinates and bounds --------------------------------------------------------------------------------------
 
 
 def test_coordinates_are_those_that_the_task_asks_for(made):
-    assigned = made(
+    ready = made(
         TINY_LATTE,
         "problem.target.viscosity=[0.02,0.04]",
         "optimise.start.viscosity=[0.03,0.03]",
@@ -165,52 +165,52 @@ def test_coordinates_are_those_that_the_task_asks_for(made):
         "optimise.bounds.viscosity=[[0.01,0.02],[0.1,0.2]]",
         "optimise.bounds.gravity=[-20,20]",
     )
-    assert assigned.search.coordinates == {"gravity": Knots(6, 3), "viscosity": Logarithm()}
-    np.testing.assert_allclose(assigned.start["viscosity"], np.log([0.03, 0.03]))
-    np.testing.assert_allclose(assigned.start["gravity"], np.tile([0.0, -9.81, 0.0], (3, 1)), atol=1e-14)
-    np.testing.assert_allclose(assigned.bounds["viscosity"], np.log([[0.01, 0.02], [0.1, 0.2]]))
-    assert assigned.bounds["gravity"] == (-20.0, 20.0)
+    assert ready.search.coordinates == {"gravity": TimeInterpolation(6, 3), "viscosity": Logarithm()}
+    np.testing.assert_allclose(ready.start["viscosity"], np.log([0.03, 0.03]))
+    np.testing.assert_allclose(ready.start["gravity"], np.tile([0.0, -9.81, 0.0], (3, 1)), atol=1e-14)
+    np.testing.assert_allclose(ready.bounds["viscosity"], np.log([[0.01, 0.02], [0.1, 0.2]]))
+    assert ready.bounds["gravity"] == (-20.0, 20.0)
 
 
 def test_a_tilt_is_hidden_searched_and_bounded(made):
     text = TINY_LATTE.replace("[[0.0, -9.81, 4.0], [4.0, -9.81, 0.0]]", "[[0.0, 20.0], [20.0, 0.0]]")
     text = text.replace("[[0.0, -9.81, 0.0], [0.0, -9.81, 0.0]]", "[[0.0, 0.0], [0.0, 0.0]]").replace("gravity", "tilt")
-    assigned = made(text, "optimise.bounds.tilt=[-15,15]")
-    assert assigned.search.coordinates == {"tilt": Knots(6, 3)} and assigned.start["tilt"].shape == (3, 2)
-    gravity = Tilt((0.0, -9.81, 0.0)).gravity(assigned.hidden("tilt"))
+    ready = made(text, "optimise.bounds.tilt=[-15,15]")
+    assert ready.search.coordinates == {"tilt": TimeInterpolation(6, 3)} and ready.start["tilt"].shape == (3, 2)
+    gravity = Tilt((0.0, -9.81, 0.0)).gravity(ready.true_parameter("tilt"))
     np.testing.assert_allclose(np.linalg.norm(gravity, axis=1), 9.81, rtol=1e-14)
-    end = assigned.problem.states({"gravity": gravity}, [6])[6]
-    np.testing.assert_array_equal(assigned.targets[6], assigned.image(end))
-    found = optimise(assigned.search, assigned.start, LBFGS(scale=10.0), 3, bounds=assigned.bounds)
+    end = ready.problem.states({"gravity": gravity}, [6])[6]
+    np.testing.assert_array_equal(ready.targets[6], ready.image(end))
+    found = optimise(ready.search, ready.start, LBFGS(scale=10.0), 3, bounds=ready.bounds)
     assert found.loss < found.history[0].loss
     assert 0.0 < max(np.abs(record.parameters["tilt"]).max() for record in found.history) <= 15.0
 
 
 def test_what_cannot_be_negative_is_bounded(made):
-    hidden = ["problem.target.mobility=2e-5", "problem.target.viscosity=[0.1,0.2]"]
+    target = ["problem.target.mobility=2e-5", "problem.target.viscosity=[0.1,0.2]"]
     start = "optimise.start={mobility=1e-5,viscosity=[0.2,0.1]}"
-    assigned = made(TINY_LATTE.replace("knots = 3", ""), *hidden, start, 'optimise.logarithmic=["viscosity"]')
-    assert assigned.bounds == {"mobility": (0.0, None)}
-    found = optimise(assigned.search, assigned.start, Adam(2e-5), 2, assigned.bounds)
+    ready = made(TINY_LATTE.replace("knots = 3", ""), *target, start, 'optimise.logarithmic=["viscosity"]')
+    assert ready.bounds == {"mobility": (0.0, None)}
+    found = optimise(ready.search, ready.start, Adam(2e-5), 2, ready.bounds)
     assert min(record.parameters["mobility"] for record in found.history) >= 0.0
-    narrow = made(TINY_LATTE.replace("knots = 3", ""), *hidden, start, "optimise.bounds.mobility=[1e-6,1e-4]")
+    narrow = made(TINY_LATTE.replace("knots = 3", ""), *target, start, "optimise.bounds.mobility=[1e-6,1e-4]")
     assert narrow.bounds == {"mobility": (1e-6, 1e-4), "viscosity": (0.0, None)}
 
 
 def test_without_knots_each_step_is_free(made):
-    assigned = made(TINY_LATTE.replace("knots = 3", ""))
-    assert assigned.search.coordinates == {} and assigned.start["gravity"].shape == (6, 3)
+    ready = made(TINY_LATTE.replace("knots = 3", ""))
+    assert ready.search.coordinates == {} and ready.start["gravity"].shape == (6, 3)
 
 
 @pytest.mark.parametrize("lower", [-9.81, -9.810000001])
 def test_a_start_on_its_bound_is_within(made, lower):
     """Whatever round-off does to its knots."""
-    assigned = made(TINY_LATTE, f"optimise.bounds.gravity=[[-3,{lower},-3],[3,0,3]]")
-    low, high = assigned.bounds["gravity"]
-    assert (assigned.start["gravity"] >= low).all() and (assigned.start["gravity"] <= high).all()
-    found = optimise(assigned.search, assigned.start, Adam(5.0), 2, bounds=assigned.bounds)
+    ready = made(TINY_LATTE, f"optimise.bounds.gravity=[[-3,{lower},-3],[3,0,3]]")
+    low, high = ready.bounds["gravity"]
+    assert (ready.start["gravity"] >= low).all() and (ready.start["gravity"] <= high).all()
+    found = optimise(ready.search, ready.start, Adam(5.0), 2, bounds=ready.bounds)
     for record in found.history:
-        rows = assigned.search.parameters(record.parameters)["gravity"]
+        rows = ready.search.parameters(record.parameters)["gravity"]
         assert (rows >= low - 1e-12).all() and (rows <= high + 1e-12).all()
 
 
@@ -232,6 +232,6 @@ def test_fingerprints_tell_tasks_apart(made):
 
 
 def test_an_optimisation_moves_particles_into_the_picture(made):
-    assigned = made(PLANE_PICTURE)
-    found = optimise(assigned.search, assigned.start, Adam(0.01), 40, bounds=assigned.bounds)
+    ready = made(PLANE_PICTURE)
+    found = optimise(ready.search, ready.start, Adam(0.01), 40, bounds=ready.bounds)
     assert found.loss < 0.7 * found.history[0].loss

@@ -64,7 +64,7 @@ def test_a_tolerance_of_lbfgs(task_file):
 def test_gravity_may_change_with_time(task_file):
     table = [[0.0, -float(step)] for step in range(5)]
     task = load_task(task_file, [f"problem.target.gravity={table}", f"optimise.start.gravity={table}"])
-    np.testing.assert_array_equal(task.hidden["gravity"], table)
+    np.testing.assert_array_equal(task.true_parameters["gravity"], table)
     np.testing.assert_array_equal(task.start["gravity"], table)
 
 
@@ -72,14 +72,16 @@ def test_a_few_rows_are_interpolated_to_one_for_each_step(task_file):
     task = load_task(
         task_file, ["problem.target.gravity=[[0,-9],[4,-5]]", "optimise.start.gravity=[[0,-7],[2,-7],[0,-5]]"]
     )
-    np.testing.assert_allclose(task.hidden["gravity"], [[0, -9], [1, -8], [2, -7], [3, -6], [4, -5]], atol=1e-15)
+    np.testing.assert_allclose(
+        task.true_parameters["gravity"], [[0, -9], [1, -8], [2, -7], [3, -6], [4, -5]], atol=1e-15
+    )
     np.testing.assert_allclose(task.start["gravity"], [[0, -7], [1, -7], [2, -7], [1, -6], [0, -5]], atol=1e-15)
 
 
 def test_a_tilt_is_a_parameter_over_time(task_file):
     task_file.write_text(GOOD_TASK.replace("gravity", "tilt").replace("[1.5, -9.81]", "[[9.0], [-3.0]]"))
     task = load_task(task_file, ["optimise.start.tilt=[[0],[0]]", "optimise.knots=2", "optimise.bounds.tilt=[-30,30]"])
-    np.testing.assert_allclose(task.hidden["tilt"], [[9.0], [6.0], [3.0], [0.0], [-3.0]], atol=1e-14)
+    np.testing.assert_allclose(task.true_parameters["tilt"], [[9.0], [6.0], [3.0], [0.0], [-3.0]], atol=1e-14)
     assert task.start["tilt"].shape == (5, 1) and not task.start["tilt"].any()
 
 
@@ -105,7 +107,7 @@ def test_a_picture_needs_no_hidden_parameters(task_file):
         load_task(task_file)
     task_file.write_text(task_file.read_text().replace("parameter_error = 0.5", "psnr = 10.0"))
     task = load_task(task_file)
-    assert (task.problem.loss, task.problem.picture, task.hidden) == ("image", "heart", {})
+    assert (task.problem.loss, task.problem.picture, task.true_parameters) == ("image", "heart", {})
     assert task.optimise.check.psnr == 10.0
 
 

@@ -5,7 +5,7 @@ import pytest
 
 import cortado
 from cortado import InputError, Problem, Simulation, losses
-from cortado.optimisation.transforms import Knots, Transformed
+from cortado.optimisation.transforms import TimeInterpolation, Transformed
 from cortado.parameters.tilt import SMALL, Tilt
 from finite_differences import decades, distance, plateau
 from scenes import plane, scene, splash
@@ -120,18 +120,18 @@ def test_one_tilt_may_vary_where_there_is_a_row_for_each_step():
 
 def test_it_is_searched_between_knots():
     problem = problem_of(plane())
-    knots = Knots(STEPS, 3)
+    knots = TimeInterpolation(STEPS, 3)
     search = Transformed(problem, {"tilt": knots})
-    hidden = {"tilt": np.array([[10.0], [-15.0], [5.0]])}
-    target = problem.end(search.parameters(hidden)).positions
+    truth = {"tilt": np.array([[10.0], [-15.0], [5.0]])}
+    target = problem.end(search.parameters(truth)).positions
     search = Transformed(Problem(problem.simulation, STEPS, losses.FinalPositions(target)), {"tilt": knots})
     found = cortado.optimise(search, {"tilt": np.zeros((3, 1))}, cortado.optimisers.LBFGS(scale=5.0), 25)
-    np.testing.assert_allclose(found.parameters["tilt"], hidden["tilt"], atol=0.1)
+    np.testing.assert_allclose(found.parameters["tilt"], truth["tilt"], atol=0.1)
 
 
 def test_gradients_with_respect_to_it_are_certified():
     found = cortado.certify(problem_of(plane()), {"tilt": [10.0]})
-    assert found.right and found.shares["tilt"] > 0.0 and "gravity" not in found.shares
+    assert found.right and found.loss_changes["tilt"] > 0.0 and "gravity" not in found.loss_changes
     assert found.horizon == STEPS
 
 

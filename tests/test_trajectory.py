@@ -27,10 +27,11 @@ from cortado.io.vtkhdf import TrajectoryWriter
 
 rows = np.arange(50.0)[:, None] * np.ones(3)
 times = 0.25 * np.arange(100_000)
-with TrajectoryWriter(sys.argv[1], times=times, particles=50, dimension=3, steps=100_000) as writer:
+options = {"others": {"emitted": np.zeros(1)}, "diagnostics": {"iterations": int, "density_errors": float}}
+with TrajectoryWriter(sys.argv[1], times=times, particles=50, dimension=3, steps=100_000, **options) as writer:
     for k in range(100_000):
-        writer.append_steps(k, 0.5 * k)
-        writer.append(rows + k, rows - k, step=k + 1)
+        writer.append_steps(iterations=k, density_errors=0.5 * k)
+        writer.append(rows + k, rows - k, step=k + 1, others={"emitted": [0.1 * k]})
         time.sleep(float(sys.argv[2]))
 """
 
@@ -58,10 +59,24 @@ def example(dimension: int, dtype: type = np.float64) -> Trajectory:
         steps=np.array([0, 2, 4, 5]),
         positions=positions,
         velocities=velocities,
-        iterations=np.array([5, 4, 3, 9, 2]),
-        density_errors=np.array([0.1, 0.02, 0.03, 0.2, 0.01]),
-        converged=np.array([True, True, True, False, True]),
+        diagnostics={
+            "iterations": np.array([5, 4, 3, 9, 2]),
+            "density_errors": np.array([0.1, 0.02, 0.03, 0.2, 0.01]),
+            "converged": np.array([True, True, True, False, True]),
+        },
+        others={"emitted": np.array([[0.0], [0.1], [0.2], [0.3]])},
+        constants={"reference_density": np.full(6, 1000.0)},
     )
+
+
+def require_same(found: Trajectory, wanted: Trajectory) -> None:
+    """Every array of one is that of the other, also those by name."""
+    for name, values in vars(wanted).items():
+        if isinstance(values, dict):
+            assert getattr(found, name).keys() == values.keys()
+        for key, value in values.items() if isinstance(values, dict) else [(None, values)]:
+            array = getattr(found, name) if key is None else getattr(found, name)[key]
+            np.testing.assert_array_equal(array, value, err_msg=f"{name} {key}")
 
 
 def frames_seen_by_vtk(path: Path, chosen: list[int] | None = None) -> tuple[list[float], list[tuple]]:
@@ -92,8 +107,7 @@ def test_saved_trajectory_comes_back(tmp_path, dimension, dtype):
     saved = example(dimension, dtype)
     saved.save(tmp_path / "a.vtkhdf")
     loaded = Trajectory.load(tmp_path / "a.vtkhdf")
-    for name, values in vars(saved).items():
-        np.testing.assert_array_equal(getattr(loaded, name), values, err_msg=name)
+    require_same(loaded, saved)
     assert loaded.positions.dtype == dtype
     assert (loaded.dimension, loaded.particles, loaded.not_converged) == (dimension, 6, 1)
     assert os.listdir(tmp_path) == ["a.vtkhdf"]
@@ -155,8 +169,10 @@ def test_killed_writer_leaves_its_frames(tmp_path):
         np.testing.assert_array_equal(arrays["steps"], counts + 1)
         np.testing.assert_array_equal(arrays["positions"], rows + counts[:, None, None])
         np.testing.assert_array_equal(arrays["velocities"], rows - counts[:, None, None])
-        assert len(arrays["iterations"]) in (frames, frames + 1)
-        np.testing.assert_array_equal(arrays["density_errors"], 0.5 * arrays["iterations"])
+        np.testing.assert_array_equal(arrays["others"]["emitted"], 0.1 * counts[:, None])
+        iterations, errors = (arrays["diagnostics"][name] for name in ("iterations", "density_errors"))
+        assert len(iterations) in (frames, frames + 1)
+        np.testing.assert_array_equal(errors, 0.5 * iterations)
 
         chosen = sorted({0, frames // 2, frames - 1})
         times, seen = frames_seen_by_vtk(path, chosen)
@@ -210,8 +226,7 @@ def test_a_damaged_file_gives_the_same_arrays_or_an_input_error(tmp_path, dimens
             refused += 1
             assert "\n" not in str(problem)
             continue
-        for name, values in vars(saved).items():
-            np.testing.assert_array_equal(getattr(loaded, name), values, err_msg=name)
+        require_same(loaded, saved)
     assert 50 < refused < 350
 
 
@@ -253,19 +268,20 @@ def test_a_disk_that_fills_up_leaves_the_frames_before(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     rows = np.ones((5, 2))
-    with TrajectoryWriter(tmp_path / "a", times=np.arange(9), particles=5, dimension=2, steps=9) as writer:
+    sizes = {"particles": 5, "dimension": 2, "steps": 9, "diagnostics": {"iterations": int}}
+    with TrajectoryWriter(tmp_path / "a", times=np.arange(9), **sizes) as writer:
         writer.append(rows, rows)
-        writer.append_steps(3, 0.5)
+        writer.append_steps(iterations=3)
         with monkeypatch.context() as patch:
             patch.setattr(cortado.io.vtkhdf, "write_fully", refuse)
             with pytest.raises(ComputationError, match="No space left on device; the 1 frames so far are kept"):
                 writer.append(2 * rows, rows)
             with pytest.raises(ComputationError, match="No space left on device"):
-                writer.append_steps(4, 0.5)
+                writer.append_steps(iterations=4)
         writer.append(3 * rows, rows)
-        writer.append_steps(5, 0.5)
+        writer.append_steps(iterations=5)
     assert [frame[0, 0] for frame in read(tmp_path / "a")["positions"]] == [1.0, 3.0]
-    assert read(tmp_path / "a")["iterations"].tolist() == [3, 5]
+    assert read(tmp_path / "a")["diagnostics"]["iterations"].tolist() == [3, 5]
 
 
 def test_writer_refuses_what_was_not_announced(tmp_path):
@@ -274,16 +290,23 @@ def test_writer_refuses_what_was_not_announced(tmp_path):
         TrajectoryWriter(tmp_path / "no" / "a", times=[0.0], particles=3, dimension=2)
     with pytest.raises(InputError, match="at least 1 frame"):
         TrajectoryWriter(tmp_path / "a", times=[], particles=3, dimension=2)
-    with TrajectoryWriter(tmp_path / "a", times=[0.0], particles=3, dimension=2, steps=1) as writer:
+    sizes = {"particles": 3, "dimension": 2, "steps": 1, "diagnostics": {"iterations": int}}
+    with TrajectoryWriter(tmp_path / "a", times=[0.0], others={"outlet": np.zeros((1, 2))}, **sizes) as writer:
         with pytest.raises(InputError, match=r"positions of shape \(3, 2\)"):
-            writer.append(np.zeros((3, 3)), rows)
+            writer.append(np.zeros((3, 3)), rows, others={"outlet": np.zeros((1, 2))})
         with pytest.raises(InputError, match="pressure"):
             writer.append(rows, rows, pressure=np.zeros(3))
-        writer.append(rows, rows)
+        with pytest.raises(InputError, match=r"the other fields \['outlet'\], found \[\]"):
+            writer.append(rows, rows)
+        with pytest.raises(InputError, match=r"outlet of shape \(1, 2\), found \(2,\)"):
+            writer.append(rows, rows, others={"outlet": np.zeros(2)})
+        writer.append(rows, rows, others={"outlet": np.zeros((1, 2))})
         with pytest.raises(InputError, match="1 frames, and one more"):
             writer.append(rows, rows)
         with pytest.raises(InputError, match="1 steps, and 2 came"):
-            writer.append_steps([5, 5], [0.1, 0.1])
+            writer.append_steps(iterations=[5, 5])
+        with pytest.raises(InputError, match=r"the diagnostics \['iterations'\], found \['density_errors'\]"):
+            writer.append_steps(density_errors=[0.1])
     with TrajectoryWriter(tmp_path / "b", times=[0.0], particles=3, dimension=2):
         pass
     assert os.listdir(tmp_path) == ["a"]
@@ -312,6 +335,7 @@ def test_some_frames_are_a_trajectory(chosen, tmp_path):
     some = trajectory[chosen]
     for name in ("times", "steps", "positions", "velocities"):
         np.testing.assert_array_equal(getattr(some, name), getattr(trajectory, name)[chosen])
+    np.testing.assert_array_equal(some.others["emitted"], trajectory.others["emitted"][chosen])
     assert some.iterations is trajectory.iterations
     if chosen.step != -1:  # as files go forwards in time
         some.save(tmp_path / "some.vtkhdf")

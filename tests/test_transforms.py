@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cortado import InputError, Problem, Simulation, gradients, losses
-from cortado.optimisation.transforms import SMALLEST, Knots, Logarithm, Softmax, Transformed
+from cortado.optimisation.transforms import SMALLEST, Logarithm, Softmax, TimeInterpolation, Transformed
 from finite_differences import decades, distance
 from scenes import plane, plane_of_three
 
@@ -20,9 +20,9 @@ CASES = {
     "logarithm": (Logarithm(), random_array(4, 3)),
     "softmax": (Softmax(), random_array(5, 3)),
     "softmax, steep": (Softmax(), 20.0 * random_array(5, 2)),
-    "knots": (Knots(11, 4), random_array(4, 3)),
-    "a knot for each step": (Knots(5, 5), random_array(5, 2)),
-    "two knots for two steps": (Knots(2, 2), random_array(2, 2)),
+    "knots": (TimeInterpolation(11, 4), random_array(4, 3)),
+    "a knot for each step": (TimeInterpolation(5, 5), random_array(5, 2)),
+    "two knots for two steps": (TimeInterpolation(2, 2), random_array(2, 2)),
 }
 cases = pytest.mark.parametrize(("coordinates", "u"), CASES.values(), ids=CASES)
 
@@ -79,15 +79,15 @@ def test_a_common_shift_of_coordinates_changes_no_fraction():
 @pytest.mark.parametrize(("steps", "knots"), [(11, 4), (9, 2), (100, 33), (5, 5)])
 def test_between_knots_is_a_straight_line(steps, knots):
     u = random_array(knots, 3)
-    path = Knots(steps, knots).parameter(u)
+    path = TimeInterpolation(steps, knots).parameter(u)
     wanted = [np.interp(np.linspace(0, 1, steps), np.linspace(0, 1, knots), column) for column in u.T]
     np.testing.assert_allclose(path, np.transpose(wanted), rtol=0, atol=1e-13)
     np.testing.assert_array_equal(path[[0, -1]], u[[0, -1]])
-    np.testing.assert_allclose(Knots(steps, knots).parameter(np.full((knots, 2), 9.81)), 9.81, rtol=1e-14)
+    np.testing.assert_allclose(TimeInterpolation(steps, knots).parameter(np.full((knots, 2), 9.81)), 9.81, rtol=1e-14)
 
 
 def test_knots_are_the_nearest_path():
-    path, knots = random_array(12, 2), Knots(12, 3)
+    path, knots = random_array(12, 2), TimeInterpolation(12, 3)
     u = knots.coordinate(path)
     rest = knots.parameter(u) - path
     assert np.linalg.norm(rest) > 1.0 and np.abs(knots.adjoint(u, rest)).max() < 1e-13
@@ -102,7 +102,7 @@ def problem():
 
 
 COORDINATES = {
-    "gravity": Knots(STEPS, 3),
+    "gravity": TimeInterpolation(STEPS, 3),
     "mass_fractions": Softmax(),
     "viscosity": Logarithm(),
     "time_step": Logarithm(),
@@ -153,7 +153,7 @@ def test_without_coordinates_it_is_the_problem_itself(problem):
 
 
 @pytest.mark.parametrize("estimator", [gradients.FrozenGeometry(), gradients.AdjointViscosity(0.2, order=2)], ids=repr)
-def test_policies_go_back_to_coordinates(problem, estimator):
+def test_estimators_go_back_to_coordinates(problem, estimator):
     search = Transformed(problem, COORDINATES)
     u = search.coordinate(start_of(problem))
     found, plain = search.estimate(u, estimator), problem.estimate(search.parameters(u), estimator)
@@ -187,8 +187,8 @@ def test_fingerprints_tell_coordinates_apart(problem):
     other = Problem(Simulation(plane(), precision="float64"), STEPS, lambda x, v, loss: None)
     searches = [
         Transformed(problem, {}),
-        Transformed(problem, {"gravity": Knots(STEPS, 3)}),
-        Transformed(problem, {"gravity": Knots(STEPS, 4)}),
+        Transformed(problem, {"gravity": TimeInterpolation(STEPS, 3)}),
+        Transformed(problem, {"gravity": TimeInterpolation(STEPS, 4)}),
         Transformed(problem, {"viscosity": Logarithm()}),
         Transformed(problem, {"time_step": Logarithm()}),
         Transformed(other, {"viscosity": Logarithm()}),

@@ -87,7 +87,7 @@ def column_at_rest(
         if step > first:
             order = simulation.solver.search.order.numpy()[: simulation.particles]
             pressures[order] += simulation.solver.iterates.p[1].numpy() / count
-            positions[:] += state.numpy(2)[0] / count
+            positions[:] += state.numpy(2)["positions"] / count
 
     simulation.rollout(first + count).forward(observe, keep=False)
     x, y = positions.T
@@ -153,7 +153,7 @@ def dam_break(across: int = 20, length: float = 4.0, until: float = 3.15, **chan
     places = [wide]
 
     def observe(step: int, state: Any) -> None:
-        x, y = state.numpy(2)[0].T
+        x, y = state.numpy(2)["positions"].T
         places.append(x[y < 2.0 * spacing].max() + 0.5 * spacing)
 
     Simulation(Scene(**{**scene, **changes})).rollout(steps).forward(observe, keep=False)
@@ -290,7 +290,8 @@ def poiseuille(times: np.ndarray, across: int, kernel: str = "cubic_spline", sup
 
     def observe(step: int, state: Any) -> None:
         if step in wanted:
-            x, v, _ = state.numpy(2)
+            fields = state.numpy(2)
+            x, v = fields["positions"], fields["velocities"]
             assert np.abs(x[:, 1] - heights[row]).max() < 0.01 * spacing  # the flow stays laminar
             speeds.append(np.bincount(row, v[:, 0]) / np.bincount(row))
 
@@ -368,9 +369,9 @@ def taylor_green(
     )
     velocities = vortices(points)
     rollout = simulation.rollout(steps)
-    rollout.initial.set(points, velocities, simulation.mass_fractions)
+    rollout.initial.set({"positions": points, "velocities": velocities})
     energies = [np.sum(velocities**2)]
-    rollout.forward(lambda step, state: energies.append(np.sum(state.numpy(2)[1] ** 2)), keep=False)
+    rollout.forward(lambda step, state: energies.append(np.sum(state.numpy(2)["velocities"] ** 2)), keep=False)
     return np.arange(steps + 1) * until / steps, np.array(energies) / energies[0]
 
 

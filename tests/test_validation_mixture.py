@@ -1,4 +1,4 @@
-"""Phases that part and mix on particles at rest, against closed forms; `validation/README.md` says what was found.
+"""Phases that separate and mix on particles at rest, against closed forms; `validation/README.md` says what was found.
 
 Lengths are in spacings, and M = alpha = 1: an interface is 4.39 epsilon wide, what grows fastest from an even mixture
 is 4 pi epsilon long, and takes 16 epsilon^2 to grow by e. The equations are those of `cortado.sph.diffusion`.
@@ -63,7 +63,7 @@ def watched(
     frames = [first]
 
     def observe(step: int, state: Any) -> None:
-        frames.append(state.numpy(2)[2])
+        frames.append(state.numpy(2)["mass_fractions"])
         if advance is not None:
             advance()
 
@@ -216,7 +216,7 @@ def test_miscible_phases_mix_as_fast_as_they_should():
 
 @pytest.mark.parametrize("form", ["constant", "degenerate"])
 def test_the_free_energy_never_rises_and_phases_keep_their_mass(form):
-    """On particles in disorder, one phase 1.8 times as dense as the other, at every one of 1,000 substeps."""
+    """On particles off the lattice, one phase 1.8 times as dense as the other, at every one of 1,000 substeps."""
     densities = (1000.0, 1800.0)
     simulation = resting(24, 24, 0.65, 3.0, densities, mobility_form=form)
     positions = simulation.positions + np.random.default_rng(1).uniform(-0.2, 0.2, simulation.positions.shape)
@@ -292,10 +292,10 @@ def test_regions_grow_by_a_third_power_of_the_time():
 # ---- more phases -----------------------------------------------------------------------------------------------------
 
 
-def parting(
+def separating(
     phases: int, until: float, across: int = 32, steps: int = 20, advance: Callable[[], None] | None = None
 ) -> np.ndarray:
-    """(steps + 1, n, phases) fractions that part from noise, until so many epsilon^2."""
+    """(steps + 1, n, phases) fractions that separate from noise, until so many epsilon^2."""
     width = 0.8
     simulation = resting(across, across, width, 3.0, (1000.0,) * phases)
     return watched(simulation, noise(simulation, 0.15 / (phases - 1), seed=3), until * width**2, steps, advance)
@@ -304,7 +304,7 @@ def parting(
 @pytest.mark.parametrize(("phases", "until"), [(3, 600.0), (4, 1000.0)])
 def test_three_and_four_phases_part(phases, until):
     """Into regions of each; nothing is clipped, and no fraction is far outside of 0 to 1."""
-    fractions = parting(phases, until)
+    fractions = separating(phases, until)
     assert np.abs(fractions.sum(axis=2) - 1.0).max() < 1e-12
     assert fractions.min() > -0.05
     assert fractions.max() < 1.05

@@ -236,7 +236,7 @@ def rayleigh_taylor(
     taken = {time: positions for step, time in wanted.items() if step == 0}
 
     def observe(step: int, state: Any) -> None:
-        x = state.numpy(2)[0]
+        x = state.numpy(2)["positions"]
         amplitudes.append(amplitude(x))
         if step in wanted:
             taken[wanted[step]] = x.copy()

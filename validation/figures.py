@@ -137,7 +137,7 @@ def contain(particles: int = 8000, steps: int = 2000) -> None:
 
     def observe(step, state) -> None:
         nonlocal outside, nearest
-        x = state.numpy(3)[0].astype(np.float64)
+        x = state.numpy(3)["positions"].astype(np.float64)
         outside += np.count_nonzero(~scene.container.contains(x, 0.0))
         nearest = min(nearest, (x - lower).min(), (upper - x).min())
 

@@ -29,11 +29,11 @@ from cortado.render.scene_renderer import scene_renderer
 
 SPACING, GRAVITY = 0.025, (0.0, -9.81)
 MOST_BLOCKS = 8
-DISORDER = 0.01
-"""Of the first positions [spacings], of a seed and again of the reference's cloud."""
+POSITION_NOISE = 0.01
+"""Of the first positions [spacings], of a seed and again of the reference's ensemble."""
 SPREAD = 0.5
 """Of the reference's gravities [m/s2]."""
-TILT, HIDDEN = 3.0, 1.0
+TILT, TRUE_SPREAD = 3.0, 1.0
 """How far the target's gravities lean to a side, and their standard deviation [m/s2]."""
 LOSSES = ("centre of mass", "density grid", "picture, pyramid", "picture", "particles")
 ESTIMATORS: dict[str, gradients.GradientEstimator] = {
@@ -43,7 +43,7 @@ ESTIMATORS: dict[str, gradients.GradientEstimator] = {
     "smoothing 0.1": gradients.AdjointViscosity(0.1),
     "smoothing": gradients.AdjointViscosity(),
     "smoothing, extrapolated": gradients.AdjointViscosity(order=2),
-    "averaged over 8": gradients.EnsembleMean(SPREAD, 8, DISORDER),
+    "averaged over 8": gradients.EnsembleMean(SPREAD, 8, POSITION_NOISE),
 }
 DRAWN = ("exact", "velocity only", "smoothing", "averaged over 8")
 
@@ -99,11 +99,13 @@ class Case:
         random = np.random.default_rng(seed)
         self.simulation, self.steps, self.blocks = simulation, steps, blocks
         self.gravity = np.tile(GRAVITY, (blocks, 1))
-        self.start = simulation.positions + DISORDER * SPACING * random.standard_normal(simulation.positions.shape)
-        hidden = self.gravity + [random.choice([-TILT, TILT]), 0.0]
-        hidden += HIDDEN * random.standard_normal(hidden.shape)
+        self.start = simulation.positions + POSITION_NOISE * SPACING * random.standard_normal(
+            simulation.positions.shape
+        )
+        true_gravity = self.gravity + [random.choice([-TILT, TILT]), 0.0]
+        true_gravity += TRUE_SPREAD * random.standard_normal(true_gravity.shape)
         self.problem = Problem(simulation, steps, losses.CentreOfMass([0.0, 0.0]))
-        target = self.problem.end(self.parameters({"gravity": hidden}))
+        target = self.problem.end(self.parameters({"gravity": true_gravity}))
         renderer = scene_renderer(simulation)
         picture = renderer.render(target.state.positions, target.state.mass_fractions, target.colours)
         made: list[Any] = [
@@ -180,9 +182,9 @@ def references(seed: int, steps: int, blocks: int, samples: int) -> list[Row]:
     case = Case(Simulation(dam_break(), precision="float64"), seed, steps, blocks)
     rows = []
     for half in (1, 2):
-        cloud = gradients.RandomizedSmoothing(SPREAD, samples // 2, DISORDER, 1000 * seed + half)
+        reference = gradients.RandomizedSmoothing(SPREAD, samples // 2, POSITION_NOISE, 1000 * seed + half)
         name = f"reference {half} of {samples}"
-        rows += [row(seed, steps, loss, name, case.estimate(loss, cloud)) for loss in LOSSES]
+        rows += [row(seed, steps, loss, name, case.estimate(loss, reference)) for loss in LOSSES]
     return rows
 
 

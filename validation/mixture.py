@@ -198,11 +198,11 @@ def _two_phases() -> LinearSegmentedColormap:
 
 
 def phases(folder: Path, across: int = 64, until: float = 1600.0, steps: int = 32) -> None:
-    """Two, three and four phases that part."""
+    """Two, three and four phases that separate."""
     shown = (0, 2, 6, 16, steps)
     counts = (2, 3, 4)
     with track(len(counts) * steps, "phases") as advance:
-        runs = [validation.parting(count, until, across, steps, advance) for count in counts]
+        runs = [validation.separating(count, until, across, steps, advance) for count in counts]
     figure, axes = plt.subplots(len(counts), len(shown), figsize=(15, 9.5), layout="constrained")
     for row, count, fractions in zip(axes, counts, runs, strict=True):
         miss = np.abs(fractions.sum(axis=2) - 1.0).max()

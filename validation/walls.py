@@ -79,7 +79,8 @@ def at_rest(kernel: str, support: float, dimension: int) -> tuple[float, float, 
 
     def observe(step: int, state: Any) -> None:
         if step > first:
-            x, v, _ = state.numpy(dimension)
+            fields = state.numpy(dimension)
+            x, v = fields["positions"], fields["velocities"]
             squares.append(float((v.astype(np.float64) ** 2).sum(axis=1).mean()))
             order = simulation.solver.search.order.numpy()[: simulation.particles]
             pressures[order] += simulation.solver.iterates.p[1].numpy() / (last - first)

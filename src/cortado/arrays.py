@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.errors import InputError, Phrase, shown
+from cortado.errors import InputError, Words, shown
 
 REFUSED = {
     "c": "complex numbers",
@@ -29,11 +29,11 @@ def as_numbers(what: str, value: Any) -> np.ndarray:
         array = np.asarray(value)
         kind = array.dtype.kind
         if _is_masked(value):
-            found: Any = Phrase("partly masked")
+            found: Any = Words("partly masked")
         elif kind in "fiu" or (kind == "O" and all(map(_is_real, array.flat))):
             return np.asarray(array, dtype=np.float64)
         else:
-            found = Phrase(f"made of {REFUSED[kind]}") if array.ndim and kind in REFUSED else value
+            found = Words(f"made of {REFUSED[kind]}") if array.ndim and kind in REFUSED else value
     except Exception:  # whatever another library raises when it is asked for an array
         found = value
     raise InputError(f"{what} is {shown(found)}, but must be a number or an array of real numbers.")

@@ -103,21 +103,21 @@ def check(
     steps: int = 50,
     parameters: tuple[str, ...] = ("gravity",),
     loss: str = "positions",
-    change: float = 0.05,
+    perturbation: float = 0.05,
     out: Path | None = None,
     overrides: Overrides = (),
     device: str = "cpu",
     json: bool = False,
     seed: int = 0,
 ) -> Work:
-    """Check the gradients of a scene, in float64: are they right, how long do they mean something, what to use beyond.
+    """Check the gradients of a scene, in float64: are they right, up to which step are they useful, what to use beyond.
 
     Args:
         scene: The scene file.
         steps: Number of time steps.
-        parameters: What is to be changed; the adjoint is checked for everything.
+        parameters: Parameters whose horizon is measured; the adjoint is checked for all of them.
         loss: How far the fluid has come, by "positions" of particles, "centre-of-mass" or "image".
-        change: A meaningful change of a parameter, relative to its size.
+        perturbation: How large a meaningful perturbation of a parameter is, relative to its size.
         out: Folder for a figure and the numbers.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
         device: "cpu", or "cuda:0" for the first GPU.
@@ -127,7 +127,8 @@ def check(
     _require_at_least(0, seed, "--seed")
     from cortado.commands.check import check_scene
 
-    return partial(check_scene, scene, steps, parameters, loss, change, out, _words(overrides), device, json, seed)
+    words = _words(overrides)
+    return partial(check_scene, scene, steps, parameters, loss, perturbation, out, words, device, json, seed)
 
 
 @gradients.command

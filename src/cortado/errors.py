@@ -19,8 +19,8 @@ class InputError(CortadoError):
     """What the user gave is wrong; takes the sentence that says so. Exit code 2."""
 
 
-class Phrase(str):
-    """Words that describe what was found, as opposed to a text that the user wrote."""
+class Words(str):
+    """Words of a sentence that describe what was found; a plain ``str`` is a text of the user, and is quoted."""
 
 
 class SceneError(CortadoError):
@@ -34,7 +34,7 @@ class SceneError(CortadoError):
         self.field = field
         """Such as ``fluid[0].upper``; empty for the scene as a whole."""
         self.found = found
-        """The value, or a `Phrase`."""
+        """The value, or a `Words`."""
         self.wanted = wanted
         """What would have been right, in words."""
         self.sentence = sentence or f"is {shown(found)}, but must be {wanted}."
@@ -82,7 +82,7 @@ class DivergedError(ComputationError):
 
 def shown(value: Any) -> str:
     """A value on one short line, for a sentence."""
-    if isinstance(value, Phrase):
+    if isinstance(value, Words):
         return str(value)
     if isinstance(value, Mapping):
         return "a table"

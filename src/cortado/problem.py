@@ -13,10 +13,10 @@ from cortado.device.state import State
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import CortadoWarning, InputError
 from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator, estimate
-from cortado.io.trajectory import Trajectory
+from cortado.io.trajectory import Trajectory, noted
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, fingerprint
 from cortado.losses.checked import as_loss
-from cortado.losses.loss import Adjoint
+from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import NAMES, UNITS, Arrays, Values
 from cortado.rollout import MEMORY_BUDGET, Observer, Rollout, StepDerivative
@@ -141,7 +141,7 @@ class Problem:
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> float:
         """The derivative of the loss along ``directions`` (any of the parameters), by forward mode."""
-        dots: dict[int, tuple[np.ndarray, ...]] = {}
+        dots: dict[int, Arrays] = {}
 
         def observe(step: int, dot: State) -> None:
             if step in self._losses:
@@ -154,8 +154,8 @@ class Problem:
             colours_dot = np.asarray(directions["colours"], dtype=np.float64)
             terms = [np.sum(bar.colours * colours_dot) for bar in bars.values()]
         for step in sorted(dots):
-            pairs = zip(bars[step].state.numpy(3), dots[step], strict=True)
-            terms += [(bar.astype(np.float64) * d).sum() for bar, d in pairs]
+            bar = bars[step].state.numpy(3)
+            terms += [(bar[name].astype(np.float64) * d).sum() for name, d in dots[step].items()]
         return float(sum(terms))
 
     @in_turn
@@ -186,8 +186,13 @@ class Problem:
         return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies])
 
     def iterations(self) -> np.ndarray:
-        """(steps,) pressure iterations of the last evaluation."""
-        return self._rollout.diagnostics["iterations"]
+        """(steps,) pressure iterations of the last evaluation, of a solver with one loop; see `diagnostics`."""
+        return noted(self.diagnostics, "iterations")
+
+    @property
+    def diagnostics(self) -> Mapping[str, np.ndarray]:
+        """(steps,) by name, of the last evaluation: ``converged``, and what else the solver notes of each step."""
+        return self._rollout.diagnostics
 
     def _ends(
         self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()
@@ -198,13 +203,10 @@ class Problem:
 
         def observe(step: int, state: State) -> None:
             if step in wanted:
-                ends[step] = Snapshot(state, self.simulation.dimension, colours)
+                ends[step] = Snapshot(state.copy(), self.simulation.dimension, colours)
 
         self._space.begin(self._rollout, values, varied)
-        if 0 in wanted:
-            first = self._rollout.initial.like()
-            first.assign(self._rollout.initial)
-            observe(0, first)  # a copy, as the next evaluation overwrites the rollout's
+        observe(0, self._rollout.initial)
         self._rollout.forward(observe, keep)
         return ends
 
@@ -223,9 +225,8 @@ class Problem:
         no_colours = np.zeros_like(end.colours)
         if isinstance(bar, State):
             return SnapshotAdjoint(bar, no_colours)
-        positions, velocities, *rest = bar
         state = self.simulation.solver.new_state()
-        state.set(positions, velocities, *rest or [np.zeros_like(end.mass_fractions)])
+        state.set(dict(zip(ADJOINT_FIELDS, bar, strict=False)))
         return SnapshotAdjoint(state, no_colours)
 
 

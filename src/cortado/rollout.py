@@ -17,7 +17,7 @@ from cortado.device.memory import require, step_parts, within
 from cortado.device.state import Parameters, State
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
-from cortado.restart import Elapsed
+from cortado.restart import Clock
 from cortado.solvers.containment import Lost
 from cortado.solvers.solver import Counts, Solver
 
@@ -70,16 +70,16 @@ class Rollout:
         self.parameters = solver.new_parameters(steps)
         self.substeps = 0
         """Explicit steps of diffusion within each step."""
-        self.time_step = self.flow_rate = 0.0
-        """[s] and [m3/s], in 2-D [m2/s], as they were given: the device rounds them."""
-        self.elapsed = Elapsed()
-        """What went before the first state."""
+        self.time_step = 0.0
+        """[s], as it was given: the device rounds it."""
+        self.clock = Clock()
+        """Of the first state."""
         self.log = solver.new_log(steps)
         """What the solver noted of the steps of the last forward run."""
         state_bytes = sum(array.capacity for array in self.initial.arrays())
         self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
         self._states: dict[int, State] = {}
-        self._buffer, self._bar = self.initial.like(), self.initial.like()
+        self._buffer, self._bar = self.initial.following(), self.initial.like()
         self._generation = -1
         self._forget_stale_graphs()
         self.evaluation = 0
@@ -105,7 +105,7 @@ class Rollout:
         back. Raises `DivergedError` after the good states were observed."""
         self._states, self._kept, self._run = {0: self.initial}, -1, -1
         state, step = self.initial, 0
-        self.solver.begin(self.elapsed, self.substeps)
+        self.solver.set_substeps(self.substeps)
         self._forget_stale_graphs()
         self.solver.reset()
         try:
@@ -140,7 +140,7 @@ class Rollout:
         self._buffer.assign(state)
         for _ in range(first, last):
             self._step()
-            chunk.append(self._buffer.like())
+            chunk.append(self._buffer.following())
             chunk[-1].assign(self._buffer)
         return chunk
 
@@ -180,7 +180,7 @@ class Rollout:
         if beyond := [step for step in bars if step not in range(self.steps + 1)]:
             raise InputError(f"bars has the state {beyond[0]}, but must have states from 0 to {self.steps}.")
         self._require("backward", self._kept)
-        self.solver.begin(self.elapsed, self.substeps)
+        self.solver.set_substeps(self.substeps)
         derivative.begin()
         self._forget_stale_graphs()
         self._bar.clear()
@@ -213,16 +213,16 @@ class Rollout:
         run with these parameters."""
         self._require("along a tangent", self._run)
         solver = self.solver
-        solver.begin(self.elapsed, self.substeps)
+        solver.set_substeps(self.substeps)
         derivative = solver.tangent(parameters_dot)
-        state = self.initial.like()
+        state = self.initial.following()
         state.assign(self.initial)
         observe(0, dot)
         for n in range(self.steps):
             counts = self.log.counts(n)
             solver.step_number.fill_(n)
             solver.replay(state, self.parameters, counts)
-            derivative.step(counts, dot, dot, self.parameters)
+            derivative.step(counts, dot, self.parameters)
             solver.write_state(counts, self.parameters, state)
             observe(n + 1, dot)
 
@@ -242,7 +242,7 @@ class Rollout:
                 counts = self.log.counts(m)
                 self.solver.step_number.fill_(m)
                 self.solver.replay(self._states[m], self.parameters, counts)
-                self._states[m + 1] = self.initial.like()
+                self._states[m + 1] = self.initial.following()
                 self.solver.write_state(counts, self.parameters, self._states[m + 1])
         if (n + 1) % self._interval:
             self._states.pop(n + 1, None)

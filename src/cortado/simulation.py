@@ -3,12 +3,15 @@
 import warnings
 from collections.abc import Mapping
 from hashlib import sha256
+from importlib import import_module
+from math import prod
 from os import PathLike
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from cortado.device.fields import first_values
 from cortado.device.kernel_cache import start_warp
 from cortado.device.memory import frame_parts, require, simulation_parts
 from cortado.device.precision import Precision, precision_named
@@ -23,18 +26,17 @@ from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import scene_values
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
-from cortado.restart import RestartState, RunConstants
+from cortado.restart import RestartState
 from cortado.rollout import Rollout
+from cortado.scene.model import SOLVERS
 from cortado.scene.scene import Scene, as_scene
 from cortado.solvers.build import first_capacity
-from cortado.solvers.pcisph.build import build_pcisph
-from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy
+from cortado.solvers.solver import Solver
+from cortado.sph.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
 from cortado.words import counted
 
 MOST_SUBSTEPS = 10_000
 """Explicit steps of diffusion in a time step; beyond it the mobility is taken for a mistake."""
-SOLVERS = {"pcisph": build_pcisph}
-"""What makes the solver of a scene, by the kind that it names."""
 GREATEST_NUMBER = 10**18
 """Of steps: within a 64-bit number."""
 
@@ -82,10 +84,15 @@ class Simulation:
         self.smoothing = discrete.kernel
         self.walls = discrete.walls.positions
         """(b, d) wall particles [m]."""
-        self.solver = SOLVERS[scene.solver.kind](scene, discrete, self.free_energy, self.precision, self.device)
+        self.lattice = discrete.lattice
+        """Constants of the lattice of particles at rest."""
+        self.free_particles = discrete.fluid.emitted.start
+        """How many particles, the first ones, do not wait in a nozzle."""
+        build = import_module(SOLVERS[scene.solver.kind]).build
+        self.solver: Solver = build(scene, discrete, self.free_energy, self.precision, self.device)
         self.state = self.solver.new_state()
         """The first state on the device."""
-        self.state.set(self.positions, self.velocities, self.mass_fractions)
+        self.state.set(first_values(self.state.fields, self.parameters()))
         for array in (self.positions, self.velocities, self.mass_fractions):
             array.setflags(write=False)
         check_sizes(self.parameters(), self.precision)
@@ -103,11 +110,6 @@ class Simulation:
     def dimension(self) -> int:
         """2 or 3."""
         return self.scene.dimension
-
-    @property
-    def free_particles(self) -> int:
-        """How many particles, the first ones, do not wait in a nozzle."""
-        return self.solver.emitter.nozzle.first if self.solver.emitter else self.particles
 
     @property
     def _points(self) -> str:
@@ -140,43 +142,49 @@ class Simulation:
     def collect(self, rollout: Rollout, record_every: int = 1) -> Trajectory:
         """Run a rollout forward and return its frames; warnings and errors as of `run`."""
         record_every = whole_number("record_every", record_every, 1)
-        numbers_in_frame = self.particles * (2 * self.dimension + len(self.scene.phase))
-        parts = frame_parts(2 + rollout.steps // record_every, 2 * numbers_in_frame, self.precision.bytes)
+        numbers = 2 * self.numbers_in_frame(self.dimension)
+        parts = frame_parts(2 + rollout.steps // record_every, numbers, self.precision.bytes)
         require(parts, "take a larger record_every or fewer steps")
-        frames = [(0, *rollout.initial.numpy(self.dimension))]
+        steps, frames = [0], [self.frame(rollout.initial)]
 
         def keep(step: int, state: State) -> None:
             if step % record_every == 0 or step == rollout.steps:
-                frames.append((step, *state.numpy(self.dimension)))
+                steps.append(step)
+                frames.append(self.frame(state))
 
         rollout.forward(keep, keep=False)
         converged = rollout.diagnostics["converged"]
         if not converged.all():
             warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=5)
-        numbers, positions, velocities, fractions = (np.array(column) for column in zip(*frames, strict=True))
+        fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
         return Trajectory(
-            times=rollout.elapsed.times(numbers, rollout.time_step),
-            steps=rollout.elapsed.steps + numbers,
-            positions=positions,
-            velocities=velocities,
-            mass_fractions=fractions if len(self.scene.phase) > 1 else None,
-            iterations=rollout.diagnostics["iterations"],
-            density_errors=rollout.diagnostics["density_errors"],
-            converged=converged,
+            times=rollout.clock.times(np.array(steps), rollout.time_step),
+            steps=rollout.clock.steps + np.array(steps),
+            positions=fields.pop("positions"),
+            velocities=fields.pop("velocities"),
+            diagnostics=rollout.diagnostics,
+            mass_fractions=fields.pop("mass_fractions", None),
+            others=fields,
+            constants=self.constants(rollout),
             substeps=rollout.substeps,
-            constants=self.constants(rollout, numbers),
         )
 
-    def constants(self, rollout: Rollout, frames: np.ndarray) -> RunConstants:
-        """What a restart needs besides the frames, which are after so many steps (frames,) of the rollout."""
-        parameters, elapsed = rollout.parameters, rollout.elapsed
-        density = parameters["reference_density"].numpy()
-        if self.scene.emitter is None:
-            return RunConstants(density, rollout.time_step)
-        path = parameters["nozzle_path"].numpy()[:, : self.dimension]
-        first = path[:1] if elapsed.outlet is None else elapsed.outlet[None]
-        outlets = np.concatenate([first, path]).astype(path.dtype)[frames]
-        return RunConstants(density, rollout.time_step, rollout.flow_rate, outlets)
+    def frame(self, state: State) -> dict[str, np.ndarray]:
+        """What a trajectory records of a state: the fields that steps change, but for the fractions of one phase."""
+        fields = state.numpy(self.dimension, constants=False)
+        if len(self.scene.phase) == 1:
+            del fields["mass_fractions"]
+        return fields
+
+    def numbers_in_frame(self, components: int) -> int:
+        """How many numbers `frame` records at most, if vectors have so many components."""
+        sizes = self.particles, components, len(self.scene.phase)
+        return sum(prod(field.shape(*sizes)) for field in self.state.fields if not field.is_constant)
+
+    def constants(self, rollout: Rollout) -> dict[str, np.ndarray]:
+        """The fields of a rollout's states that no step changes."""
+        fields = rollout.initial.fields
+        return {field.name: rollout.initial[field.name].numpy().copy() for field in fields if field.is_constant}
 
     @in_turn
     def rollout(
@@ -210,17 +218,17 @@ class Simulation:
     ) -> int:
         """Explicit steps of diffusion within a time step that are stable under these parameters; raises `InputError`
         where there would be more than `MOST_SUBSTEPS`."""
-        diffusion = self.solver.mixture.phases.diffusion
-        if diffusion is None:
+        if len(self.scene.phase) == 1:
             return 0
+        mixture = self.scene.mixture
         limit = diffusion_limit(
             self.smoothing,
             self.scene.discretisation.spacing,
             self.scene.discretisation.support_radius,
             self.dimension,
-            greatest_mobility=float(mobility) * diffusion.mobility.greatest(len(self.scene.phase)),
+            greatest_mobility=float(mobility) * MOBILITIES[mixture.mobility_form].greatest(len(self.scene.phase)),
             interface_width=float(interface_width),
-            curvature=self.scene.mixture.strength * diffusion.energy.curvature,
+            curvature=mixture.strength * self.free_energy.curvature,
             density_ratio=float(np.max(rest_density) / np.min(rest_density)),
         )
         number = float(np.ceil(float(time_step) / limit))

@@ -31,5 +31,7 @@ class Brief:
 
 
 def _brief(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{name}: {_brief(entry)}' for name, entry in value.items())}}}"
     shape = getattr(value, "shape", ())
     return f"array {shape}" if shape else repr(value)

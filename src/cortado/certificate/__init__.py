@@ -1,6 +1,6 @@
-"""Are the gradients of a problem right, and how long do they mean something? `certify` finds out."""
+"""Are the gradients of a problem right, and up to how many steps are they useful? `certify` finds out."""
 
 from cortado.certificate.certificate import Certificate, certify
-from cortado.certificate.rightness import Comparison
+from cortado.certificate.consistency import Consistency
 
-__all__ = ["Certificate", "Comparison", "certify"]
+__all__ = ["Certificate", "Consistency", "certify"]

@@ -1,4 +1,4 @@
-"""The certificate of a problem's gradients: are they right, how long do they mean something, and what to use beyond."""
+"""The certificate of a problem's gradients: are they right, up to which step are they useful, what to use beyond."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -7,12 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from cortado.certificate.agreement import Agreement, agreement
-from cortado.certificate.changes import CHANGE, coherent_directions, directions, everything, point, scales
-from cortado.certificate.course import Course
+from cortado.certificate.alignment import Alignment, alignment
+from cortado.certificate.consistency import Consistency, balanced, check_consistency
 from cortado.certificate.horizon import Horizon, horizon
-from cortado.certificate.rightness import Comparison, balanced, compare
-from cortado.certificate.text import agreement_words, gradient_table, horizon_table, parameter_table
+from cortado.certificate.loss_history import LossHistory
+from cortado.certificate.perturbations import (
+    PERTURBATION,
+    checked_parameters,
+    coherent_directions,
+    directions,
+    everything,
+    scales,
+)
+from cortado.certificate.text import consistency_words, gradient_table, horizon_table, parameter_table
 from cortado.certificate.twin import in_float64
 from cortado.errors import InputError, shown
 from cortado.gradients import AdjointNorms
@@ -26,30 +33,30 @@ from cortado.simulation import Simulation
 from cortado.words import counted
 
 ROUGHLY = 0.1
-"""How far the adjoint of a loss in float32 may be from differences of it, relative."""
+"""Relative distance at most of the adjoint of a loss in float32 from finite differences of its values."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """What `certify` found."""
+    """What `certify` returns: whether the adjoint is right, how long it is useful, and which estimator to use."""
 
     particles: int
     steps: int
     loss: float
-    shares: dict[str, float]
-    """For every parameter how much a meaningful change of it changes the loss, by the adjoint."""
-    comparison: Comparison
-    """Of all parameters together."""
+    loss_changes: dict[str, float]
+    """For every parameter, by how much a meaningful perturbation of it changes the loss, by the adjoint."""
+    consistency: Consistency
+    """Of the derivatives with respect to all parameters together."""
     wrong: tuple[str, ...]
     """Parameters with a wrong derivative; empty where the adjoint is right."""
     norms: np.ndarray
-    """(steps + 1,) of the exact adjoint of every state."""
+    """(steps + 1,) norm of the exact adjoint of the state after each number of steps."""
     growth: float
-    """e-folds of the exact adjoint a step."""
+    """By how many e-folds the norm of the exact adjoint grows in each step backwards."""
     horizons: tuple[Horizon, ...]
     """For every parameter that was asked for; none where the adjoint is wrong."""
-    agreement: Agreement | None
-    """Of all of these together with the smoothed gradient."""
+    alignment: Alignment | None
+    """How well each estimator's gradient points along the smoothed one, for all of these parameters together."""
 
     def __repr__(self) -> str:
         verdict = f"right, horizon {self.horizon}" if self.right else f"WRONG for {', '.join(self.wrong)}"
@@ -59,15 +66,15 @@ class Certificate:
     def __str__(self) -> str:
         """As tables and sentences."""
         size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}, float64"
-        lines = [size, parameter_table(self.shares, self.wrong)]
+        lines = [size, parameter_table(self.loss_changes, self.wrong)]
         if not self.right:
-            return "\n".join([*lines, f"The adjoint is WRONG: {agreement_words(self.comparison)}."])
+            return "\n".join([*lines, f"The adjoint is WRONG: {consistency_words(self.consistency)}."])
         lines += [
-            f"The adjoint is right: {agreement_words(self.comparison)}.",
+            f"The adjoint is right: {consistency_words(self.consistency)}.",
             f"The adjoint of a state grows by e^{self.growth:.4f} a step.",
             horizon_table(self.horizons),
-            *([] if self.agreement is None else [gradient_table(self.agreement)]),
-            f"Up to step {self.horizon} of {self.steps} the exact gradient means something. For {self.steps} steps use "
+            *([] if self.alignment is None else [gradient_table(self.alignment)]),
+            f"Up to step {self.horizon} of {self.steps} the exact gradient is useful. For {self.steps} steps use "
             f"gradients.{self.estimator}.",
         ]
         return "\n".join(lines)
@@ -82,25 +89,25 @@ class Certificate:
 
     @property
     def horizon(self) -> int:
-        """The last step up to which the exact gradient means something, for all the parameters asked for."""
+        """The last step up to which the exact gradient is useful for every parameter that was asked for."""
         return min((one.measured for one in self.horizons), default=0)
 
     @property
     def estimator(self) -> str:
-        """Which to use for these parameters and that many steps, as it is written in Python."""
+        """The gradient estimator to use for these parameters and this number of steps, as it is written in Python."""
         if not self.right:
             return "RandomizedSmoothing()"
         if all(one.lasts for one in self.horizons):
             return "Exact()"
-        if self.agreement is None:
+        if self.alignment is None:
             return "AdjointViscosity()"
-        best = self.agreement.best
+        best = self.alignment.best
         return "RandomizedSmoothing()" if best is None else best.estimator
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        c, found = self.comparison, asdict(self)
-        found["comparison"] |= {"disagreement": c.disagreement, "miss": c.miss, "last_believed": c.last_believed}
+        c, found = self.consistency, asdict(self)
+        found["consistency"] |= {"disagreement": c.disagreement, "miss": c.miss, "last_converged": c.last_converged}
         for one, made in zip(self.horizons, found["horizons"], strict=True):
             made |= {"measured": one.measured, "predicted": one.predicted}
         found |= {"right": self.right, "horizon": self.horizon, "estimator": self.estimator}
@@ -110,59 +117,60 @@ class Certificate:
 def certify(
     problem: Problem | Simulation | Scene | str | PathLike[str],
     parameters: Values | Sequence[str] = ("gravity",),
-    change: float = CHANGE,
+    perturbation: float = PERTURBATION,
     seed: int = 0,
     steps: int | None = None,
 ) -> Certificate:
     """Check the gradients of a problem, always in float64; ``certify("scene.toml", steps=50)`` those of a scene.
 
     A problem in float32 is made once more in float64, on the same device, to be checked: the code is the same, and
-    round-off does not hide what is wrong. A loss of your own goes on being asked in float32 then; its adjoint is held
-    against its own differences to a tenth, which is what float32 allows.
+    round-off does not hide what is wrong. A loss of your own is still computed in float32 then; its adjoint is compared
+    with finite differences of its values, and may be off by a tenth, which is what float32 allows.
 
-    Whether the adjoint is right is asked of every parameter that the scene has. How long it means something, and which
-    estimator to use beyond, of ``parameters``: values, or names of the scene's.
+    The adjoint is checked with respect to every parameter of the scene. The horizon, which is the number of steps up to
+    which the exact gradient is useful, and the estimator to use beyond it, are found for ``parameters`` alone: these
+    are either values by name, or names of parameters whose values are the scene's.
 
     Args:
-        problem: one; or, with a number of ``steps``, a simulation, a scene or the path of its file: the loss is then
-            how far the particles have come, their mean squared distance from where they start.
-        change: what a meaningful change of a parameter is, in its own size; of positions in spacings, of velocities in
-            those of a fall over the height of the fluid.
+        problem: a problem; or, with a number of ``steps``, a simulation, a scene or the path of a scene's file. The
+            loss is then the particles' mean squared distance from where they start.
+        perturbation: how large a meaningful perturbation of a parameter is, relative to the parameter's value; for
+            positions it is relative to the spacing, for velocities to the speed of a fall over the fluid's height.
         seed: of the random directions.
-        steps: left out where a problem is given, which has a number of its own.
+        steps: to be left out where a problem is given, as a problem has its own number of steps.
 
     Raises `InputError` for arguments that do not fit, `DivergedError` where the problem itself diverges.
     """
-    if not 0.0 < change < 1.0:
-        raise InputError(f"change is {shown(change)}, but must be greater than 0 and less than 1.")
+    if not 0.0 < perturbation < 1.0:
+        raise InputError(f"perturbation is {shown(perturbation)}, but must be greater than 0 and less than 1.")
     problem = in_float64(_problem(problem, steps))
-    chosen, random = point(problem, parameters), np.random.default_rng(seed)
-    course, values = Course(problem), everything(problem, chosen)
+    chosen, random = checked_parameters(problem, parameters), np.random.default_rng(seed)
+    history, values = LossHistory(problem), everything(problem, chosen)
     norms = AdjointNorms(problem.simulation.solver, problem.steps)
     exact = problem.estimate({**chosen, **values}, observe=norms)
-    along = directions(values, scales(problem, values, change), random)
-    comparison, wrong = _rightness(course, values, exact.gradient, along)
+    along = directions(values, scales(problem, values, perturbation), random)
+    consistency, wrong = _consistency(history, values, exact.gradient, along)
 
-    sizes = scales(problem, chosen, change)
+    sizes = scales(problem, chosen, perturbation)
     asked = {} if wrong else chosen
-    changes = coherent_directions(problem, chosen, sizes, random)
+    perturbations = coherent_directions(problem, chosen, sizes, random)
     time = float(values["time_step"]) * max(problem.steps, 1)
     return Certificate(
         particles=problem.simulation.particles,
         steps=problem.steps,
         loss=exact.loss,
-        shares={name: abs(float((exact.gradient[name] * along[name]).sum())) for name in along},
-        comparison=comparison,
+        loss_changes={name: abs(float((exact.gradient[name] * along[name]).sum())) for name in along},
+        consistency=consistency,
         wrong=wrong,
         norms=np.hypot(norms.numpy()[:, 0], norms.numpy()[:, 1] / time),
         growth=growth(norms.numpy(), float(values["time_step"])) / max(problem.steps, 1),
-        horizons=tuple(horizon(course, chosen, name, changes[name]) for name in asked),
-        agreement=agreement(problem, asked, sizes, _of(chosen, exact.gradient)) if asked else None,
+        horizons=tuple(horizon(history, chosen, name, perturbations[name]) for name in asked),
+        alignment=alignment(problem, asked, sizes, _of(chosen, exact.gradient)) if asked else None,
     )
 
 
 def _problem(subject: Any, steps: int | None) -> Problem:
-    """A problem as it is, or that of how far a scene comes in a number of steps."""
+    """The problem itself; for a scene or a simulation, one whose loss is how far the particles move in ``steps``."""
     if isinstance(subject, Problem):
         if steps is not None:
             own = f"as the problem has {subject.steps} steps"
@@ -176,19 +184,21 @@ def _problem(subject: Any, steps: int | None) -> Problem:
 
 
 def _of(chosen: Arrays, gradient: Arrays) -> Arrays:
-    """The gradient in the shapes of the chosen parameters: tables may be one vector for all steps."""
+    """The gradient in the shapes of the chosen parameters: one over time may be given as one vector for all steps."""
     return {
         name: gradient[name] if gradient[name].shape == value.shape else gradient[name].sum(axis=0)
         for name, value in chosen.items()
     }
 
 
-def _rightness(course: Course, values: Arrays, gradient: Arrays, along: Arrays) -> tuple[Comparison, tuple[str, ...]]:
-    """The comparison of all parameters together, and, where it fails, those that fail alone."""
-    together = compare(course, values, gradient, balanced(gradient, along))
+def _consistency(
+    history: LossHistory, values: Arrays, gradient: Arrays, along: Arrays
+) -> tuple[Consistency, tuple[str, ...]]:
+    """The check of all parameters together and, where it fails, the names of those that also fail alone."""
+    together = check_consistency(history, values, gradient, balanced(gradient, along))
     if together.right:
-        return together, tuple(along) if course.rough_miss(values, along) > ROUGHLY else ()
-    alone = {name: compare(course, values, gradient, {name: along[name]}) for name in along}
+        return together, tuple(along) if history.rough_miss(values, along) > ROUGHLY else ()
+    alone = {name: check_consistency(history, values, gradient, {name: along[name]}) for name in along}
     return together, tuple(name for name in along if not alone[name].right) or tuple(along)
 
 

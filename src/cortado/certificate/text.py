@@ -1,38 +1,38 @@
-"""What a certificate found, as tables and sentences."""
+"""The results of a certificate as tables and sentences."""
 
 from collections.abc import Mapping, Sequence
 from io import StringIO
 from math import log10
 from typing import Any
 
-from cortado.certificate.agreement import Agreement
+from cortado.certificate.alignment import Alignment
+from cortado.certificate.consistency import Consistency
 from cortado.certificate.horizon import Horizon
-from cortado.certificate.rightness import Comparison
 
 WIDTH = 110
 """Characters of a table at most."""
 
 
-def parameter_table(shares: Mapping[str, float], wrong: Sequence[str]) -> str:
-    """How much each parameter changes the loss, and whether its derivative is right."""
-    verdicts = {name: "WRONG" if name in wrong else "right" for name in shares}
+def parameter_table(loss_changes: Mapping[str, float], wrong: Sequence[str]) -> str:
+    """By how much each parameter changes the loss, and whether its adjoint is right."""
+    verdicts = {name: "WRONG" if name in wrong else "right" for name in loss_changes}
     rows = [
-        [name, f"{share:.3e}", verdicts[name] if share or name in wrong else "not felt by this loss"]
-        for name, share in shares.items()
+        [name, f"{share:.3e}", verdicts[name] if share or name in wrong else "no effect on this loss"]
+        for name, share in loss_changes.items()
     ]
-    return _table(["parameter", "a change of it changes the loss by", "adjoint"], rows)
+    return _table(["parameter", "a perturbation changes the loss by", "adjoint"], rows)
 
 
-def agreement_words(comparison: Comparison) -> str:
-    """To how many digits the ways to the derivative agree."""
-    digits = f"reverse and forward mode agree to {_digits(comparison.disagreement)} digits"
-    if comparison.miss is None:
+def consistency_words(c: Consistency) -> str:
+    """To how many digits reverse mode, forward mode and central differences agree."""
+    digits = f"reverse and forward mode agree to {_digits(c.disagreement)} digits"
+    if c.miss is None:
         return f"{digits}, no difference is reliable here"
-    return f"{digits}, with differences to {_digits(comparison.miss)}, up to step {comparison.last_believed}"
+    return f"{digits}, with differences to {_digits(c.miss)}, up to step {c.last_converged}"
 
 
 def horizon_table(horizons: Sequence[Horizon]) -> str:
-    """Up to which step each exact derivative means something."""
+    """Up to which step the exact derivative with respect to each parameter is useful."""
     rows = [
         [
             horizon.parameter,
@@ -44,12 +44,12 @@ def horizon_table(horizons: Sequence[Horizon]) -> str:
     return _table(["parameter", "predicted horizon", "measured horizon"], rows)
 
 
-def gradient_table(agreement: Agreement) -> str:
-    """How near each gradient is to that of the smoothed loss."""
-    rows = [[judged.estimator, f"{judged.cosine:.3f}", f"{judged.size:.3g}"] for judged in agreement.estimators]
+def gradient_table(alignment: Alignment) -> str:
+    """How well each estimator's gradient is aligned with that of the smoothed loss."""
+    rows = [[judged.estimator, f"{judged.cosine:.3f}", f"{judged.size:.3g}"] for judged in alignment.estimators]
     return (
         f"{_table(['estimator', 'cosine', 'size'], rows)}\n"
-        f"to the gradient of the smoothed loss, whose own error is {agreement.noise:.0%}"
+        f"to the gradient of the smoothed loss, whose own error is {alignment.noise:.0%}"
     )
 
 

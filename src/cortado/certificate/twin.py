@@ -1,4 +1,4 @@
-"""A problem once more in float64: in float32 round-off is far greater than what a certificate looks for."""
+"""A copy of a problem in float64: in float32 the round-off is far greater than the errors a certificate looks for."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from cortado.losses import (
     SnapshotAdjoint,
 )
 from cortado.losses.checked import as_loss
-from cortado.losses.loss import Adjoint
+from cortado.losses.loss import Adjoint, by_field
 from cortado.problem import Problem
 from cortado.render.renderer import Renderer
 from cortado.simulation import Simulation
@@ -26,8 +26,8 @@ ANY_PRECISION = (FinalPositions, CentreOfMass, CentreOfMassAlong)
 def in_float64(problem: Problem) -> Problem:
     """The problem itself where it is one in float64, else the same scene, device, steps and loss in float64.
 
-    A loss of our own looks at states in float64 then. Of any other nobody knows whether it can, so it goes on being
-    asked in float32: see `Rounded`.
+    Losses of this package are computed from states in float64 then. Whether any other loss can be is not known, so it
+    is still computed in float32: see `Rounded`.
     """
     single = problem.simulation
     if single.precision == FLOAT64:
@@ -51,7 +51,7 @@ def _loss_in_float64(loss: Any, single: Simulation) -> Any:
 
 
 class Rounded:
-    """A loss that may know float32 alone, asked about states in float64: its values are as rough as float32 is."""
+    """A loss that may work in float32 alone, given states in float64, which are rounded to float32 for it."""
 
     def __init__(self, loss: Any, single: Simulation):
         """``single``: the simulation in float32 that the loss was made for."""
@@ -62,15 +62,13 @@ class Rounded:
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
         value, bar = self._loss.value_and_adjoint(self._rounded(end))
-        if isinstance(bar, State):
-            return value, bar.numpy(end.dimension)
-        if isinstance(bar, SnapshotAdjoint):
-            state = end.state.like()
-            state.set(*bar.state.numpy(end.dimension))
-            return value, SnapshotAdjoint(state, bar.colours)
-        return value, bar
+        if not isinstance(bar, (State, SnapshotAdjoint)):
+            return value, bar
+        state = end.state.like()
+        state.set(by_field(bar, end.dimension))
+        return value, SnapshotAdjoint(state, bar.colours) if isinstance(bar, SnapshotAdjoint) else state
 
     def _rounded(self, end: Snapshot) -> Snapshot:
         state = self._single.solver.new_state()
-        state.set(end.positions, end.velocities, end.mass_fractions)
+        state.set(end.state.numpy(end.dimension))
         return Snapshot(state, end.dimension, end.colours)

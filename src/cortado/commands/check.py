@@ -20,7 +20,7 @@ def check_scene(
     steps: int,
     parameters: Sequence[str],
     loss: str,
-    change: float,
+    perturbation: float,
     out: Path | None,
     overrides: list[str],
     device: str,
@@ -34,7 +34,7 @@ def check_scene(
     problem = Problem(simulation, check_steps(steps), _loss(loss, simulation))
     if out is not None:
         _make(out)
-    certificate = certify(problem, parameters, change, seed)
+    certificate = certify(problem, parameters, perturbation, seed)
     found = json.dumps(certificate.as_dict(), indent=2)
     text = found if as_json else f"Loss: {loss}.\n{certificate}"
     if out is not None:

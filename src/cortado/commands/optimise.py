@@ -1,4 +1,4 @@
-"""``cortado optimise``: find what a task asks for, resume the search, and judge the result."""
+"""``cortado optimise``: solve the inverse problem of a task, resume the search, and judge the result."""
 
 import math
 from dataclasses import dataclass, replace
@@ -26,14 +26,14 @@ Rows = list[tuple[str, object]]
 
 @dataclass(frozen=True)
 class Verdict:
-    """What an optimisation reached, against what the task asks for."""
+    """How near an optimisation came to what the task asks for."""
 
     first: float
     """Loss of the start."""
     reduction: float
     """Loss of the start / best loss; infinite where the best is 0."""
     errors: dict[str, float]
-    """By parameter: distance (L2) from the hidden one, relative to its size unless that is 0."""
+    """By parameter: distance (L2) of the estimate from the true value, relative to its size unless that is 0."""
     psnr: float | None
     """Of the last image [dB]; None where positions are compared."""
     failures: list[str]
@@ -89,15 +89,15 @@ def _solved(made: Setup, folder: RunFolder, resume: bool) -> str:
         advice = f"{error.advice}, a smaller learning rate, or bounds on the parameters"
         advice = "; ".join(filter(None, [advice, _kept(folder)]))
         raise error.with_advice(advice) from error
-    found = made.search.parameters(result.parameters)
+    estimate = made.search.parameters(result.parameters)
     noise = None
     if made.renderer is not None:
         last, target = max(made.targets.items())
-        noise = psnr(made.image(made.problem.states(found, [last])[last]), target)
+        noise = psnr(made.image(made.problem.states(estimate, [last])[last]), target)
     first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
-    verdict = judge(made.task, result, found, noise, first)
+    verdict = judge(made.task, result, estimate, noise, first)
     figures = task_figures(made, result, folder.figures)
-    write_report(folder, made.task.scene.name, _rows(made, found, result, verdict, estimator), figures)
+    write_report(folder, made.task.scene.name, _rows(made, estimate, result, verdict, estimator), figures)
     if verdict.failures:
         raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
     return f"{_summary(made, result, verdict)} The results are in {folder.path}; open report.html."
@@ -106,19 +106,20 @@ def _solved(made: Setup, folder: RunFolder, resume: bool) -> str:
 def judge(
     task: Task,
     result: Result,
-    found: dict[str, np.ndarray] | None = None,
+    estimate: dict[str, np.ndarray] | None = None,
     noise: float | None = None,
     first: float | None = None,
 ) -> Verdict:
     """Hold a result against the task's [optimise.check].
 
-    ``found``: its parameters, where the result has coordinates; ``noise``: the peak signal-to-noise ratio reached [dB];
-    ``first``: the loss of the start, where the history begins with another loss.
+    ``estimate``: its parameters, where the result has coordinates; ``noise``: the peak signal-to-noise ratio that was
+    reached [dB]; ``first``: the loss of the start, where the history begins with another loss.
     """
-    check, found = task.optimise.check, result.parameters if found is None else found
+    check, estimate = task.optimise.check, result.parameters if estimate is None else estimate
     first = result.history[0].loss if first is None else first
     reduction = first / result.loss if result.loss > 0.0 else math.inf
-    errors = {name: _distance(value, task.hidden[name]) for name, value in found.items() if name in task.hidden}
+    true = task.true_parameters
+    errors = {name: _distance(value, true[name]) for name, value in estimate.items() if name in true}
     failures = []
     if reduction < check.loss_reduction:
         failures.append(f"The loss fell {reduction:.3g} times, but the task asks for {check.loss_reduction:g} times.")
@@ -132,10 +133,10 @@ def judge(
     return Verdict(first, reduction, errors, noise, failures)
 
 
-def _distance(found: ArrayLike, hidden: ArrayLike) -> float:
-    """|found - hidden| / |hidden|, each repeated over the steps where only the other one changes with time."""
-    found, hidden = np.broadcast_arrays(found, hidden)
-    return float(np.linalg.norm(found - hidden) / (np.linalg.norm(hidden) or 1.0))
+def _distance(estimate: ArrayLike, true: ArrayLike) -> float:
+    """|estimate - true| / |true|, each repeated over the steps where only the other one changes with time."""
+    estimate, true = np.broadcast_arrays(estimate, true)
+    return float(np.linalg.norm(estimate - true) / (np.linalg.norm(true) or 1.0))
 
 
 def _search(made: Setup, folder: RunFolder, resume: bool) -> tuple[Result, GradientEstimator]:
@@ -171,7 +172,7 @@ def _search(made: Setup, folder: RunFolder, resume: bool) -> tuple[Result, Gradi
 
 
 def _summary(made: Setup, result: Result, verdict: Verdict) -> str:
-    reached = [f"{name} within {100 * error:.3g}% of the hidden one" for name, error in verdict.errors.items()]
+    reached = [f"{name} within {100 * error:.3g}% of its true value" for name, error in verdict.errors.items()]
     if verdict.psnr is not None:
         reached.insert(0, f"the image is matched to {verdict.psnr:.3g} dB")
     fell = f"fell {verdict.reduction:.3g} times" if result.loss > 0.0 else f"went from {verdict.first:.3g} to 0"
@@ -180,7 +181,7 @@ def _summary(made: Setup, result: Result, verdict: Verdict) -> str:
 
 
 def _rows(
-    made: Setup, found: dict[str, np.ndarray], result: Result, verdict: Verdict, estimator: GradientEstimator
+    made: Setup, estimate: dict[str, np.ndarray], result: Result, verdict: Verdict, estimator: GradientEstimator
 ) -> Rows:
     rows: Rows = [
         ("particles", made.problem.simulation.particles),
@@ -193,10 +194,10 @@ def _rows(
     ]
     if verdict.psnr is not None:
         rows.append(("image, PSNR [dB]", f"{verdict.psnr:.4g}"))
-    for name, value in found.items():
-        rows.append((f"{name}, found", np.array2string(np.asarray(value), precision=6, threshold=20)))
-        hidden = made.hidden(name)
-        if hidden is not None:
-            rows.append((f"{name}, hidden", np.array2string(hidden, precision=6, threshold=20)))
+    for name, value in estimate.items():
+        rows.append((f"{name}, estimate", np.array2string(np.asarray(value), precision=6, threshold=20)))
+        true = made.true_parameter(name)
+        if true is not None:
+            rows.append((f"{name}, true", np.array2string(true, precision=6, threshold=20)))
             rows.append((f"{name}, relative error", f"{verdict.errors[name]:.3%}"))
     return rows

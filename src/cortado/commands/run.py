@@ -14,12 +14,14 @@ from cortado.io.interruption import keeping
 from cortado.io.progress import track
 from cortado.io.report import Figures, write_report
 from cortado.io.run_folder import RunFolder
-from cortado.io.trajectory import Trajectory, fraction_fields, fraction_names
+from cortado.io.trajectory import Trajectory, append_frame, frame_writer
 from cortado.io.video import MOST_FRAMES, write_video
-from cortado.io.vtkhdf import TrajectoryWriter
 from cortado.rollout import Rollout
-from cortado.scene.scene import Scene, load_scene
+from cortado.scene.scene import load_scene
 from cortado.simulation import Simulation, check_steps, not_converged_sentence
+
+Rows = list[tuple[str, object]]
+"""(label, value) of each row of a report"""
 
 
 def run_scene(
@@ -37,7 +39,7 @@ def run_scene(
     scene = load_scene(scene_file, overrides)
     simulation = Simulation(scene, device, precision)
     rollout = simulation.rollout(check_steps(steps))
-    numbers = simulation.particles * (6 + len(scene.phase))
+    numbers = simulation.numbers_in_frame(components=3)  # as in the file
     frames = frame_parts(2 + steps // record_every, numbers, simulation.precision.bytes)
     require(frames, "take a larger --record-every or fewer steps")
     with locked(out):
@@ -54,49 +56,35 @@ def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record
     try:
         _write_trajectory(simulation, rollout, folder, record_every)
     except DivergedError as error:
-        _write_pictures(simulation.scene, simulation, folder, [("ended early", error)])
+        _write_pictures(simulation, rollout.substeps, folder, [("ended early", error)])
         advice = f"{error.advice}; the frames so far are in {folder.path}"
         raise error.with_advice(advice) from error
-    _write_pictures(simulation.scene, simulation, folder, [])
+    _write_pictures(simulation, rollout.substeps, folder, [])
 
 
 def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:
     steps = rollout.steps
     recorded = np.array([*range(0, steps, record_every), steps])
+    times, first = rollout.clock.times(recorded, rollout.time_step), simulation.frame(rollout.initial)
+    constants = simulation.constants(rollout)
     with (
-        TrajectoryWriter(
-            folder.trajectory,
-            times=rollout.elapsed.times(recorded, rollout.time_step),
-            particles=simulation.particles,
-            dimension=simulation.dimension,
-            precision=simulation.precision.name,  # type: ignore[arg-type]
-            steps=steps,
-            scalars=fraction_names(len(simulation.scene.phase)),
-            constants=simulation.constants(rollout, recorded).arrays(),
-        ) as writer,
+        frame_writer(folder.trajectory, times, first, constants, steps, rollout.diagnostics) as writer,
         track(steps, "run") as advance,
     ):
 
-        def write(step: int, state: State) -> None:
-            positions, velocities, fractions = state.numpy(simulation.dimension)
-            writer.append(positions, velocities, step=step, **fraction_fields(fractions))
-
         def observe(step: int, state: State) -> None:
             if step % record_every == 0 or step == steps:
-                write(step, state)
+                append_frame(writer, simulation.frame(state), step)
             advance()
 
-        write(0, rollout.initial)
-
+        append_frame(writer, first, 0)
         try:
             rollout.forward(observe, keep=False)
         finally:
             found = rollout.diagnostics
-            iterations, errors = found["iterations"], found["density_errors"]
-            writer.append_steps(iterations, errors, found["converged"])
-            rows = zip(iterations, errors, found["greatest_density_errors"], strict=True)
-            for step, (count, error, greatest) in enumerate(rows, 1):
-                folder.append_metrics(step=step, iterations=count, density_error=error, greatest_density_error=greatest)
+            writer.append_steps(**found)
+            for step, row in enumerate(zip(*found.values(), strict=True), 1):
+                folder.append_metrics(step=step, **dict(zip(found, row, strict=True)))
 
 
 def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], folder: Path) -> Figures:
@@ -115,8 +103,9 @@ def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], 
     return figures
 
 
-def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder, remarks: list[tuple[str, object]]) -> None:
+def _write_pictures(simulation: Simulation, substeps: int, folder: RunFolder, remarks: Rows) -> None:
     """The report with its pictures; ``remarks`` are its first rows."""
+    scene = simulation.scene
     trajectory = Trajectory.load(folder.trajectory)
     shown = sorted({0, len(trajectory.times) // 2, len(trajectory.times) - 1})
     speeds = [np.linalg.norm(trajectory.velocities[frame], axis=1) for frame in shown]
@@ -135,17 +124,16 @@ def _write_pictures(scene: Scene, simulation: Simulation, folder: RunFolder, rem
     ]
     if scene.render is not None:
         figures += _rendered(simulation, trajectory, shown, folder.figures)
-    if len(trajectory.density_errors) and scene.forces.pressure:
+    if len(trajectory.converged) and "density_errors" in trajectory.diagnostics and scene.forces.pressure:
         path = folder.figures / "density_errors.png"
         density_errors(trajectory, path, tolerance=scene.solver.density_tolerance)
         figures.append(("Average density error of each step, and the tolerance asked.", path))
-    substeps = simulation.solver.mixture.substeps  # of the run that has just ended
     rows = [
         *remarks,
         ("particles", simulation.particles),
         *([("substeps of diffusion in each step", substeps)] if substeps else []),
         ("wall particles", len(simulation.walls)),
-        ("steps", len(trajectory.iterations)),
+        ("steps", len(trajectory.converged)),
         ("simulated time [s]", f"{trajectory.times[-1]:.4g}"),
         ("precision", simulation.precision.name),
     ]

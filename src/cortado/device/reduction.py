@@ -8,7 +8,7 @@ import warp as wp
 from cortado.device.precision import Precision
 
 
-def _name(dtype: Any) -> str:
+def type_name(dtype: Any) -> str:
     """Of a number, vector or matrix type, to tell their modules apart."""
     shape = getattr(dtype, "_shape_", ())
     return "_".join([getattr(dtype, "_wp_scalar_type_", dtype).__name__, *map(str, shape)])
@@ -17,7 +17,7 @@ def _name(dtype: Any) -> str:
 @cache
 def sum_kernel(dtype: Any) -> Any:
     """Sums of numbers, vectors or matrices of one type: partial[t] from values t, t + T, t + 2 T, ..."""
-    module = wp.get_module(f"cortado_sum_{_name(dtype)}")
+    module = wp.get_module(f"cortado_sum_{type_name(dtype)}")
     module.options["enable_backward"] = False
 
     @wp.kernel(module=module, enable_backward=False)
@@ -54,7 +54,7 @@ def sum_and_maximum_kernel(precision: Precision) -> Any:
 @cache
 def add_kernel(dtype: Any) -> Any:
     """total += value, element by element."""
-    module = wp.get_module(f"cortado_add_{_name(dtype)}")
+    module = wp.get_module(f"cortado_add_{type_name(dtype)}")
     module.options["enable_backward"] = False
 
     @wp.kernel(module=module, enable_backward=False)

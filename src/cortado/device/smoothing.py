@@ -17,11 +17,11 @@ from cortado.lattice.smoothing import CUBIC_SPLINE, WENDLAND_C2, WENDLAND_C4, Sm
 
 @dataclass(frozen=True)
 class RadialFunctions:
-    """Warp functions of a kernel's dimensionless form: w, w' / q and what the Hessian needs."""
+    """Warp functions of a kernel's dimensionless form: w, f = w' / q, which its gradient needs, and f', its Hessian."""
 
     value: Any
-    slope: Any
-    bend: Any
+    gradient_factor: Any
+    hessian_factor: Any
 
 
 def _cubic_spline(precision: Precision) -> RadialFunctions:
@@ -35,20 +35,20 @@ def _cubic_spline(precision: Precision) -> RadialFunctions:
         return real(2.0) * t * t * t
 
     @wp.func
-    def slope(q: real) -> real:
+    def gradient_factor(q: real) -> real:
         t = wp.max(real(1.0) - q, real(0.0))
         if q <= real(0.5):
             return real(18.0) * q - real(12.0)
         return real(-6.0) * t * t / q
 
     @wp.func
-    def bend(q: real) -> real:
+    def hessian_factor(q: real) -> real:
         t = wp.max(real(1.0) - q, real(0.0))
         if q <= real(0.5):
             return real(18.0)
         return real(6.0) * t * (real(2.0) * q + t) / (q * q)
 
-    return RadialFunctions(value=value, slope=slope, bend=bend)
+    return RadialFunctions(value=value, gradient_factor=gradient_factor, hessian_factor=hessian_factor)
 
 
 def _wendland_c2(precision: Precision) -> RadialFunctions:
@@ -60,16 +60,16 @@ def _wendland_c2(precision: Precision) -> RadialFunctions:
         return t * t * t * t * (real(1.0) + real(4.0) * q)
 
     @wp.func
-    def slope(q: real) -> real:
+    def gradient_factor(q: real) -> real:
         t = wp.max(real(1.0) - q, real(0.0))
         return real(-20.0) * t * t * t
 
     @wp.func
-    def bend(q: real) -> real:
+    def hessian_factor(q: real) -> real:
         t = wp.max(real(1.0) - q, real(0.0))
         return real(60.0) * t * t
 
-    return RadialFunctions(value=value, slope=slope, bend=bend)
+    return RadialFunctions(value=value, gradient_factor=gradient_factor, hessian_factor=hessian_factor)
 
 
 def _wendland_c4(precision: Precision) -> RadialFunctions:
@@ -82,18 +82,18 @@ def _wendland_c4(precision: Precision) -> RadialFunctions:
         return t_2 * t_2 * t_2 * (real(1.0) + real(6.0) * q + (real(35.0) / real(3.0)) * q * q)
 
     @wp.func
-    def slope(q: real) -> real:
+    def gradient_factor(q: real) -> real:
         t = wp.max(real(1.0) - q, real(0.0))
         t_2 = t * t
         return (real(-56.0) / real(3.0)) * (real(1.0) + real(5.0) * q) * t_2 * t_2 * t
 
     @wp.func
-    def bend(q: real) -> real:
+    def hessian_factor(q: real) -> real:
         t = wp.max(real(1.0) - q, real(0.0))
         t_2 = t * t
         return real(560.0) * q * t_2 * t_2
 
-    return RadialFunctions(value=value, slope=slope, bend=bend)
+    return RadialFunctions(value=value, gradient_factor=gradient_factor, hessian_factor=hessian_factor)
 
 
 RADIAL_FUNCTIONS = {
@@ -101,7 +101,7 @@ RADIAL_FUNCTIONS = {
     WENDLAND_C2.name: _wendland_c2,
     WENDLAND_C4.name: _wendland_c4,
 }
-"""By the kernel's name: for a precision, the Warp functions ``value``, ``slope`` and ``bend`` (w, f and f')."""
+"""By the kernel's name: for a precision, ``value`` w, ``gradient_factor`` f and ``hessian_factor`` f'."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def smoothing_functions(kernel: SmoothingKernel, precision: Precision) -> Smooth
     """
     real, vector = precision.real, precision.vector
     radial = RADIAL_FUNCTIONS[kernel.name](precision)
-    value, slope, bend = radial.value, radial.slope, radial.bend
+    value, gradient_factor, hessian_factor = radial.value, radial.gradient_factor, radial.hessian_factor
     tiny = wp.constant(real(precision.tiny))
 
     @wp.func
@@ -130,13 +130,13 @@ def smoothing_functions(kernel: SmoothingKernel, precision: Precision) -> Smooth
 
     @wp.func
     def gradient(x: vector, h: real, sigma: real) -> vector:
-        return (sigma / (h * h) * slope(wp.length(x) / h)) * x
+        return (sigma / (h * h) * gradient_factor(wp.length(x) / h)) * x
 
     @wp.func
     def hessian_product(x: vector, u: vector, h: real, sigma: real) -> vector:
         q = wp.length(x) / h
         # tiny guards coincident particles: there s = 0, the second term is 0 and H = W''(0) I, as it should be.
-        radial_part = bend(q) / ((q + tiny) * h * h) * wp.dot(x, u)
-        return (sigma / (h * h)) * (slope(q) * u + radial_part * x)
+        radial_part = hessian_factor(q) / ((q + tiny) * h * h) * wp.dot(x, u)
+        return (sigma / (h * h)) * (gradient_factor(q) * u + radial_part * x)
 
     return SmoothingFunctions(weight=weight, gradient=gradient, hessian_product=hessian_product)

@@ -1,83 +1,30 @@
-"""What a scene becomes on a device: Warp arrays by name. Vectors have three components here, z is 0 in 2-D."""
+"""What a step depends on, as Warp arrays by name: the state before it, and the parameters."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 import warp as wp
 
+from cortado.device.arrays import Arrays, padded, zeros
+from cortado.device.fields import Entry, StateField
 from cortado.device.precision import Precision
 from cortado.parameters.registry import BY_NAME, Axis, Role, names
 from cortado.parameters.values import OVER_TIME
 
 
-def padded(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (n, 2) or (n, 3) with three components, in float64."""
-    return np.hstack([vectors, np.zeros((len(vectors), 3 - vectors.shape[1]))])
-
-
-def to_device(values: np.ndarray, precision: Precision, device: Any) -> wp.array:
-    """Vectors (n, 2) or (n, 3) as a Warp array of vectors (n,)."""
-    return wp.array(padded(values), dtype=precision.vector, device=device)
-
-
-class Arrays:
-    """Warp arrays by name."""
-
-    def __init__(self, arrays: Mapping[str, wp.array]):
-        self._arrays = dict(arrays)
-        self._named: dict[str, dict[str, wp.array]] = {}
-
-    def __getitem__(self, name: str) -> wp.array:
-        return self._arrays[name]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Their names, in their order."""
-        return tuple(self._arrays)
-
-    def arrays(self) -> list[wp.array]:
-        """The arrays, in their order."""
-        return list(self._arrays.values())
-
-    def named(self, suffix: str = "") -> dict[str, wp.array]:
-        """The arrays as kernels call their arguments: "_dot" behind the name of a tangent, "_bar" of an adjoint."""
-        if suffix not in self._named:
-            self._named[suffix] = {name + suffix: array for name, array in self._arrays.items()}
-        return self._named[suffix]
-
-    def assign(self, other: Self) -> None:
-        """Copy another of the same device and sizes, without a host round trip."""
-        for own, source in zip(self.arrays(), other.arrays(), strict=True):
-            wp.copy(own, source)
-
-    def like(self) -> Self:
-        """One of the same sizes that is still to be written."""
-        return type(self)({name: wp.empty_like(a, requires_grad=False) for name, a in self._arrays.items()})
-
-    def gradients(self) -> Self:
-        """The adjoints of the arrays that Warp's tape has written."""
-        return type(self)({name: array.grad for name, array in self._arrays.items()})
-
-    def clear(self) -> None:
-        """Make everything 0."""
-        for array in self.arrays():
-            array.zero_()
-
-
-def zeros(kinds: Mapping[str, tuple[int, Any]], device: Any, requires_grad: bool = False) -> dict[str, wp.array]:
-    """Arrays of zeros by name, each of a size and a Warp type."""
-    options = {"device": device, "requires_grad": requires_grad}
-    return {name: wp.zeros(size, dtype=dtype, **options) for name, (size, dtype) in kinds.items()}
-
-
 class State(Arrays):
-    """Where the fluid is, how it moves and what it is, in the scene's order of particles. Also the type of its
-    derivatives.
+    """All that a step depends on besides parameters, by the names of the fields that the solver declares. Also the type
+    of its derivatives.
 
-    ``positions`` (n,) vectors [m], ``velocities`` (n,) vectors [m / s], ``mass_fractions`` (n,) of as many numbers as
-    there are phases [-].
+    Every state has ``positions`` (n,) vectors [m], ``velocities`` (n,) vectors [m / s] and ``mass_fractions`` (n,) of
+    as many numbers as there are phases [-], in the scene's order of particles.
     """
+
+    def __init__(self, fields: tuple[StateField, ...], arrays: Mapping[str, wp.array]):
+        super().__init__(arrays)
+        self.fields = fields
 
     @property
     def positions(self) -> wp.array:
@@ -94,45 +41,40 @@ class State(Arrays):
         """(n,) of as many numbers as there are phases [-]."""
         return self["mass_fractions"]
 
-    @classmethod
-    def zeros(cls, particles: int, phases: int, precision: Precision, device: Any, requires_grad: bool = False) -> Self:
-        """A state of zeros."""
-        vectors = (particles, precision.vector)
-        fractions = (particles, precision.fractions(phases))
-        kinds = {"positions": vectors, "velocities": vectors, "mass_fractions": fractions}
-        return cls(zeros(kinds, device, requires_grad))
+    def like(self) -> Self:
+        """One of the same fields and sizes, all 0."""
+        return type(self)(self.fields, {name: wp.zeros_like(self[name], requires_grad=False) for name in self.names})
 
-    def set(self, positions: np.ndarray, velocities: np.ndarray, mass_fractions: np.ndarray) -> None:
-        """Write arrays, (n, d) vectors and (n, phases)."""
-        self.positions.assign(padded(positions))
-        self.velocities.assign(padded(velocities))
-        self.mass_fractions.assign(mass_fractions)
+    def following(self) -> Self:
+        """A later state of the same run that is still to be written: what no step changes is the same array."""
+        new = {f.name: self[f.name] if f.is_constant else wp.empty_like(self[f.name]) for f in self.fields}
+        return type(self)(self.fields, new)
 
-    def numpy(self, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions and velocities (n, dimension), mass fractions (n, phases), as new arrays."""
-        return (
-            self.positions.numpy()[:, :dimension].copy(),
-            self.velocities.numpy()[:, :dimension].copy(),
-            self.mass_fractions.numpy().copy(),
-        )
+    def copy(self) -> Self:
+        """The same in arrays of its own."""
+        new = self.like()
+        new.assign(self)
+        return new
+
+    def set(self, values: Mapping[str, Any]) -> None:
+        """Write fields by name: vectors (n, d), numbers (n,), fractions (n, phases)."""
+        for field in self.fields:
+            if field.name in values:
+                given = np.asarray(values[field.name])
+                self[field.name].assign(padded(given) if field.entry is Entry.VECTOR else given)
+
+    def numpy(self, dimension: int, constants: bool = True) -> dict[str, np.ndarray]:
+        """Every field as a new array: vectors (n, dimension), numbers (n,), fractions (n, phases); ``constants``: also
+        what no step changes."""
+        arrays = {f: self[f.name].numpy() for f in self.fields if constants or not f.is_constant}
+        return {f.name: (a[:, :dimension] if f.entry is Entry.VECTOR else a).copy() for f, a in arrays.items()}
 
 
 class Parameters(Arrays):
     """What steps depend on besides the state, by the names of the registry. Also the type of its derivatives.
 
-    A parameter over time is (steps,) vectors, one of phases (phases,) numbers, any other (1,) number. Besides them
-    ``reference_density`` (n,) [kg / m3]: the mass of a particle over its volume on the rest lattice, in the scene's
-    order.
+    A parameter over time is (steps,) vectors, one of phases (phases,) numbers, any other (1,) number.
     """
-
-    @classmethod
-    def zeros(
-        cls, steps: int, particles: int, phases: int, precision: Precision, device: Any, requires_grad: bool = False
-    ) -> Self:
-        """Parameters of a run of so many steps, all 0."""
-        sizes = {Axis.STEP: (max(steps, 1), precision.vector), Axis.PHASE: (phases, precision.real)}
-        kinds = {name: sizes.get(BY_NAME[name].axis, (1, precision.real)) for name in names(Role.RUN)}
-        return cls(zeros({**kinds, "reference_density": (particles, precision.real)}, device, requires_grad))
 
     def set(self, values: Mapping[str, Any]) -> None:
         """Write some by name: a vector (d,) for every step, or vectors (steps, d); numbers or arrays of them."""
@@ -146,16 +88,32 @@ class Parameters(Arrays):
                 array.assign(np.broadcast_to(given, array.shape))
 
 
-class Fields(Arrays):
-    """Sorted particles within a step. Also the type of tangents and adjoints.
+@dataclass(frozen=True)
+class Layout:
+    """How large the arrays of one solver are, and where they are. Several scenes in one launch, or solids, would be an
+    axis more here; kernels have one thread for each particle, whichever scene it belongs to."""
 
-    ``x`` (n,) positions [m]; ``v`` (n,) velocities [m / s]; ``n`` (n,) number densities [-], 1 on the rest lattice;
-    ``m`` (n,) masses over the volume on the rest lattice [kg / m3], so that the density is m n; ``rho_0`` (n,) rest
-    densities [kg / m3]; ``mu`` (n,) dynamic viscosities [Pa s].
-    """
+    particles: int
+    phases: int
+    precision: Precision
+    device: Any
 
-    @classmethod
-    def zeros(cls, particles: int, precision: Precision, device: Any, requires_grad: bool = False) -> Self:
-        """Fields of zeros."""
-        types = dict.fromkeys("xv", precision.vector) | dict.fromkeys(("n", "m", "rho_0", "mu"), precision.real)
-        return cls(zeros({name: (particles, dtype) for name, dtype in types.items()}, device, requires_grad))
+    def state(self, fields: tuple[StateField, ...], requires_grad: bool = False) -> State:
+        """A state of these fields, all 0."""
+        precision = self.precision
+        dtypes = {
+            Entry.NUMBER: precision.real,
+            Entry.VECTOR: precision.vector,
+            Entry.FRACTIONS: precision.fractions(self.phases),
+            Entry.DOUBLE: wp.float64,
+        }
+        sizes = {Axis.PARTICLE: self.particles, Axis.SCALAR: 1}
+        kinds = {field.name: (sizes[field.axis], dtypes[field.entry]) for field in fields}
+        return State(fields, zeros(kinds, self.device, requires_grad))
+
+    def parameters(self, steps: int, requires_grad: bool = False) -> Parameters:
+        """Parameters of a run of so many steps, all 0."""
+        real, vector = self.precision.real, self.precision.vector
+        of_axis = {Axis.STEP: (max(steps, 1), vector), Axis.PHASE: (self.phases, real)}
+        kinds = {name: of_axis.get(BY_NAME[name].axis, (1, real)) for name in names(Role.RUN)}
+        return Parameters(zeros(kinds, self.device, requires_grad))

@@ -53,7 +53,7 @@ class Lattice:
     stiffness: float
     """k [m2]: delta = k / dt^2 [Pa m3 / kg] (report eq. 7, put right) for a filled neighbourhood."""
     response: float
-    """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of the yield, see `cortado.solvers.pcisph.wall_relaxation`."""
+    """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of `cortado.solvers.pcisph.wall_relaxation`."""
     laplacian_correction: float
     """[-], see `cortado.lattice.calibration.lattice_laplacian_correction`."""
 

@@ -40,7 +40,7 @@ def curve(
     x_label: str,
     y_label: str,
     logarithmic: bool = False,
-    hidden: Sequence[ArrayLike] = (),
+    true: Sequence[ArrayLike] = (),
 ) -> Path:
     """Several series over the same numbers.
 
@@ -48,7 +48,7 @@ def curve(
         x: (k,), at whole numbers only if they are integers.
         series: label -> (k,); what is not finite is left out. Labels are shown if there are two or more.
         logarithmic: scale of the series, where any is positive; zeros and negative numbers are left out.
-        hidden: (k,) each, what the series should be, dashed on top of them.
+        true: (k,) each, what the series should be, dashed on top of them.
     """
     x, lines = np.asarray(x), {label: np.asarray(values, dtype=float) for label, values in series.items()}
     for label, values in lines.items():
@@ -59,62 +59,64 @@ def curve(
         axes = figure.subplots()
         for k, (label, values) in enumerate(lines.items()):
             _line(axes, x, values, logarithmic, color=PALETTE[k % len(PALETTE)], label=label)
-        for k, truth in enumerate(hidden):
-            axes.plot(x, np.asarray(truth, dtype=float), **DASHED, color=INK, label=None if k else "hidden")
+        for k, column in enumerate(true):
+            axes.plot(x, np.asarray(column, dtype=float), **DASHED, color=INK, label=None if k else "true")
         axes.margins(x=0.03, y=0.08)
         axes.set(title=title, xlabel=x_label, ylabel=y_label)
         if np.issubdtype(x.dtype, np.integer):
             whole_numbers(axes.xaxis)
-        if len(lines) + len(hidden) > 1:
+        if len(lines) + len(true) > 1:
             axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     return Path(path)
 
 
 def parameters(
     history: ArrayLike,
-    hidden: ArrayLike | None,
+    true: ArrayLike | None,
     path: str | Path,
     *,
     names: Sequence[str] | None = None,
     unit: str = "",
     title: str = "Recovered parameters",
 ) -> Path:
-    """Every component of the parameters over the iterations (solid), against the hidden ones (dashed).
+    """Every component of the parameters over the iterations (solid), against their true values (dashed).
 
     Args:
         history: (iterations, k), or (iterations, ...) with k components in all.
-        hidden: (k,) or the same shape as one iteration; None where nobody knows.
+        true: (k,) or the same shape as one iteration; None where they are not known.
         names: k of them; by default x, y, z for up to three, numbers for more.
     """
     values = np.asarray(history, dtype=float)
     values = values.reshape(len(values), -1)
     count = values.shape[1]
-    truth = None if hidden is None else np.broadcast_to(np.ravel(np.asarray(hidden, dtype=float)), (count,))
+    levels = None if true is None else np.broadcast_to(np.ravel(np.asarray(true, dtype=float)), (count,))
     labels = names or (["x", "y", "z"][:count] if count <= 3 else [str(k + 1) for k in range(count)])
     with drawing(path) as figure:
         axes = figure.subplots()
         for k in range(count):
             colour, faint = PALETTE[k % len(PALETTE)], 1.0 if count <= len(PALETTE) else 0.55
             axes.plot(values[:, k], color=colour, alpha=faint, label=labels[k])
-            if truth is not None:
-                axes.axhline(truth[k], **DASHED, color=colour, alpha=faint)
+            if levels is not None:
+                axes.axhline(levels[k], **DASHED, color=colour, alpha=faint)
         axes.set(title=title, xlabel="iteration", ylabel=f"value [{unit}]" if unit else "value")
         axes.margins(x=0.02, y=0.08)
         whole_numbers(axes.xaxis)
-        if truth is not None:
-            axes.plot([], [], **DASHED, color=FAINT, label="hidden")
+        if levels is not None:
+            axes.plot([], [], **DASHED, color=FAINT, label="true")
         if count <= len(PALETTE):
             axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     return Path(path)
 
 
 def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float | None = None) -> Path:
-    """Density error [%] and pressure iterations of every step; steps that did not converge are marked.
+    """Density error [%] and iterations, of each loop of the solver, of every step; steps that did not converge are
+    marked.
 
     Args:
         tolerance: the solver's, drawn as a line [-].
     """
-    steps = np.arange(1, len(trajectory.iterations) + 1)
+    steps = np.arange(1, len(trajectory.converged) + 1)
+    loops = {name: column for name, column in trajectory.diagnostics.items() if column.dtype.kind == "i"}
     errors = 100.0 * trajectory.density_errors
     failed = ~trajectory.converged
     with drawing(path, height=6.0) as figure:
@@ -128,7 +130,11 @@ def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float
         upper.set_title("Density error and pressure iterations", pad=32)
         upper.set_ylabel("average density\nerror [%]")
         upper.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2)
-        lower.step(steps, trajectory.iterations, color=PALETTE[1], where="mid", linewidth=1.2)
+        for number, (name, iterations) in enumerate(loops.items(), 1):
+            style = {"color": PALETTE[number % len(PALETTE)], "label": name.replace("_", " ")}
+            lower.step(steps, iterations, where="mid", linewidth=1.2, **style)
+        if len(loops) > 1:
+            lower.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
         lower.set(xlabel="step", ylabel="pressure\niterations", ylim=(0, None))
         whole_numbers(lower.xaxis)
         whole_numbers(lower.yaxis)

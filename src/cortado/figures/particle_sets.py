@@ -42,16 +42,16 @@ def particles(
         dimension: 2 or 3; that of the first set when left out. In 2-D a third component is ignored.
     """
     sets = [np.asarray(one, dtype=float)[:, :dimension] for one in positions]
-    tints = [None] * len(sets) if colours is None else [np.asarray(one, dtype=float) for one in colours]
+    values = [None] * len(sets) if colours is None else [np.asarray(one, dtype=float) for one in colours]
     lower, upper = _bounds(sets, container)
     across, up = upper - lower
     panel = min(5.5 if len(sets) > 1 else 8.0, 11.0 / len(sets), 7.0 * across / up)  # width [inch]
     width, height = max(panel * len(sets) + 1.2, 8.0), max(panel * up / across + 1.2, 3.6)
     with drawing(path, width, height) as figure:
         panels = figure.subplots(1, len(sets), sharex=True, sharey=True, squeeze=False)[0]
-        scale = _ColourScale(sets, tints)
-        for axes, points, tint, title in zip(panels, sets, tints, titles, strict=True):
-            _draw_set(axes, points, scale.rgb(points, tint), title)
+        scale = _ColourScale(sets, values)
+        for axes, points, own, title in zip(panels, sets, values, titles, strict=True):
+            _draw_set(axes, points, scale.rgb(points, own), title)
             if container is not None:
                 _outline(axes, container)
             axes.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal", xlabel="x [m]")
@@ -82,26 +82,26 @@ def _bounds(
 class _ColourScale:
     """Turns what the caller gave for colours into red, green, blue, with one scale for all panels."""
 
-    def __init__(self, sets: list[NDArray[Any]], tints: Sequence[NDArray[Any] | None]) -> None:
+    def __init__(self, sets: list[NDArray[Any]], colours: Sequence[NDArray[Any] | None]) -> None:
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import LinearSegmentedColormap, Normalize
 
-        numbers = [tint for tint in tints if tint is not None and tint.ndim == 1]
+        numbers = [one for one in colours if one is not None and one.ndim == 1]
         depths = [_depth(points) for points in sets]
         values = np.concatenate(numbers or depths)
         values = values[np.isfinite(values)]
         low, high = np.percentile(values, _SHOWN_RANGE) if len(values) else (0.0, 1.0)
         self.clips = bool(len(values) and values.max() > high)
         flat = high - low <= 1e-12 * max(abs(high), abs(low))  # one value, or plane: the near colour
-        shades = LinearSegmentedColormap.from_list("depth", [_FAR, _NEAR])
-        self._map = ScalarMappable(Normalize(low - 1.0 if flat else low, high), "cividis" if numbers else shades)
+        by_depth = LinearSegmentedColormap.from_list("depth", [_FAR, _NEAR])
+        self._map = ScalarMappable(Normalize(low - 1.0 if flat else low, high), "cividis" if numbers else by_depth)
         self.mappable = self._map if numbers else None
 
-    def rgb(self, points: NDArray[Any], tint: NDArray[Any] | None) -> NDArray[Any]:
+    def rgb(self, points: NDArray[Any], colours: NDArray[Any] | None) -> NDArray[Any]:
         """(n, 3) in [0, 1]"""
-        if tint is not None and tint.ndim == 2:
-            return np.clip(tint, 0.0, 1.0)
-        return self._map.to_rgba(_depth(points) if tint is None else tint)[:, :3]
+        if colours is not None and colours.ndim == 2:
+            return np.clip(colours, 0.0, 1.0)
+        return self._map.to_rgba(_depth(points) if colours is None else colours)[:, :3]
 
 
 def _depth(points: NDArray[Any]) -> NDArray[Any]:

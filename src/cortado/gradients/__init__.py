@@ -1,8 +1,9 @@
-"""How a gradient is come by: objects to be given to `Problem.value_and_gradient`, each with its formula, bias and cost.
+"""Gradient estimators: objects to be given to `Problem.value_and_gradient`, each with its formula, bias and cost.
 
-`Exact` is the derivative of the discrete map, `Tape` the same by other means. Where neighbouring trajectories separate
-it says less and less, and others take its place: `AdjointViscosity`, `FrozenGeometry`, `Damped`, or the mean of theirs
-over an ensemble, `EnsembleMean`. `RandomizedSmoothing`, from forward runs alone, is what they are measured by.
+`Exact` is the derivative of the discrete map by its own adjoint, `Tape` the same by Warp's automatic differentiation.
+Beyond the predictability horizon, where neighbouring trajectories diverge, that derivative is of little use, and others
+take its place: `AdjointViscosity`, `FrozenGeometry`, `Damped`, or the mean of their gradients over an ensemble,
+`EnsembleMean`. `RandomizedSmoothing`, which needs forward runs alone, is the reference that they are compared with.
 """
 
 from cortado.gradients.adjoint_filters import AdjointNorms
@@ -50,5 +51,8 @@ def estimate(
     estimator: GradientEstimator | None = None,
     observe: Observer | None = None,
 ) -> Estimate:
-    """What an estimator, `Exact` if none is given, has to say of a problem, or an `InputError` where it is none."""
+    """The loss of a problem and its gradient by an estimator, `Exact` if none is given.
+
+    Raises `InputError` where what is given is no estimator.
+    """
     return checked_estimator(Exact() if estimator is None else estimator).estimate(problem, parameters, observe)

@@ -1,4 +1,4 @@
-"""Filters of the adjoint of a state between two backward steps, and its norms (`cortado.gradients.filter_kernels`)."""
+"""Filters that act on the adjoint of a state between two backward steps, and the norms of adjoints."""
 
 from collections.abc import Iterable
 
@@ -26,11 +26,11 @@ class Average:
         self._most = wp.zeros(solver.particles, dtype=real, device=device)
 
     def set_strength(self, strength: float) -> None:
-        """From now on; from 0, which leaves everything as it is, to 1."""
+        """Set the strength of the following calls, from 0, which changes nothing, to 1."""
         self._strength.fill_(strength)
 
     def __call__(self, bar: State, parameters: Parameters) -> None:
-        """Blend the adjoint of the state whose step the solver has recorded."""
+        """Blend the adjoint of the state whose step the solver has replayed last."""
         context = self._solver.context(parameters)
         context.launch(self._kernels.crowd, most=self._most)
         for name in self._fields:
@@ -40,7 +40,7 @@ class Average:
 
 
 class Limit:
-    """Cuts fields of an adjoint, particle by particle, to so many root mean squares over all particles."""
+    """Limits the vector of each particle in an adjoint to a number of times the root mean square over all particles."""
 
     def __init__(self, solver: Solver, fields: Iterable[str]):
         particles, device = solver.particles, solver.device
@@ -51,7 +51,7 @@ class Limit:
         self._times = wp.full(1, np.inf, dtype=wp.float64, device=device)
 
     def set_times(self, times: float) -> None:
-        """From now on; infinitely many leave everything as it is."""
+        """Set the limit of the following calls, in root mean squares; an infinite one changes nothing."""
         self._times.fill_(times)
 
     def __call__(self, bar: State) -> None:
@@ -75,7 +75,7 @@ class Drag:
 
 
 class AdjointNorms:
-    """An observer of a way back that keeps the norms of adjoints, on the device until they are asked for."""
+    """An observer of the reverse pass that keeps the norms of adjoints, on the device until `numpy` is called."""
 
     def __init__(self, solver: Solver, steps: int):
         particles, device = solver.particles, solver.device

@@ -1,4 +1,5 @@
-"""The gradient of a loss averaged over an ensemble, from forward runs alone or from gradients that stay small."""
+"""The gradient of a loss averaged over an ensemble, by finite differences or as the mean of other estimators'
+gradients."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -7,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from cortado.errors import InputError, shown
-from cortado.gradients.ensemble_members import Cloud
+from cortado.gradients.ensemble_members import Ensemble
 from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator, checked_estimator, tuned
 from cortado.gradients.filters import AdjointViscosity
 from cortado.parameters.values import Arrays, Values
@@ -15,23 +16,24 @@ from cortado.rollout import Observer
 
 SMOOTHING = AdjointViscosity(order=2)
 MOST_NUMBERS = 64
-"""Numbers that differences may be taken along: each costs two runs a sample."""
+"""Components that differences are taken along at most: each costs two runs a sample."""
 
 
 @dataclass(frozen=True)
-class RandomizedSmoothing(Cloud):
-    """Central differences, averaged over an ensemble of parameters and first states: the reference beyond chaos.
+class RandomizedSmoothing(Ensemble):
+    """Central differences, averaged over an ensemble of parameters and first states: the reference for long runs.
 
     Formula: for parameters u of N numbers, each in units of its spread h,
 
         g = mean over samples of sum_k (L(u + r q_k) - L(u - r q_k)) / (2 r) q_k,   r = sqrt(N),
 
-    with q_1 ... q_N an orthonormal basis, turned at random in every sample, and first positions perturbed, the same way
-    on both sides of a difference. It is the gradient of the loss averaged over the ball of a `Cloud`, of radius
+    with q_1 ... q_N an orthonormal basis, rotated at random in every sample, and first positions perturbed, in the same
+    way on both sides of a difference. It is the gradient of the loss averaged over the ball of an `Ensemble`, of radius
     h sqrt(N) (randomised smoothing, in antithetic and orthogonal directions).
 
-    Bias: features of the loss narrower than the spread are lost, as they should be; noise, which `Estimate`'s
-    ``standard_error`` tells. Cost: 2 N samples forward runs, so that it is for a few dozen numbers at most.
+    Bias: features of the loss that are narrower than the spread are averaged out, as intended. Noise: the
+    ``standard_error`` of the `Estimate`. Cost: 2 N forward runs a sample, so that it is for a few dozen numbers at
+    most.
     """
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
@@ -53,21 +55,22 @@ class RandomizedSmoothing(Cloud):
 
 
 @dataclass(frozen=True)
-class EnsembleMean(Cloud):
-    """Gradients of another estimator, averaged over an ensemble of parameters and first states: an ensemble mean.
+class EnsembleMean(Ensemble):
+    """The mean of another estimator's gradients over an ensemble of parameters and first states.
 
     Formula: g = mean over points of the ensemble of the estimator's gradient there. It is the gradient of the loss that
-    `RandomizedSmoothing` differentiates, as far as the estimator's are right, for any number of parameters. Of `Exact`
-    gradients beyond chaos the mean is useless, as few of them drown the rest.
+    `RandomizedSmoothing` differentiates, as far as the estimator is right, and its cost does not depend on the number
+    of parameters. The mean of `Exact` gradients of long runs is useless, as the largest few of them dominate it.
 
-    Bias: that of the estimator; the perturbed first positions' part of the loss, where that is small; noise, which
-    `Estimate`'s ``standard_error`` tells. Cost: ``samples`` times that of the estimator, and a forward run.
+    Bias: that of the estimator; and where the loss is as small as the effect of the perturbed first positions, that
+    effect. Noise: the ``standard_error`` of the `Estimate`. Cost: ``samples`` times that of the estimator, and a
+    forward run.
     """
 
     samples: int = 4
-    """An even number, as points come in pairs of opposite ones."""
+    """An even number, as samples are drawn in antithetic pairs."""
     estimator: GradientEstimator = SMOOTHING
-    """Whose gradients are averaged. The strength of an `AdjointViscosity` is found once, at the parameters."""
+    """The estimator whose gradients are averaged. An automatic strength is found once, at the given parameters."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -76,7 +79,7 @@ class EnsembleMean(Cloud):
         checked_estimator(self.estimator)
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """``observe`` is given the adjoints of one point after the other."""
+        """``observe`` is called with the adjoints of one sample after the other."""
         ensemble = self.around(problem, parameters)
         loss, estimator = problem.value(ensemble.values), tuned(self.estimator, problem, ensemble.values)
         made = partial(estimator.estimate, problem, observe=observe)
@@ -89,15 +92,15 @@ class EnsembleMean(Cloud):
         return Estimate(loss, gradient, pairs[-1][-1].strength, error)
 
     def tuned(self, problem: Differentiable, parameters: Values) -> "EnsembleMean":
-        """The same with an estimator that is tuned here."""
+        """The same with its estimator tuned at these parameters."""
         return replace(self, estimator=tuned(self.estimator, problem, parameters))
 
 
 def _mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of rows, and its standard error."""
+    """The mean of the rows and its standard error."""
     return samples.mean(axis=0), samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
 
 
 def _numbers(gradient: Arrays, names: Iterable[str]) -> np.ndarray:
-    """Of these parameters, one after another."""
+    """The gradient with respect to these parameters as one vector."""
     return np.concatenate([gradient[name].ravel() for name in names])

@@ -1,4 +1,4 @@
-"""Parameters and first states around given ones, over which a loss or its gradient is averaged."""
+"""Ensembles: parameters and first states around given ones, over which a loss or its gradient is averaged."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,15 +16,17 @@ Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
-class Cloud:
-    """How wide it is, and how many samples of it are taken; they are the same at every call.
+class Ensemble:
+    """An ensemble around the parameters that an estimator is asked about: its width, and how many samples are drawn.
 
-    Parameters, N numbers, lie in a ball of radius sqrt(N), in units of their spreads; every coordinate of the first
-    positions is perturbed by a normal number. With each point goes the one opposite.
+    The parameters, N numbers in all, are drawn from a ball of radius sqrt(N), in units of their spreads; to every
+    coordinate of the first positions a normal random number is added. Samples come in antithetic pairs, and are the
+    same at every call.
     """
 
     spread: float | Mapping[str, float] = 0.5
-    """Of the parameters, in their units, or by name; sqrt((N + 2) / N) times the standard deviation of a number."""
+    """Width of the ensemble in each parameter, in its units, one for all or by name. It is sqrt((N + 2) / N) times the
+    standard deviation of a component."""
     samples: int = 8
     position_noise: float = 0.01
     """Standard deviation of the perturbations of first positions [spacings]; 0 for none."""
@@ -42,7 +44,7 @@ class Cloud:
             raise InputError(f"seed is {shown(self.seed)}, but must be a whole number of at least 0.")
 
     def around(self, problem: Differentiable, parameters: Values) -> "Sampler":
-        """Of these parameters of a problem."""
+        """The ensemble around these parameters of a problem."""
         values = {name: as_numbers(f"parameter {name}", value) for name, value in parameters.items()}
         spreads = np.concatenate([np.full(value.size, self._spread(name)) for name, value in values.items()])
         start = problem.simulation.positions
@@ -61,11 +63,11 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Sampler:
-    """An ensemble around the parameters of a problem, and the random numbers that samples are drawn by."""
+    """An ensemble around the parameters of a problem, from which samples are drawn."""
 
     values: Arrays
     spreads: np.ndarray
-    """(numbers,) of all numbers of the values, one after another."""
+    """(numbers,) the spread of every component of the values, as one vector."""
     start: np.ndarray
     """(n, d) first positions of the simulation [m]"""
     position_noise: float
@@ -84,11 +86,12 @@ class Sampler:
         return radius / np.linalg.norm(direction) * direction
 
     def displacement(self) -> np.ndarray:
-        """(n, d) a random one of the first positions [m]"""
+        """(n, d) a random displacement of the first positions [m]"""
         return self.position_noise * self.random.standard_normal(self.start.shape)
 
     def at(self, u: np.ndarray, displacement: np.ndarray, made: Callable[[Arrays], Made]) -> Made:
-        """What is made of the parameters moved by ``u`` (numbers,), in spreads, and first positions displaced."""
+        """The result of ``made`` for the parameters moved by ``u`` (numbers,), in spreads, and displaced first
+        positions."""
         values = _moved(self.values, self.spreads * u)
         if self.position_noise:
             values["initial_positions"] = values.get("initial_positions", self.start) + displacement
@@ -99,12 +102,12 @@ class Sampler:
             raise InputError(f"A sample of the ensemble does not fit: {error} {advice}") from error
 
     def named(self, numbers: np.ndarray) -> Arrays:
-        """Numbers one after another, as arrays by the parameters' names."""
+        """One vector of numbers (numbers,) as arrays by the parameters' names."""
         return _moved({name: np.zeros_like(value) for name, value in self.values.items()}, numbers)
 
 
 def _moved(values: Arrays, change: np.ndarray) -> Arrays:
-    """Values plus a change of all their numbers, one after another."""
+    """Values plus a change (numbers,), which is one vector for all of them."""
     ends = np.cumsum([value.size for value in values.values()])
     parts = np.split(change, ends[:-1])
     return {name: value + part.reshape(value.shape) for (name, value), part in zip(values.items(), parts, strict=True)}

@@ -1,4 +1,4 @@
-"""What an estimator is: a way to come by a gradient, given to `Problem.value_and_gradient`."""
+"""The protocols of gradient estimators, which are given to `Problem.value_and_gradient`, and what these return."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from cortado.words import sized
 
 @dataclass(frozen=True)
 class Estimate:
-    """A loss and its gradient, with what an estimator has to say about it."""
+    """A loss and its gradient, with what the estimator knows about its accuracy."""
 
     loss: float
     gradient: Arrays
     """For each parameter given, an array of its shape (float64)."""
     strength: float | None = None
-    """Of the smoothing that `AdjointViscosity` applied, the weakest of those that were extrapolated."""
+    """The strength of `AdjointViscosity`; where two were extrapolated, the smaller one."""
     standard_error: Arrays | None = None
-    """Of every number of the gradient, where it is an average (`RandomizedSmoothing`, `EnsembleMean`)."""
+    """Of every component of the gradient, where it is an average (`RandomizedSmoothing`, `EnsembleMean`)."""
 
     def __repr__(self) -> str:
         strength = "" if self.strength is None else f", strength {self.strength:.4g}"
@@ -31,25 +31,26 @@ class Estimate:
 
 
 class ForwardPass(Protocol):
-    """A forward run with its loss, which can be gone back through as often as wanted, until the problem's next run."""
+    """A forward run with its loss. Any number of reverse passes may follow, until the problem is run again."""
 
     @property
     def loss(self) -> float:
-        """Of the run."""
+        """The loss of the run."""
 
     @property
     def rollout(self) -> Rollout:
         """The run."""
 
     def derivative(self, estimator: "AdjointEstimator") -> StepDerivative:
-        """The estimator's backward step, made once for each problem."""
+        """The estimator's backward step; it is made once for each problem and estimator."""
 
     def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:
-        """The gradient; ``observe`` is given the number and the adjoint of every state, from the last to the first."""
+        """The gradient; ``observe`` is called with the number and the adjoint of every state, from the last to the
+        first."""
 
 
 class Differentiable(Protocol):
-    """What an estimator sees of a `Problem`."""
+    """What an estimator uses of a `Problem`."""
 
     simulation: Any
 
@@ -57,18 +58,18 @@ class Differentiable(Protocol):
         """The loss, forward only."""
 
     def forward_pass(self, parameters: Values) -> ForwardPass:
-        """A forward run that can be gone back through."""
+        """A forward run that reverse passes may follow."""
 
 
 class GradientEstimator(Protocol):
-    """A way to come by a gradient."""
+    """Computes a gradient, exact or approximate."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """The loss and its gradient; ``observe`` is given the adjoint of every state, by estimators that have any."""
+        """The loss and its gradient; estimators that compute adjoints of states call ``observe`` with each of them."""
 
 
 def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
-    """The estimator, if it is one: its class is not."""
+    """The estimator; raises `InputError` for anything else, such as the class of an estimator."""
     if isinstance(estimator, type) or not hasattr(estimator, "estimate"):
         raise InputError(f"estimator is {estimator!r}, but must be an object such as cortado.gradients.Exact().")
     return estimator
@@ -76,20 +77,20 @@ def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
 
 @runtime_checkable
 class Tunable(Protocol):
-    """An estimator that finds something out before it makes a gradient."""
+    """An estimator with a setting that it chooses by itself, such as an automatic strength."""
 
     def tuned(self, problem: Differentiable, parameters: Values) -> GradientEstimator:
-        """The same with what it finds out here, for use at parameters nearby."""
+        """The same with the setting chosen at these parameters, for use at others nearby."""
 
 
 def tuned(estimator: GradientEstimator, problem: Differentiable, parameters: Values) -> GradientEstimator:
-    """The estimator with what there is to find out found out, so that a search does so once."""
+    """The estimator with its automatic settings chosen at these parameters, so that a search chooses them once."""
     checked_estimator(estimator)
     return estimator.tuned(problem, parameters) if isinstance(estimator, Tunable) else estimator
 
 
 class AdjointEstimator(ABC):
-    """An estimator that goes back once through one rollout, step by step."""
+    """An estimator that makes one reverse pass through one rollout, step by step."""
 
     @abstractmethod
     def derivative(self, rollout: Rollout) -> StepDerivative:
@@ -102,7 +103,7 @@ class AdjointEstimator(ABC):
 
 
 class Filtered:
-    """The backward step of another estimator, and then a filter of the adjoint."""
+    """The backward step of another estimator, followed by a filter of the adjoint."""
 
     def __init__(self, base: StepDerivative):
         self._base, self.rollout, self.solver, self.capturable = base, base.rollout, base.solver, base.capturable
@@ -118,5 +119,5 @@ class Filtered:
         return self._base.parameters()
 
     def filter(self, bar: State) -> None:
-        """Change the adjoint of the state whose step the solver has recorded."""
+        """Change the adjoint of the state whose step the solver has replayed last."""
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""Estimators that differentiate the discrete step as it is, or as if positions were frozen within it."""
+"""Estimators that differentiate the discrete step: exactly, or with positions frozen within each step."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,9 +15,9 @@ from cortado.solvers.solver import Counts
 class Exact(AdjointEstimator):
     """The exact adjoint of the discrete step, by gathers: no atomics, the same bits every time.
 
-    Formula: the transposed derivative of the step. Bias: none; but where neighbouring trajectories separate it grows as
-    they do, by a constant factor a step. Cost: each step once more forward, and about twice the neighbour sums of a
-    step backward.
+    Formula: the transposed derivative of the step. Bias: none; but where neighbouring trajectories diverge it grows as
+    fast as they do, by a constant factor a step. Cost: every step is computed once more forward, and the backward step
+    has about twice the neighbour sums of a forward one.
     """
 
     def derivative(self, rollout: Rollout) -> StepDerivative:
@@ -32,12 +32,13 @@ class FrozenGeometry(AdjointEstimator):
 
         v^ <- B^T (v^ + dt x^),   x^ <- x^,   B = dv' / dv at fixed positions:
 
-    pressure and viscosity answer to velocities, neighbours and weights stay. B hardly amplifies, as viscosity damps and
-    pressure takes away what would compress, so that the adjoint grows at most linearly with the steps.
+    pressure and viscosity respond to velocities, while neighbours and weights are constant. B hardly amplifies, as
+    viscosity damps velocities and pressure removes their divergence, so that the adjoint grows at most linearly with
+    the number of steps.
 
-    Bias: whatever pushes back a displaced fluid is missing, gravity waves for one; directions decay over times in which
-    the fluid sloshes. Cost: less than `Exact`, as there is no Hessian of the smoothing kernel. Prior art: the default
-    of DiffFR (Li et al. 2023).
+    Bias: restoring forces are missing, such as those of gravity waves, so that the direction of the gradient is lost
+    over times in which the fluid sloshes. Cost: less than `Exact`, as there is no Hessian of the smoothing kernel.
+    Prior art: the default of DiffFR (Li et al. 2023).
     """
 
     def derivative(self, rollout: Rollout) -> StepDerivative:
@@ -46,9 +47,9 @@ class FrozenGeometry(AdjointEstimator):
 
 @dataclass(frozen=True)
 class Tape(AdjointEstimator):
-    """The exact adjoint again, by Warp's own automatic differentiation of the forward kernels.
+    """The exact adjoint by Warp's own automatic differentiation of the forward kernels.
 
-    The report's autograd: slower than `Exact`, with atomics on a GPU, and kept to check it.
+    It is slower than `Exact`, with atomics on a GPU, and is kept to check it.
     """
 
     def derivative(self, rollout: Rollout) -> StepDerivative:
@@ -68,7 +69,7 @@ class _AdjointStep:
 
     def step(self, state: State, counts: Counts, bar: State) -> None:
         self.solver.replay(state, self._parameters, counts)
-        self._adjoint.step(counts, bar, bar, self._parameters)
+        self._adjoint.step(counts, bar, self._parameters)
 
     def parameters(self) -> Parameters:
         return self._adjoint.collect()
@@ -81,7 +82,8 @@ class _TapeStep:
         solver = rollout.solver
         self.rollout, self._given, self._parameters = rollout, solver, rollout.parameters
         self.solver = solver.differentiable()
-        self._before, self._after = (self.solver.new_state(requires_grad=True) for _ in range(2))
+        self._before = self.solver.new_state(requires_grad=True)
+        self._after = self._before.following()
         self._own = self.solver.new_parameters(rollout.steps, requires_grad=True)
 
     def begin(self) -> None:

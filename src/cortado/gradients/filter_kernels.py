@@ -1,13 +1,14 @@
-"""What may be done to the adjoint a of a state between two backward steps: an average over neighbours, a limit, a drag.
+"""Filters of the adjoint a of a state between two backward steps: an average over neighbours, a limit, a drag.
 
     average:  a_i += strength sum_j w_ij (a_j - a_i),   w_ij = W_ij / max(s_i, s_j, W(h / 2)),   s_i = sum_j W_ij
     limit:    a_i *= min(1, times r / |a_i|),   r^2 = sum_j |a_j|^2 / particles
     drag:     a_i *= exp(-rate dt)
 
 over fluid neighbours j of i. The weights of the average are symmetric, so that sum_i a_i is kept; and those of a
-particle add up to at most 1, so that for 0 <= strength <= 1 the square norm cannot grow. Long waves of a hardly feel
-it, those of the length of a few spacings decay: a viscosity of the adjoint. Divided by s, it acts at a surface and in a
-drop of a few particles as it does within the fluid; W(h / 2) is for those that hardly touch.
+particle add up to at most 1, so that for 0 <= strength <= 1 the square norm cannot grow. Long waves of a are hardly
+damped, those of a few spacings decay: the average is a viscosity of the adjoint. Owing to the division by s it acts at
+a surface, and in a drop of a few particles, as it does within the fluid; W(h / 2) limits it for particles that hardly
+touch.
 """
 
 from dataclasses import dataclass

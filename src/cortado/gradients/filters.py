@@ -26,24 +26,26 @@ class AdjointViscosity(AdjointEstimator):
         a_i <- a_i + strength sum_j w_ij (a_j - a_i),   w_ij = W_ij / max(s_i, s_j, W(h / 2)),   s_i = sum_j W_ij.
 
     The weights are symmetric and add up to 1 at most: sum_i a_i is kept, the square norm does not grow. What grows
-    exponentially in an adjoint lives at the scale of particles, the answer to a control at that of the fluid: a step
-    damps a wave of length l by about strength (2 pi / l)^2 s_W^2 / 2, s_W^2 being the second moment of W.
+    exponentially in an adjoint lives at the scale of particles, the response to a parameter at that of the fluid: a
+    step damps a wave of length l by about strength (2 pi / l)^2 s_W^2 / 2, s_W^2 being the second moment of W.
 
-    Then each vector of a is cut to ``limit`` root mean squares over all particles: now and then an adjoint grows at a
-    few particles faster than a smoothing can spread it, and would drown the rest.
+    Then each vector of a is limited to ``limit`` root mean squares over all particles: now and then the adjoint of a
+    few particles grows faster than the average can spread it, and would dominate the rest.
 
-    Long waves are damped too, a little, and those of early controls most. With an ``order`` of 2 the gradients g(s) and
-    g(2 s) of two strengths, both of which are tame, are extrapolated to none (Richardson): g = 2 g(s) - g(2 s).
+    Long waves are damped too, a little, and most of all the gradient with respect to early steps. With
+    an ``order`` of 2 the gradients g(s) and g(2 s) of two strengths, neither of which grows exponentially, are
+    extrapolated to a strength of 0 (Richardson): g = 2 g(s) - g(2 s).
 
-    Bias: what short waves would have told, and of long ones a part that falls as s^order; noise, of which the second
-    order has up to 3 times as much: it is for means over several runs (`EnsembleMean`). Losses of single particles,
-    which have no long waves, get no good gradient. Cost: ``order`` ways back, with a sum over neighbours more a field
-    and step; with "auto" some more through the same run (see `gradients.strength`), which `tuned` saves a search.
+    Bias: the short waves of the adjoint are lost, and of the long ones a part that falls as s^order. Noise: with the
+    second order up to 3 times as much, so that it is for means over several runs (`EnsembleMean`). The gradient of a
+    loss of single particles, which has no long waves, is poor. Cost: ``order`` reverse passes, with one more sum over
+    neighbours for each field and step; with "auto" some more reverse passes through the same run (see
+    `gradients.strength`), which a search saves by `tuned`.
     """
 
     strength: float | Literal["auto"] = "auto"
     """s, up to 1 / ``order``; 0 is the base estimator bit for bit; "auto" is ``order`` + 1 times the smallest at which
-    the adjoint does not grow exponentially, if that is not too much; reported as ``strength`` of the `Estimate`."""
+    the adjoint does not grow exponentially, at most 1 / ``order``; it is the ``strength`` of the `Estimate`."""
     fields: tuple[str, ...] = FIELDS
     """Of "positions" and "velocities"."""
     limit: float = 4.0
@@ -52,7 +54,7 @@ class AdjointViscosity(AdjointEstimator):
     order: int = 1
     """1, or 2 for an extrapolation. As the base of another estimator this one is not extrapolated."""
     base: AdjointEstimator = EXACT
-    """Whose backward steps these are."""
+    """The estimator whose adjoint is filtered."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fields", tuple(self.fields))
@@ -74,7 +76,7 @@ class AdjointViscosity(AdjointEstimator):
         return ViscousStep(self.base.derivative(rollout), rollout, self)
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """``observe`` is given the adjoints of the weakest strength."""
+        """``observe`` is called with the adjoints of the smaller strength."""
         forward_pass = problem.forward_pass(parameters)
         strength = self._sufficient(forward_pass) if self.strength == "auto" else float(self.strength)
         gradient = self._back(forward_pass, strength, observe)
@@ -119,7 +121,7 @@ class ViscousStep(Filtered):
         self.set_strength(float(estimator.strength))
 
     def set_strength(self, strength: float) -> None:
-        """From now on."""
+        """Set the strength of the following steps."""
         self._average.set_strength(strength)
         self._limit.set_times(self._times if strength > 0.0 else np.inf)
 
@@ -132,14 +134,14 @@ class ViscousStep(Filtered):
 class Damped(AdjointEstimator):
     """The adjoint, with that of velocities damped after each backward step.
 
-    Formula: v^ <- exp(-rate dt) v^. Bias: what happened earlier counts less, by exp(-rate time); long waves suffer as
-    much as short ones. Cost: next to nothing over its base.
+    Formula: v^ <- exp(-rate dt) v^. Bias: the effect of earlier steps is reduced, by exp(-rate time), and that of long
+    waves as much as that of short ones. Cost: hardly more than that of its base.
     """
 
     rate: float
     """[1 / s]"""
     base: AdjointEstimator = EXACT
-    """Whose backward steps these are."""
+    """The estimator whose adjoint is filtered."""
 
     def __post_init__(self) -> None:
         if not (isinstance(self.rate, (int, float, np.number)) and np.isfinite(self.rate) and self.rate >= 0.0):

@@ -1,1 +1,1 @@
-"""Inverse problems from files: a scene, what is asked of it, and how to find it."""
+"""Inverse problems from files: a scene, a target, and how the parameters that lead to it are estimated."""

@@ -16,8 +16,8 @@ from cortado.parameters.values import OVER_TIME, UNITS
 
 MOST_CURVES = 12
 """Parameters with more components get no picture of their own."""
-MOMENTS = 6
-"""Images on the way."""
+IMAGES = 6
+"""Images that show the course of the optimisation."""
 
 
 def task_figures(made: Setup, result: Result, folder: Path) -> Figures:
@@ -37,8 +37,8 @@ def task_figures(made: Setup, result: Result, folder: Path) -> Figures:
 def _particles(made: Setup, result: Result, folder: Path) -> tuple[str, Path]:
     before, after = (made.problem.end(made.search.parameters(u)).positions for u in (made.start, result.parameters))
     target = made.targets[made.problem.steps]
-    path = particles([before, after, target], ["start", "found", "target"], folder / "particles.png")
-    return "Where the fluid ends: with the first guess, with the parameters found, and the target.", path
+    path = particles([before, after, target], ["start", "estimate", "target"], folder / "particles.png")
+    return "Where the fluid ends: with the first guess, with the estimate, and the target.", path
 
 
 def _images(made: Setup, result: Result, folder: Path) -> Figures:
@@ -48,40 +48,40 @@ def _images(made: Setup, result: Result, folder: Path) -> Figures:
         return made.image(made.problem.states(made.search.parameters(u), [last])[last])
 
     path = images(
-        [image(made.start), image(result.parameters), target], ["start", "found", "target"], folder / "images.png"
+        [image(made.start), image(result.parameters), target], ["start", "estimate", "target"], folder / "images.png"
     )
-    figures: Figures = [("The last image: with the first guess, with the parameters found, and the target.", path)]
-    moments = np.unique(np.linspace(0, len(result.history) - 1, MOMENTS).astype(int))
-    shown = [image(result.history[k].parameters) for k in moments]
-    path = images(shown, [f"iteration {k}" for k in moments], folder / "progress.png")
+    figures: Figures = [("The last image: with the first guess, with the estimate, and the target.", path)]
+    iterations = np.unique(np.linspace(0, len(result.history) - 1, IMAGES).astype(int))
+    shown = [image(result.history[k].parameters) for k in iterations]
+    path = images(shown, [f"iteration {k}" for k in iterations], folder / "progress.png")
     figures.append(("The last image during the optimisation.", path))
     steps = made.problem.steps
     if steps > 0 and find_spec("av"):
         numbers = np.unique(np.linspace(0, steps, MOST_FRAMES).astype(int))
-        found = made.problem.states(made.search.parameters(result.parameters), numbers.tolist())
-        path = write_video(folder / "found.mp4", (made.image(found[k]) for k in numbers.tolist()), 20)
-        figures.append(("What happens with the parameters found.", path))
+        states = made.problem.states(made.search.parameters(result.parameters), numbers.tolist())
+        path = write_video(folder / "estimate.mp4", (made.image(states[k]) for k in numbers.tolist()), 20)
+        figures.append(("The run with the estimated parameters.", path))
     return figures
 
 
 def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
-    """A small parameter over the iterations, one over time as it was found."""
-    found, hidden = made.search.parameters(result.parameters)[name], made.hidden(name)
-    if name in OVER_TIME and np.ndim(found) == 2:
+    """The estimate of a parameter over the iterations; of one that changes over time, the last estimate over time."""
+    estimate, true = made.search.parameters(result.parameters)[name], made.true_parameter(name)
+    if name in OVER_TIME and np.ndim(estimate) == 2:
         axes = Tilt(made.task.scene.forces.gravity).towards if name == "tilt" else "xyz"
-        series = {f"{axis}, found": column for axis, column in zip(axes, found.T, strict=False)}
-        truth = () if hidden is None else tuple(np.broadcast_to(hidden, found.shape).T)
+        series = {f"{axis}, estimate": column for axis, column in zip(axes, estimate.T, strict=False)}
+        truth = () if true is None else tuple(np.broadcast_to(true, estimate.shape).T)
         path = folder / f"{name}.png"
         label = f"{name} [{UNITS[name]}]"
-        curve(np.arange(len(found)), series, path, title=name, x_label="step", y_label=label, hidden=truth)
+        curve(np.arange(len(estimate)), series, path, title=name, x_label="step", y_label=label, true=truth)
         return [(f"The parameter {name} over time.", path)]
-    if hidden is None or max(np.size(found), hidden.size) > MOST_CURVES:
+    if true is None or max(np.size(estimate), true.size) > MOST_CURVES:
         return []
     values = [made.search.parameters(record.parameters)[name] for record in result.history]
-    history = [np.broadcast_arrays(value, hidden)[0] for value in values]
-    hidden = np.broadcast_to(hidden, history[0].shape)
+    history = [np.broadcast_arrays(value, true)[0] for value in values]
+    true = np.broadcast_to(true, history[0].shape)
     phases = [phase.name for phase in made.task.scene.phase]
     is_material = BY_NAME[name].axis is Axis.PHASE and BY_NAME[name].components is None
     names = phases if is_material and len(phases) > 1 else None
-    path = parameters(history, hidden, folder / f"{name}.png", names=names, title=name, unit=UNITS[name])
-    return [(f"The parameter {name} during the optimisation, and the hidden one.", path)]
+    path = parameters(history, true, folder / f"{name}.png", names=names, title=name, unit=UNITS[name])
+    return [(f"The parameter {name} during the optimisation, and its true value.", path)]

@@ -1,4 +1,4 @@
-"""A task made ready: its problem with the target, in the coordinates in which it is searched, from a start."""
+"""The setup of a task on a device: its problem with the target, and its start in the coordinates of the search."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +10,7 @@ from cortado.inverse.tables import DISTANCES, RANDOM
 from cortado.inverse.task import Task
 from cortado.io.pictures import heart, read_picture, rosetta
 from cortado.losses import FinalPositions, Frames, Image, Loss, Snapshot
-from cortado.optimisation.transforms import Bijector, Knots, Logarithm, Softmax, Transformed
+from cortado.optimisation.transforms import Bijector, Logarithm, Softmax, TimeInterpolation, Transformed
 from cortado.parameters.registry import BY_NAME, Range
 from cortado.parameters.values import OVER_TIME, Arrays
 from cortado.problem import Problem
@@ -24,16 +24,16 @@ DRAWN = {"heart": heart, "rosetta": rosetta}
 
 @dataclass(frozen=True)
 class Setup:
-    """What `cortado.optimise` is given, and what its result is held against."""
+    """The arguments for `cortado.optimise`, and the target that its result is compared with."""
 
     task: Task
     problem: Problem
     searches: tuple[Transformed, ...]
-    """One after the other, through thicker and thicker fluid, in the same coordinates; the last is the task's own."""
+    """One for each entry of the extinction schedule, in the same coordinates; the last is the scene's own."""
     start: Arrays
-    """Coordinates to begin with."""
+    """Coordinates with which the search starts."""
     bounds: dict[str, tuple[Any, Any]]
-    """Of coordinates."""
+    """Lower and upper bounds of coordinates."""
     renderer: Renderer | None
     """None where positions are compared."""
     targets: dict[int, np.ndarray]
@@ -41,7 +41,7 @@ class Setup:
 
     @property
     def search(self) -> Transformed:
-        """The last one."""
+        """The last of the searches, that of the task itself."""
         return self.searches[-1]
 
     def image(self, end: Snapshot) -> np.ndarray:
@@ -49,9 +49,9 @@ class Setup:
         assert self.renderer is not None
         return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
 
-    def hidden(self, name: str) -> np.ndarray | None:
-        """The parameter that made the target, None where a picture is the target."""
-        return self.task.hidden.get(name)
+    def true_parameter(self, name: str) -> np.ndarray | None:
+        """The parameter's value in the run that made the target; None where a picture is the target."""
+        return self.task.true_parameters.get(name)
 
 
 def setup(task: Task, device: str, precision: str) -> Setup:
@@ -60,8 +60,8 @@ def setup(task: Task, device: str, precision: str) -> Setup:
     start = {name: _start(name, value, simulation) for name, value in task.start.items()}
     found = _coordinates(task, start)
     searches = []
-    for share in task.optimise.extinctions:
-        renderer = scene_renderer(simulation, share) if task.problem.loss == "image" else None
+    for factor in task.optimise.extinction_schedule:
+        renderer = scene_renderer(simulation, factor) if task.problem.loss == "image" else None
         targets = _targets(task, simulation, renderer)
         problem = Problem(simulation, task.problem.steps, _frames(task, targets, renderer))
         searches.append(Transformed(problem, found))
@@ -89,7 +89,7 @@ def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> d
         return {steps[-1]: _picture(task, renderer)}
     nothing = FinalPositions(simulation.positions)
     try:
-        ends = Problem(simulation, task.problem.steps, nothing).states(task.hidden, steps)
+        ends = Problem(simulation, task.problem.steps, nothing).states(task.true_parameters, steps)
     except DivergedError as error:
         advice = f"this is the run with the parameters of problem.target, so change those, or {error.advice}"
         raise error.with_advice(advice) from None
@@ -103,7 +103,8 @@ def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> d
 
 
 def _picture(task: Task, renderer: Renderer) -> np.ndarray:
-    """The picture that a task names; one of ours in the colours of the scene, the last phase on the first."""
+    """The picture that a task names; "heart" and "rosetta" are drawn in the scene's colours, the last phase on the
+    first."""
     name, scene = task.problem.picture, task.scene
     assert name is not None
     rows, columns, _ = renderer.shape
@@ -141,13 +142,16 @@ def _coordinates(task: Task, start: Arrays) -> dict[str, Bijector]:
         if name == "mass_fractions":
             found[name] = Softmax()
         elif name in OVER_TIME and value.ndim == 2 and task.optimise.knots is not None:
-            found[name] = Knots(task.problem.steps, task.optimise.knots)
+            found[name] = TimeInterpolation(task.problem.steps, task.optimise.knots)
     return found
 
 
 def _bounds(task: Task) -> dict[str, tuple[Any, Any]]:
-    """Bounds hold for knots as they do for what lies between them, and for logarithms after they are taken. A parameter
-    that cannot be negative has 0 as a bound."""
+    """Bounds of coordinates, by name.
+
+    Those of a parameter over time hold for its knots, and so for what is interpolated between them; those of a
+    logarithmic parameter are logarithms. A parameter that cannot be negative has 0 as a lower bound.
+    """
     with_zero = [name for name in task.start if BY_NAME[name].range is Range.NOT_NEGATIVE]
     free = [name for name in with_zero if name not in task.optimise.logarithmic]
     found: dict[str, tuple[Any, Any]] = dict.fromkeys(free, (0.0, None))

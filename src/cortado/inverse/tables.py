@@ -1,4 +1,4 @@
-"""The tables [problem] and [optimise] of a task, with the kinds of values that only they have."""
+"""The tables [problem] and [optimise] of a task, with the field types that only they have."""
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -17,12 +17,12 @@ from pydantic import (
     model_validator,
 )
 
-from cortado.errors import Phrase
+from cortado.errors import Words
 from cortado.gradients import AdjointEstimator, AdjointViscosity, EnsembleMean, Exact, FrozenGeometry, GradientEstimator
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, Optimiser
 from cortado.parameters.values import NAMES, UNITS
-from cortado.scene.fields import MISSING, OneOf, Several, Text, as_number, count, quantity, wrong
+from cortado.scene.fields import MISSING, OneOf, Several, Text, as_number, count, field_error, quantity
 from cortado.scene.sentences import wanted
 from cortado.scene.tables import Table
 
@@ -43,13 +43,13 @@ CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
 
 
 def _arrays(values: Any, words: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Values by name as arrays, or as one of the words where a parameter can be random; raises `wrong`."""
+    """Values by name as arrays, or as one of the words where a parameter can be random; raises a `field_error`."""
     if not isinstance(values, Mapping) or not values:
-        raise wrong((), Phrase("empty") if values == {} else values, wanted(_VALUES))
+        raise field_error((), Words("empty") if values == {} else values, wanted(_VALUES))
     found = {}
     for name, value in values.items():
         if name not in NAMES:
-            raise wrong((name,), Phrase("unknown"), f"one of {', '.join(NAMES)}")
+            raise field_error((name,), Words("unknown"), f"one of {', '.join(NAMES)}")
         is_word = name in CAN_BE_RANDOM and isinstance(value, str) and value in words
         found[name] = value if is_word else _array(name, value)
     return found
@@ -58,11 +58,11 @@ def _arrays(values: Any, words: tuple[str, ...] = ()) -> dict[str, Any]:
 def _array(name: str, value: Any) -> Any:
     finite = "made of finite numbers: one, a list of them, or a list of lists of one length"
     if not _is_numeric(value):
-        raise wrong((name,), value, finite)
+        raise field_error((name,), value, finite)
     try:
         return np.array(value, dtype=np.float64)
     except ValueError:
-        raise wrong((name,), value, finite) from None
+        raise field_error((name,), value, finite) from None
 
 
 def _is_numeric(value: Any) -> bool:
@@ -73,13 +73,13 @@ def _is_numeric(value: Any) -> bool:
 
 
 def _growing(value: Any, check: ValidatorFunctionWrapHandler) -> tuple[float, ...]:
-    """Shares that grow to 1; raises `wrong`."""
+    """Factors that grow to 1; raises a `field_error`."""
     with suppress(ValidationError):
-        shares = check(value)
-        if shares[-1] == 1.0 and all(a < b for a, b in pairwise(shares)):
-            return shares
+        factors = check(value)
+        if factors[-1] == 1.0 and all(a < b for a, b in pairwise(factors)):
+            return factors
     words = "a list of numbers greater than 0, each greater than the one before, the last of them 1"
-    raise wrong((), value, words)
+    raise field_error((), value, words)
 
 
 _VALUES: Any = {
@@ -91,43 +91,45 @@ _VALUES: Any = {
     },
 }
 Values = Annotated[dict[str, Any], BeforeValidator(_arrays), WithJsonSchema(_VALUES)]
-"""Parameters by name: a number, or a list, of lists, of numbers."""
+"""Parameters by name, each a number, a list of numbers, or a list of lists of numbers."""
 Start = Annotated[dict[str, Any], BeforeValidator(partial(_arrays, words=(RANDOM,))), WithJsonSchema(_VALUES)]
 """Values, of which some may be the word "random"."""
-Shares = Annotated[Several[Annotated[float, quantity(gt=0.0, le=1.0)]], WrapValidator(_growing)]
-"""Numbers that grow to 1."""
+Schedule = Annotated[Several[Annotated[float, quantity(gt=0.0, le=1.0)]], WrapValidator(_growing)]
+"""A continuation schedule: factors that grow to 1."""
 
 
 class ProblemTable(Table):
-    """[problem]: a number of steps, and a target: what a run with hidden parameters makes, or a picture."""
+    """[problem]: a number of steps, and a target: the end of a run with true parameters, or a picture."""
 
     steps: Annotated[int, count(0, 10_000_000)]
     """Time steps; 0 for a loss of the first state."""
     loss: Literal["positions", "image"] = "positions"
-    """What is compared: where the particles are, or how they look."""
+    """What is compared with the target: positions of particles, or images."""
     distance: Annotated[str, OneOf(DISTANCES)] = "squared_difference"
     """How images are compared."""
     frames: Annotated[int, count(1, 10_000)] = 1
-    """How many states are compared, evenly spaced up to the last one."""
+    """Number of states that are compared, evenly spaced up to the last one."""
     target: Values | None = None
-    """Hidden parameters: the target is what their run makes."""
+    """The true parameters: the target is what a run with them makes."""
     picture: Text | None = None
     """"heart", "rosetta", or a file with a picture, beside the task's own."""
 
     @model_validator(mode="after")
     def _check_target(self) -> Self:
         if self.picture is None and self.target is None:
-            raise wrong(("target",), MISSING, f"{wanted(_VALUES)}, as there is no picture")
+            raise field_error(("target",), MISSING, f"{wanted(_VALUES)}, as there is no picture")
         if self.picture is not None and self.target is not None:
-            raise wrong(("picture",), self.picture, "left out, as there is a target")
+            raise field_error(("picture",), self.picture, "left out, as there is a target")
         if self.picture is not None and self.loss != "image":
-            raise wrong(("loss",), self.loss, '"image", as there is a picture')
+            raise field_error(("loss",), self.loss, '"image", as there is a picture')
         if self.picture is not None and self.frames > 1:
-            raise wrong(("frames",), self.frames, "1, as there is a picture, which is one")
+            raise field_error(("frames",), self.frames, "1, as there is a picture, which is one")
         if self.loss != "image" and "distance" in self.model_fields_set:
-            raise wrong(("distance",), self.distance, "left out, as positions are compared")
+            raise field_error(("distance",), self.distance, "left out, as positions are compared")
         if self.frames > max(self.steps, 1):
-            raise wrong(("frames",), self.frames, f"at most {max(self.steps, 1)}, as there are {self.steps} steps")
+            raise field_error(
+                ("frames",), self.frames, f"at most {max(self.steps, 1)}, as there are {self.steps} steps"
+            )
         return self
 
     @property
@@ -137,46 +139,46 @@ class ProblemTable(Table):
 
 
 class CheckTable(Table):
-    """[optimise.check]: what the run has to reach."""
+    """[optimise.check]: what the estimate has to reach."""
 
     loss_reduction: Annotated[float, quantity(ge=1.0)] = 1.0
     """First loss / best loss."""
     parameter_error: Annotated[float, quantity(gt=0.0)] = 1e50
-    """Largest relative distance (L2) of a found parameter from the hidden one."""
+    """Largest relative distance (L2) of an estimated parameter from its true value."""
     psnr: Annotated[float, quantity("dB", ge=0.0)] = 0.0
-    """Peak signal-to-noise ratio of the found image to the target."""
+    """Peak signal-to-noise ratio of the image of the estimate to the target."""
 
 
 class GradientTable(Table):
     """[optimise.gradient]: which gradient the search follows, see docs/gradients.md."""
 
     name: Annotated[str, OneOf(ESTIMATORS)] = "exact"
-    """What is done on the way back through a run."""
+    """Name of the estimator."""
     strength: Annotated[float, quantity(gt=0.0, le=1.0)] | None = None
-    """Of adjoint smoothing; None: found at the start of a search."""
+    """Strength of `AdjointViscosity`; None: chosen at the start of a search."""
     samples: Annotated[int, count(1, 10_000)] = 1
-    """Runs of an ensemble that the gradient is the mean of."""
+    """Runs of the ensemble over which the gradient is averaged."""
     spread: Values | None = None
-    """Of the ensemble: by name a number, in the units of what is searched."""
+    """Width of the ensemble in each parameter, by name, in the units of what is searched."""
     position_noise: Annotated[float, quantity("spacings", ge=0.0)] = EnsembleMean.position_noise
-    """Of the first positions in the ensemble."""
+    """Standard deviation of the perturbations of first positions in the ensemble."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.strength is not None and self.name != "adjoint_viscosity":
-            raise wrong(("strength",), self.strength, "left out, as nothing is smoothed")
+            raise field_error(("strength",), self.strength, "left out, as nothing is smoothed")
         if self.strength is not None and self.strength * self._order > 1.0:
-            raise wrong(("strength",), self.strength, f"at most {1.0 / self._order:g}, as means are extrapolated")
+            raise field_error(("strength",), self.strength, f"at most {1.0 / self._order:g}, as means are extrapolated")
         if self.samples != 1 and (self.samples % 2 or self.samples < 4):
-            raise wrong(("samples",), self.samples, "1, or an even number of at least 4")
+            raise field_error(("samples",), self.samples, "1, or an even number of at least 4")
         if self.samples > 1 and self.spread is None:
-            raise wrong(("spread",), MISSING, "a table of numbers greater than 0, as there are several samples")
+            raise field_error(("spread",), MISSING, "a table of numbers greater than 0, as there are several samples")
         for name in ("spread", "position_noise"):
             if self.samples == 1 and name in self.model_fields_set:
-                raise wrong((name,), Phrase("given"), "left out, as there is one sample")
+                raise field_error((name,), Words("given"), "left out, as there is one sample")
         for name, number in (self.spread or {}).items():
             if number.ndim or not number > 0.0:
-                raise wrong(("spread", name), number.tolist(), "a number greater than 0")
+                raise field_error(("spread", name), number.tolist(), "a number greater than 0")
         return self
 
     @property
@@ -195,36 +197,36 @@ class GradientTable(Table):
 
 
 class OptimiseTable(Table):
-    """[optimise]: from where, how and how long."""
+    """[optimise]: the start of the search, its algorithm, and its length."""
 
     start: Start
-    """Parameters to begin with; these are optimised."""
+    """Parameters with which the search starts; these are optimised."""
     knots: Annotated[int, count(2, 10_000_000)] | None = None
-    """Parameters over time are interpolated between so many free values; None: every step has its own."""
+    """Number of free rows between which parameters over time are interpolated; None: one row for each step."""
     logarithmic: tuple[Annotated[str, OneOf(NAMES)], ...] = ()
-    """Parameters that are changed by factors."""
+    """Parameters that are searched by their logarithm."""
     bounds: Values | None = None
     """By name: two entries, the lower and the upper bound."""
-    extinctions: Shares = (1.0,)
-    """Of one search after the other, each from where the last one ended, relative to the scene's: through thinner fluid
-    a picture tells how much there is, and particles that hide behind each other have to part."""
+    extinction_schedule: Schedule = (1.0,)
+    """A continuation schedule: one search for each factor, which starts where the last one ended and sees the fluid
+    with the scene's extinction times that factor. A picture of thinner fluid shows what is behind its surface."""
     optimiser: Annotated[str, OneOf(OPTIMISERS)] = "adam"
     """Name of the algorithm."""
     learning_rate: Annotated[float, quantity("units of the parameters", gt=0.0)]
     """In units of the parameters; for L-BFGS the size of its first step."""
     tolerance: Annotated[float, quantity(gt=0.0, le=0.5)] | None = None
-    """Of L-BFGS: it ends where the gradient is this part of the first; None: where round-off stops it."""
+    """L-BFGS ends where the gradient is this part of the first one; None: where round-off stops it."""
     iterations: Annotated[int, count(1, 10_000_000)]
     """Updates at most, of each search."""
     gradient: GradientTable = GradientTable()
-    """Which gradient it follows."""
+    """The gradient that the search follows."""
     check: CheckTable = CheckTable()
-    """What the run has to reach."""
+    """What the estimate has to reach."""
 
     @model_validator(mode="after")
     def _check_tolerance(self) -> Self:
         if self.tolerance is not None and self.optimiser != "lbfgs":
-            raise wrong(("tolerance",), self.tolerance, 'left out, as only "lbfgs" has one')
+            raise field_error(("tolerance",), self.tolerance, 'left out, as only "lbfgs" has one')
         return self
 
     def algorithm(self) -> Optimiser:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from cortado.discretise.sampling import fluid_particles
-from cortado.errors import Phrase, SceneError
+from cortado.errors import SceneError, Words
 from cortado.inverse.tables import OptimiseTable, ProblemTable, TaskTables
-from cortado.optimisation.transforms import Knots
+from cortado.optimisation.transforms import TimeInterpolation
 from cortado.parameters.registry import BY_NAME, Range
 from cortado.parameters.values import OVER_TIME, SUM_TOLERANCE, Arrays, is_too_small
 from cortado.scene.fields import MISSING
@@ -22,17 +22,17 @@ from cortado.scene.toml import read_toml
 
 @dataclass(frozen=True)
 class Task:
-    """A scene, what is asked of it, and how to find it. Parameters over time have a row for each step."""
+    """An inverse problem: a scene, a target, and how it is searched. Parameters over time have a row for each step."""
 
     scene: Scene
     problem: ProblemTable
     optimise: OptimiseTable
-    hidden: Arrays
-    """Parameters that made the target; none for a picture."""
+    true_parameters: Arrays
+    """Those of the run that made the target; none where the target is a picture."""
     start: dict[str, Any]
-    """Parameters to begin with; arrays, or the word "random"."""
+    """Parameters with which the search starts; arrays, or the word "random"."""
     folder: Path = Path()
-    """Where its other files are looked for."""
+    """The folder of the task's file; paths in the task are relative to it."""
 
 
 def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Task:
@@ -44,18 +44,18 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
         with sentences(TaskTables):
             tables = TaskTables.model_validate({key: data[key] for key in TaskTables.model_fields if key in data})
         problem, optimise = tables.problem, tables.optimise
-        hidden, steps = problem.target or {}, problem.steps
+        true, steps = problem.target or {}, problem.steps
         for name in optimise.start:
-            if problem.picture is None and name not in hidden:
+            if problem.picture is None and name not in true:
                 raise SceneError(None, f"problem.target.{name}", MISSING, "given, as optimise.start has it")
-        hidden = _resolved("problem.target", hidden, scene, steps)
+        true = _resolved("problem.target", true, scene, steps)
         start = _resolved("optimise.start", optimise.start, scene, steps)
         _check_options(problem, optimise, start)
         for name, pair in (optimise.bounds or {}).items():
             _check_bounds(name, pair, optimise, start, scene)
     except SceneError as error:
         raise error.in_file(file) from None
-    return Task(scene, problem, optimise, hidden, start, Path(file).parent)
+    return Task(scene, problem, optimise, true, start, Path(file).parent)
 
 
 def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int) -> dict[str, Any]:
@@ -65,21 +65,21 @@ def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int) -
         field = f"{table}.{name}"
         parameter = BY_NAME[name]
         if not parameter.present(scene):
-            raise SceneError(None, field, Phrase("given"), f"left out, as the scene {parameter.absent}")
+            raise SceneError(None, field, Words("given"), f"left out, as the scene {parameter.absent}")
         if name == "gravity" and "tilt" in values:
             wanted = "left out, as the tilt says where it points"
-            raise SceneError(None, field, Phrase("given"), wanted)
+            raise SceneError(None, field, Words("given"), wanted)
         if isinstance(array, str):
             found[name] = array
             continue
         shapes = _shapes(name, scene, steps)
         if name in OVER_TIME and array.ndim == 2 and 2 <= len(array) <= steps and array.shape[1:] == shapes[0]:
-            array = Knots(steps, len(array)).parameter(array)
+            array = TimeInterpolation(steps, len(array)).parameter(array)
         if array.shape not in shapes:
             wanted = _in_words(shapes)
             if name in OVER_TIME and steps > 1:
                 wanted = f"{_in_words(shapes[:1])}, or 2 to {steps} rows of it"
-            raise SceneError(None, field, Phrase(_in_words([array.shape])), wanted)
+            raise SceneError(None, field, Words(_in_words([array.shape])), wanted)
         _check_range(name, field, array)
         found[name] = array
     return found
@@ -98,7 +98,7 @@ def _check_range(name: str, field: str, array: np.ndarray) -> None:
 
 
 def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mapping[str, Any]) -> None:
-    """Raises `SceneError` for an option that does not fit the others; none is silently left unused."""
+    """Raises `SceneError` for an option that does not fit the others, so that none is silently ignored."""
     over_time = [name for name in OVER_TIME if name in start and start[name].ndim == 2]
     if optimise.knots is not None and not over_time:
         raise SceneError(None, "optimise.knots", optimise.knots, "left out, as nothing that is optimised has rows")
@@ -114,16 +114,16 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
             raise SceneError(None, f"optimise.start.{name}", float(start[name].min()), "greater than 0")
     spread = optimise.gradient.spread
     for name in sorted(set(start) ^ set(spread or start)):
-        wanted, found = ("given, as it is searched", MISSING) if name in start else ("left out", Phrase("given"))
+        wanted, found = ("given, as it is searched", MISSING) if name in start else ("left out", Words("given"))
         raise SceneError(None, f"optimise.gradient.spread.{name}", found, wanted)
     given = optimise.check.model_fields_set
-    if problem.loss != "image" and len(optimise.extinctions) > 1:
+    if problem.loss != "image" and len(optimise.extinction_schedule) > 1:
         wanted = "left out, as positions are compared"
-        raise SceneError(None, "optimise.extinctions", list(optimise.extinctions), wanted)
+        raise SceneError(None, "optimise.extinction_schedule", list(optimise.extinction_schedule), wanted)
     if problem.loss != "image" and "psnr" in given:
         raise SceneError(None, "optimise.check.psnr", optimise.check.psnr, "left out, as positions are compared")
     if problem.picture is not None and "parameter_error" in given:
-        wanted = "left out, as the target is a picture and no parameter is hidden"
+        wanted = "left out, as the target is a picture, not a run with true parameters"
         raise SceneError(None, "optimise.check.parameter_error", optimise.check.parameter_error, wanted)
 
 
@@ -131,13 +131,13 @@ def _check_bounds(name: str, pair: np.ndarray, optimise: OptimiseTable, start: M
     """Raises `SceneError` for bounds that do not fit the start."""
     field = f"optimise.bounds.{name}"
     if name not in start:
-        raise SceneError(None, field, Phrase("given"), "left out, as optimise.start lacks it")
+        raise SceneError(None, field, Words("given"), "left out, as optimise.start lacks it")
     if name == "mass_fractions":
-        raise SceneError(None, field, Phrase("given"), "left out, as fractions stay from 0 to 1 by themselves")
+        raise SceneError(None, field, Words("given"), "left out, as fractions stay from 0 to 1 by themselves")
     value = start[name]
     if pair.ndim == 0 or len(pair) != 2:
         wanted = "two entries, the lower and the upper bound"
-        raise SceneError(None, field, Phrase(_in_words([pair.shape])), wanted)
+        raise SceneError(None, field, Words(_in_words([pair.shape])), wanted)
     if (pair[0] > pair[1]).any():
         raise SceneError(None, field, pair.tolist(), "two entries, the lower one not above the upper one")
     if name in optimise.logarithmic and (pair <= 0.0).any():
@@ -151,7 +151,7 @@ def _check_bounds(name: str, pair: np.ndarray, optimise: OptimiseTable, start: M
     except ValueError:
         each = " or ".join(["a number", *(f"of shape {shape[k:]}" for k in reversed(range(len(shape))))])
         wanted = f"two entries, the lower and the upper bound, each {each}"
-        raise SceneError(None, field, Phrase(_in_words([pair.shape])), wanted) from None
+        raise SceneError(None, field, Words(_in_words([pair.shape])), wanted) from None
     comparable = not isinstance(value, str) and pair[0].shape in ((), value.shape, value.shape[1:])
     if comparable and ((value < pair[0]) | (value > pair[1])).any():
         raise SceneError(None, f"optimise.start.{name}", value.tolist(), f"within {field}, {pair.tolist()}")

@@ -24,7 +24,7 @@ _LARGEST = 2**31
 _FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html")
 _FOLDERS = ("checkpoint", "figures")
 _PICTURES = ("particles", "rendered", "density_errors", "loss", "images", "progress", *NAMES)
-FIGURES = (*(f"{name}.png" for name in _PICTURES), "run.mp4", "found.mp4")
+FIGURES = (*(f"{name}.png" for name in _PICTURES), "run.mp4", "estimate.mp4")
 """Every file that a run may have in its figures; whatever else is there is the user's."""
 
 

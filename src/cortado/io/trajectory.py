@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from operator import index
 from pathlib import Path
 from typing import Any, Self, overload
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cortado.errors import InputError, shown
 from cortado.io import vtkhdf
 from cortado.io.notebook import as_text, with_picture
-from cortado.restart import Elapsed, RestartState, RunConstants
+from cortado.restart import Clock, RestartState
 from cortado.words import counted
 
 
@@ -37,7 +37,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """What a run leaves: recorded frames, and what the pressure solver did at every step.
+    """What a run leaves: recorded frames, and what the solver noted of every step.
 
     ``trajectory[k]`` is the `Frame` k, counted from the end where k is negative; ``trajectory[2:5]`` and
     ``trajectory[::10]`` are trajectories of these frames alone; ``len``, ``for`` and ``reversed`` go over the frames.
@@ -54,32 +54,30 @@ class Trajectory:
     """(frames, n, d) [m]"""
     velocities: NDArray[Any]
     """(frames, n, d) [m/s]"""
-    iterations: NDArray[Any]
-    """(steps,) [-] pressure iterations used at each step"""
-    density_errors: NDArray[Any]
-    """(steps,) [-] average (rho - rho_0) / rho_0 at the end of each step"""
-    converged: NDArray[Any]
-    """(steps,) bool: whether the pressure solver reached its tolerance"""
+    diagnostics: Mapping[str, NDArray[Any]]
+    """(steps,) by name: ``converged``, and what else the solver notes; see `StepLog`"""
     mass_fractions: NDArray[Any] | None = None
     """(frames, n, phases) [-]; None with one phase"""
+    others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """(frames, ...) further fields of the states by name, with an emitter ``outlet`` [m] and ``emitted`` [m]: see
+    `RestartState`"""
+    constants: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """fields that no step changes: ``reference_density`` (n,), a particle's mass over its volume on the rest lattice
+    [kg/m3]"""
     substeps: int = 0
     """[-] explicit steps of diffusion within each step"""
-    constants: RunConstants | None = None
-    """what a restart needs besides; None in a file of an earlier version"""
 
     def __post_init__(self) -> None:
         frames = {len(self.times), len(self.steps), len(self.positions), len(self.velocities)}
-        steps = {len(self.iterations), len(self.density_errors), len(self.converged)}
+        steps = {name: len(column) for name, column in self.diagnostics.items()}
         if self.positions.ndim != 3 or self.positions.shape != self.velocities.shape or len(frames) > 1:
             raise InputError(
                 f"Positions and velocities must both be (frames, n, d) with a time and a step per frame, "
                 f"but found {self.positions.shape}, {self.velocities.shape}, {self.times.shape} and "
                 f"{self.steps.shape}."
             )
-        if len(steps) > 1:
-            raise InputError(
-                f"Iterations, density errors and converged must be of one length, but have {sorted(steps)}."
-            )
+        if len(set(steps.values())) > 1:
+            raise InputError(f"The diagnostics must be of one length, but have {steps}.")
 
     def __repr__(self) -> str:
         times = f", {self.times[0]:.4g} to {self.times[-1]:.4g} s" if len(self) else ""
@@ -108,7 +106,7 @@ class Trajectory:
     def __getitem__(self, k: slice) -> Trajectory: ...
 
     def __getitem__(self, k: int | slice) -> Frame | Trajectory:
-        """A frame, or a trajectory of some; what the pressure solver did stays that of the whole run.
+        """A frame, or a trajectory of some; what the solver noted stays that of the whole run.
 
         Raises:
             IndexError: there is no such frame.
@@ -130,13 +128,10 @@ class Trajectory:
 
     def _chosen(self, frames: slice) -> Trajectory:
         """The trajectory of some frames."""
-        constants = self.constants
-        if constants is not None and constants.outlets is not None:
-            constants = replace(constants, outlets=constants.outlets[frames])
         names = ("times", "steps", "positions", "velocities", "mass_fractions")
         arrays = {name: getattr(self, name) for name in names}
         chosen: dict[str, Any] = {name: None if array is None else array[frames] for name, array in arrays.items()}
-        return replace(self, **chosen, constants=constants)
+        return replace(self, **chosen, others={name: array[frames] for name, array in self.others.items()})
 
     @property
     def dimension(self) -> int:
@@ -149,8 +144,37 @@ class Trajectory:
         return self.positions.shape[1]
 
     @property
+    def _fields(self) -> dict[str, NDArray[Any]]:
+        """(frames, ...) every field that steps change, by its name."""
+        fractions = {} if self.mass_fractions is None else {"mass_fractions": self.mass_fractions}
+        return {"positions": self.positions, "velocities": self.velocities, **fractions, **self.others}
+
+    @property
+    def iterations(self) -> NDArray[Any]:
+        """(steps,) [-] pressure iterations of each step, of a solver with one loop.
+
+        Raises:
+            InputError: the solver notes something else.
+        """
+        return noted(self.diagnostics, "iterations")
+
+    @property
+    def density_errors(self) -> NDArray[Any]:
+        """(steps,) [-] average (rho - rho_0) / rho_0 at the end of each step.
+
+        Raises:
+            InputError: the solver notes something else.
+        """
+        return noted(self.diagnostics, "density_errors")
+
+    @property
+    def converged(self) -> NDArray[Any]:
+        """(steps,) bool: whether the solver reached its tolerance."""
+        return self.diagnostics["converged"]
+
+    @property
     def not_converged(self) -> int:
-        """Number of steps at which the pressure solver did not reach its tolerance."""
+        """Number of steps at which the solver did not reach its tolerance."""
         return int(np.count_nonzero(~self.converged))
 
     @property
@@ -158,16 +182,12 @@ class Trajectory:
         """The state of the last frame, from which `Simulation.run` goes on bit for bit.
 
         Raises:
-            InputError: there is no frame, or the trajectory is from a file that does not hold all of it.
+            InputError: there is no frame.
         """
         if not len(self):
             raise InputError("The trajectory has no frame, but must have one to go on from.")
-        if self.constants is None:
-            raise InputError("The trajectory is from an earlier version of Cortado, without what a restart needs.")
-        outlets = self.constants.outlets
-        elapsed = Elapsed(int(self.steps[-1]), float(self.times[-1]), None if outlets is None else outlets[-1])
-        fractions = None if self.mass_fractions is None else self.mass_fractions[-1]
-        return RestartState(self.positions[-1], self.velocities[-1], fractions, self.constants, elapsed)
+        last = {name: array[-1] for name, array in self._fields.items()}
+        return RestartState({**last, **self.constants}, Clock(int(self.steps[-1]), float(self.times[-1])))
 
     def save(self, path: str | Path) -> None:
         """Writes a VTKHDF file, which ParaView opens; a file of that name is replaced.
@@ -176,21 +196,12 @@ class Trajectory:
             InputError: no frames, or a path that cannot be written.
             ComputationError: the disk is full.
         """
-        single = self.positions.dtype == np.float32
-        with vtkhdf.TrajectoryWriter(
-            path,
-            times=self.times,
-            particles=self.particles,
-            dimension=self.dimension,
-            precision="float32" if single else "float64",
-            steps=len(self.iterations),
-            scalars=fraction_names(0 if self.mass_fractions is None else self.mass_fractions.shape[2]),
-            constants=None if self.constants is None else self.constants.arrays(),
-        ) as writer:
-            writer.append_steps(self.iterations, self.density_errors, self.converged)
+        frames = self._fields
+        first = {name: array[0] if len(array) else array for name, array in frames.items()}
+        with frame_writer(path, self.times, first, self.constants, len(self.converged), self.diagnostics) as writer:
+            writer.append_steps(**self.diagnostics)
             for k, step in enumerate(self.steps):
-                fractions = {} if self.mass_fractions is None else fraction_fields(self.mass_fractions[k])
-                writer.append(self.positions[k], self.velocities[k], step=int(step), **fractions)
+                append_frame(writer, {name: array[k] for name, array in frames.items()}, int(step))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -200,22 +211,59 @@ class Trajectory:
             InputError: the file is missing, damaged, or none of Cortado's trajectories.
         """
         arrays = vtkhdf.read(path)
-        names = ("times", "steps", "positions", "velocities", "iterations", "density_errors", "converged")
+        names = ("times", "steps", "positions", "velocities", "diagnostics", "others", "constants")
         phases = sum(name.startswith(FRACTION) for name in arrays)
-        fractions = np.stack([arrays[name] for name in fraction_names(phases)], axis=-1) if phases else None
-        constants = RunConstants.of(arrays["constants"], len(arrays["times"]))
-        found = {name: arrays[name] for name in names}
-        return cls(**found, mass_fractions=fractions, constants=constants)
+        fractions = np.stack([arrays[name] for name in _fraction_names(phases)], axis=-1) if phases else None
+        return cls(**{name: arrays[name] for name in names}, mass_fractions=fractions)
+
+
+def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
+    """(steps,) of that name; raises `InputError` where a solver has other diagnostics."""
+    if name not in diagnostics:
+        raise InputError(f"{name} is no diagnostic of this solver, whose diagnostics are {', '.join(diagnostics)}.")
+    return diagnostics[name]
 
 
 FRACTION = "mass_fraction_"
 
 
-def fraction_names(phases: int) -> list[str]:
+def frame_writer(
+    path: str | Path,
+    times: NDArray[Any],
+    first: Mapping[str, NDArray[Any]],
+    constants: Mapping[str, NDArray[Any]],
+    steps: int,
+    diagnostics: Mapping[str, NDArray[Any]],
+) -> vtkhdf.TrajectoryWriter:
+    """A file with room for frames at ``times`` (frames,) [s] that hold the same fields as the first, and for what is
+    noted of so many steps, which have the names and types of ``diagnostics``."""
+    particles, dimension = first["positions"].shape[-2:]
+    single = first["positions"].dtype == np.float32
+    return vtkhdf.TrajectoryWriter(
+        path,
+        times=times,
+        particles=particles,
+        dimension=dimension,
+        precision="float32" if single else "float64",
+        steps=steps,
+        scalars=_fraction_names(first["mass_fractions"].shape[-1] if "mass_fractions" in first else 0),
+        others=_others(first),
+        constants=constants,
+        diagnostics={name: column.dtype for name, column in diagnostics.items()},
+    )
+
+
+def append_frame(writer: vtkhdf.TrajectoryWriter, frame: Mapping[str, NDArray[Any]], step: int) -> None:
+    """Write the fields of a frame, after so many steps, to a file of `frame_writer`."""
+    fractions = frame["mass_fractions"].T if "mass_fractions" in frame else ()
+    scalars = dict(zip(_fraction_names(len(fractions)), fractions, strict=True))
+    writer.append(frame["positions"], frame["velocities"], step=step, others=_others(frame), **scalars)
+
+
+def _others(frame: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    return {name: frame[name] for name in frame if name not in ("positions", "velocities", "mass_fractions")}
+
+
+def _fraction_names(phases: int) -> list[str]:
     """Names of the scalar fields that hold the mass fractions of several phases; none for one phase."""
-    return [f"{FRACTION}{k}" for k in range(phases)] if phases > 1 else []
-
-
-def fraction_fields(fractions: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """Mass fractions (n, phases) as scalar fields by name."""
-    return dict(zip(fraction_names(fractions.shape[1]), fractions.T, strict=False))
+    return [f"{FRACTION}{k}" for k in range(phases)]

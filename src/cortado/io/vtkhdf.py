@@ -12,18 +12,18 @@ import os
 import shutil
 import struct
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from cortado.errors import ComputationError, InputError
 from cortado.io.files import sentences, unfinished, write_fully
-from cortado.io.vtkhdf_layout import FORMAT, STEP_RECORD, STEPS_SEED, WRITTEN, Layout, frames_seed
+from cortado.io.vtkhdf_layout import FORMAT, WRITTEN, Layout, frames_seed, steps_seed
 
 
 class TrajectoryWriter:
@@ -39,8 +39,10 @@ class TrajectoryWriter:
         dimension: 2 or 3; in 2-D the stored points have z = 0.
         precision: of the stored positions, velocities and scalars.
         steps: the most steps of which `append_steps` will be told.
-        scalars: names of further scalar fields of every frame, such as "density" and "pressure".
-        constants: arrays by name that hold for the whole run, or for each of the frames that will come.
+        scalars: names of further scalar fields of every frame, such as "density" and "pressure", which ParaView shows.
+        others: further arrays of every frame by name, as they are in the first: their types and shapes are kept.
+        constants: arrays by name that hold for the whole run.
+        diagnostics: the type of each number that `append_steps` will be told of a step, by name.
 
     Raises:
         InputError: a size that makes no sense, or a path that cannot be written.
@@ -57,7 +59,9 @@ class TrajectoryWriter:
         precision: Literal["float32", "float64"] = "float32",
         steps: int = 0,
         scalars: Sequence[str] = (),
+        others: Mapping[str, ArrayLike] | None = None,
         constants: Mapping[str, ArrayLike] | None = None,
+        diagnostics: Mapping[str, DTypeLike] | None = None,
     ) -> None:
         moments = np.array(times, dtype=np.float64, ndmin=1)
         if len(moments) < 1 or particles < 1 or dimension not in (2, 3) or steps < 0:
@@ -68,8 +72,16 @@ class TrajectoryWriter:
         self.path = Path(path)
         self.frames_written = 0
         self.steps_written = 0
-        fixed = {name: np.asarray(value) for name, value in (constants or {}).items()}
-        self._layout = Layout(moments, (particles, dimension), np.dtype(precision), steps, tuple(scalars), fixed)
+        self._layout = Layout(
+            moments,
+            (particles, dimension),
+            np.dtype(precision),
+            steps,
+            tuple(scalars),
+            {name: np.asarray(value) for name, value in (others or {}).items()},
+            {name: np.asarray(value) for name, value in (constants or {}).items()},
+            {name: np.dtype(dtype) for name, dtype in (diagnostics or {}).items()},
+        )
         self._unfinished = unfinished(self.path)
         with sentences(self.path):
             _require_room(self._layout, self.path)
@@ -80,10 +92,16 @@ class TrajectoryWriter:
             except BaseException:
                 self.close()
                 raise
-        self._frames_checksum, self._steps_checksum = self._layout.seed, STEPS_SEED
+        self._frames_checksum, self._steps_checksum = self._layout.seed, steps_seed(self._layout.records)
 
     def append(
-        self, positions: ArrayLike, velocities: ArrayLike, *, step: int | None = None, **scalars: ArrayLike
+        self,
+        positions: ArrayLike,
+        velocities: ArrayLike,
+        *,
+        step: int | None = None,
+        others: Mapping[str, ArrayLike] | None = None,
+        **scalars: ArrayLike,
     ) -> None:
         """Writes one frame.
 
@@ -91,6 +109,7 @@ class TrajectoryWriter:
             positions: (n, d) [m]
             velocities: (n, d) [m/s]
             step: number of steps taken so far; the number of this frame when left out.
+            others: exactly those given at construction.
             scalars: (n,) each, exactly those named at construction.
 
         Raises:
@@ -101,17 +120,26 @@ class TrajectoryWriter:
         frames = len(self._layout.times)
         if frame >= frames:
             raise InputError(f"{self.path} was laid out for {frames} frames, and one more came.")
-        if set(scalars) != set(self._layout.scalars):
-            raise InputError(f"Expected the scalar fields {sorted(self._layout.scalars)}, found {sorted(scalars)}.")
+        for what, found, wanted in (
+            ("scalar fields", scalars, self._layout.scalars),
+            ("other fields", others or {}, self._layout.others),
+        ):
+            if set(found) != set(wanted):
+                raise InputError(f"Expected the {what} {sorted(wanted)}, found {sorted(found)}.")
         fields = {"VTKHDF/Points": self._vectors("positions", positions)}
         fields["VTKHDF/PointData/velocity"] = self._vectors("velocities", velocities)
         for name, values in scalars.items():
             fields[f"VTKHDF/PointData/{name}"] = self._checked(name, values, self._layout.shape[:1])
         number = np.int64(frame if step is None else step)
-        rows = [fields[name].tobytes() for name in self._layout.rows]
-        checksum = _frame_checksum(self._frames_checksum, self._layout.times[frame], number, rows)
+        rows = {name: fields[name].tobytes() for name in self._layout.rows}
+        for name, first in sorted(self._layout.others.items()):
+            array = np.asarray((others or {})[name], dtype=first.dtype)
+            if array.shape != first.shape:
+                raise InputError(f"Expected {name} of shape {first.shape}, found {array.shape}.")
+            rows[f"cortado/states/{name}"] = array.tobytes()
+        checksum = _frame_checksum(self._frames_checksum, self._layout.times[frame], number, rows.values())
         with self._refusal():
-            for name, row in zip(self._layout.rows, rows, strict=True):
+            for name, row in rows.items():
                 self._write(name, frame * len(row), row)
             self._write("cortado/frame_steps", 8 * frame, number.tobytes())
             self._write("VTKHDF/Steps/PartOffsets", 8 * frame, struct.pack("<q", WRITTEN))
@@ -120,22 +148,24 @@ class TrajectoryWriter:
                 os.replace(self._unfinished, self.path)
         self.frames_written, self._frames_checksum = frame + 1, checksum
 
-    def append_steps(self, iterations: ArrayLike, density_errors: ArrayLike, converged: ArrayLike = True) -> None:
-        """Writes what the pressure solver reported of one step (scalars) or of several ((k,) each).
+    def append_steps(self, **diagnostics: ArrayLike) -> None:
+        """Writes what the solver noted of one step (scalars) or of several ((k,) each), by name.
 
         Raises:
-            InputError: more steps than announced.
+            InputError: names other than announced, or more steps than announced.
             ComputationError: the disk refused.
         """
-        columns = np.broadcast_arrays(np.atleast_1d(iterations), density_errors, converged)
-        first, last = self.steps_written, self.steps_written + columns[0].size
+        kinds = self._layout.diagnostics
+        if set(diagnostics) != set(kinds):
+            raise InputError(f"Expected the diagnostics {sorted(kinds)}, found {sorted(diagnostics)}.")
+        records = _records(diagnostics, self._layout.records)
+        first, last = self.steps_written, self.steps_written + len(records)
         if last > self._layout.steps:
             raise InputError(f"{self.path} was laid out for {self._layout.steps} steps, and {last} came.")
-        records = _records(columns)
         checksum = zlib.crc32(records.tobytes(), self._steps_checksum)
         with self._refusal():
-            for name in STEP_RECORD.names or ():
-                self._write(f"cortado/{name}", first * STEP_RECORD[name].itemsize, records[name].tobytes())
+            for name, dtype in kinds.items():
+                self._write(f"cortado/diagnostics/{name}", first * dtype.itemsize, records[name].tobytes())
             self._write("cortado/progress", 8, struct.pack("<II", last, checksum))
         self.steps_written, self._steps_checksum = last, checksum
 
@@ -185,8 +215,8 @@ def read(path: str | Path) -> dict[str, Any]:
 
     Returns:
         times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s],
-        iterations (steps,), density_errors (steps,) and converged (steps,) bool as in `Trajectory`,
-        under its own name every scalar field (frames, n), and constants, by name what holds for the whole run.
+        under its own name every scalar field (frames, n); by name others, further arrays of every frame, constants,
+        what holds for the whole run, and diagnostics, (steps,) each.
 
     Raises:
         InputError: the file is missing, damaged, or none of Cortado's trajectories.
@@ -217,39 +247,47 @@ def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
     dimension, particles = int(own.attrs["dimension"]), int(vtk["NumberOfPoints"][0])
     rows = {"VTKHDF/Points": vtk["Points"]}
     rows |= {f"VTKHDF/PointData/{name}": dataset for name, dataset in sorted(vtk["PointData"].items())}
-    columns = [vtk["Steps/Values"], own["frame_steps"], *(own[name] for name in STEP_RECORD.names or ())]
-    if any(dataset.nbytes > size for dataset in (*columns, *rows.values(), *own["constants"].values())):
-        return None
-    constants = {name: dataset[()] for name, dataset in own["constants"].items()}
-    times, numbers = (column[:frames] for column in columns[:2])
-    records = _records([column[:steps] for column in columns[2:]])
-    fields = {name: dataset[: frames * particles] for name, dataset in rows.items()}
-    fields = {name: field.reshape(frames, particles, *field.shape[1:]) for name, field in fields.items()}
+    groups = {name: dict(sorted(own[name].items())) for name in ("constants", "states", "diagnostics")}
+    columns = [vtk["Steps/Values"], own["frame_steps"]]
+    for dataset in (*columns, *rows.values(), *(dataset for group in groups.values() for dataset in group.values())):
+        if dataset.nbytes > size or dataset.dtype.kind not in "fiub":
+            return None
+    constants = {name: dataset[()] for name, dataset in groups["constants"].items()}
+    others = {name: dataset[:frames] for name, dataset in groups["states"].items()}
+    times, numbers = (column[:frames] for column in columns)
+    diagnostics = {name: dataset[:steps] for name, dataset in groups["diagnostics"].items()}
+    record = np.dtype([(name, column.dtype) for name, column in diagnostics.items()])
+    points = {name: dataset[: frames * particles] for name, dataset in rows.items()}
+    points = {name: field.reshape(frames, particles, *field.shape[1:]) for name, field in points.items()}
 
-    checksum = frames_seed((particles, dimension), {name: field.dtype for name, field in fields.items()}, constants)
+    fields = points | others
+    kinds = {name: (field.dtype, field.shape[1:]) for name, field in fields.items()}
+    checksum = frames_seed((particles, dimension), kinds, constants)
     for k in range(frames):
         checksum = _frame_checksum(checksum, times[k], numbers[k], [field[k].tobytes() for field in fields.values()])
-    if checksum != frames_checksum or zlib.crc32(records.tobytes(), STEPS_SEED) != steps_checksum:
+    records = _records(diagnostics, record) if record.names else np.zeros(0)
+    if checksum != frames_checksum or zlib.crc32(records.tobytes(), steps_seed(record)) != steps_checksum:
         return None
-    arrays = {name.rpartition("/")[2]: field for name, field in fields.items()}
+    arrays = {name.rpartition("/")[2]: field for name, field in points.items()}
     arrays["velocities"] = np.ascontiguousarray(arrays.pop("velocity")[..., :dimension])
     arrays["positions"] = np.ascontiguousarray(arrays.pop("Points")[..., :dimension])
-    arrays |= {name: np.ascontiguousarray(records[name]) for name in STEP_RECORD.names or ()}
-    return arrays | {"times": times, "steps": numbers, "constants": constants}
+    named = {"others": others, "constants": constants, "diagnostics": diagnostics}
+    return arrays | {"times": times, "steps": numbers, **named}
 
 
-def _frame_checksum(checksum: int, time: Any, number: Any, rows: Sequence[bytes]) -> int:
+def _frame_checksum(checksum: int, time: Any, number: Any, rows: Iterable[bytes]) -> int:
     """The CRC-32 of the frames so far with one more: its time [s], its number of steps, and its fields."""
     for content in (time.tobytes(), number.tobytes(), *rows):
         checksum = zlib.crc32(content, checksum)
     return checksum
 
 
-def _records(columns: Sequence[Any]) -> NDArray[Any]:
-    """(steps,) of `STEP_RECORD` from one array for each of its names."""
-    records = np.zeros(len(columns[0]), STEP_RECORD)
-    for name, column in zip(STEP_RECORD.names or (), columns, strict=True):
-        records[name] = column
+def _records(columns: Mapping[str, ArrayLike], record: np.dtype[Any]) -> NDArray[Any]:
+    """(steps,) records from one array for each of their names."""
+    arrays = {name: np.atleast_1d(column) for name, column in columns.items()}
+    records = np.zeros(max((len(array) for array in arrays.values()), default=0), record)
+    for name, array in arrays.items():
+        records[name] = array
     return records
 
 

@@ -25,12 +25,8 @@ from numpy.typing import NDArray
 
 from cortado.io.files import write_fully
 
-FORMAT = 2
-"""Of the group "cortado"; the first had no checksums."""
-STEP_RECORD = np.dtype([("iterations", "<i4"), ("density_errors", "<f8"), ("converged", "?")])
-"""What is kept of every step."""
-STEPS_SEED = zlib.crc32(b"steps")
-"""The checksum of no steps."""
+FORMAT = 3
+"""Of the group "cortado"; the first had no checksums, the second no states to go on from."""
 WRITTEN, MISSING = 0, 1
 """The parts of a frame that is there, and of one that is not."""
 _TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")
@@ -49,8 +45,12 @@ class Layout:
     """Of positions, velocities and scalars."""
     steps: int
     scalars: tuple[str, ...]
+    others: Mapping[str, NDArray[Any]]
+    """Further arrays of every frame, as they are in the first."""
     constants: Mapping[str, NDArray[Any]]
     """Arrays of any shape that hold for the whole run."""
+    diagnostics: Mapping[str, np.dtype[Any]]
+    """Numbers of every step."""
 
     @property
     def rows(self) -> dict[str, tuple[int, ...]]:
@@ -59,17 +59,25 @@ class Layout:
         return {"VTKHDF/Points": (3,)} | {f"VTKHDF/PointData/{name}": fields[name] for name in sorted(fields)}
 
     @property
+    def records(self) -> np.dtype[Any]:
+        """What is kept of a step."""
+        return np.dtype(sorted(self.diagnostics.items()))
+
+    @property
     def seed(self) -> int:
         """The checksum of no frames."""
-        return frames_seed(self.shape, dict.fromkeys(self.rows, self.dtype), self.constants)
+        particles = self.shape[0]
+        kinds = {name: (self.dtype, (particles, *row)) for name, row in self.rows.items()}
+        kinds |= {name: (array.dtype, array.shape) for name, array in sorted(self.others.items())}
+        return frames_seed(self.shape, kinds, self.constants)
 
     @property
     def size(self) -> int:
         """About how many bytes the file takes when it is full."""
         numbers = sum(int(np.prod(row, dtype=int)) for row in self.rows.values())
-        frame = self.shape[0] * numbers * self.dtype.itemsize + 8 * (17 + len(self.scalars))
-        constants = sum(array.nbytes for array in self.constants.values())
-        return len(self.times) * frame + self.steps * STEP_RECORD.itemsize + 8 * 2 * self.shape[0] + constants
+        others, constants = (sum(a.nbytes for a in arrays.values()) for arrays in (self.others, self.constants))
+        frame = self.shape[0] * numbers * self.dtype.itemsize + others + 8 * (17 + len(self.scalars))
+        return len(self.times) * frame + self.steps * self.records.itemsize + 8 * 2 * self.shape[0] + constants
 
     def create(self) -> tuple[Pages, dict[str, int]]:
         """The empty file, and the byte at which each dataset begins."""
@@ -87,11 +95,15 @@ class Layout:
         group = own.create_group("constants")
         for name, array in self.constants.items():
             group[name] = array
-        own["progress"] = np.array([[0, self.seed], [0, STEPS_SEED]], np.uint32)
+        own["progress"] = np.array([[0, self.seed], [0, steps_seed(self.records)]], np.uint32)
         places = {"cortado/progress": own["progress"].id.get_offset()}
         places["cortado/frame_steps"] = _reserve(own, "frame_steps", (len(self.times),), np.int64)
-        for name in STEP_RECORD.names or ():
-            places[f"cortado/{name}"] = _reserve(own, name, (max(self.steps, 1),), STEP_RECORD[name])
+        states, steps = own.create_group("states"), own.create_group("diagnostics")
+        for name, array in self.others.items():
+            shape = (len(self.times), *array.shape)
+            places[f"cortado/states/{name}"] = _reserve(states, name, shape, array.dtype)
+        for name, dtype in self.diagnostics.items():
+            places[f"cortado/diagnostics/{name}"] = _reserve(steps, name, (max(self.steps, 1),), dtype)
         return places
 
     def _create_vtk(self, vtk: Any) -> dict[str, int]:
@@ -121,12 +133,20 @@ class Layout:
 
 
 def frames_seed(
-    shape: tuple[int, int], dtypes: Mapping[str, np.dtype[Any]], constants: Mapping[str, NDArray[Any]]
+    shape: tuple[int, int],
+    kinds: Mapping[str, tuple[np.dtype[Any], tuple[int, ...]]],
+    constants: Mapping[str, NDArray[Any]],
 ) -> int:
     """The checksum that those of the frames begin with: it changes with whatever says how to read them, and with what
-    holds for all of them."""
+    holds for all of them. ``kinds``: type and shape of each field of a frame."""
     fixed = [(name, array.dtype.str, array.shape, array.tobytes()) for name, array in sorted(constants.items())]
-    return zlib.crc32(repr((shape, [(name, dtype.str) for name, dtype in dtypes.items()], fixed)).encode())
+    varying = [(name, dtype.str, sizes) for name, (dtype, sizes) in kinds.items()]
+    return zlib.crc32(repr((shape, varying, fixed)).encode())
+
+
+def steps_seed(records: np.dtype[Any]) -> int:
+    """The checksum of no steps, of which such records are kept."""
+    return zlib.crc32(repr(records.descr).encode())
 
 
 def _reserve(group: Any, name: str, shape: tuple[int, ...], dtype: Any) -> int:

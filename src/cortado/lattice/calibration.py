@@ -49,7 +49,8 @@ def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, 
 
 
 RATE_LIMIT = 1.5
-"""Greatest `greatest_rate` that is let through; the iteration converges below 2, and the margin is for disorder."""
+"""Greatest `greatest_rate` that is let through; the iteration converges below 2, and the margin is for particles off
+the lattice."""
 
 
 def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
@@ -101,8 +102,9 @@ def laplacian_rate(kernel: SmoothingKernel, spacing: float, support: float, dime
 
 
 DIFFUSION_SAFETY = 0.5
-"""Part of the lattice's limit on a step of diffusion that is taken; the rest is for disorder (eigenvalues were at most
-1.08 times those of the lattice on random particles) and for fractions that stray out of [0, 1]."""
+"""Part of the lattice's limit on a step of diffusion that is taken; the rest is for particles off the lattice
+(eigenvalues were at most 1.08 times those of the lattice on random particles) and for fractions that stray out of [0,
+1]."""
 
 
 def diffusion_limit(

@@ -27,7 +27,7 @@ class SmoothingKernel:
     """sigma h^d in two and in three dimensions."""
     value: Callable[[np.ndarray], np.ndarray]
     """w(q)."""
-    slope: Callable[[np.ndarray], np.ndarray]
+    gradient_factor: Callable[[np.ndarray], np.ndarray]
     """f(q) = w'(q) / q."""
 
     def normalisation(self, dimension: int, support: float) -> float:
@@ -42,7 +42,7 @@ class SmoothingKernel:
     def gradient(self, separation: np.ndarray, support: float) -> np.ndarray:
         """grad W [1 / m^(d+1)] at separations (n, d) [m]."""
         q = np.minimum(np.linalg.norm(separation, axis=-1, keepdims=True) / support, 1.0)
-        return self.normalisation(separation.shape[-1], support) / support**2 * self.slope(q) * separation
+        return self.normalisation(separation.shape[-1], support) / support**2 * self.gradient_factor(q) * separation
 
 
 CUBIC_SPLINE = SmoothingKernel(

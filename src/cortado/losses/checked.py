@@ -11,10 +11,10 @@ from cortado.arrays import as_numbers, as_one_number
 from cortado.device.state import State
 from cortado.errors import InputError, shown
 from cortado.losses import Loss, Recorded, Snapshot, SnapshotAdjoint
-from cortado.losses.loss import Adjoint
+from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
 
-FORMS = ("positions", "velocities", "mass fractions")
-"""What the arrays of an adjoint are with respect to, in their order."""
+FORMS = tuple(name.replace("_", " ") for name in ADJOINT_FIELDS)
+"""What the arrays of an adjoint are derivatives with respect to, in words."""
 
 
 class CheckedLoss:
@@ -82,7 +82,10 @@ def _require_arguments(what: str, function: Callable[..., Any], wanted: tuple[st
 def _checked_state(bar: Any, end: Snapshot) -> State:
     if not isinstance(bar, State):
         raise InputError(f"the loss's adjoint has a {type(bar).__name__} as its state, but must have a State.")
-    for form, found, wanted in zip(FORMS, bar.arrays(), end.state.arrays(), strict=True):
+    if bar.names != end.state.names:
+        raise InputError(f"the loss's adjoint has {', '.join(bar.names)}, but must have {', '.join(end.state.names)}.")
+    for name in bar.names:
+        form, found, wanted = name.replace("_", " "), bar[name], end.state[name]
         if not isinstance(found, wp.array) or _layout(found) != _layout(wanted):
             text = _layout(found) if isinstance(found, wp.array) else f"a {type(found).__name__}"
             raise InputError(f"the loss's adjoint of {form} is {text}, but must be {_layout(wanted)}.")

@@ -49,7 +49,6 @@ class Image:
         image = self.image(end)
         found = self.renderer.adjoint(self.distance.adjoint(image, self.target))
         bar = end.state.like()
-        bar.velocities.zero_()
         wp.copy(bar.positions, found.positions)
         wp.copy(bar.mass_fractions, found.fractions)
         return self.distance.value(image, self.target), SnapshotAdjoint(bar, found.colours)

@@ -18,7 +18,8 @@ class Snapshot:
     """A state of a rollout, the last one as a rule, as NumPy arrays or as Warp arrays, in the scene's order."""
 
     state: State
-    """Warp arrays (n,): positions [m], velocities [m / s], mass fractions [-]."""
+    """Warp arrays (n,): positions [m], velocities [m / s], mass fractions [-], and what else the solver carries from
+    step to step."""
     dimension: int
     colours: np.ndarray
     """(phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
@@ -57,9 +58,18 @@ class SnapshotAdjoint:
     """(phases, 3)"""
 
 
+ADJOINT_FIELDS = ("positions", "velocities", "mass_fractions")
+"""What the arrays of an adjoint are derivatives with respect to, in their order."""
 Adjoint = State | SnapshotAdjoint | tuple[np.ndarray, ...]
 """Derivatives of a loss with respect to positions and velocities, (n, d) each, and, if there is a third array, mass
 fractions (n, phases); or as Warp arrays."""
+
+
+def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
+    """An adjoint as arrays by the fields of a state that they are derivatives with respect to, vectors (n, d)."""
+    if isinstance(bar, SnapshotAdjoint):
+        return bar.state.numpy(dimension)
+    return bar.numpy(dimension) if isinstance(bar, State) else dict(zip(ADJOINT_FIELDS, bar, strict=False))
 
 
 class Loss(Protocol):

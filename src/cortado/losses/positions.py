@@ -7,9 +7,10 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import as_numbers
+from cortado.device.arrays import to_device
 from cortado.device.launching import launch, sum_of
 from cortado.device.precision import Precision
-from cortado.device.state import State, to_device
+from cortado.device.state import State
 from cortado.device.threads import WARP
 from cortado.errors import InputError
 from cortado.losses.loss import Snapshot
@@ -42,7 +43,6 @@ class FinalPositions:
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, State]:
         x, target, device = self._positions_and_target(end)
         bar = end.state.like()
-        bar.clear()
         factor, kernel = 2.0 / len(x), matching_kernels(end.precision).difference
         launch(kernel, len(x), device, factor=factor, x=x, target=target, bar=bar.positions)
         return self._mean_square(x, target, device, end.precision), bar

@@ -4,14 +4,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from cortado.errors import InputError, Phrase, shown
+from cortado.errors import InputError, Words, shown
 
 LossFunction = Callable[[dict[str, Any]], tuple[Any, Mapping[str, Any]]]
 """Parameters by name -> the loss, and its gradient by the same names."""
 
 
 class Differentiable(Protocol):
-    """What is optimised. It may have an attribute `fingerprint`, a text that says which problem it is.
+    """A problem that can be optimised. It may have an attribute `fingerprint`, a text that identifies it.
 
     The fingerprint is kept in the checkpoint, so that the run of one problem is not resumed with another.
     """
@@ -22,7 +22,7 @@ class Differentiable(Protocol):
 
 @dataclass(frozen=True)
 class Function:
-    """A function of the parameters as a `Differentiable`; it makes its gradient itself."""
+    """A function of the parameters, which returns its own gradient, as a `Differentiable`."""
 
     function: LossFunction
 
@@ -33,7 +33,8 @@ class Function:
         return str(getattr(self.function, "__qualname__", kind.__qualname__))
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
-        """What the function returns; raises `InputError` where an estimator is given: there is nothing for it to do."""
+        """What the function returns; raises `InputError` where an estimator is given, as the gradient is the function's
+        own."""
         if gradient is not None:
             raise InputError("gradient is given, but must be left out where a function makes its own.")
         return self.function(parameters)
@@ -59,9 +60,9 @@ def loss_and_gradient(returned: Any) -> tuple[Any, Mapping[str, Any]]:
     if pair and isinstance(returned[1], Mapping):
         return returned[0], returned[1]
     if pair:
-        found: Any = Phrase(f"a loss and a gradient of type {type(returned[1]).__name__}")
+        found: Any = Words(f"a loss and a gradient of type {type(returned[1]).__name__}")
     elif isinstance(returned, (tuple, list)):
-        found = Phrase(f"a {type(returned).__name__} of {len(returned)}")
+        found = Words(f"a {type(returned).__name__} of {len(returned)}")
     else:
         found = returned
     raise InputError(

@@ -1,7 +1,7 @@
 """`cortado.optimise`: lower the loss of a problem, with a history, bounds, and a checkpoint to resume from.
 
-The optimiser sees one vector; this module packs the named parameters into it, keeps the log of the
-evaluations, and gives the best parameters back.
+The optimiser sees one vector; this module ravels the named parameters into it, keeps the replay log, and gives the best
+parameters back.
 """
 
 import math
@@ -19,7 +19,7 @@ from cortado.errors import ComputationError, InputError, shown
 from cortado.optimisation.differentiable import Differentiable, LossFunction, as_differentiable, loss_and_gradient
 from cortado.optimisation.named_optimisers import as_optimiser
 from cortado.optimisation.optimisers import Optimiser, Search
-from cortado.optimisation.replay_log import Evaluation, EvaluationLog, Log, MemoryLog, Packing, Vector
+from cortado.optimisation.replay_log import Evaluation, Log, MemoryLog, ParameterLayout, ReplayLog, Vector
 from cortado.optimisation.result import Parameters, Record, Result
 
 GREATEST_GRADIENT = 1e150
@@ -50,7 +50,7 @@ def optimise(
             last iterate.
         bounds: by name, (lower, upper), each a number, an array of the parameter's shape, or None.
         gradient: how the problem is differentiated, handed to it as it is.
-        checkpoint: folder for the log of the evaluations, each on the disk before the next begins.
+        checkpoint: folder for the replay log, in which each evaluation is on the disk before the next begins.
         resume: go on with the run in `checkpoint`, bit for bit as if it had not been interrupted; begin it if
             there is none. `iterations` may then be another number.
         on_iteration: called with the `Record` of every evaluation, also of each one read from the checkpoint.
@@ -61,25 +61,25 @@ def optimise(
     """
     algorithm, differentiable = as_optimiser(optimiser, settings), as_differentiable(problem)
     values = _checked_start(start)
-    packing = Packing.of(values)
-    vector = packing.pack(values)
-    lower, upper = _checked_bounds(bounds or {}, packing)
-    _require_within(vector, lower, upper, packing)
-    algorithm.check(packing)
+    layout = ParameterLayout.of(values)
+    vector = layout.ravel(values)
+    lower, upper = _checked_bounds(bounds or {}, layout)
+    _require_within(vector, lower, upper, layout)
+    algorithm.check(layout)
     _require_count(iterations)
     identity = {
         "optimiser": _description(algorithm),
         "gradient": _description(gradient),
         "problem": str(getattr(differentiable, "fingerprint", "")),
     }
-    with closing(_open_log(checkpoint, resume, packing, identity)) as log:
-        evaluator = _Evaluator(differentiable, gradient, packing, start, log, on_iteration)
-        outcome = algorithm.minimise(Search(evaluator, packing, vector, lower, upper, iterations))
+    with closing(_open_log(checkpoint, resume, layout, identity)) as log:
+        evaluator = _Evaluator(differentiable, gradient, layout, start, log, on_iteration)
+        outcome = algorithm.minimise(Search(evaluator, layout, vector, lower, upper, iterations))
     best = min(evaluator.history, key=lambda record: record.loss)
     return Result(
         parameters=_copied(best.parameters),
         loss=best.loss,
-        last_parameters=_as_given(packing.unpack(outcome.last), start),
+        last_parameters=_as_given(layout.unravel(outcome.last), start),
         history=tuple(evaluator.history),
         evaluations=len(evaluator.history),
         message=outcome.message,
@@ -97,7 +97,7 @@ class _Evaluator:
 
     problem: Differentiable
     estimator: Any
-    packing: Packing
+    layout: ParameterLayout
     start: Mapping[str, Any]
     log: Log
     on_iteration: Callable[[Record], None] | None
@@ -111,7 +111,7 @@ class _Evaluator:
             iteration=len(self.history),
             loss=evaluation.loss,
             gradient_norm=math.sqrt(np.sum(evaluation.gradient**2)),
-            parameters=_as_given(self.packing.unpack(vector), self.start),
+            parameters=_as_given(self.layout.unravel(vector), self.start),
             replayed=replayed,
         )
         self.history.append(record)
@@ -138,7 +138,7 @@ class _Evaluator:
         A first evaluation that is refused has a wrong start; later ones, parameters to which the search has come.
         """
         try:
-            found = self.problem.value_and_gradient(self.packing.unpack(vector), gradient=self.estimator)
+            found = self.problem.value_and_gradient(self.layout.unravel(vector), gradient=self.estimator)
         except InputError as error:
             if not self.history:
                 raise
@@ -148,21 +148,21 @@ class _Evaluator:
                 f"{self.log.fate}."
             ) from error
         loss, gradients = loss_and_gradient(found)
-        evaluation = Evaluation(vector.copy(), as_one_number("The problem's loss", loss), self._packed(gradients))
+        evaluation = Evaluation(vector.copy(), as_one_number("The problem's loss", loss), self._ravelled(gradients))
         self._require_finite(evaluation)
         self.log.append(evaluation)
         return evaluation
 
-    def _packed(self, gradients: Mapping[str, Any]) -> Vector:
+    def _ravelled(self, gradients: Mapping[str, Any]) -> Vector:
         """The gradient as one vector, after a check of its names and shapes."""
-        wanted = dict(zip(self.packing.names, self.packing.shapes, strict=True))
+        wanted = dict(zip(self.layout.names, self.layout.shapes, strict=True))
         found = {name: np.shape(gradient) for name, gradient in gradients.items()}
         if found != wanted:
             raise InputError(
                 f"The problem gave gradients of shapes {found} for parameters of shapes {wanted}; a gradient "
                 "has the names and the shapes of the parameters."
             )
-        return self.packing.pack({name: as_numbers(f"The gradient of '{name}'", gradients[name]) for name in wanted})
+        return self.layout.ravel({name: as_numbers(f"The gradient of '{name}'", gradients[name]) for name in wanted})
 
     def _require_finite(self, evaluation: Evaluation) -> None:
         """Raise ComputationError, with advice, if an evaluation cannot be used."""
@@ -183,16 +183,16 @@ class _Evaluator:
 
     def _names_of(self, components: np.ndarray) -> str:
         """The parameters to which the marked components (size,) of the vector belong, for a message."""
-        marked = self.packing.unpack(components.astype(np.float64))
+        marked = self.layout.unravel(components.astype(np.float64))
         return ", ".join(f"'{name}'" for name, marks in marked.items() if marks.any())
 
 
 def _open_log(
-    checkpoint: str | os.PathLike[str] | None, resume: bool, packing: Packing, settings: Mapping[str, str]
+    checkpoint: str | os.PathLike[str] | None, resume: bool, layout: ParameterLayout, settings: Mapping[str, str]
 ) -> Log:
-    """The log of evaluations on disk, or in memory if there is no checkpoint."""
+    """The replay log on disk, or in memory if there is no checkpoint."""
     if checkpoint is not None:
-        return EvaluationLog(checkpoint, packing, settings, resume)
+        return ReplayLog(checkpoint, layout, settings, resume)
     if resume:
         raise InputError("resume=True needs the checkpoint folder of the run to resume; give checkpoint=...")
     return MemoryLog()
@@ -222,18 +222,18 @@ def _checked_value(what: str, value: Any) -> Vector:
     return array
 
 
-def _checked_bounds(bounds: Mapping[str, tuple[Any, Any]], packing: Packing) -> tuple[Vector, Vector]:
+def _checked_bounds(bounds: Mapping[str, tuple[Any, Any]], layout: ParameterLayout) -> tuple[Vector, Vector]:
     """Lower and upper bounds as vectors (size,), or InputError if they do not fit the parameters."""
-    unknown = sorted(set(bounds) - set(packing.names))
+    unknown = sorted(set(bounds) - set(layout.names))
     if unknown:
         raise InputError(
             f"Bounds are given for {', '.join(map(repr, unknown))}, which the start does not name; the "
-            f"optimised parameters are {', '.join(map(repr, packing.names))}."
+            f"optimised parameters are {', '.join(map(repr, layout.names))}."
         )
-    shapes = dict(zip(packing.names, packing.shapes, strict=True))
+    shapes = dict(zip(layout.names, layout.shapes, strict=True))
     sides = {name: _checked_pair(name, bounds.get(name, (None, None)), shapes[name]) for name in shapes}
-    lower = packing.pack({name: pair[0] for name, pair in sides.items()})
-    upper = packing.pack({name: pair[1] for name, pair in sides.items()})
+    lower = layout.ravel({name: pair[0] for name, pair in sides.items()})
+    upper = layout.ravel({name: pair[1] for name, pair in sides.items()})
     return lower, upper
 
 
@@ -254,9 +254,9 @@ def _checked_pair(name: str, pair: tuple[Any, Any], shape: tuple[int, ...]) -> t
     return low, high
 
 
-def _require_within(vector: Vector, lower: Vector, upper: Vector, packing: Packing) -> None:
+def _require_within(vector: Vector, lower: Vector, upper: Vector, layout: ParameterLayout) -> None:
     """Raise InputError if the start is outside of the bounds."""
-    outside = packing.unpack(((vector < lower) | (vector > upper)).astype(np.float64))
+    outside = layout.unravel(((vector < lower) | (vector > upper)).astype(np.float64))
     for name, marks in outside.items():
         if marks.any():
             raise InputError(

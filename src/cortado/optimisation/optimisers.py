@@ -1,8 +1,8 @@
 """The optimisers: each an object that holds its settings and its algorithm.
 
-An optimiser is deterministic: what it asks for depends on its settings and on the evaluations it was given,
-on nothing else. Resuming (`cortado.optimisation.optimise`) rests on this; an optimiser with random numbers must draw
-them from a seed of its own.
+An optimiser is deterministic: the points at which it evaluates depend on its settings and on the losses and gradients
+before, and on nothing else. Resuming (`cortado.optimisation.optimise`) rests on this; an optimiser with random numbers
+must draw them from a seed of its own.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -12,7 +12,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from cortado.errors import InputError
-from cortado.optimisation.replay_log import Packing, Vector
+from cortado.optimisation.replay_log import ParameterLayout, Vector
 from cortado.scene.fields import as_number
 from cortado.words import quoted
 
@@ -23,11 +23,11 @@ PerParameter = float | Mapping[str, float]
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What an optimiser is given."""
+    """The problem that an optimiser is given, as a function of one vector."""
 
     evaluate: Callable[[Vector], tuple[float, Vector]]
     # vector (size,) -> loss, gradient (size,)
-    packing: Packing
+    layout: ParameterLayout
     # which components of the vectors belong to which parameter
     start: Vector
     # (size,), within the bounds
@@ -45,7 +45,7 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What an optimiser gives back."""
+    """What an optimiser returns."""
 
     last: Vector
     # (size,), the last iterate, which has been evaluated
@@ -59,7 +59,7 @@ class Outcome:
 class Optimiser(Protocol):
     """An algorithm that lowers the loss."""
 
-    def check(self, packing: Packing) -> None:
+    def check(self, layout: ParameterLayout) -> None:
         """Raise InputError if the settings do not fit these parameters."""
 
     def minimise(self, search: Search) -> Outcome:
@@ -92,13 +92,13 @@ class Adam:
         _require_fraction("beta2", self.beta2)
         _require_positive("epsilon", self.epsilon)
 
-    def check(self, packing: Packing) -> None:
+    def check(self, layout: ParameterLayout) -> None:
         """Raise InputError if the learning rates are not those of these parameters."""
-        _require_names("learning_rate", self.learning_rate, packing)
+        _require_names("learning_rate", self.learning_rate, layout)
 
     def minimise(self, search: Search) -> Outcome:
         """Make `search.iterations` updates; one gradient each, and one evaluation of the last iterate."""
-        learning_rate = search.packing.spread(self.learning_rate)
+        learning_rate = search.layout.spread(self.learning_rate)
         theta = search.start
         m, v = np.zeros_like(theta), np.zeros_like(theta)
         for t in range(1, search.iterations + 1):
@@ -131,13 +131,13 @@ class GradientDescent:
         _require_positive("learning_rate", self.learning_rate)
         _require_fraction("momentum", self.momentum)
 
-    def check(self, packing: Packing) -> None:
+    def check(self, layout: ParameterLayout) -> None:
         """Raise InputError if the learning rates are not those of these parameters."""
-        _require_names("learning_rate", self.learning_rate, packing)
+        _require_names("learning_rate", self.learning_rate, layout)
 
     def minimise(self, search: Search) -> Outcome:
         """Make `search.iterations` updates; one gradient each, and one evaluation of the last iterate."""
-        learning_rate = search.packing.spread(self.learning_rate)
+        learning_rate = search.layout.spread(self.learning_rate)
         before = x = search.start
         for _ in range(search.iterations):
             _, g = search.evaluate(x)
@@ -175,15 +175,15 @@ class LBFGS:
         _require_fraction("The tolerance of L-BFGS", self.tolerance)
         _require_positive("scale", self.scale)
 
-    def check(self, packing: Packing) -> None:
+    def check(self, layout: ParameterLayout) -> None:
         """Raise InputError if the scales are not those of these parameters."""
-        _require_names("scale", self.scale, packing)
+        _require_names("scale", self.scale, layout)
 
     def minimise(self, search: Search) -> Outcome:
         """Make at most `search.iterations` updates, of one or more evaluations each."""
         from scipy.optimize import minimize
 
-        scale = search.packing.spread(self.scale)
+        scale = search.layout.spread(self.scale)
         loss_start, gradient_start = search.evaluate(search.start)
         unit = _greatest_projected(search, search.start, gradient_start, scale)
         if unit == 0.0:
@@ -262,12 +262,12 @@ def _require_fraction(name: str, value: float) -> None:
         raise InputError(f"{name} must be a number in [0, 1), not {value!r}.")
 
 
-def _require_names(name: str, values: PerParameter, packing: Packing) -> None:
+def _require_names(name: str, values: PerParameter, layout: ParameterLayout) -> None:
     """Raise InputError if a setting is given per parameter for others than these parameters."""
-    if isinstance(values, Mapping) and set(values) != set(packing.names):
+    if isinstance(values, Mapping) and set(values) != set(layout.names):
         raise InputError(
             f"{name} is given for {quoted(values)}, but the optimised parameters are "
-            f"{quoted(packing.names)}; give it for each of these, or one number for all."
+            f"{quoted(layout.names)}; give it for each of these, or one number for all."
         )
 
 

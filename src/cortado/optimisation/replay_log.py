@@ -1,7 +1,8 @@
-"""The evaluations of an optimisation: how parameters are packed into one vector, and the log kept of them.
+"""The replay log of an optimisation, and how named parameters are ravelled into the one vector that it holds.
 
-An optimisation is a deterministic function of its evaluations. The log of the evaluations is therefore a
-complete checkpoint of any optimiser: a run is resumed by replaying the optimiser against the log.
+An optimiser is deterministic: given the losses and gradients of a former run, it takes the same steps. The replay log
+keeps every evaluation of the loss and its gradient, and so it is a complete checkpoint of any optimiser: a run is
+resumed by replaying the optimiser against the log.
 """
 
 import json
@@ -21,14 +22,14 @@ from cortado.io.files import parsed_json, sentences, write_atomically, write_ful
 
 Vector = npt.NDArray[np.float64]
 
-FORMAT = "cortado evaluations 1"
+FORMAT = "cortado replay log 1"
 LONGEST_HEADER = 2**20
 """Bytes of the first line of a log."""
-FILE_NAME = "evaluations.log"
+FILE_NAME = "replay.log"
 
 
 @dataclass(frozen=True)
-class Packing:
+class ParameterLayout:
     """Where each named parameter lies in the one vector that an optimiser sees."""
 
     names: tuple[str, ...]
@@ -38,7 +39,7 @@ class Packing:
 
     @classmethod
     def of(cls, parameters: Mapping[str, Vector]) -> Self:
-        """The packing of these parameters, in their order."""
+        """The layout of these parameters, in their order."""
         return cls(tuple(parameters), tuple(np.shape(value) for value in parameters.values()))
 
     @property
@@ -51,12 +52,12 @@ class Packing:
         """The number of components of the vector."""
         return sum(self.sizes)
 
-    def pack(self, parameters: Mapping[str, Any]) -> Vector:
-        """The vector (size,) of parameters that have the names and shapes of this packing."""
+    def ravel(self, parameters: Mapping[str, Any]) -> Vector:
+        """The vector (size,) of parameters that have the names and shapes of this layout."""
         parts = [np.asarray(parameters[name], dtype=np.float64).ravel() for name in self.names]
         return np.concatenate(parts)
 
-    def unpack(self, vector: Vector) -> dict[str, Vector]:
+    def unravel(self, vector: Vector) -> dict[str, Vector]:
         """The parameters, by name, of a vector (size,), as copies; scalars are arrays of shape ()."""
         parts = np.split(vector, np.cumsum(self.sizes)[:-1])
         return {
@@ -81,7 +82,7 @@ class Evaluation:
 
 
 class Log(Protocol):
-    """What the optimisation needs of a log of evaluations."""
+    """What the optimisation needs of a replay log."""
 
     @property
     def fate(self) -> str:
@@ -100,7 +101,7 @@ class Log(Protocol):
 
 
 class MemoryLog:
-    """A log that lives as long as the process."""
+    """A replay log that lives as long as the process."""
 
     fate = "were not kept, as there is no checkpoint"
 
@@ -122,8 +123,8 @@ class MemoryLog:
         """Nothing is open."""
 
 
-class EvaluationLog:
-    """A log in one file of a folder; a kill at any moment costs at most the evaluation being written.
+class ReplayLog:
+    """A replay log in one file of a folder; a kill at any moment costs at most the evaluation being written.
 
     The file is a line of JSON (format, names, shapes, settings) and then one record of fixed size per
     evaluation: index (uint64), loss, parameters and gradient (float64), and the CRC-32 of all these (uint32),
@@ -132,24 +133,24 @@ class EvaluationLog:
     """
 
     def __init__(
-        self, folder: str | os.PathLike[str], packing: Packing, settings: Mapping[str, str], resume: bool
+        self, folder: str | os.PathLike[str], layout: ParameterLayout, settings: Mapping[str, str], resume: bool
     ) -> None:
         """Open the log of `folder`, or begin one there.
 
         Parameters:
             folder: made if it is not there.
-            packing: names and shapes of the parameters.
+            layout: names and shapes of the parameters.
             settings: what else must be the same when the run is resumed, as text by name.
             resume: go on with the evaluations in the folder, if there are any.
 
         Raises InputError if the folder holds evaluations and `resume` is false, if they belong to other
         settings, or if the file is damaged elsewhere than at its end.
         """
-        self._packing = packing
+        self._layout = layout
         self._path = Path(folder) / FILE_NAME
-        self._record_size = 8 + 8 * (1 + 2 * packing.size) + 4
-        shapes = [list(shape) for shape in packing.shapes]
-        header = {"format": FORMAT, "names": list(packing.names), "shapes": shapes, **settings}
+        self._record_size = 8 + 8 * (1 + 2 * layout.size) + 4
+        shapes = [list(shape) for shape in layout.shapes]
+        header = {"format": FORMAT, "names": list(layout.names), "shapes": shapes, **settings}
         if not resume:
             _require_unused(self._path)
         if not resume or not self._path.exists():
@@ -177,7 +178,7 @@ class EvaluationLog:
         """The evaluation of that index, 0 <= index < len(self), bit for bit as it was appended."""
         self._file.seek(self._first_record + index * self._record_size)
         values = np.frombuffer(self._file.read(self._record_size)[8:-4], dtype="<f8").astype(np.float64)
-        size = self._packing.size
+        size = self._layout.size
         return Evaluation(values[1 : 1 + size], float(values[0]), values[1 + size :])
 
     def append(self, evaluation: Evaluation) -> None:
@@ -261,7 +262,7 @@ def _read_header(file: BinaryIO, path: Path) -> dict[str, Any]:
     except ValueError:
         found = None
     if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise InputError(f"'{path}' is no log of evaluations ('{FORMAT}'); give another checkpoint folder.")
+        raise InputError(f"'{path}' is no replay log ('{FORMAT}'); give another checkpoint folder.")
     return found
 
 

@@ -1,4 +1,4 @@
-"""What an optimisation leaves: its best parameters, and every evaluation on the way."""
+"""The result of an optimisation: its best parameters, and every evaluation on the way."""
 
 import re
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Record:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What an optimisation found."""
+    """The best parameters of an optimisation, with its history."""
 
     parameters: Parameters
     # with the lowest loss seen

@@ -1,7 +1,7 @@
-"""Other coordinates for the parameters of a problem, in which an optimiser may step freely.
+"""Transforms of parameters: coordinates u of a parameter p(u) in which an optimiser may step freely.
 
-A coordinate u stands for the parameter p(u): fractions that add up to 1, numbers that stay positive, controls that
-change slowly.
+Whatever u is, p(u) is a parameter that can be: fractions that add up to 1, a number that stays positive, a parameter
+over time that changes slowly.
 """
 
 from collections.abc import Mapping
@@ -19,25 +19,25 @@ from cortado.problem import Problem
 from cortado.rollout import Observer, StepDerivative
 
 SMALLEST = 1e-4
-"""Fractions below it are taken as it where coordinates are looked for: that of 0 is infinitely far away."""
+"""Smaller fractions are replaced by this one where their coordinates are computed: that of 0 is minus infinity."""
 
 
 class Bijector(Protocol):
-    """A smooth map p(u), with what it does to a gradient."""
+    """A smooth map p(u) with its inverse and its adjoint."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
         """p(u)."""
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        """A u with p(u) = ``parameter``, as nearly as there is one."""
+        """The u for which p(u) is ``parameter``, or nearest to it."""
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
-        """The derivative with respect to u, from that with respect to p(u)."""
+        """The derivative of a loss with respect to u, given ``bar``, that with respect to p(u)."""
 
 
 @dataclass(frozen=True)
 class Logarithm:
-    """p = exp(u): a positive number, changed by factors."""
+    """p = exp(u): a step in u multiplies the parameter, which stays positive."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
         return np.exp(u)
@@ -68,8 +68,8 @@ class Softmax:
 
 
 @dataclass(frozen=True)
-class Knots:
-    """p (steps, d) interpolated linearly in time between knots u (k, d), the first and last at both ends."""
+class TimeInterpolation:
+    """p (steps, d) interpolated linearly in time between knots u (k, d) at even times from first to last step."""
 
     steps: int
     knots: int
@@ -91,7 +91,7 @@ class Knots:
 
 
 class Transformed:
-    """A problem whose parameters are coordinates; those without any are their own."""
+    """A problem as a function of coordinates: those of the given bijectors, all other parameters as they are."""
 
     def __init__(self, problem: Problem, coordinates: Mapping[str, Bijector]):
         self.problem, self.coordinates = problem, dict(coordinates)
@@ -99,7 +99,7 @@ class Transformed:
 
     @property
     def fingerprint(self) -> str:
-        """Which problem in which coordinates this is."""
+        """A text that identifies the problem and its coordinates."""
         return f"{self.problem.fingerprint}; coordinates {sorted(self.coordinates.items(), key=str)}"
 
     def parameters(self, u: Mapping[str, Any]) -> Arrays:
@@ -127,16 +127,16 @@ class Transformed:
     def estimate(
         self, u: Mapping[str, Any], gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
-        """The same, with what the estimator reports; a spread, of an estimator that has one, is that of coordinates."""
+        """The same, with what the estimator reports. The spread of an ensemble is one of coordinates."""
         return estimate(self, u, gradient, observe)
 
     def forward_pass(self, u: Mapping[str, Any]) -> "TransformedPass":
-        """A forward run that can be gone back through: what estimators work with."""
+        """A forward run that estimators can go back through."""
         return TransformedPass(self.problem.forward_pass(self.parameters(u)), self.coordinates, u)
 
 
 class TransformedPass:
-    """A forward run of a problem, and ways back to coordinates."""
+    """A forward run of a problem, and the reverse pass to coordinates."""
 
     def __init__(self, forward_pass: ForwardPass, coordinates: Mapping[str, Bijector], u: Mapping[str, Any]):
         self._pass, self._coordinates, self._u = forward_pass, coordinates, u

@@ -1,6 +1,7 @@
 """Whether parameters make sense for a scene: numbers that a precision holds, places inside of the container, and time
 steps below the limit of stability."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -29,8 +30,8 @@ def check_sizes(values: Arrays, precision: Precision) -> None:
 
 
 def check_places(values: Arrays, scene: Scene, free: int) -> None:
-    """Fluid starts inside of the container, and a nozzle stays there; raises `InputError`. Only the first ``free``
-    particles do not wait in the nozzle, where they may be outside."""
+    """Fluid starts inside of the container, and the opening of the emitter stays there; raises `InputError`. Only the
+    first ``free`` particles do not wait in the emitter, where they may be outside."""
     spacing = scene.discretisation.spacing
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
@@ -46,30 +47,26 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
             )
 
 
-def check_state(state: RestartState, scene: Scene, shape: tuple[int, int], free: int) -> None:
-    """A state to go on from is one of the scene, with positions of a shape (n, d); raises `InputError`. Only the first
-    ``free`` particles never waited in the nozzle."""
+def check_state(state: RestartState, shapes: Mapping[str, tuple[int, ...]], scene: Scene, free: int) -> None:
+    """A state to go on from is one of the scene, whose fields have these shapes; raises `InputError`. Only the first
+    ``free`` particles never waited in the emitter."""
     if not isinstance(state, RestartState):
         raise InputError(f"state is {shown(state)}, but must be a RestartState, such as trajectory.last_state.")
-    parts: dict[str, tuple[Any, tuple[int, ...]]] = {
-        "positions": (state.positions, shape),
-        "velocities": (state.velocities, shape),
-        "constants.reference_density": (state.constants.reference_density, shape[:1]),
-    }
-    if len(scene.phase) > 1:
-        parts["mass_fractions"] = (state.mass_fractions, (shape[0], len(scene.phase)))
-    for name, (value, wanted) in parts.items():
-        array = as_numbers(f"state.{name}", value)
+    if state.fields.keys() != shapes.keys():
+        raise InputError(f"state has {', '.join(state.fields)}, but must have {', '.join(shapes)} in this scene.")
+    for name, wanted in shapes.items():
+        array = as_numbers(f"state {name}", state[name])
         if array.shape != wanted:
-            raise InputError(f"state.{name} has shape {array.shape}, but must be {wanted}.")
+            raise InputError(f"state {name} has shape {array.shape}, but must be {wanted}.")
         if not np.isfinite(array).all():
-            raise InputError(f"state.{name} has a value that is not finite, but must be numbers.")
-    if (np.asarray(state.constants.reference_density) <= 0.0).any():
-        raise InputError("state.constants.reference_density must be greater than 0.")
+            raise InputError(f"state {name} has a value that is not finite, but must be numbers.")
+    if (np.asarray(state["reference_density"]) <= 0.0).any():
+        raise InputError("state reference_density must be greater than 0.")
     held = scene.forces.pressure and np.isinf(scene.container.region(scene.dimension).rim)
-    for particle in _outside(scene, np.asarray(state.positions)[:free])[:1] if held else ():
-        place = _place(state.positions[particle])
-        raise InputError(f"state.positions has particle {particle} at {place}, outside the container of this scene.")
+    positions = np.asarray(state["positions"])
+    for particle in _outside(scene, positions[:free])[:1] if held else ():
+        place = _place(positions[particle])
+        raise InputError(f"state positions has particle {particle} at {place}, outside the container of this scene.")
 
 
 def unstable_sentence(values: Arrays, scene: Scene) -> str | None:

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.device.fields import Entry, first_values
 from cortado.device.precision import Precision
 from cortado.device.state import Parameters, State
 from cortado.device.threads import WARP
@@ -23,10 +24,12 @@ from cortado.parameters.reference_density import (
 from cortado.parameters.registry import BY_NAME, Role, Source, names
 from cortado.parameters.tilt import Tilt
 from cortado.parameters.values import OVER_TIME, Arrays, Values, check_known, checked_value, scene_values
-from cortado.restart import Elapsed, RestartState
+from cortado.restart import Clock, RestartState
 from cortado.rollout import Rollout
 
 RUN, STATE = names(Role.RUN), names(Role.STATE)
+DENSITY = "reference_density"
+"""The field of a state that the first mass fractions and the rest densities decide."""
 DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
 """Parameters that explicit steps of diffusion have to follow."""
 
@@ -47,7 +50,7 @@ class Simulated(Source, Protocol):
 
     @property
     def free_particles(self) -> int:
-        """How many particles, the first ones, do not wait in a nozzle."""
+        """How many particles, the first ones, do not wait in an emitter."""
 
     def substeps(self, time_step: NDArray, mobility: NDArray, interface_width: NDArray, rest_density: NDArray) -> int:
         """Explicit steps of diffusion within a time step that are stable with these parameters."""
@@ -93,18 +96,16 @@ class ParameterSpace:
         """
         simulation, parameters, values = self._simulation, rollout.parameters, self._upright(values)
         rollout.evaluation += 1
-        rollout.elapsed = Elapsed() if state is None else state.elapsed
-        if state is not None:
-            fractions = self._scene["mass_fractions"] if state.mass_fractions is None else state.mass_fractions
-            rollout.initial.set(state.positions, state.velocities, fractions)
-        elif values.keys().isdisjoint(STATE):
-            rollout.initial.assign(simulation.state)
+        rollout.clock = Clock() if state is None else state.clock
+        rollout.initial.assign(simulation.state)
+        if state is None:
+            rollout.initial.set(first_values(simulation.state.fields, values))
+            rollout.initial.set({DENSITY: self._reference_density(values)})
         else:
-            rollout.initial.set(*(values.get(name, self._scene[name]) for name in STATE))
+            rollout.initial.set(state.fields)
         chosen = {name: values.get(name, self._scene[name]) for name in RUN}
-        rollout.time_step, rollout.flow_rate = float(chosen["time_step"]), float(chosen["flow_rate"])
-        density = self._reference_density(values) if state is None else state.constants.reference_density
-        parameters.set({**chosen, "reference_density": density})
+        rollout.time_step = float(chosen["time_step"])
+        parameters.set(chosen)
         needed = simulation.substeps(**{name: chosen[name] for name in DIFFUSION})
         rollout.substeps = max(needed, 1) if "mobility" in varied and self._phases > 1 else needed
 
@@ -112,14 +113,14 @@ class ParameterSpace:
         """Whether a state is one of this simulation, and ``values`` go with it; raises `InputError`."""
         for name in (*STATE, "rest_density"):
             if name in values:
-                raise InputError(f"control {name} is given, but must be left out with a state, which has its own.")
-        check_state(state, self._simulation.scene, self._simulation.positions.shape, self._simulation.free_particles)
-        if self._simulation.scene.emitter is not None:
-            for name in ("time_step", "flow_rate"):
-                before, now = getattr(state.constants, name), float(values.get(name, self._scene[name]))
-                if now != before:
-                    wanted = f"{before} with this state, whose nozzle ran with that"
-                    raise InputError(f"{name} is {now:g}, but must be {wanted}.")
+                raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
+        simulation = self._simulation
+        shapes = {
+            field.name: field.shape(len(simulation.positions), simulation.dimension, self._phases)
+            for field in simulation.state.fields
+            if field.name != "mass_fractions" or self._phases > 1
+        }
+        check_state(state, shapes, simulation.scene, simulation.free_particles)
 
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
@@ -131,21 +132,24 @@ class ParameterSpace:
             angles = values.get("tilt", np.zeros(self._simulation.dimension - 1))
             along = {**along, "gravity": self._tilt.tangent(angles, along["tilt"])}
         along = {name: along.get(name, np.zeros_like(value)) for name, value in self._scene.items()}
-        dot.set(*(along[name] for name in STATE))
+        dot.set(first_values(dot.fields, along))
         fractions_dot, density_dot = along["mass_fractions"], np.atleast_1d(along["rest_density"])
-        change = reference_density_tangent(*self._composition(values), fractions_dot, density_dot)
-        parameters.set({**{name: along[name] for name in RUN}, "reference_density": change})
+        dot.set({DENSITY: reference_density_tangent(*self._composition(values), fractions_dot, density_dot)})
+        parameters.set({name: along[name] for name in RUN})
         return dot, parameters
 
     def gradient(self, values: Arrays, state: State, parameters: Parameters) -> Arrays:
         """Adjoints of the first state and of the parameters, for the names and in the shapes of ``values``."""
         dimension = self._simulation.dimension
-        found: Arrays = {}
-        if not values.keys().isdisjoint(STATE):
-            found |= dict(zip(STATE, (array.astype(np.float64) for array in state.numpy(dimension)), strict=True))
-        for name in RUN:
-            if name in values:
-                found[name] = parameters[name].numpy().astype(np.float64)
+        found: Arrays = {name: parameters[name].numpy() for name in RUN if name in values}
+        for field in state.fields:
+            if field.first in values:
+                bar = state[field.name].numpy()
+                if field.first in found:
+                    found[field.first][0] += bar[0]
+                else:
+                    found[field.first] = bar[:, :dimension] if field.entry is Entry.VECTOR else bar
+        found = {name: bar.astype(np.float64) for name, bar in found.items()}
         if "tilt" in values:
             gravity = parameters["gravity"].numpy()[:, :dimension].astype(np.float64)
             found["tilt"] = self._tilt.adjoint(values["tilt"], gravity)
@@ -154,11 +158,11 @@ class ParameterSpace:
                 table = found[name][:, :dimension]
                 found[name] = table if values[name].ndim == 2 else table.sum(axis=0)
         if not values.keys().isdisjoint(("mass_fractions", "rest_density")):
-            bar = parameters["reference_density"].numpy().astype(np.float64)
+            bar = state[DENSITY].numpy().astype(np.float64)
             bars = reference_density_adjoint(*self._composition(values), bar)
-            for name, share in zip(("mass_fractions", "rest_density"), bars, strict=True):
+            for name, own_bar in zip(("mass_fractions", "rest_density"), bars, strict=True):
                 if name in found:
-                    found[name] = found[name] + share
+                    found[name] = found[name] + own_bar
         return {name: found[name].reshape(values[name].shape) for name in values if name in found}
 
     def _check(self, values: Arrays) -> None:

@@ -29,16 +29,20 @@ class Tilt:
     def tangent(self, angles: np.ndarray, dot: np.ndarray) -> np.ndarray:
         """The derivative of `gravity` along ``dot`` [m/s2], of the angles' shape."""
         a, a_dot = np.radians(angles), np.radians(dot)
-        sine, bend = self._factors(a)
+        sine, sine_derivative = self._factors(a)
         along = (a * a_dot).sum(axis=-1, keepdims=True)
-        return self._size * np.concatenate([-sine * along, sine * a_dot + bend * along * a], axis=-1) @ self._axes
+        return (
+            self._size
+            * np.concatenate([-sine * along, sine * a_dot + sine_derivative * along * a], axis=-1)
+            @ self._axes
+        )
 
     def adjoint(self, angles: np.ndarray, bar: np.ndarray) -> np.ndarray:
         """The derivative with respect to the angles [1/degree], from that with respect to gravity."""
         a, bars = np.radians(angles), self._size * bar @ self._axes.T
-        sine, bend = self._factors(a)
+        sine, sine_derivative = self._factors(a)
         rest_bar, lean_bar = bars[..., :1], bars[..., 1:]
-        along = bend * (a * lean_bar).sum(axis=-1, keepdims=True) - sine * rest_bar
+        along = sine_derivative * (a * lean_bar).sum(axis=-1, keepdims=True) - sine * rest_bar
         return np.radians(sine * lean_bar + along * a)
 
     @property
@@ -64,5 +68,5 @@ class Tilt:
         """(..., 1) s = sin|a| / |a|, and its derivative along |a|, over |a|."""
         size = np.linalg.norm(a, axis=-1, keepdims=True)
         sine, safe = np.sinc(size / np.pi), np.maximum(size, SMALL)
-        bend = (np.cos(safe) - np.sinc(safe / np.pi)) / safe**2
-        return sine, np.where(size < SMALL, -1.0 / 3.0 + size**2 / 30.0 - size**4 / 840.0, bend)
+        derivative = (np.cos(safe) - np.sinc(safe / np.pi)) / safe**2
+        return sine, np.where(size < SMALL, -1.0 / 3.0 + size**2 / 30.0 - size**4 / 840.0, derivative)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cortado.device.cores import usable_cores
 from cortado.discretise.discrete_scene import DiscreteScene, discretise
 from cortado.errors import DivergedError, InputError, shown
 from cortado.lattice.calibration import SKIN
@@ -62,6 +63,8 @@ class Simulation:
         all cores unless said, or one where there are too few particles. The bits of the results do not depend on them.
         """
         scene = as_scene(scene)
+        if scene.solver.kind != "pcisph":
+            raise InputError(f"solver.kind is {shown(scene.solver.kind)}, but must be pcisph for the reference engine.")
         if len(scene.phase) > 1 or scene.emitter is not None:
             raise InputError("scene has several phases or an emitter, but must have neither for the reference engine.")
         unknown = [p.name for p in BY_NAME.values() if p.is_optional and p.present(scene)]
@@ -78,7 +81,7 @@ class Simulation:
         self._region = scene.container.region(scene.dimension).opened(discrete.periods)
         if threads is None:
             least = LEAST_PARALLEL.get(precision, 1000)
-            threads = min(len(os.sched_getaffinity(0)), 1 + len(self.positions) // least)
+            threads = min(usable_cores(), 1 + len(self.positions) // least)
         self.threads = _positive("threads", threads)
         self._engine = extension().make_engine(precision, _engine_scene(scene, discrete), self.threads)
 
@@ -91,7 +94,7 @@ class Simulation:
     ) -> History:
         """Run from the scene's first state; ``controls`` replace its parameters. Raises `DivergedError` when a
         particle is lost."""
-        at = self._parameters(controls or {}, steps, "control")
+        at = self._parameters(controls or {}, steps, "parameter")
         return self._history(self._engine.run(at, steps, _positive("record_every", record_every), observe))
 
     def tangent(

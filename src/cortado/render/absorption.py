@@ -33,12 +33,12 @@ class BrightnessFunctions:
     """Warp functions of what a sample lets through."""
 
     brightness: Any
-    brightness_slope: Any
+    brightness_derivative: Any
 
 
 @cache
 def brightness_functions(precision: Precision) -> BrightnessFunctions:
-    """Warp functions ``brightness`` E(u) and ``brightness_slope`` E'(u); both take exp(-u) besides."""
+    """Warp functions ``brightness`` E(u) and ``brightness_derivative`` E'(u); both take exp(-u) besides."""
     real = precision.real
 
     @wp.func
@@ -52,7 +52,7 @@ def brightness_functions(precision: Precision) -> BrightnessFunctions:
         return total
 
     @wp.func
-    def brightness_slope(u: real, passed: real) -> real:
+    def brightness_derivative(u: real, passed: real) -> real:
         """Below 0.1 the series -sum_n (n + 1) (-u)^n / (n + 2)!."""
         if u > real(0.1):
             return (passed * (real(1.0) + u) - real(1.0)) / (u * u)
@@ -61,7 +61,7 @@ def brightness_functions(precision: Precision) -> BrightnessFunctions:
             total = real(1.0) - total * u * real(11 - n) / (real(10 - n) * real(12 - n))
         return real(-0.5) * total
 
-    return BrightnessFunctions(brightness=brightness, brightness_slope=brightness_slope)
+    return BrightnessFunctions(brightness=brightness, brightness_derivative=brightness_derivative)
 
 
 @dataclass(frozen=True)
@@ -76,14 +76,14 @@ class AbsorptionKernels:
 @cache
 def absorption_kernels(precision: Precision) -> AbsorptionKernels:
     """Kernels over pixels: ``forward`` and ``adjoint``; and over nodes: ``gather``, of the adjoints of samples."""
-    real, vector, ink, pose = precision.real, precision.vector, rgba_type(precision), pose_type(precision)
+    real, vector, rgba, pose = precision.real, precision.vector, rgba_type(precision), pose_type(precision)
     nodes_struct, camera_struct = nodes_type(precision), camera_type(precision)
     rays, interpolation = ray_functions(precision), interpolation_functions(precision)
     start, direction, distance = rays.start, rays.direction, rays.distance
     samples_within, pixels_before = rays.samples_within, rays.pixels_before
-    value, slope, share = interpolation.value, interpolation.slope, interpolation.share
+    value, gradient, trilinear_weight = interpolation.value, interpolation.gradient, interpolation.trilinear_weight
     shining = brightness_functions(precision)
-    brightness, brightness_slope = shining.brightness, shining.brightness_slope
+    brightness, brightness_derivative = shining.brightness, shining.brightness_derivative
     place = node_functions(precision).place
     module = wp.get_module(f"cortado_absorption_{precision.name}")
     module.options["enable_backward"] = False
@@ -99,7 +99,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
         nodes: nodes_struct,
         thickness: real,
         background: vector,
-        field: wp.array3d(dtype=ink),
+        field: wp.array3d(dtype=rgba),
         # out
         image: wp.array(dtype=vector),
         spans: wp.array(dtype=wp.vec2i),
@@ -126,12 +126,12 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
         camera: camera_struct,
         nodes: nodes_struct,
         thickness: real,
-        field: wp.array3d(dtype=ink),
+        field: wp.array3d(dtype=rgba),
         image: wp.array(dtype=vector),
         spans: wp.array(dtype=wp.vec2i),
         image_bar: wp.array(dtype=vector),
         # out
-        samples_bar: wp.array2d(dtype=ink),
+        samples_bar: wp.array2d(dtype=rgba),
         pose_bar: wp.array(dtype=pose),
     ):
         """``samples_bar`` [sample of the span, pixel]; ``pose_bar`` gathers the adjoint of the pose ray by ray."""
@@ -153,11 +153,11 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
             shine = brightness(u, passed)
             colour_bar = wp.dot(vector(q[0], q[1], q[2]), bar)
             behind = behind - seen * shine * colour_bar
-            coverage_bar = thickness * (seen * brightness_slope(u, passed) * colour_bar - behind)
+            coverage_bar = thickness * (seen * brightness_derivative(u, passed) * colour_bar - behind)
             p_bar = (seen * shine) * bar
-            q_bar = ink(p_bar[0], p_bar[1], p_bar[2], coverage_bar)
+            q_bar = rgba(p_bar[0], p_bar[1], p_bar[2], coverage_bar)
             samples_bar[s - span[0], pixel] = q_bar
-            x_bar = slope(x, q_bar, field, nodes)
+            x_bar = gradient(x, q_bar, field, nodes)
             push += x_bar
             turn += wp.cross(x - camera.position, x_bar)
             transmitted = transmitted * passed
@@ -168,9 +168,9 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
         camera: camera_struct,
         nodes: nodes_struct,
         spans: wp.array(dtype=wp.vec2i),
-        samples_bar: wp.array2d(dtype=ink),
+        samples_bar: wp.array2d(dtype=rgba),
         # out
-        field_bar: wp.array3d(dtype=ink),
+        field_bar: wp.array3d(dtype=rgba),
     ):
         """Every node gathers from the samples in the eight cells around it, found by way of the screen."""
         k, j, i = wp.tid()
@@ -178,7 +178,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
         lower = x_g - diagonal(nodes)
         upper = x_g + diagonal(nodes)
         window = pixels_before(lower, upper, camera)
-        total = ink()
+        total = rgba()
         for row in range(window[2], window[3]):
             for column in range(window[0], window[1]):
                 pixel = row * camera.columns + column
@@ -187,7 +187,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
                 near_by = samples_within(o, d, lower, upper, camera)
                 span = spans[pixel]
                 for s in range(wp.max(near_by[0], span[0]), wp.min(near_by[1], span[1])):
-                    total += share(o + distance(s, camera) * d, x_g, nodes) * samples_bar[s - span[0], pixel]
+                    total += trilinear_weight(o + distance(s, camera) * d, x_g, nodes) * samples_bar[s - span[0], pixel]
         field_bar[k, j, i] = total
 
     return AbsorptionKernels(forward=march, adjoint=march_adjoint, gather=gather)

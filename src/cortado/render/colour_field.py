@@ -102,7 +102,7 @@ class ColourFieldKernels:
 def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
     """Kernels ``forward``, over nodes, and ``adjoint``, over sorted particles."""
     precision = discretisation.precision
-    real, vector, ink = precision.real, precision.vector, rgba_type(precision)
+    real, vector, rgba = precision.real, precision.vector, rgba_type(precision)
     nodes_struct, grid_type = nodes_type(precision), cell_grid_type(precision)
     cells, smooth = cell_functions(precision), smoothing_functions(discretisation.smoothing, precision)
     wrap, cell_of, below, above = cells.wrap, cells.cell_of, cells.below, cells.above
@@ -122,16 +122,16 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
         grid: grid_type,
         h: real,
         sigma: real,
-    ) -> ink:
+    ) -> rgba:
         """Over the particles of the cells c_x - 1, c_x and c_x + 1 of one row."""
         n = grid.shape[0]
-        total = ink()
+        total = rgba()
         for o in range(below(n), above(n)):
             cell = row + wrap(c_x + o, n)
             for j in range(grid.starts[cell], grid.starts[cell + 1]):
                 x_gj = nearest(x_g - x[j], nodes)
                 if wp.dot(x_gj, x_gj) < h * h:
-                    total += weight(x_gj, h, sigma) * ink(colour[j][0], colour[j][1], colour[j][2], real(1.0))
+                    total += weight(x_gj, h, sigma) * rgba(colour[j][0], colour[j][1], colour[j][2], real(1.0))
         return total
 
     @wp.kernel(module=module, enable_backward=False)
@@ -144,14 +144,14 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
         x: wp.array(dtype=vector),
         colour: wp.array(dtype=vector),
         # out
-        field: wp.array3d(dtype=ink),
+        field: wp.array3d(dtype=rgba),
     ):
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)
         c = cell_of(x_g, grid)
         n_y = grid.shape[1]
         n_z = grid.shape[2]
-        total = ink()
+        total = rgba()
         for o_z in range(below(n_z), above(n_z)):
             for o_y in range(below(n_y), above(n_y)):
                 row = (wrap(c[2] + o_z, n_z) * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]
@@ -172,17 +172,17 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
         order: wp.array(dtype=wp.int32),
         x: wp.array(dtype=vector),
         colour: wp.array(dtype=vector),
-        field_bar: wp.array3d(dtype=ink),
+        field_bar: wp.array3d(dtype=rgba),
         # out
         x_scene_bar: wp.array(dtype=vector),
         colour_scene_bar: wp.array(dtype=vector),
     ):
         p = wp.tid()
         x_p = x[p]
-        ink_p = ink(colour[p][0], colour[p][1], colour[p][2], real(1.0))
+        rgba_p = rgba(colour[p][0], colour[p][1], colour[p][2], real(1.0))
         r = nodes.frequency * h
         x_bar = vector()
-        ink_bar = ink()
+        rgba_bar = rgba()
         for q in range(nodes.images[0] * nodes.images[1] * nodes.images[2]):
             x_q = image(q, x_p, h, nodes)
             s = nodes.frequency * (x_q - nodes.origin)
@@ -192,9 +192,9 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
                         x_gq = place(i, j, k, nodes) - x_q
                         if wp.dot(x_gq, x_gq) < h * h:
                             bar = field_bar[k, j, i]
-                            ink_bar += weight(x_gq, h, sigma) * bar
-                            x_bar += -wp.dot(bar, ink_p) * gradient(x_gq, h, sigma)
+                            rgba_bar += weight(x_gq, h, sigma) * bar
+                            x_bar += -wp.dot(bar, rgba_p) * gradient(x_gq, h, sigma)
         x_scene_bar[order[p]] = volume * x_bar
-        colour_scene_bar[order[p]] = volume * vector(ink_bar[0], ink_bar[1], ink_bar[2])
+        colour_scene_bar[order[p]] = volume * vector(rgba_bar[0], rgba_bar[1], rgba_bar[2])
 
     return ColourFieldKernels(forward=colour_field, adjoint=colour_field_adjoint)

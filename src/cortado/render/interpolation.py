@@ -18,35 +18,35 @@ class InterpolationFunctions:
     """Warp functions of trilinear interpolation between the nodes of a field."""
 
     value: Any
-    slope: Any
-    share: Any
+    gradient: Any
+    trilinear_weight: Any
 
 
 @cache
 def interpolation_functions(precision: Precision) -> InterpolationFunctions:
-    """Warp functions ``value`` at a point, ``slope`` (the gradient of bar . value) and ``share`` (of one node)."""
-    real, vector, ink = precision.real, precision.vector, rgba_type(precision)
+    """Warp functions ``value`` at a point, ``gradient`` (of bar . value) and ``trilinear_weight`` (of one node)."""
+    real, vector, rgba = precision.real, precision.vector, rgba_type(precision)
     nodes_struct = nodes_type(precision)
 
     @wp.func
-    def node(i: int, j: int, k: int, field: wp.array3d(dtype=ink), nodes: nodes_struct) -> ink:
+    def node(i: int, j: int, k: int, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
         n = nodes.shape
         if i >= 0 and j >= 0 and k >= 0 and i < n[0] and j < n[1] and k < n[2]:
             return field[k, j, i]
-        return ink()
+        return rgba()
 
     @wp.func
     def part(f: real, side: int) -> real:
         return wp.where(side == 0, real(1.0) - f, f)
 
     @wp.func
-    def value(x: vector, field: wp.array3d(dtype=ink), nodes: nodes_struct) -> ink:
+    def value(x: vector, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
         s = nodes.frequency * (x - nodes.origin)
         i = int(wp.floor(s[0]))
         j = int(wp.floor(s[1]))
         k = int(wp.floor(s[2]))
         f = s - vector(real(i), real(j), real(k))
-        total = ink()
+        total = rgba()
         for a in range(2):
             for b in range(2):
                 for c in range(2):
@@ -55,7 +55,7 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
         return total
 
     @wp.func
-    def slope(x: vector, bar: ink, field: wp.array3d(dtype=ink), nodes: nodes_struct) -> vector:
+    def gradient(x: vector, bar: rgba, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> vector:
         """On the face of a cell, where the gradient jumps, that of the cell which begins there."""
         s = nodes.frequency * (x - nodes.origin)
         i = int(wp.floor(s[0]))
@@ -75,12 +75,12 @@ def interpolation_functions(precision: Precision) -> InterpolationFunctions:
         return nodes.frequency * total
 
     @wp.func
-    def share(x: vector, x_g: vector, nodes: nodes_struct) -> real:
-        """How much of the value at x comes from the node at x_g."""
+    def trilinear_weight(x: vector, x_g: vector, nodes: nodes_struct) -> real:
+        """The weight of the node at x_g in the value at x."""
         s = nodes.frequency * (x - x_g)
         w_x = wp.max(real(1.0) - wp.abs(s[0]), real(0.0))
         w_y = wp.max(real(1.0) - wp.abs(s[1]), real(0.0))
         w_z = wp.max(real(1.0) - wp.abs(s[2]), real(0.0))
         return w_x * w_y * w_z
 
-    return InterpolationFunctions(value=value, slope=slope, share=share)
+    return InterpolationFunctions(value=value, gradient=gradient, trilinear_weight=trilinear_weight)

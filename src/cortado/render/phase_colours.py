@@ -28,11 +28,11 @@ def phase_colour_kernels(precision: Precision, phases: int) -> PhaseColourKernel
     """Kernels ``forward`` (which sorts positions besides) and ``adjoint``."""
     vector, fractions = precision.vector, precision.fractions(phases)
     colours_matrix = colours_type(precision, phases)
-    module = wp.get_module(f"cortado_tint_{phases}_{precision.name}")
+    module = wp.get_module(f"cortado_phase_colour_{phases}_{precision.name}")
     module.options["enable_backward"] = False
 
     @wp.kernel(module=module, enable_backward=False)
-    def tint(
+    def phase_colour(
         colours: wp.array(dtype=colours_matrix),
         order: wp.array(dtype=wp.int32),
         x_scene: wp.array(dtype=vector),
@@ -61,4 +61,4 @@ def phase_colour_kernels(precision: Precision, phases: int) -> PhaseColourKernel
         c_scene_bar[j] = colours[0] * bar
         colours_bar[j] = wp.outer(c_scene[j], bar)
 
-    return PhaseColourKernels(forward=tint, adjoint=phase_colour_adjoint)
+    return PhaseColourKernels(forward=phase_colour, adjoint=phase_colour_adjoint)

@@ -8,9 +8,9 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import as_numbers
+from cortado.device.arrays import padded
 from cortado.device.kernel_cache import start_warp
 from cortado.device.precision import Precision
-from cortado.device.state import padded
 from cortado.device.threads import WARP
 from cortado.errors import InputError, shown
 from cortado.lattice.smoothing import SmoothingKernel

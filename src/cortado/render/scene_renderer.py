@@ -6,6 +6,7 @@ import numpy as np
 from pydantic import AfterValidator, TypeAdapter
 
 from cortado.device.precision import Precision
+from cortado.discretise.discrete_scene import Lattice
 from cortado.lattice.smoothing import SmoothingKernel
 from cortado.render.cameras import Perspective
 from cortado.render.renderer import Renderer
@@ -34,28 +35,31 @@ class Pictured(Protocol):
     precision: Precision
     device: Any
     smoothing: SmoothingKernel
-    solver: Any
+    lattice: Lattice
 
     @property
     def dimension(self) -> int:
         """2 or 3."""
 
 
-def scene_renderer(simulation: Pictured, share: float = 1.0, **settings: Any) -> Renderer:
-    """A renderer for the particles of a simulation, as the table [render] of its scene wants it, or from above; with
-    that share of the extinction. ``settings`` replace keys of the table; see `Simulation.renderer`."""
+def scene_renderer(simulation: Pictured, extinction_factor: float = 1.0, **settings: Any) -> Renderer:
+    """A renderer for the particles of a simulation, as the table [render] of its scene wants it, or from above.
+
+    The extinction is multiplied by ``extinction_factor``. ``settings`` replace keys of the table; see
+    `Simulation.renderer`.
+    """
     scene = simulation.scene
     lower, upper = _extent(simulation)
     dimension = simulation.dimension
     cell = scene.discretisation.spacing * FINENESS[dimension]
     table = _table(scene, settings)
     return Renderer(
-        _view(table, lower, upper, scene.discretisation.spacing, cell, share),
+        _view(table, lower, upper, scene.discretisation.spacing, cell, extinction_factor),
         lower,
         upper,
         smoothing=simulation.smoothing,
         support=scene.discretisation.support_radius,
-        volume=simulation.solver.lattice.volume,
+        volume=simulation.lattice.volume,
         particles=simulation.particles,
         phases=len(scene.phase),
         precision=simulation.precision,
@@ -77,7 +81,9 @@ def _table(scene: Scene, settings: dict[str, Any]) -> Render:
         return TypeAdapter(dict[str, resolved]).validate_python({"render": {**given, **settings}})["render"]
 
 
-def _view(table: Render, lower: np.ndarray, upper: np.ndarray, spacing: float, cell: float, share: float) -> View:
+def _view(
+    table: Render, lower: np.ndarray, upper: np.ndarray, spacing: float, cell: float, extinction_factor: float
+) -> View:
     dimension = len(lower)
     options: dict[str, Any] = {"background": table.background}
     resolution = (table.resolution[0], table.resolution[1])
@@ -85,13 +91,13 @@ def _view(table: Render, lower: np.ndarray, upper: np.ndarray, spacing: float, c
         opacity = TopView.opacity if table.extinction is None else table.extinction * spacing
         # In 2-D the one layer of nodes is a cell thick, and has to be as opaque as a layer of particles.
         thickness = cell if dimension == 2 else spacing
-        up_axis, options["opacity"] = UP[dimension], share * opacity
+        up_axis, options["opacity"] = UP[dimension], extinction_factor * opacity
         return TopView(tuple(lower), tuple(upper), thickness, resolution, up_axis, **options)
     assert table.position is not None and table.look_at is not None and table.field_of_view is not None
     up = tuple(np.eye(3)[UP[dimension]])
     camera = Perspective(table.position, table.look_at, up, table.field_of_view, resolution=resolution)
     extinction = CLEARNESS / float(np.max(upper - lower)) if table.extinction is None else table.extinction
-    return Volume(camera, share * extinction, **options)
+    return Volume(camera, extinction_factor * extinction, **options)
 
 
 def _extent(simulation: Pictured) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""What must hold for a scene as a whole: names, sizes, and where the fluid is. Each check raises `wrong`."""
+"""What must hold for a scene as a whole: names, sizes, and where the fluid is. Each check raises a `field_error`."""
 
 from itertools import product
 
@@ -7,11 +7,11 @@ from pydantic_core import PydanticCustomError
 from scipy.spatial import cKDTree
 
 from cortado.device.memory import sampling_parts, shortage
-from cortado.errors import InputError, Phrase, shown
+from cortado.errors import InputError, Words, shown
 from cortado.lattice.shapes import Points
 from cortado.scene.containers import check_length
 from cortado.scene.emitter import Emitter
-from cortado.scene.fields import FieldPath, wrong
+from cortado.scene.fields import FieldPath, field_error
 from cortado.scene.fluids import Body, Fluid, PointsFluid
 from cortado.scene.mixture import Mixture
 from cortado.scene.model import SceneTables
@@ -56,12 +56,12 @@ def _check_phases(scene: SceneTables) -> None:
     names = [phase.name for phase in scene.phase]
     for index, name in enumerate(names):
         if name in names[:index]:
-            raise wrong(("phase", index, "name"), name, f"different from that of phase[{names.index(name)}]")
+            raise field_error(("phase", index, "name"), name, f"different from that of phase[{names.index(name)}]")
     for path, body in _bodies(scene):
         if body.phase not in names:
-            raise wrong((*path, "phase"), body.phase, f"the name of a phase, of {shown(names)}")
+            raise field_error((*path, "phase"), body.phase, f"the name of a phase, of {shown(names)}")
     if len(names) == 1 and scene.mixture != Mixture():
-        raise wrong(("mixture",), Phrase("given"), "left out, as the scene has only one phase")
+        raise field_error(("mixture",), Words("given"), "left out, as the scene has only one phase")
 
 
 def _check_files(scene: SceneTables) -> None:
@@ -71,7 +71,7 @@ def _check_files(scene: SceneTables) -> None:
                 fluid.points()
             except InputError as error:
                 sentence = f"cannot be used: {error}"
-                raise wrong(("fluid", index, "file"), fluid.file, "a file of positions", sentence) from None
+                raise field_error(("fluid", index, "file"), fluid.file, "a file of positions", sentence) from None
 
 
 def _check_counts(scene: SceneTables) -> None:
@@ -81,35 +81,35 @@ def _check_counts(scene: SceneTables) -> None:
     for count, what in ((fluid, "particles of fluid"), (walls, "wall particles")):
         if count > MOST_PARTICLES:
             wanted = f"so large that there are at most {MOST_PARTICLES:.0e} {what}, not about {count:.1e}"
-            raise wrong(("discretisation", "spacing"), spacing, wanted)
+            raise field_error(("discretisation", "spacing"), spacing, wanted)
     lack = shortage(sampling_parts(fluid, walls))
     if lack:
         wanted = f"larger, or the fluid and the container smaller: the scene needs {lack}"
-        raise wrong(("discretisation", "spacing"), spacing, wanted)
+        raise field_error(("discretisation", "spacing"), spacing, wanted)
 
 
 def _check_place(scene: SceneTables) -> None:
     spacing, ends = scene.discretisation.spacing, scene.container.extent()
     if ends is not None and np.abs(ends).max() > FURTHEST * spacing:
-        raise wrong(("container",), Phrase(f"{np.abs(ends).max():g} m from the origin"), _nearer(spacing))
+        raise field_error(("container",), Words(f"{np.abs(ends).max():g} m from the origin"), _nearer(spacing))
 
 
 def _check_size(index: int, fluid: Fluid, spacing: float) -> None:
     if fluid.count(spacing) == 0.0:
         wanted = f"at least one spacing, {spacing:g} m, wide along every axis"
-        raise wrong(("fluid", index), Phrase("too thin to hold a particle"), wanted)
+        raise field_error(("fluid", index), Words("too thin to hold a particle"), wanted)
 
 
 def _check_length(emitter: Emitter, spacing: float) -> None:
     if emitter.layers(spacing) == 0.0:
         wanted = f"greater than half a spacing, {0.5 * spacing:g} m, for the column to hold a layer of particles"
-        raise wrong(("emitter", "length"), emitter.length, wanted)
+        raise field_error(("emitter", "length"), emitter.length, wanted)
 
 
 def _check_distance(path: FieldPath, body: Body, spacing: float) -> None:
     furthest = np.abs(body.extent(spacing)).max()
     if furthest > FURTHEST * spacing:
-        raise wrong(path, Phrase(f"{furthest:g} m from the origin"), _nearer(spacing))
+        raise field_error(path, Words(f"{furthest:g} m from the origin"), _nearer(spacing))
 
 
 def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
@@ -132,8 +132,8 @@ def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
 
 
 def _outside(index: int, place: Points) -> PydanticCustomError:
-    found = Phrase(f"partly outside, for example at {_place(place)}")
-    return wrong(("fluid", index), found, "inside the container")
+    found = Words(f"partly outside, for example at {_place(place)}")
+    return field_error(("fluid", index), found, "inside the container")
 
 
 def _check_outlet(scene: SceneTables, emitter: Emitter) -> None:
@@ -144,21 +144,21 @@ def _check_outlet(scene: SceneTables, emitter: Emitter) -> None:
     spacing, lengths = scene.discretisation.spacing, scene.container.periods(scene.dimension)[1]
     tolerance, outlet, opening = 1e-6 * spacing, np.array(emitter.outlet), emitter.opening(spacing)
     if not scene.container.contains(outlet[None], tolerance).all():
-        raise wrong(("emitter", "outlet"), emitter.outlet, "inside the container")
+        raise field_error(("emitter", "outlet"), emitter.outlet, "inside the container")
     outside = ~scene.container.contains(opening, tolerance)
     if outside.any():
         wanted = f"so small that the opening is inside the container, also at {_place(opening[outside][0])}"
-        raise wrong(("emitter", "radius"), emitter.radius, wanted)
+        raise field_error(("emitter", "radius"), emitter.radius, wanted)
     ahead = outlet + np.where(lengths > 0.0, 0.0, spacing * np.array(emitter.direction))
     if not scene.container.contains(ahead[None], tolerance).all():
-        raise wrong(("emitter", "direction"), emitter.direction, "into the container, where the outlet is")
+        raise field_error(("emitter", "direction"), emitter.direction, "into the container, where the outlet is")
     ends, (lower, upper) = scene.container.extent(), emitter.extent(spacing)
     if ends is None:
         return
     out = (lengths > 0.0) & ((lower < ends[0] - tolerance) | (upper > ends[1] + tolerance))
     if out.any():
-        found = Phrase(f"partly outside along axis {int(np.argmax(out))}, which is periodic")
-        raise wrong(("emitter",), found, "inside the container along that axis")
+        found = Words(f"partly outside along axis {int(np.argmax(out))}, which is periodic")
+        raise field_error(("emitter",), found, "inside the container along that axis")
 
 
 def _check_distinct(index: int, fluid: Fluid, spacing: float) -> None:
@@ -168,10 +168,10 @@ def _check_distinct(index: int, fluid: Fluid, spacing: float) -> None:
     points = fluid.points()
     distinct, counts = np.unique(points, axis=0, return_counts=True)
     if len(distinct) < len(points):
-        raise wrong(("fluid", index), *_overlap("itself", distinct[np.argmax(counts)], spacing))
+        raise field_error(("fluid", index), *_overlap("itself", distinct[np.argmax(counts)], spacing))
     distances = cKDTree(points).query(points, k=[2])[0].ravel()
     if distances.min() < _nearest(spacing):
-        raise wrong(("fluid", index), *_overlap("itself", points[np.argmin(distances)], spacing))
+        raise field_error(("fluid", index), *_overlap("itself", points[np.argmin(distances)], spacing))
 
 
 def _check_overlaps(scene: SceneTables) -> None:
@@ -187,7 +187,7 @@ def _check_overlaps(scene: SceneTables) -> None:
         for first in np.nonzero((gaps < _nearest(spacing)).all(axis=1))[0]:
             place = _meeting(bodies[first], bodies[second], shift, spacing)
             if place is not None:
-                raise wrong(paths[second], *_overlap(field_name(paths[first]), place, spacing))
+                raise field_error(paths[second], *_overlap(field_name(paths[first]), place, spacing))
 
 
 def _meeting(first: Body, second: Body, shift: Points, spacing: float) -> Points | None:
@@ -201,9 +201,9 @@ def _meeting(first: Body, second: Body, shift: Points, spacing: float) -> Points
     return near[np.argmin(distances)] if distances.min() < _nearest(spacing) else None
 
 
-def _overlap(other: str, place: Points, spacing: float) -> tuple[Phrase, str]:
+def _overlap(other: str, place: Points, spacing: float) -> tuple[Words, str]:
     wanted = f"at least half a spacing, {NEAREST * spacing:g} m, from it everywhere"
-    return Phrase(f"overlapping {other} at {_place(place)}"), wanted
+    return Words(f"overlapping {other} at {_place(place)}"), wanted
 
 
 def _nearest(spacing: float) -> float:

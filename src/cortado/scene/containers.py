@@ -8,10 +8,10 @@ from pydantic import Field, model_validator
 
 from cortado.discretise.walls.places import Places, box_places, cup_places
 from cortado.discretise.walls.points import box_walls, cup_walls
-from cortado.errors import Phrase
+from cortado.errors import Words
 from cortado.lattice.region import Region
 from cortado.lattice.shapes import Points
-from cortado.scene.fields import FieldPath, Flag, Length, Vector, quantity, wrong
+from cortado.scene.fields import FieldPath, Flag, Length, Vector, field_error, quantity
 from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
 from cortado.scene.tables import Table
 
@@ -162,12 +162,12 @@ def check_length(container: Container, spacing: float, support_radius: float) ->
         return
     lengths = ends[1] - ends[0]
     if lengths.min() < spacing * (1.0 - 1e-6):
-        found = Phrase(f"only {lengths.min():g} m wide")
-        raise wrong(("container",), found, f"at least one spacing, {spacing:g} m, wide")
+        found = Words(f"only {lengths.min():g} m wide")
+        raise field_error(("container",), found, f"at least one spacing, {spacing:g} m, wide")
     periods = container.periods(len(lengths))[1]
     short = (periods > 0.0) & (periods <= 2.0 * support_radius)
     if short.any():
         axis = int(np.argmax(short))
         reason = f"the {periods[axis]:g} m of this axis are not more than two support radii, {2.0 * support_radius:g} m"
         wanted = f"false, as {reason}"
-        raise wrong(("container", "periodic", axis), True, wanted)
+        raise field_error(("container", "periodic", axis), True, wanted)

@@ -1,4 +1,4 @@
-"""Fluid that comes out of a nozzle: a column of particles that waits upstream of an opening."""
+"""An emitter: a column of particles that waits upstream of an opening, and comes out of it with one speed."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import field_validator
 
 from cortado.lattice.shapes import ROUND_OFF, Points, across, disc, disc_cells
-from cortado.scene.fields import GREATEST, Length, Vector, quantity, wrong
+from cortado.scene.fields import GREATEST, Length, Vector, field_error, quantity
 from cortado.scene.fluids import Body
 
 
@@ -31,7 +31,7 @@ class EmitterSample:
 
 
 class Emitter(Body):
-    """A nozzle: a disc, or a line in 2-D, out of which a column of fluid comes with one speed."""
+    """An opening, a disc or in 2-D a line, out of which a column of fluid comes with one speed."""
 
     outlet: Vector[Length]
     """(d,) centre of the opening [m]"""
@@ -50,7 +50,7 @@ class Emitter(Body):
         """A vector that is normalised but for round-off stays what it is, so that JSON brings the same emitter back."""
         size = math.hypot(*direction)
         if size < 1.0 / GREATEST:
-            raise wrong((), direction, "a vector that is not zero")
+            raise field_error((), direction, "a vector that is not zero")
         return direction if abs(size - 1.0) < 1e-12 else tuple(value / size for value in direction)
 
     def layers(self, spacing: float) -> float:

@@ -1,7 +1,8 @@
-"""The kinds of value that a scene holds, for pydantic.
+"""The types of the fields of a scene, for pydantic.
 
-A field is ``Annotated[float, quantity("kg/m3", gt=0.0)]``. Pydantic checks it, and describes it in the JSON schema of
-its table, out of which `cortado.scene.sentences` makes sentences: what an editor says, and a sentence, is checked.
+A field is ``Annotated[float, quantity("kg/m3", gt=0.0)]``. Pydantic checks its value, and describes it in the JSON
+schema of its table. From this schema `cortado.scene.sentences` makes the sentences of errors, so that the checks, the
+sentences and the help of an editor always agree.
 """
 
 import math
@@ -14,17 +15,21 @@ import numpy as np
 from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from cortado.errors import Phrase
+from cortado.errors import Words
 
 GREATEST = 1e50
 """No number of a scene is larger, as its cube must fit into a float64, and no positive one smaller than its inverse."""
-MISSING = Phrase("missing")
+MISSING = Words("missing")
 FieldPath = Sequence[str | int]
 
 
 @dataclass(frozen=True, repr=False)
-class Trouble:
-    """What a check found. Pydantic takes the text of it, which must not hold the value: that may be of any length."""
+class FieldError:
+    """What is wrong with a field.
+
+    Its ``repr`` does not show the value that was found, as pydantic puts it into messages, and the value may be of any
+    length.
+    """
 
     path: tuple[str | int, ...]
     found: Any
@@ -32,12 +37,12 @@ class Trouble:
     sentence: str | None
 
 
-def wrong(path: FieldPath, found: Any, wanted: str, sentence: str | None = None) -> PydanticCustomError:
-    """What a check raises; the path (names and indices) starts at the model that is being checked."""
-    return PydanticCustomError("scene", "wrong value", {"trouble": Trouble(tuple(path), found, wanted, sentence)})
+def field_error(path: FieldPath, found: Any, wanted: str, sentence: str | None = None) -> PydanticCustomError:
+    """The exception that a check raises; the path (names and indices) starts at the model that is being checked."""
+    return PydanticCustomError("scene", "wrong value", {"error": FieldError(tuple(path), found, wanted, sentence)})
 
 
-# ---- kinds of value ----------------------------------------------------------------------------------------------
+# ---- field types -------------------------------------------------------------------------------------------------
 
 
 def quantity(unit: str = "-", *, gt: float | None = None, ge: float = -GREATEST, le: float = GREATEST) -> Any:
@@ -59,7 +64,7 @@ def components(*names: str) -> Any:
 
 @dataclass(frozen=True)
 class OneOf:
-    """A name out of those of a registry."""
+    """One of the names of a registry."""
 
     names: Collection[str]
 
@@ -71,7 +76,7 @@ Item = TypeVar("Item")
 PER_AXIS = "per axis"
 """Marks the fields with one component for each axis of the scene."""
 Vector = Annotated[tuple[Item, ...], PER_AXIS, Field(min_length=2, max_length=3, fail_fast=True)]
-"""One component for each axis: a vector, or flags. Of a default in space the plane has the first two."""
+"""One component for each axis: a vector, or flags. In 2-D the default is the first two components of that in 3-D."""
 Several = Annotated[tuple[Item, ...], Field(min_length=1, fail_fast=True)]
 """A list of at least one entry."""
 Text = Annotated[str, Field(strict=True, pattern=r"\S")]
@@ -83,7 +88,7 @@ Colour = Annotated[tuple[Annotated[float, quantity(ge=0.0, le=1.0)], ...], compo
 
 
 def without_numpy(value: Any) -> Any:
-    """What of NumPy it is, or what of NumPy its entries are, as Python's numbers and lists."""
+    """The value with arrays and numbers of NumPy, also those in a list, as lists and numbers of Python."""
     if isinstance(value, (list, tuple)):
         return [entry.tolist() if isinstance(entry, (np.ndarray, np.generic)) else entry for entry in value]
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value

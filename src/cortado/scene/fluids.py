@@ -9,7 +9,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from cortado.lattice.region import Region
 from cortado.lattice.shapes import ROUND_OFF, Block, Points, block_about, block_between, corners
-from cortado.scene.fields import FieldPath, Length, Text, Vector, quantity, wrong
+from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
 from cortado.scene.points import read_points
 from cortado.scene.tables import Table
 
@@ -162,7 +162,7 @@ class PointsFluid(Fluid):
         try:
             return str((folder / file).absolute())
         except (OSError, ValueError):
-            raise wrong((), file, "the name of a file") from None
+            raise field_error((), file, "the name of a file") from None
 
     def points(self) -> Points:
         """(n, d) [m]; raises `InputError`."""
@@ -184,10 +184,10 @@ AnyFluid = Annotated[BoxFluid | CylinderFluid | SphereFluid | PointsFluid, Field
 def check_order(lower: tuple[float, ...], upper: tuple[float, ...]) -> None:
     """Every component of upper must be greater than that of lower."""
     if len(lower) == len(upper) and any(b <= a for a, b in zip(lower, upper, strict=True)):
-        raise wrong(("upper",), upper, f"greater than lower, {list(lower)}, in every component")
+        raise field_error(("upper",), upper, f"greater than lower, {list(lower)}, in every component")
 
 
 def refuse_plane(dimension: int, path: FieldPath, others: str) -> None:
     """A cylinder needs three dimensions."""
     if dimension == 2:
-        raise wrong((*path, "shape"), "cylinder", f"{others} in 2-D")
+        raise field_error((*path, "shape"), "cylinder", f"{others} in 2-D")

@@ -10,7 +10,7 @@ class Mixture(Table):
     """The Cahn-Hilliard equation that the mass fractions follow (Yang et al. 2015); the scene's phases, in order."""
 
     free_energy: Literal["double_well", "miscible"] = "double_well"
-    """"double_well": phases part, into pure ones; "miscible": they mix, by Fick's law."""
+    """"double_well": phases separate, into pure ones; "miscible": they mix, by Fick's law."""
     strength: Annotated[float, quantity(gt=0.0)] = 1.0
     """alpha, the factor of the free energy."""
     mobility: Annotated[float, quantity("m2/s", ge=0.0)] = 0.0

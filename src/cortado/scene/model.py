@@ -10,7 +10,7 @@ from pydantic import Field, ValidationInfo, create_model, field_validator, model
 from cortado.parameters.registry import PARAMETERS
 from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import Emitter
-from cortado.scene.fields import Colour, Flag, Several, Text, Vector, count, quantity, wrong
+from cortado.scene.fields import Colour, Flag, OneOf, Several, Text, Vector, count, field_error, quantity
 from cortado.scene.fluids import AnyFluid
 from cortado.scene.mixture import Mixture
 from cortado.scene.render import Render
@@ -69,10 +69,14 @@ Forces: Any = create_model("Forces", __base__=FixedForces, __module__=__name__, 
 """Which forces act: `FixedForces`, and the optional ones of the registry of parameters."""
 
 
+SOLVERS = {"pcisph": "cortado.solvers.pcisph.build"}
+"""By the kind that a scene names, the module whose ``build`` makes the solver of a scene."""
+
+
 class Solver(Table):
     """How a step is solved."""
 
-    kind: Literal["pcisph"] = "pcisph"
+    kind: Annotated[str, OneOf(SOLVERS)] = "pcisph"
     """Name of the algorithm."""
     time_step: Annotated[float, quantity("s", gt=0.0)]
     """[s]"""
@@ -89,7 +93,7 @@ class Solver(Table):
     def _check_iterations(self) -> Self:
         if self.minimum_iterations > self.maximum_iterations:
             wanted = f"at most maximum_iterations, {self.maximum_iterations}"
-            raise wrong(("minimum_iterations",), self.minimum_iterations, wanted)
+            raise field_error(("minimum_iterations",), self.minimum_iterations, wanted)
         return self
 
 
@@ -108,7 +112,7 @@ class SceneTables(Table):
     fluid: Several[AnyFluid]
     """The bodies of fluid; particles come in this order."""
     emitter: Emitter | None = None
-    """Fluid that comes out of a nozzle; its particles come after those of all fluids."""
+    """An emitter, out of which fluid comes; its particles come after those of all fluids."""
     container: AnyContainer = Field(default=NoContainer(), validate_default=True)
     """What holds the fluid."""
     mixture: Mixture = Mixture()

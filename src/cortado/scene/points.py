@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from cortado.errors import InputError, Phrase, shown
+from cortado.errors import InputError, Words, shown
 from cortado.io.input_files import reason, regular_file
 from cortado.lattice.shapes import Points
 from cortado.scene.point_reader import MOST_POINTS, READERS, REFUSED
@@ -73,7 +73,7 @@ def _read_npy(path: str, size: int, dimension: int) -> Any:
     except InputError:
         raise
     except Exception as problem:  # of many types, where a header is damaged
-        raise InputError(f"{path!r} is no array that NumPy can read ({shown(Phrase(reason(problem)))}).") from None
+        raise InputError(f"{path!r} is no array that NumPy can read ({shown(Words(reason(problem)))}).") from None
 
 
 def _read_apart(path: str, size: int) -> Any:

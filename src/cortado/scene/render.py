@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from cortado.scene.fields import MISSING, Colour, FieldPath, Length, components, count, quantity, wrong
+from cortado.scene.fields import MISSING, Colour, FieldPath, Length, components, count, field_error, quantity
 from cortado.scene.tables import Table
 
 Pixels = Annotated[tuple[Annotated[int, count(8, 4096)], ...], components("columns", "rows")]
@@ -36,17 +36,17 @@ class Render(Table):
     def _check_camera(cls, value: Any, info: ValidationInfo) -> Any:
         view = info.data.get("view")
         if value is not None and view in ("top", "plane"):
-            raise wrong((), value, f'left out, as the view is "{view}": only the view "volume" has a camera')
+            raise field_error((), value, f'left out, as the view is "{view}": only the view "volume" has a camera')
         if value is None and view == "volume":
             if info.field_name == "field_of_view":
                 return 40.0
-            raise wrong((), MISSING, 'a list of 3 components: x, y and z, as the view is "volume"')
+            raise field_error((), MISSING, 'a list of 3 components: x, y and z, as the view is "volume"')
         return value
 
     @model_validator(mode="after")
     def _check_direction(self) -> Self:
         if self.position is not None and self.position == self.look_at:
-            raise wrong(("look_at",), self.look_at, "another place than position")
+            raise field_error(("look_at",), self.look_at, "another place than position")
         return self
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
@@ -55,5 +55,5 @@ class Render(Table):
             return self.model_copy(update={"view": "plane"})
         if (self.view == "plane") != (dimension == 2):
             wanted = '"plane", as the scene has 2 dimensions' if dimension == 2 else '"top" or "volume" in 3-D'
-            raise wrong((*path, "view"), self.view, wanted)
+            raise field_error((*path, "view"), self.view, wanted)
         return self

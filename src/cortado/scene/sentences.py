@@ -1,4 +1,4 @@
-"""How what is wrong in a table becomes a sentence, a `SceneError`, with words made out of the table's JSON schema."""
+"""Turns an error in a table into a sentence, a `SceneError`, with words from the JSON schema of the table."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -14,7 +14,7 @@ Schema = Mapping[str, Any]
 
 @contextmanager
 def sentences(model: type[BaseModel]) -> Iterator[None]:
-    """Turn the first trouble that pydantic reports of a model into a `SceneError`."""
+    """Turn the first error that pydantic reports of a model into a `SceneError`."""
     try:
         yield
     except ValidationError as error:
@@ -37,11 +37,11 @@ def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
     first = error.errors(include_url=False)[0]
     schema, path = _schema_at(model.model_json_schema(), first["loc"])
     if first["type"] == "scene":
-        trouble = first["ctx"]["trouble"]
-        path, sentence = [*path, *trouble.path], trouble.sentence
+        own = first["ctx"]["error"]
+        path, sentence = [*path, *own.path], own.sentence
         if sentence:
             sentence = sentence.replace("{table}", f"[{field_name(path[:-1])}]" if path[1:] else "the scene")
-        return SceneError(None, field_name(path), trouble.found, trouble.wanted, sentence)
+        return SceneError(None, field_name(path), own.found, own.wanted, sentence)
     found, words = first["input"], wanted(schema, field_name(path[-1:]))
     if first["type"] == "missing":
         found = MISSING

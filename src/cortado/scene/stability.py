@@ -35,7 +35,7 @@ def stability_limit(scene: SceneTables, values: Arrays | None = None) -> float:
 
 
 def _first_speed(scene: SceneTables, values: Arrays) -> float:
-    """The largest speed with which fluid starts or comes out of a nozzle [m/s]."""
+    """The largest speed with which fluid starts or comes out of the emitter [m/s]."""
     if "initial_velocities" in values:
         speed = float(np.linalg.norm(values["initial_velocities"], axis=1).max())
     else:

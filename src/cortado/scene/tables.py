@@ -10,8 +10,8 @@ from typing import Any, ClassVar, Self
 from pydantic import BaseModel, ConfigDict, model_validator
 from pydantic_core import PydanticCustomError
 
-from cortado.errors import Phrase
-from cortado.scene.fields import PER_AXIS, FieldPath, without_numpy, wrong
+from cortado.errors import Words
+from cortado.scene.fields import PER_AXIS, FieldPath, field_error, without_numpy
 from cortado.scene.sentences import sentences
 
 
@@ -48,11 +48,11 @@ class Table(BaseModel):
                 filled[name] = value if name in self.model_fields_set else value[:dimension]
                 if len(filled[name]) != dimension:
                     wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
-                    raise wrong((*path, name), value, wanted)
+                    raise field_error((*path, name), value, wanted)
         return self.model_copy(update=filled)
 
 
 def _unknown_key(key: str, known: list[str]) -> PydanticCustomError:
     close = get_close_matches(key, known, n=1)
     advice = f"did you mean {close[0]}?" if close else f"its keys are {', '.join(known)}."
-    return wrong((key,), Phrase("unknown"), f"one of {', '.join(known)}", f"is not a key of {{table}}; {advice}")
+    return field_error((key,), Words("unknown"), f"one of {', '.join(known)}", f"is not a key of {{table}}; {advice}")

@@ -5,20 +5,22 @@ from typing import Any
 
 import numpy as np
 
+from cortado.device.arrays import padded
 from cortado.device.cells import Grid
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.neighbours import NeighbourSearch
-from cortado.device.state import padded
+from cortado.device.precision import Precision
 from cortado.discretise.discrete_scene import DiscreteScene
 from cortado.lattice.calibration import SKIN
 from cortado.parameters.registry import PARAMETERS
 from cortado.scene.containers import NoContainer
 from cortado.scene.scene import Scene
 from cortado.solvers.containment import Walled
+from cortado.solvers.particles import ParticleSystem
 from cortado.sph.diffusion import Diffusion
+from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy
 from cortado.sph.mixture import Phases
-from cortado.sph.nozzle import Nozzle
 from cortado.sph.parts import Force, Setting
 
 
@@ -28,7 +30,25 @@ def first_capacity(support: float, dimension: int) -> int:
     return int(1.5 * filled) + 6
 
 
-def search_of(scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, device: Any) -> NeighbourSearch:
+def particle_system(
+    scene: Scene, discrete: DiscreteScene, free_energy: FreeEnergy, precision: Precision, device: Any
+) -> ParticleSystem:
+    """A scene that is cut into particles, on a device."""
+    discretisation = Discretisation(discrete.kernel, precision)
+    return ParticleSystem(
+        scene.solver.kind,
+        discretisation,
+        discrete.lattice,
+        _search(scene, discrete, discretisation, device),
+        _forces(scene, discrete, discretisation, device),
+        [*discrete.periods, *[0.0] * (3 - scene.dimension)],
+        _phases(scene, discretisation, free_energy),
+        _nozzle(scene, discrete),
+        _walled(scene, discrete),
+    )
+
+
+def _search(scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, device: Any) -> NeighbourSearch:
     """The search for neighbours within the support, and a little beyond."""
     support, particles = discrete.lattice.support, len(discrete.fluid.positions)
     grid = Grid.around(
@@ -43,7 +63,7 @@ def search_of(scene: Scene, discrete: DiscreteScene, discretisation: Discretisat
     return NeighbourSearch(discretisation, grid, padded(walls.positions), walls.weights, particles, room, device)
 
 
-def forces_of(scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, device: Any) -> list[Force]:
+def _forces(scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, device: Any) -> list[Force]:
     """Those of the parameters that the scene has, in the order of the registry."""
     particles, layers = len(discrete.fluid.positions), discrete.wall_layers
     setting = Setting(scene, discretisation, discrete.lattice, layers, particles, device)
@@ -52,7 +72,7 @@ def forces_of(scene: Scene, discrete: DiscreteScene, discretisation: Discretisat
     return [force for force in found if force is not None]
 
 
-def phases_of(scene: Scene, discretisation: Discretisation, free_energy: FreeEnergy) -> Phases:
+def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnergy) -> Phases:
     """The phases, and how they diffuse into one another."""
     mixture, count = scene.mixture, len(scene.phase)
     if count == 1:
@@ -61,7 +81,7 @@ def phases_of(scene: Scene, discretisation: Discretisation, free_energy: FreeEne
     return Phases(count, diffusion, mixture.strength)
 
 
-def nozzle_of(scene: Scene, discrete: DiscreteScene) -> Nozzle | None:
+def _nozzle(scene: Scene, discrete: DiscreteScene) -> Nozzle | None:
     """The particles that wait in a nozzle; None without an emitter."""
     fluid, sample = discrete.fluid, discrete.fluid.emitter
     if scene.emitter is None or sample is None:
@@ -75,7 +95,7 @@ def nozzle_of(scene: Scene, discrete: DiscreteScene) -> Nozzle | None:
     )
 
 
-def walled_of(scene: Scene, discrete: DiscreteScene) -> Walled:
+def _walled(scene: Scene, discrete: DiscreteScene) -> Walled:
     """Where particles may go. Walls act through the pressure: without it they hold nothing."""
     holds = scene.container if scene.forces.pressure else NoContainer()
     region = holds.region(scene.dimension).opened(discrete.periods)

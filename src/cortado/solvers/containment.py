@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.device.arrays import padded
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import Precision
-from cortado.device.state import State, padded
+from cortado.device.state import State
 from cortado.lattice.region import TOLERANCE, Region
 from cortado.solvers.containment_kernels import NO_PARTICLE, bounds_type, lost_kernel
 

@@ -1,6 +1,7 @@
 """What a solver is: an algorithm that takes steps, and can take one again, along tangents, and back.
 
-Rollouts, gradients and the certificate know a solver by this protocol; `cortado.solvers.pcisph` is one.
+Rollouts, gradients and the certificate know a solver by this protocol, and so do files and reports of runs.
+`cortado.solvers.particles` has what solvers of particles share; `cortado.solvers.pcisph` is one.
 """
 
 from collections.abc import Mapping
@@ -13,7 +14,6 @@ from cortado.device.launching import KernelLauncher
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.state import Parameters, State
 from cortado.device.threads import Turn
-from cortado.restart import Elapsed
 from cortado.solvers.containment import Containment
 from cortado.sph.parts import StepContext
 
@@ -28,6 +28,7 @@ class StepLog(Protocol):
     def diagnostics(self) -> Mapping[str, NDArray]:
         """(steps,) by name, of the steps that were read. Every solver has ``converged``; PCISPH also ``iterations``,
         ``density_errors``, the average of the compressions (rho* - rho_0)+ / rho_0, and ``greatest_density_errors``.
+        Reports draw ``density_errors``, and whole numbers as the iterations of loops.
         """
 
     def read(self, steps: int) -> None:
@@ -40,8 +41,8 @@ class StepLog(Protocol):
 class StepTangent(Protocol):
     """Forward mode of a step that a solver has replayed, along tangents of the parameters."""
 
-    def step(self, counts: Counts, state_dot: State, new_state_dot: State, parameters: Parameters) -> None:
-        """From the tangent of the step's state to that of its result, which may be the same arrays."""
+    def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
+        """Replace the tangent of the step's state by that of its result."""
 
 
 class StepAdjoint(Protocol):
@@ -50,8 +51,8 @@ class StepAdjoint(Protocol):
     def begin(self) -> None:
         """Forget the adjoints of the parameters of an earlier way back."""
 
-    def step(self, counts: Counts, new_state_bar: State, state_bar: State, parameters: Parameters) -> None:
-        """From the adjoint of the step's result to that of its state, which may be the same arrays."""
+    def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
+        """Replace the adjoint of the step's result by that of its state."""
 
     def collect(self) -> Parameters:
         """The adjoints of the parameters, of all steps since `begin`."""
@@ -59,7 +60,9 @@ class StepAdjoint(Protocol):
 
 class Solver(Protocol):
     """The solver of one set of particles on one device, which rollouts share. Of its methods `make_room` alone
-    waits for the device and reads from it."""
+    waits for the device and reads from it. `tangent`, `adjoint` and `differentiable` raise `InputError`, one sentence,
+    where a solver has no such derivative.
+    """
 
     discretisation: Discretisation
     particles: int
@@ -81,9 +84,8 @@ class Solver(Protocol):
     def new_log(self, steps: int) -> StepLog:
         """Room for what is noted of so many steps."""
 
-    def begin(self, elapsed: Elapsed, substeps: int) -> None:
-        """What to know of a run before any of its steps: what went before it, and how many explicit substeps of
-        diffusion each step has."""
+    def set_substeps(self, substeps: int) -> None:
+        """Take so many explicit substeps of diffusion in each step from now on."""
 
     def reset(self) -> None:
         """Forget the counts and flags of an earlier run, also of one that was interrupted."""
@@ -92,7 +94,7 @@ class Solver(Protocol):
         """Whether the lists of neighbours were too short; they are longer now, and what used them must be repeated."""
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: Any) -> None:
-        """One step, noted in a log of `new_log`."""
+        """One step, noted in a log of `new_log`. The two states may be one and the same."""
 
     def reserve(self, counts: Counts) -> None:
         """Make room for all intermediate values of a step."""

@@ -58,8 +58,8 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
     sums = pairwise_laplacian_functions(discretisation, phases)
     spread, spread_tangent, spread_adjoint = sums.spread, sums.spread_tangent, sums.spread_adjoint
     energy, form = diffusion.energy.functions(precision, phases), diffusion.mobility.functions(precision, phases)
-    energy_slope, energy_bend = energy.slope, energy.bend
-    mobile, mobile_slope = form.value, form.slope
+    energy_gradient, energy_hessian_product = energy.gradient, energy.hessian_product
+    mobile, mobile_gradient = form.value, form.gradient
 
     @wp.func
     def project(u: fractions) -> fractions:
@@ -90,7 +90,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         i = s.first + wp.tid()
         total = spread(i, x, n, m, c, s)
         stiffness = interface_width[0] * interface_width[0] * s.volume / m[i]
-        chi[i] = strength * project(energy_slope(c[i])) - stiffness * total
+        chi[i] = strength * project(energy_gradient(c[i])) - stiffness * total
         w[i] = m[i] * mobility[0] * mobile(c[i])
 
     @wp.kernel(module=diffusion.module(True))
@@ -138,10 +138,12 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         scale = s.volume / m[i]
         stiffness = width * width * scale
         stiffness_dot = real(2.0) * width * interface_width_dot[0] * scale - stiffness * m_dot[i] / m[i]
-        chi_dot[i] = strength * project(energy_bend(c[i], c_dot[i])) - stiffness * total_dot - stiffness_dot * total
+        chi_dot[i] = (
+            strength * project(energy_hessian_product(c[i], c_dot[i])) - stiffness * total_dot - stiffness_dot * total
+        )
         m_0 = mobility[0]
         w_dot[i] = (m_dot[i] * m_0 + m[i] * mobility_dot[0]) * mobile(c[i]) + m[i] * m_0 * wp.dot(
-            mobile_slope(c[i]), c_dot[i]
+            mobile_gradient(c[i]), c_dot[i]
         )
 
     @wp.kernel(module=diffusion.module(False), enable_backward=False)
@@ -219,7 +221,9 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         n_bar[i] = n_bar[i] + n_sum
         m_bar[i] = m_bar[i] + w_bar * m_0 * mobile_i - own / m_i
         straight = project(chi_bar)
-        c_bar[i] = c_bar[i] + (w_bar * m_i * m_0) * mobile_slope(c[i]) + strength * energy_bend(c[i], straight)
+        c_bar[i] = (
+            c_bar[i] + (w_bar * m_i * m_0) * mobile_gradient(c[i]) + strength * energy_hessian_product(c[i], straight)
+        )
         time_step_bar[i] = time_step_bar[i] + own / time_step[0]
         mobility_bar[i] = mobility_bar[i] + w_bar * m_i * mobile_i
         z[i] = (-interface_width[0] * interface_width[0] * s.volume / m_i) * chi_bar

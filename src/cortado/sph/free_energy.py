@@ -1,6 +1,6 @@
 """Helmholtz free energies F(c) = alpha f(c) of a mixture, and how mobile its phases are (Yang et al. 2015).
 
-    double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: phases part, into pure ones (Lee and Kim 2015)
+    double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: phases separate, into pure ones (Lee and Kim 2015)
     miscible     f = sum_k c_k^2 / 2: phases mix, by Fick's law
 
     constant     m = 1
@@ -39,7 +39,7 @@ class FreeEnergy:
     """The greatest eigenvalue of the Hessian of f, without its part along (1, ..., 1), for fractions in [0, 1]: it
     bounds the time step."""
     functions: Callable[[Precision, int], Any]
-    """Warp functions of fractions, for a number of phases: ``slope`` (grad f) and ``bend`` (the Hessian times u)."""
+    """Warp functions of fractions, for a number of phases: ``gradient`` (grad f) and ``hessian_product`` (H u)."""
 
 
 @dataclass(frozen=True)
@@ -50,15 +50,15 @@ class Mobility:
     greatest: Callable[[int], float]
     """The greatest m of so many phases."""
     functions: Callable[[Precision, int], Any]
-    """Warp functions ``value`` and ``slope`` (grad m) of fractions."""
+    """Warp functions ``value`` and ``gradient`` (grad m) of fractions."""
 
 
 @dataclass(frozen=True)
 class EnergyFunctions:
     """Warp functions of a free energy: grad f, and its Hessian times a vector."""
 
-    slope: Any
-    bend: Any
+    gradient: Any
+    hessian_product: Any
 
 
 @cache
@@ -66,15 +66,15 @@ def _double_well(precision: Precision, phases: int) -> EnergyFunctions:
     real, fractions = precision.real, precision.fractions(phases)
 
     @wp.func
-    def slope(c: fractions) -> fractions:
+    def gradient(c: fractions) -> fractions:
         squares = wp.cw_mul(c, c)
         return c - real(3.0) * squares + real(2.0) * wp.cw_mul(squares, c)
 
     @wp.func
-    def bend(c: fractions, u: fractions) -> fractions:
+    def hessian_product(c: fractions, u: fractions) -> fractions:
         return u - real(6.0) * wp.cw_mul(c, u) + real(6.0) * wp.cw_mul(wp.cw_mul(c, c), u)
 
-    return EnergyFunctions(slope=slope, bend=bend)
+    return EnergyFunctions(gradient=gradient, hessian_product=hessian_product)
 
 
 @cache
@@ -82,14 +82,14 @@ def _miscible(precision: Precision, phases: int) -> EnergyFunctions:
     fractions = precision.fractions(phases)
 
     @wp.func
-    def slope(c: fractions) -> fractions:
+    def gradient(c: fractions) -> fractions:
         return c
 
     @wp.func
-    def bend(c: fractions, u: fractions) -> fractions:
+    def hessian_product(c: fractions, u: fractions) -> fractions:
         return u
 
-    return EnergyFunctions(slope=slope, bend=bend)
+    return EnergyFunctions(gradient=gradient, hessian_product=hessian_product)
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class MobilityFunctions:
     """Warp functions of a mobility: m, and its gradient."""
 
     value: Any
-    slope: Any
+    gradient: Any
 
 
 @cache
@@ -109,10 +109,10 @@ def _constant(precision: Precision, phases: int) -> MobilityFunctions:
         return real(1.0)
 
     @wp.func
-    def slope(c: fractions) -> fractions:
+    def gradient(c: fractions) -> fractions:
         return fractions()
 
-    return MobilityFunctions(value=value, slope=slope)
+    return MobilityFunctions(value=value, gradient=gradient)
 
 
 @cache
@@ -139,7 +139,7 @@ def _degenerate(precision: Precision, phases: int) -> MobilityFunctions:
         return real(0.5) * (z + wp.sqrt(z * z + floor * floor))
 
     @wp.func
-    def slope(c: fractions) -> fractions:
+    def gradient(c: fractions) -> fractions:
         z = products(c)
         t = total(c)
         along = fractions()
@@ -147,7 +147,7 @@ def _degenerate(precision: Precision, phases: int) -> MobilityFunctions:
             along[k] = t - c[k]
         return (real(0.5) + real(0.5) * z / wp.sqrt(z * z + floor * floor)) * along
 
-    return MobilityFunctions(value=value, slope=slope)
+    return MobilityFunctions(value=value, gradient=gradient)
 
 
 def _double_well_value(c: np.ndarray) -> np.ndarray:

@@ -8,10 +8,15 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.fields import Entry, StateField
 from cortado.device.precision import Precision
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.materials import mixture_kernels
 from cortado.sph.parts import Adjoints, StepContext, Tangents
+
+MASS_FRACTIONS = StateField("mass_fractions", "", Entry.FRACTIONS, first="mass_fractions")
+REFERENCE_DENSITY = StateField("reference_density", "kg/m³", Entry.NUMBER, is_constant=True)
+"""Of a particle: its mass over its volume on the rest lattice, which its first fractions decide."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +32,9 @@ class Phases:
 
 class Mixture:
     """The composition of the particles of one solver; its arrays are reused by every step."""
+
+    fields = (MASS_FRACTIONS, REFERENCE_DENSITY)
+    """What it carries from step to step."""
 
     def __init__(self, phases: Phases, precision: Precision, particles: int, device: Any, requires_grad: bool = False):
         self.phases = phases
@@ -83,11 +91,11 @@ class MixtureAdjoint:
         self._mixture = mixture
         self._c_bar, self._y, self._z = (mixture.fractions() for _ in range(3))
 
-    def step(self, step: StepContext, bar: Adjoints, new_fractions_bar: wp.array, fractions_bar: wp.array) -> None:
-        """From the adjoints of the materials and of the new fractions to that of the old ones, in scene order."""
+    def step(self, step: StepContext, bar: Adjoints, fractions_bar: wp.array) -> None:
+        """Replace the adjoint of the new fractions, in scene order, by that of the old ones, to which materials add."""
         mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, bar.named
         substeps, strength, c_bar, y, z = mixture.substeps, mixture.phases.strength, self._c_bar, self._y, self._z
-        step.launch(kernels.blend.adjoint, *known, c=mixture.c[substeps], c_scene_bar=new_fractions_bar, c_bar=c_bar)
+        step.launch(kernels.blend.adjoint, *known, c=mixture.c[substeps], c_scene_bar=fractions_bar, c_bar=c_bar)
         for k in reversed(range(substeps)):
             assert diffusion is not None
             c, chi, w = mixture.c[k], mixture.chi[k], mixture.w[k]

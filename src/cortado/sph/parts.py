@@ -10,10 +10,11 @@ from typing import Any, Protocol
 
 import warp as wp
 
+from cortado.device.arrays import Arrays, Fields, zeros
 from cortado.device.launching import KernelLauncher, Named, add, sum_of
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.precision import Precision
-from cortado.device.state import Arrays, Fields, Parameters, zeros
+from cortado.device.state import Parameters
 from cortado.discretise.discrete_scene import Lattice
 from cortado.discretise.walls.layers import WallLayers
 from cortado.parameters.registry import BY_NAME, Axis
@@ -92,9 +93,7 @@ class Adjoints:
         """For kernels: ``x_bar`` and so on; ``viscosity_bar`` is (n,), of particles' shares, where a part names the
         viscosity among its ``shares``, and the sum (phases,) elsewhere."""
         whole = {
-            f"{name}_bar": self.parameters[name]
-            for name in self.parameters.names
-            if name not in BY_NAME or BY_NAME[name].axis is Axis.STEP
+            f"{name}_bar": self.parameters[name] for name in self.parameters.names if BY_NAME[name].axis is Axis.STEP
         }
         return self.fields.named("_bar"), self.shares.named("_bar"), whole
 

@@ -31,27 +31,27 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
     separation, vectors, numbers = pair.separation, pair.vectors, pair.numbers
     phi = form(discretisation)
     phi_force, phi_tangent, phi_adjoint_x, phi_adjoint_v = phi.force, phi.tangent, phi.adjoint_x, phi.adjoint_v
-    name = form.__name__  # a module for each form: their functions share names
+    name = form.__name__  # a module for each form: their functions have the same names
 
     @wp.func
-    def shared(a: real, b: real) -> real:
-        """mu_ij; without viscosity on either side 0."""
+    def pair_viscosity(a: real, b: real) -> real:
+        """mu_ij, the harmonic mean of two viscosities; 0 where both are 0."""
         if a + b > real(0.0):
             return real(2.0) * a * b / (a + b)
         return real(0.0)
 
     @wp.func
-    def share(a: real, b: real) -> real:
-        """d mu_ij / d mu_i; where neither side has any, that of both rising together."""
+    def pair_viscosity_derivative(a: real, b: real) -> real:
+        """d mu_ij / d mu_i; where both are 0, the derivative for both increasing together."""
         if a + b > real(0.0):
             part = b / (a + b)
             return real(2.0) * part * part
         return real(0.5)
 
-    @wp.func_grad(shared)
-    def adjoin_shared(a: real, b: real, bar: real):
-        wp.adjoint[a] += share(a, b) * bar
-        wp.adjoint[b] += share(b, a) * bar
+    @wp.func_grad(pair_viscosity)
+    def adjoin_pair_viscosity(a: real, b: real, bar: real):
+        wp.adjoint[a] += pair_viscosity_derivative(a, b) * bar
+        wp.adjoint[b] += pair_viscosity_derivative(b, a) * bar
 
     @wp.func
     def force_sum(
@@ -73,7 +73,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
             n_j = numbers(n, k, i, s)
             mu_j = numbers(mu, k, i, s)
             for u in range(UNROLL):
-                weight = shared(mu_i, mu_j[u]) * s.volume / n_j[u]
+                weight = pair_viscosity(mu_i, mu_j[u]) * s.volume / n_j[u]
                 total += weight * phi_force(separation(x_i, x_j[u], s), v_i - v_j[u], s)
         if friction != real(0.0):
             for k in range(s.fluid_count[i], s.count[i]):
@@ -109,8 +109,9 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
                 x_ij = separation(x_i, x[j], s)
                 v_ij = v_i - v[j]
                 volume_j = s.volume / n[j]
-                mu_ij = shared(mu_i, mu[j])
-                mu_dot_ij = share(mu_i, mu[j]) * mu_dot_i + share(mu[j], mu_i) * mu_dot[j]
+                mu_ij = pair_viscosity(mu_i, mu[j])
+                own = pair_viscosity_derivative(mu_i, mu[j]) * mu_dot_i
+                mu_dot_ij = own + pair_viscosity_derivative(mu[j], mu_i) * mu_dot[j]
                 total += volume_j * (mu_dot_ij - mu_ij * n_dot[j] / n[j]) * phi_force(x_ij, v_ij, s)
                 total += (volume_j * mu_ij) * phi_tangent(x_ij, v_ij, x_dot_i - x_dot[j], v_dot_i - v_dot[j], s)
         if friction != real(0.0):
@@ -207,14 +208,14 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
                 v_ij = v_i - v_j[u]
                 w_ij = w_i - w_j[u] / m_j[u]
                 volume_j = s.volume / n_j[u]
-                weight = volume_j * shared(mu_i, mu_j[u])
+                weight = volume_j * pair_viscosity(mu_i, mu_j[u])
                 force = phi_force(x_ij, v_ij, s)
                 force_work = wp.dot(force, w_ij)
                 x_sum += weight * phi_adjoint_x(x_ij, v_ij, w_ij, s)
                 v_sum += weight * phi_adjoint_v(x_ij, v_ij, w_ij, s)
                 work += weight * force_work
                 own_work += weight * wp.dot(force, w_i)
-                mu_work += volume_j * share(mu_i, mu_j[u]) * force_work
+                mu_work += volume_j * pair_viscosity_derivative(mu_i, mu_j[u]) * force_work
         if friction != real(0.0):
             for k in range(s.fluid_count[i], s.count[i]):
                 b = s.neighbours[k, i]

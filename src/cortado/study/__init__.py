@@ -1,5 +1,5 @@
-"""The gradient study: gradients by many ways side by side, one experiment a file, each with its numbers and a picture.
+"""The gradient study: gradients computed in many ways, compared in experiments with numbers and a picture each.
 
-An experiment is a TOML file in ``experiments/``, a `experiment.Kind` measures, draws and judges it, and
-``cortado gradients figure`` does all three. A new kind is a module here, and an entry in ``kinds.py``.
+An experiment is a TOML file in ``experiments/``; its type (`experiment.ExperimentType`) measures, draws and judges it,
+and ``cortado gradients figure`` does all three. A new type is a module here, and an entry in ``registry.py``.
 """

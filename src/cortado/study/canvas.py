@@ -1,4 +1,4 @@
-"""Pictures of the study, in the look of all other pictures."""
+"""Pictures of the study, in the style of all other pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How near two gradients are, and how quickly a norm grows."""
+"""The distance between two gradients, and the growth rate of a norm."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,24 +8,24 @@ from numpy.typing import ArrayLike, NDArray
 
 Gradient = Mapping[str, ArrayLike]
 WINDOWS = 4
-"""Parts of a history, at most, whose slopes tell how certain the slope of the whole is."""
+"""Parts of a history at most, from whose slopes the standard error of the whole slope is computed."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A gradient held against another one, all numbers of all parameters as one vector."""
+    """The distance of a gradient from the true one, all components of all parameters as one vector."""
 
     relative_l2: float
-    """|found - truth| / |truth|"""
+    """|estimate - true| / |true|"""
     cosine: float
-    """Of the angle between them."""
+    """The cosine of the angle between them."""
     norm_ratio: float
-    """|found| / |truth|"""
+    """|estimate| / |true|"""
 
 
-def compare(found: Gradient, truth: Gradient) -> Comparison:
-    """Hold a gradient against another one of the same parameters."""
-    a, b = (np.concatenate([np.ravel(g[name]) for name in truth]).astype(np.float64) for g in (found, truth))
+def compare(estimate: Gradient, true: Gradient) -> Comparison:
+    """Compare a gradient with the true one, with respect to the same parameters."""
+    a, b = (np.concatenate([np.ravel(g[name]) for name in true]).astype(np.float64) for g in (estimate, true))
     size = np.linalg.norm(b)
     with np.errstate(divide="ignore", invalid="ignore"):
         return Comparison(
@@ -37,12 +37,12 @@ def compare(found: Gradient, truth: Gradient) -> Comparison:
 
 @dataclass(frozen=True)
 class Growth:
-    """Of a norm that is multiplied by exp(rate) a step."""
+    """The growth of a norm that is multiplied by exp(rate) in each step."""
 
     rate: float
-    """e-folds a step: the slope of a line through the norm's logarithm."""
+    """e-folds a step: the slope of a line fitted to the norm's logarithm."""
     error: float
-    """Standard error of it, from the slopes of `WINDOWS` parts."""
+    """Its standard error, from the slopes of `WINDOWS` parts."""
 
     def __str__(self) -> str:
         return f"{self.rate:.4f} ± {self.error:.4f} per step"

@@ -1,4 +1,4 @@
-"""Numbers with their uncertainty, and the fits that give them."""
+"""Numbers with their standard errors, and fits."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Estimate:
 
     @classmethod
     def of(cls, samples: ArrayLike) -> Estimate:
-        """The mean of independent samples; of one alone the error is not known (nan)."""
+        """The mean of independent samples; the error of a single sample is nan."""
         found = np.asarray(samples, dtype=float)
         if len(found) < 2:
             return cls(float(found[0]), float("nan"))
@@ -49,7 +49,7 @@ class Line:
 
     @classmethod
     def through(cls, x: ArrayLike, y: ArrayLike) -> Line:
-        """By least squares; errors are those of points that scatter alike, and need three of them."""
+        """A line fitted by least squares; the errors assume equal variances, and need at least three points."""
         x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
         if len(x) < 3:
             slope, offset = np.polyfit(x, y, 1)
@@ -66,12 +66,12 @@ def growth_rate(steps: ArrayLike, sizes: ArrayLike) -> float:
 
 
 def geometric_mean(values: ArrayLike) -> float:
-    """Of positive values; what is 0 by underflow counts as 1e-300."""
+    """The geometric mean of positive values; a value that underflowed to 0 counts as 1e-300."""
     return float(np.exp(np.log(np.maximum(values, 1e-300)).mean()))
 
 
 def norms(vectors: ArrayLike) -> NDArray[np.float64]:
-    """Euclidean norms (frames,) of (frames, n, d); inf for what has grown too large to be squared."""
+    """Euclidean norms (frames,) of (frames, n, d); inf where a square overflows."""
     with np.errstate(over="ignore", invalid="ignore"):
         found = np.sqrt((np.asarray(vectors) ** 2).sum(axis=(1, 2)))
     return np.where(np.isnan(found), np.inf, found)

@@ -1,4 +1,4 @@
-"""What an experiment is: a kind, which measures, draws and judges, with the settings from a file."""
+"""An experiment: a type of experiment, which measures, draws and judges, with settings from a file."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -16,14 +16,16 @@ if TYPE_CHECKING:
 
 
 class Settings(tables.Table):
-    """What the file of an experiment holds beside its kind; each kind adds its own. The kinds of values of
-    `cortado.scene.fields` make sentences of what is wrong."""
+    """The settings in the file of an experiment; each type of experiment adds its own.
+
+    Their field types are those of `cortado.scene.fields`, which make sentences of errors.
+    """
 
     title: Text
-    """Above the picture."""
+    """The title of the picture."""
 
     def identity(self) -> dict[str, Any]:
-        """What decides the measurement, for JSON: with the same, it need not be repeated."""
+        """The settings on which the measurement depends, for JSON; with the same ones it is not repeated."""
         return self.model_dump(mode="json")
 
 
@@ -46,20 +48,22 @@ Window = Annotated[tuple[Annotated[float, quantity("steps", ge=0.0)], ...], comp
 
 
 class Progress(Protocol):
-    """Shows how far a measurement is: ``with progress(total) as advance: ... advance(n)``, in units of your choice that
-    take about the same time each."""
+    """Shows the progress of a measurement: ``with progress(total) as advance: ... advance(n)``.
+
+    The units of ``total`` and ``n`` are free, as long as each takes about the same time.
+    """
 
     def __call__(self, total: int) -> AbstractContextManager[Advance]: ...
 
 
 @dataclass(frozen=True)
-class Kind:
-    """A kind of experiment."""
+class ExperimentType:
+    """A type of experiment: how it is measured, drawn and judged."""
 
     name: str
-    """What files call it."""
+    """The ``kind`` in files of experiments."""
     settings: type[Settings]
-    """What its files hold."""
+    """The settings in these files."""
     measure: Callable[[Any, Progress], Table]
     """Settings -> measurements."""
     draw: Callable[[Table, Any], "Figure"]
@@ -70,11 +74,11 @@ class Kind:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A kind with its settings."""
+    """A type of experiment with the settings from a file."""
 
     name: str
     """The file's, without its ending."""
-    kind: Kind
+    type: ExperimentType
     settings: Settings
     reduced: bool
     """Whether the file's [reduced] settings are in place."""

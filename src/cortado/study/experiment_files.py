@@ -1,4 +1,4 @@
-"""From a file in ``experiments/`` to an experiment."""
+"""Reads files of ``experiments/``."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from cortado.scene.scene import Scene, scene_from_dict
 from cortado.scene.sentences import sentences, wanted
 from cortado.scene.toml import read_toml
 from cortado.study.experiment import Experiment
-from cortado.study.kinds import KINDS
+from cortado.study.registry import EXPERIMENT_TYPES
 from cortado.study.scenes import merged
 
 
@@ -31,17 +31,17 @@ def load_experiment(path: str | os.PathLike[str], reduced: bool = False, overrid
     if reduced:
         data |= replaced
     name = data.pop("kind", MISSING)
-    if not isinstance(name, str) or name not in KINDS:
-        raise SceneError(file, "kind", name, wanted({"enum": list(KINDS)}))
-    kind = KINDS[name]
-    if "scene" in kind.settings.model_fields and "scene" in data:
+    if not isinstance(name, str) or name not in EXPERIMENT_TYPES:
+        raise SceneError(file, "kind", name, wanted({"enum": list(EXPERIMENT_TYPES)}))
+    experiment_type = EXPERIMENT_TYPES[name]
+    if "scene" in experiment_type.settings.model_fields and "scene" in data:
         data["scene"] = _scene(data["scene"], file)
     try:
-        with sentences(kind.settings):
-            settings = kind.settings.model_validate(data, context={"folder": Path(file).parent})
+        with sentences(experiment_type.settings):
+            settings = experiment_type.settings.model_validate(data, context={"folder": Path(file).parent})
     except SceneError as error:
         raise error.in_file(file) from None
-    return Experiment(Path(file).stem, kind, settings, reduced)
+    return Experiment(Path(file).stem, experiment_type, settings, reduced)
 
 
 def _scene(value: Any, file: str) -> Scene:

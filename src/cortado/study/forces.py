@@ -1,4 +1,4 @@
-"""The report's Figures 5 and 6: the norm of the gradient over the steps with forces taken away, by finite differences
+"""The report's Figures 5 and 6: the norm of the gradient over the steps with forces left out, by finite differences
 and analytic."""
 
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ from cortado.reference import Terms
 from cortado.scene.fields import OneOf, Several, count, quantity
 from cortado.study.canvas import blank
 from cortado.study.comparison import growth
-from cortado.study.experiment import Kind, Progress, SceneSettings
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings
 from cortado.study.gravity_tangents import COST, LABEL, along_gravity, row
 from cortado.study.scenes import varied
 from cortado.study.sources import ReferenceTangent
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 
 ANALYTIC = 0.0
 """The step of the analytic derivative: the limit of the differences."""
-AGREEMENT = 0.1
-"""A difference is taken for the derivative as long as it is no farther from it, relative."""
+SAME = 0.1
+"""Relative distance up to which a difference counts as equal to the derivative."""
 
 
 @dataclass(frozen=True)
 class Ablation:
-    """What is taken away."""
+    """Which forces and terms are left out."""
 
     changes: dict[str, Any] = field(default_factory=dict)
-    """Of the scene, so that the run itself changes."""
+    """Replacements in the scene, which change the run itself."""
     terms: Terms | None = None
-    """Of the derivative only; None where it is whole."""
+    """Terms that are kept in the derivative alone; None for all."""
 
 
 NO_PRESSURE, NO_VISCOSITY = {"pressure": False}, {"viscosity": "none"}
@@ -51,9 +51,9 @@ class Forces(SceneSettings):
     """Settings."""
 
     steps: Annotated[int, count(8, 1_000_000)]
-    """Of the run."""
+    """Steps of the run."""
     precision: Annotated[str, OneOf(COST)] = "float64"
-    """Of the reference engine."""
+    """Precision of the reference engine."""
     differences: Several[Annotated[float, quantity("m/s2", gt=0.0)]] = ()
     """Steps of finite differences [m / s2]; without any, the picture is of the analytic derivative."""
     impact: Annotated[int, count(0, 1_000_000)]
@@ -95,7 +95,7 @@ def draw(table: Table, settings: Forces) -> "Figure":
 
 
 def _style(k: int, ablation: Ablation) -> dict[str, Any]:
-    """Lines without pressure lie on one another: a wide one, and dashes with gaps for those below."""
+    """Lines without pressure coincide, so that the first is wide and the others are dashed."""
     style: dict[str, Any] = {"color": PALETTE[k]}
     if ablation.changes == {"forces": NO_PRESSURE}:
         return style | {"linewidth": 6.0, "alpha": 0.45}
@@ -120,14 +120,14 @@ def verdict(table: Table, settings: Forces) -> list[str]:
     )
     for difference in settings.differences:
         found, exact = (table.where(forces=FULL, difference=h) for h in (difference, ANALYTIC))
-        off = np.abs(found["norm"] - exact["norm"]) > AGREEMENT * exact["norm"]
+        off = np.abs(found["norm"] - exact["norm"]) > SAME * exact["norm"]
         left = int(found["step"][off][0]) if off.any() else settings.steps
         late = found.chosen(found["step"] > settings.steps - settings.steps // 8)
         apart = 2.0 * difference * late["norm"] / late["distance"]
         end, factor = found["norm"][-1], exact["norm"][-1] / found["norm"][-1]
         sentences.append(
             f"Finite differences of step {difference:g} m/s², {FULL}: equal to the analytic norm within "
-            f"{AGREEMENT:.0%} up to step {left}, {end:.3g} s² and {factor:.2g} times below it at the end; "
+            f"{SAME:.0%} up to step {left}, {end:.3g} s² and {factor:.2g} times below it at the end; "
             f"over the last eighth of the steps the two runs are {apart.mean():.2f} ± {apart.std():.2f} of the "
             "distance between two unrelated states apart."
         )
@@ -143,4 +143,4 @@ def _free_fall(table: Table) -> float:
     return float(np.abs(norms / norms[-1] * expected[-1] / expected - 1.0).max())
 
 
-FORCES = Kind("forces", Forces, measure, draw, verdict)
+FORCES = ExperimentType("forces", Forces, measure, draw, verdict)

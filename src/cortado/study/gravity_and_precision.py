@@ -8,7 +8,7 @@ import numpy as np
 from cortado.figures.canvas import DASHED, FAINT, PALETTE
 from cortado.scene.fields import OneOf, Several, count, quantity
 from cortado.study.canvas import blank
-from cortado.study.experiment import Kind, Progress, SceneSettings
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings
 from cortado.study.gravity_tangents import COST, LABEL, along_gravity
 from cortado.study.sources import ReferenceTangent
 from cortado.study.tables import Table
@@ -23,11 +23,11 @@ class GravityAndPrecision(SceneSettings):
     """Settings."""
 
     steps: Annotated[int, count(1, 1_000_000)]
-    """After which the gradient is looked at."""
+    """Number of steps after which the gradient is measured."""
     gravities: Several[Annotated[float, quantity("m/s2", gt=0.0)]]
-    """Sizes, along the scene's direction [m / s2]."""
+    """Sizes of gravity, in the direction of the scene's [m / s2]."""
     precisions: Several[Annotated[str, OneOf(COST)]]
-    """The last one is what the others are held against."""
+    """Precisions; the last one is the reference for the others."""
     difference: Annotated[float, quantity("m/s2", gt=0.0)]
     """Step of the finite differences [m / s2]."""
 
@@ -94,9 +94,9 @@ def verdict(table: Table, settings: GravityAndPrecision) -> list[str]:
 
 
 def _distance(table: Table, method: str, precision: str, truth: str) -> np.ndarray:
-    """Relative, of the norms in two precisions, by gravity."""
+    """Relative distance of the norms in two precisions, for each gravity."""
     found, expected = (table.where(method=method, precision=p)["norm"] for p in (precision, truth))
     return np.abs(found / expected - 1.0)
 
 
-GRAVITY_AND_PRECISION = Kind("gravity_and_precision", GravityAndPrecision, measure, draw, verdict)
+GRAVITY_AND_PRECISION = ExperimentType("gravity_and_precision", GravityAndPrecision, measure, draw, verdict)

@@ -1,4 +1,5 @@
-"""Runs of the reference engine with their derivative by the size of gravity: what the report's Figures 4 to 7 show."""
+"""Runs of the reference engine with their derivative with respect to the size of gravity, as in the report's Figures 4
+to 7."""
 
 from typing import Any
 
@@ -10,15 +11,17 @@ from cortado.scene.scene import Scene
 from cortado.study.sources import ReferenceTangent
 
 COST = {"float32": 1, "float64": 1, "float80": 3, "float128": 60}
-"""Time of a step, about, in that of float64."""
+"""Approximate time of a step, relative to that in float64."""
 LABEL = "|dx/dg|  [s²]"
 
 
 def along_gravity(
     scene: Scene, steps: int, source: ReferenceTangent, gravity: float | None = None
 ) -> tuple[History, float]:
-    """The tangents along the direction of gravity, whose size ``gravity`` [m / s2] may replace; and the distance of the
-    last state from one in which the same places are taken by other particles [m], as those of two unrelated runs are.
+    """The tangents along the direction of gravity, and the distance between two unrelated states [m].
+
+    ``gravity`` [m / s2] may replace the size of gravity. Unrelated states are the last one, and the last one with its
+    particles permuted at random.
     """
     direction = np.array(scene.forces.gravity)
     size = float(np.linalg.norm(direction))

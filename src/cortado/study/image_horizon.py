@@ -13,7 +13,7 @@ from cortado.scene.fields import Several, Vector, count, quantity
 from cortado.simulation import Simulation
 from cortado.study.canvas import blank
 from cortado.study.comparison import growth
-from cortado.study.experiment import DeviceSettings, Kind, Progress, SceneSettings
+from cortado.study.experiment import DeviceSettings, ExperimentType, Progress, SceneSettings
 from cortado.study.sources import ByEstimator, FiniteDifference, Source, Warp
 from cortado.study.tables import Table
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TAPE, ADJOINT = "autograd (Warp's tape)", "adjoint by gathers"
-AGREEMENT = 0.1
-"""A difference is taken for the gradient as long as it is no farther from it, relative."""
+SAME = 0.1
+"""Relative distance up to which a difference counts as equal to the gradient."""
 
 
 class ImageHorizon(DeviceSettings, SceneSettings):
@@ -30,12 +30,12 @@ class ImageHorizon(DeviceSettings, SceneSettings):
 
     horizons: Several[Annotated[int, count(1, 1_000_000)]]
     """Numbers of steps, growing."""
-    hidden: Vector[Annotated[float, quantity("m/s2")]]
-    """(d,) the gravity whose picture is the target [m / s2]; the gradient is taken at the scene's own."""
+    true_gravity: Vector[Annotated[float, quantity("m/s2")]]
+    """(d,) the true gravity, whose picture is the target [m / s2]; the gradient is taken at the scene's own."""
     differences: Several[Annotated[float, quantity("m/s2", gt=0.0)]]
     """Steps of finite differences [m / s2]."""
     precision: Literal["float32", "float64"] = "float32"
-    """Of the simulation."""
+    """Precision of the simulation."""
 
 
 def measure(settings: ImageHorizon, progress: Progress) -> Table:
@@ -63,9 +63,11 @@ def _name(step: float) -> str:
 
 
 def _problem(simulation: Simulation, horizon: int, settings: ImageHorizon) -> Problem:
-    """The squared difference from the picture that the hidden gravity makes after so many steps."""
+    """The squared difference from the picture that the true gravity makes after so many steps."""
     renderer = scene_renderer(simulation)
-    end = Problem(simulation, horizon, FinalPositions(simulation.positions)).end({"gravity": np.array(settings.hidden)})
+    end = Problem(simulation, horizon, FinalPositions(simulation.positions)).end(
+        {"gravity": np.array(settings.true_gravity)}
+    )
     target = renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
     return Problem(simulation, horizon, Image(renderer, target))
 
@@ -99,12 +101,12 @@ def verdict(table: Table, settings: ImageHorizon) -> list[str]:
     norms = np.linalg.norm(exact, axis=1)
     off = np.linalg.norm(tape - exact, axis=1) / norms
     fine = _gradients(table, _name(min(settings.differences)))
-    near = np.linalg.norm(exact - fine, axis=1) <= AGREEMENT * norms
+    near = np.linalg.norm(exact - fine, axis=1) <= SAME * norms
     left = int(horizons[~near][0]) if not near.all() else None
     sentences = [
         f"Autograd and the adjoint by gathers, which share no code, agree to {np.median(off):.1e} (median; at most "
         f"{off.max():.1e}) in {settings.precision}: what grows is no fault of automatic differentiation.",
-        f"Finite differences of step {min(settings.differences):g} m/s² are within {AGREEMENT:.0%} of the gradient "
+        f"Finite differences of step {min(settings.differences):g} m/s² are within {SAME:.0%} of the gradient "
         + (f"until they leave it at {left} steps." if left else f"at all horizons up to {horizons[-1]} steps."),
     ]
     if left:
@@ -126,4 +128,4 @@ def verdict(table: Table, settings: ImageHorizon) -> list[str]:
     return sentences
 
 
-IMAGE_HORIZON = Kind("image_horizon", ImageHorizon, measure, draw, verdict)
+IMAGE_HORIZON = ExperimentType("image_horizon", ImageHorizon, measure, draw, verdict)

@@ -1,9 +1,9 @@
 """Where the growth lives: at the scale of particles or of the fluid.
 
-The derivative by gravity, and one along a random direction, which has forgotten where it began, are taken apart into
-the motion of all particles together, cosine modes of the box, what an SPH average leaves, and a picture; beside them
-white noise on the same particles, and what a change of gravity that is not small does. And every part is followed in
-time: is there one that does not grow?
+The derivative with respect to gravity, and one along a random direction, are decomposed into the common motion of all
+particles, cosine modes of the box, the part that remains after an SPH average, and the change of a picture. They are
+compared with white noise on the same particles, and with the effect of a change of gravity that is not small. The
+growth of every part over time shows whether there is one that does not grow.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from cortado.reference import History, Simulation
 from cortado.scene.fields import Vector, count, quantity
 from cortado.study import spatial_scales
 from cortado.study.canvas import blank
+from cortado.study.ensembles import perturbed, side_by_side
 from cortado.study.estimates import Estimate, geometric_mean, growth_rate
-from cortado.study.experiment import Kind, Progress, SceneSettings, Window
-from cortado.study.starts import perturbed, side_by_side
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Window
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -33,26 +33,26 @@ SIZES = {"size": "all particles", "modes size": "longest waves", "common size": 
 
 
 class LocalitySettings(SceneSettings):
-    """Tangents taken apart by scale."""
+    """Settings of the decomposition of tangents by scale."""
 
     direction: Vector[Annotated[float, quantity("m/s2")]]
-    """Of the change of gravity."""
+    """Direction of the change of gravity."""
     change: Annotated[float, quantity("m/s2", gt=0.0)]
-    """How much gravity changes, up and down, where it is not a derivative."""
+    """The change of gravity that is not small, in both directions."""
     steps: Annotated[int, count(2, 10_000)]
     record_every: Annotated[int, count(1, 1000)]
     window: Window
-    """Two: where rates are fitted and shares averaged."""
+    """Begin and end of the window in which rates are fitted and fractions averaged."""
     long_modes: Annotated[int, count(1, 10_000)]
-    """How many cosine modes count as the fluid's."""
+    """Number of cosine modes that count as long waves."""
     seeds: Annotated[int, count(1, 100)]
     perturbation: Annotated[float, quantity("spacings", ge=0.0)]
-    """Of the first positions."""
+    """Perturbation of the first positions [spacings]."""
 
 
 def measure(settings: LocalitySettings, progress: Progress) -> Table:
-    """Columns: seed, step, vector, quantity, value. Quantities: sizes and shares of a vector and of its parts, and
-    "modes k", the share of the k longest waves."""
+    """Columns: seed, step, vector, quantity, value. Quantities are norms of a vector and of its parts, the fractions of
+    its energy that parts have, and "modes k", that of the k longest waves."""
     tasks = [partial(_rows, settings, seed) for seed in range(settings.seeds)]
     with progress(settings.seeds) as advance:
         return Table.joined(side_by_side(tasks, advance))
@@ -108,12 +108,12 @@ def _parts(settings: LocalitySettings, positions: np.ndarray, box_modes: np.ndar
 
 
 def _counts(particles: int) -> list[int]:
-    """Numbers of modes, about evenly spread over their logarithms."""
+    """Numbers of modes, about evenly spaced on a logarithmic scale."""
     return sorted({round(k) for k in np.geomspace(1, particles, 16)})
 
 
 def draw(table: Table, settings: LocalitySettings) -> Figure:
-    """Shares of long waves; growth of every part; and how many particles take part."""
+    """Energy of long waves; growth of every part; and the number of particles that take part."""
     figure = blank(15.0, 5.4)
     spectrum, growth, spread = figure.subplots(1, 3)
     figure.suptitle(settings.title)
@@ -142,7 +142,8 @@ def draw(table: Table, settings: LocalitySettings) -> Figure:
 
 
 def verdict(table: Table, settings: LocalitySettings) -> list[str]:
-    """The shares against those of noise, the rates of every part, and what is left of the fluid's own response."""
+    """The energy of each part relative to that of noise, the growth rates, and the fluid's response to a finite
+    change."""
     inside = _inside(table, settings)
 
     def estimate(vector: str, quantity: str) -> Estimate:
@@ -166,10 +167,10 @@ def verdict(table: Table, settings: LocalitySettings) -> list[str]:
         f"the {settings.long_modes} longest waves {against_noise('long modes')} times, and what an SPH average leaves "
         f"{against_noise('smoothed')} times.",
         f"It is spread over {estimate(GRAVITY, 'participation')} of {particles} particles, one "
-        f"along a random direction over {estimate(RANDOM, 'participation')}, the answer to a change of gravity by "
+        f"along a random direction over {estimate(RANDOM, 'participation')}, the response to a change of gravity by "
         f"{settings.change:g} m/s² over {estimate(CHANGE, 'participation')}.",
         "Rates of growth a step: " + ", ".join(f"{name} {rates[part]}" for part, name in SIZES.items()) + ".",
-        f"The answer to that change of gravity does not grow ({still['size']} a step; centre of mass "
+        f"The response to that change of gravity does not grow ({still['size']} a step; centre of mass "
         f"{still['common size']}); at step {max(table.values('step'))} the derivative of the centre of mass is "
         f"{excess:.0e} times it.",
         f"Where it lives: {'at the scale of particles' if finer else 'not only at the scale of particles'}; but no "
@@ -202,4 +203,4 @@ def _rate(inside: Table, vector: str, quantity: str) -> Estimate:
     return Estimate.of([growth_rate(one["step"], one["value"]) for _, one in rows.groups("seed")])
 
 
-LOCALITY = Kind("locality", LocalitySettings, measure, draw, verdict)
+LOCALITY = ExperimentType("locality", LocalitySettings, measure, draw, verdict)

@@ -10,7 +10,7 @@ import numpy as np
 from cortado.figures.canvas import INK, PALETTE
 from cortado.study.canvas import blank
 from cortado.study.estimates import Estimate, Line
-from cortado.study.experiment import Kind
+from cortado.study.experiment import ExperimentType
 from cortado.study.lyapunov_exponents import LyapunovSettings, measure, window_steps
 from cortado.study.tables import Table
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 LOGARITHMIC = 20.0
 """Ratio of the greatest to the least x of a panel from which on its axis is logarithmic."""
 SAME = 0.2
-"""Relative difference of two ways up to which they agree."""
+"""Relative difference up to which two methods count as equal."""
 
 
 WAYS: dict[str, dict[str, Any]] = {
@@ -30,7 +30,7 @@ WAYS: dict[str, dict[str, Any]] = {
 
 
 def draw(table: Table, settings: LyapunovSettings) -> Figure:
-    """A panel for everything that was varied, and the spectrum."""
+    """A panel for each setting that was varied, and the spectrum."""
     figure = blank(16.0, 8.6)
     figure.suptitle(settings.title)
     panels = table.values("panel")
@@ -85,7 +85,7 @@ def _bars(axes: Any, rows: Table) -> None:
 
 
 def verdict(table: Table, settings: LyapunovSettings) -> list[str]:
-    """The exponent, whether two ways agree on it, and what changes it."""
+    """The exponent, whether two methods agree on it, and how it depends on the settings."""
     cases = list(_cases(table))
     base = next(rows for rows in cases if rows["label"][0] == "base")
     tangents, pairs = _estimate(base, "tangent"), _estimate(base, "pair")
@@ -100,10 +100,10 @@ def verdict(table: Table, settings: LyapunovSettings) -> list[str]:
         for rows in cases
         if np.isfinite(_numbers(_leading(rows, "pair"))[0]) and _estimate(rows, "tangent").value > 0.003
     ]
-    agreement = Estimate.of(ratios)
+    ratio = Estimate.of(ratios)
     agreeing = sum(abs(ratio - 1.0) <= SAME for ratio in ratios)
     sentences.append(
-        f"Over {len(ratios)} variants the exponent from pairs is {agreement} times that from tangents, within "
+        f"Over {len(ratios)} variants the exponent from pairs is {ratio} times that from tangents, within "
         f"{SAME:.0%} in {agreeing} of them."
     )
     first, last = window_steps(settings, settings.scene)
@@ -117,13 +117,13 @@ def verdict(table: Table, settings: LyapunovSettings) -> list[str]:
     holds = tangents.value > 3.0 * tangents.error and agreeing > len(ratios) / 2
     sentences.append(
         f"Chaos: {'true' if holds else 'not confirmed'}: the exact derivative grows by {tangents} a step, at which "
-        f"neighbouring runs part that no derivative was taken of ({pairs})."
+        f"neighbouring runs diverge of which no derivative was taken ({pairs})."
     )
     return sentences
 
 
 def _powers(table: Table) -> list[str]:
-    """How the exponent goes with what was varied over positive numbers."""
+    """How the exponent depends on settings that are positive numbers."""
     sentences = []
     for (panel, label), rows in table.chosen(np.nan_to_num(table["x"]) > 0.0).groups("panel", "label"):
         found = [(x, _estimate(one, "tangent").value, _in_time(one)) for (x,), one in rows.groups("x")]
@@ -139,7 +139,7 @@ def _powers(table: Table) -> list[str]:
 
 
 def _parts(table: Table, base: Estimate) -> list[str]:
-    """What the variants without a number do."""
+    """The exponents of the variants that are not numbers."""
     return [
         f"{label[0].upper()}{label[1:]}: {_estimate(rows, 'tangent')} a step from tangents"
         + (f", {_estimate(rows, 'pair')} from pairs" if len(_finite(_leading(rows, "pair"))) else "")
@@ -150,7 +150,7 @@ def _parts(table: Table, base: Estimate) -> list[str]:
 
 
 def _cases(table: Table) -> Iterator[Table]:
-    """The rows of every variant; of one that is in several panels only once."""
+    """The rows of every variant, once where it is in several panels."""
     varied = table.chosen(table["panel"] != "spectrum")
     numbers = varied.columns | {"x": np.nan_to_num(varied["x"], nan=-1.0)}  # nan is not itself
     found = {rows["rate"].tobytes(): rows for _, rows in Table(numbers).groups("panel", "label", "x")}
@@ -180,4 +180,4 @@ def _numbers(rows: Table) -> tuple[float, float]:
     return estimate.value, np.nan_to_num(estimate.error) if np.isfinite(estimate.value) else np.nan
 
 
-LYAPUNOV = Kind("lyapunov", LyapunovSettings, measure, draw, verdict)
+LYAPUNOV = ExperimentType("lyapunov", LyapunovSettings, measure, draw, verdict)

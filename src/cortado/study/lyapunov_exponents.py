@@ -1,8 +1,8 @@
-"""Lyapunov exponents of a flow and of its variants, by two ways that share nothing but the step.
+"""Lyapunov exponents of a flow and of its variants, by two methods that share nothing but the forward step.
 
-Tangents are pushed along a run and made orthonormal again and again; and two runs, of which one starts a hair's breadth
-away, part. The second knows nothing of derivatives: where both agree, growth is the fluid's. Tangents can also leave
-out a term of the derivative, which says what each of them does to the growth.
+The first method propagates tangents along a run, and makes them orthonormal at regular steps. The second measures how
+fast two runs diverge whose first states are nearly the same; it uses no derivative, so that growth on which both agree
+is a property of the flow. With a term of the derivative left out, the tangents show what that term contributes.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from cortado.reference import Simulation, Terms
 from cortado.scene import tables
 from cortado.scene.fields import Several, Text, components, count, quantity
 from cortado.scene.scene import Scene
+from cortado.study.ensembles import perturbed, side_by_side
 from cortado.study.estimates import growth_rate, norms
 from cortado.study.experiment import Progress, SceneSettings
 from cortado.study.lyapunov_spectrum import growth_by_segment
 from cortado.study.scenes import varied
-from cortado.study.starts import perturbed, side_by_side
 from cortado.study.tables import Table
 
 Term = Literal["viscosity", "pressure", "hessian", "density"]
 
 
 class Variant(tables.Table):
-    """One thing changed in the scene, or in the derivative."""
+    """A variant of the scene or of the derivative, which differs in one setting."""
 
     panel: Text
-    """Of the picture, where it belongs."""
+    """The panel of the picture in which it is drawn."""
     label: Text
-    """Of a curve in it, or of a bar if there is no ``x``."""
+    """Label of a curve in the panel, or of a bar where there is no ``x``."""
     x: Annotated[float, quantity()] | None = None
-    """Where on the curve."""
+    """Its place on the curve."""
     scene: Mapping[str, Any] = Field(default_factory=dict)
-    """What differs from the scene."""
+    """Replacements in the scene."""
     without: Several[Term] = ()
     """Terms of the tangent that are left out (`cortado.reference.Terms`)."""
 
@@ -47,25 +47,25 @@ class LyapunovSettings(SceneSettings):
     """Exponents of the scene and of its variants."""
 
     fall: Annotated[float, quantity("m", gt=0.0)]
-    """Height of the fall: times are counted in the time that it takes, (2 fall / g)^(1/2), so that variants of gravity
-    are seen at the same stage."""
+    """Height of the fall. Times are in units of its duration, (2 fall / g)^(1/2), so that variants with another gravity
+    are compared at the same stage."""
     window: Annotated[tuple[Annotated[float, quantity("falls", ge=0.0)], ...], components("first", "last")]
-    """Two: where exponents are measured."""
+    """Begin and end of the window in which exponents are measured."""
     seeds: Annotated[int, count(1, 100)]
     perturbation: Annotated[float, quantity("spacings", ge=0.0)]
-    """Of the first positions."""
+    """Perturbation of the first positions [spacings]."""
     vectors: Annotated[int, count(1, 1000)]
-    """Tangents of a variant."""
+    """Number of tangents for a variant."""
     spectrum: Annotated[int, count(1, 10_000)]
-    """Tangents of the scene itself, once."""
+    """Number of tangents for the scene itself, with one seed."""
     segment: Annotated[int, count(1, 1000)]
     """Steps between two orthonormalisations."""
     velocity_time: Annotated[float, quantity("s", gt=0.0)]
-    """What velocities are multiplied with in the norm of a tangent."""
+    """Factor of velocities in the norm of a tangent."""
     separation: Annotated[float, quantity("m", gt=0.0)]
-    """Of two runs at the start, each coordinate about so much."""
+    """Distance of two runs at the start, in each coordinate."""
     linear: Annotated[float, quantity("m", gt=0.0)]
-    """Distance of two runs, over all particles, up to which they count."""
+    """Distance of two runs, over all particles, up to which their divergence is measured."""
     variants: Several[Variant]
 
 
@@ -163,7 +163,7 @@ def _growth(
 def _parting(
     settings: LyapunovSettings, simulation: Simulation, start: np.ndarray, first: int, last: int, seed: int
 ) -> float:
-    """The rate at which two runs part, as long as they are close; nan where that is too short."""
+    """The rate at which two runs diverge, as long as they are close; nan where too few steps are."""
     offset = settings.separation * np.random.default_rng((seed, 2)).normal(size=start.shape)
     one, other = (simulation.run(last, {"initial_positions": at}) for at in (start, start + offset))
     apart = norms(other.positions - one.positions)

@@ -1,8 +1,9 @@
 """Kernels that are deliberately wrong: a neighbour sum and its non-linear use in one kernel.
 
-Every value is that of the kernels in `cortado.physics`, bit for bit. But Warp's backward pass does not run a dynamic
-loop again: after it the sum is 0 there, and what follows it (the clamp of the pressure, the yield beside a wall) has a
-silently wrong adjoint. So it is in the obvious way to write SPH in Warp, and in Warp's own example.
+Every value is that of the solver's kernels, bit for bit. But Warp's backward pass does not run a dynamic loop again:
+after the loop the sum is 0 there, and what follows it (the clamp of the pressure, the pressure relaxation beside a
+wall) has a silently wrong adjoint, without a warning. The obvious way to write SPH in Warp has this error, and so has
+Warp's own example.
 """
 
 # mypy: ignore-errors
@@ -30,6 +31,7 @@ class OneKernelTape(Tape):
         step = super().derivative(rollout)
         loops = one_kernel_loops(rollout.solver.discretisation)
         wrong = {topic: Kernels(loops[topic], None, None) for topic in self.topics}
+        step.solver.density = wrong.pop("density", step.solver.density)
         step.solver.kernels = replace(step.solver.kernels, **wrong)
         return step
 

@@ -1,6 +1,7 @@
-"""The report's Figure 7: the two terms of the pressure force's derivative, each alone.
+"""The report's Figure 7: the derivative of the pressure force with one of its two terms at a time.
 
-Twice: a tangent that is propagated with one term only, and what each term does in one step to the exact tangent.
+It measures a tangent that is propagated with that term only, and the size of each term in one step along the exact
+tangent.
 """
 
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +13,7 @@ from cortado.reference import Terms
 from cortado.scene.fields import OneOf, Several, count
 from cortado.study.canvas import blank
 from cortado.study.comparison import growth
-from cortado.study.experiment import Kind, Progress, SceneSettings
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings
 from cortado.study.gravity_tangents import COST, LABEL, along_gravity, row
 from cortado.study.sources import ReferenceTangent
 from cortado.study.tables import Table
@@ -30,9 +31,9 @@ class PressureTerms(SceneSettings):
     """Settings."""
 
     steps: Annotated[int, count(8, 1_000_000)]
-    """Of the run."""
+    """Steps of the run."""
     precisions: Several[Annotated[str, OneOf(COST)]]
-    """Of the reference engine."""
+    """Precisions of the reference engine."""
     impact: Annotated[int, count(0, 1_000_000)]
     """The step from which on growth is measured: when the fluid has hit the floor."""
 
@@ -100,4 +101,4 @@ def verdict(table: Table, settings: PressureTerms) -> list[str]:
     return sentences
 
 
-PRESSURE_TERMS = Kind("pressure_terms", PressureTerms, measure, draw, verdict)
+PRESSURE_TERMS = ExperimentType("pressure_terms", PressureTerms, measure, draw, verdict)

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado import losses, reference
-from cortado.device.state import State
 from cortado.errors import InputError
-from cortado.losses import Snapshot, SnapshotAdjoint
+from cortado.losses import Snapshot
 from cortado.losses.checked import as_loss
+from cortado.losses.loss import by_field
 from cortado.problem import Problem
 from cortado.reference.digits import Digits
 
@@ -32,11 +32,11 @@ class _OnDevice:
 
     def adjoint(self, positions: Digits, velocities: Digits) -> tuple[NDArray[Any], NDArray[Any]]:
         _, bar = self._loss.value_and_adjoint(self._end(positions, velocities))
-        state = bar.state if isinstance(bar, SnapshotAdjoint) else bar
-        found = state.numpy(self._simulation.dimension) if isinstance(state, State) else state
-        return np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.float64)
+        found = by_field(bar, self._simulation.dimension)
+        return found["positions"].astype(np.float64), found["velocities"].astype(np.float64)
 
     def _end(self, positions: Digits, velocities: Digits) -> Snapshot:
         given, state = self._simulation.parameters(), self._simulation.solver.new_state()
-        state.set(positions.high, velocities.high, given["mass_fractions"])
+        fractions = given["mass_fractions"]
+        state.set({"positions": positions.high, "velocities": velocities.high, "mass_fractions": fractions})
         return Snapshot(state, self._simulation.dimension, given["colours"])

@@ -1,4 +1,4 @@
-"""The folder of an experiment: its numbers, its picture, and what they say."""
+"""The folder of an experiment: its numbers, its picture and its verdict."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class Results:
         self._make_folder()
         started = time.perf_counter()
         progress = partial(track, description=experiment.name)
-        table = experiment.kind.measure(experiment.settings, progress)
+        table = experiment.type.measure(experiment.settings, progress)
         table.write_csv(self.data)
         return self._show(experiment, table, time.perf_counter() - started)
 
     def redraw(self, experiment: Experiment) -> list[str]:
-        """Draw and judge the numbers that are there; returns the verdict."""
+        """Draw and judge numbers that were measured before; returns the verdict."""
         return self._show(experiment, Table.read_csv(self.data), self._recorded().get("seconds"))
 
     def has(self, experiment: Experiment) -> bool:
@@ -43,13 +43,13 @@ class Results:
         return {key: recorded.get(key) for key in ("kind", "settings")} == _identity(experiment)
 
     def verdict(self) -> list[str]:
-        """The sentences of what is there."""
+        """The verdict that was written before."""
         return self._recorded()["verdict"]
 
     def _show(self, experiment: Experiment, table: Table, seconds: float | None) -> list[str]:
-        kind, settings = experiment.kind, experiment.settings
-        save(lambda: kind.draw(table, settings), self.picture)
-        verdict = kind.verdict(table, settings)
+        own, settings = experiment.type, experiment.settings
+        save(lambda: own.draw(table, settings), self.picture)
+        verdict = own.verdict(table, settings)
         record = {**_identity(experiment), "reduced": experiment.reduced, "seconds": seconds, "verdict": verdict}
         write_atomically(self.sentences, "".join(f"{sentence}\n" for sentence in [settings.title, *verdict]))
         write_atomically(self.record, json.dumps(record, indent=2) + "\n")
@@ -70,4 +70,4 @@ class Results:
 
 
 def _identity(experiment: Experiment) -> dict[str, Any]:
-    return {"kind": experiment.kind.name, "settings": experiment.settings.identity()}
+    return {"kind": experiment.type.name, "settings": experiment.settings.identity()}

@@ -1,9 +1,9 @@
-"""How long a precision lasts: the tangent of each one's own run, against that of the most precise one.
+"""Round-off: up to which step the tangent of a run in each precision agrees with that of the most precise run.
 
-If errors of rounding were amplified by the arithmetic of the derivative, a tangent in low precision along a given
-trajectory would leave the exact one. If it is the trajectories that part, it does so only along its own, and after a
-time of (digits of the precision) / (growth rate): the first is tried too, by taking every step in low precision from
-the state of the most precise run.
+If the arithmetic of the derivative amplified errors of rounding, a tangent in low precision would differ from the exact
+one even along the same trajectory. This is tested by taking every step in low precision from the states of the most
+precise run. If it is the trajectories that diverge, it differs only along its own trajectory, and after a time of
+(digits of the precision) / (growth rate).
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE
 from cortado.reference import Digits, History, Simulation
 from cortado.scene.fields import OneOf, Several, Vector, count, quantity
 from cortado.study.canvas import blank
+from cortado.study.ensembles import perturbed, side_by_side
 from cortado.study.estimates import Estimate, Line, growth_rate, norms
-from cortado.study.experiment import Kind, Progress, SceneSettings, Window
-from cortado.study.starts import perturbed, side_by_side
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Window
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -30,23 +30,23 @@ ROUND_OFF_UNIT = {"float32": 2.0**-24, "float64": 2.0**-53, "float80": 2.0**-64,
 
 
 class RoundOffSettings(SceneSettings):
-    """Tangents in several precisions."""
+    """Settings of tangents in several precisions."""
 
     direction: Vector[Annotated[float, quantity("m/s2")]]
-    """Of the change of gravity."""
+    """Direction of the change of gravity."""
     precisions: Several[Annotated[str, OneOf(ROUND_OFF_UNIT)]]
     reference: Annotated[str, OneOf(ROUND_OFF_UNIT)]
-    """The most precise one."""
+    """The precision of the reference run."""
     steps: Annotated[int, count(2, 10_000)]
     record_every: Annotated[int, count(1, 1000)]
     """Steps between two rows."""
     threshold: Annotated[float, quantity(gt=0.0, le=1.0)]
-    """Relative error at which a tangent has left the reference."""
+    """Relative error beyond which a tangent counts as different from the reference."""
     window: Window
-    """Two: where the growth rate is fitted."""
+    """Begin and end of the window in which the growth rate is fitted."""
     seeds: Annotated[int, count(1, 100)]
     perturbation: Annotated[float, quantity("spacings", ge=0.0)]
-    """Of the first positions."""
+    """Perturbation of the first positions [spacings]."""
 
 
 def measure(settings: RoundOffSettings, progress: Progress) -> Table:
@@ -90,7 +90,8 @@ def _rows(settings: RoundOffSettings, seed: int, precision: str, start: np.ndarr
 
 
 def _along(settings: RoundOffSettings, simulation: Simulation, reference: History) -> np.ndarray:
-    """Distances (steps + 1,) to the reference's tangent of one whose every step starts from the reference's state."""
+    """Distances (steps + 1,) from the reference's tangent of one whose every step starts from a state of the
+    reference."""
     assert reference.position_tangents is not None
     gravity = np.asarray(settings.direction)
     x_dot = v_dot = Digits.of(np.zeros(simulation.positions.shape))
@@ -140,7 +141,8 @@ def draw(table: Table, settings: RoundOffSettings) -> Figure:
 
 
 def verdict(table: Table, settings: RoundOffSettings) -> list[str]:
-    """Where each precision leaves, whether that is where its digits are used up, and the same along one trajectory."""
+    """The step at which each precision differs from the reference, the predicted one, and the error along one
+    trajectory."""
     found, rate = _horizons(table, settings), _rate(table, settings)
     sentences = []
     grown = table["size"][table["step"] == table["step"].max()].max()
@@ -171,7 +173,7 @@ def verdict(table: Table, settings: RoundOffSettings) -> list[str]:
 
 
 def _horizons(table: Table, settings: RoundOffSettings) -> list[tuple[Any, Any]]:
-    """(precision, first step above the threshold) for every run that reaches it."""
+    """(precision, first step above the threshold) for every run that exceeds it."""
     found = []
     for (_, precision), rows in table.groups("seed", "precision"):
         above = rows["step"][rows["own"] > settings.threshold]
@@ -187,4 +189,4 @@ def _rate(table: Table, settings: RoundOffSettings) -> Estimate:
     return Estimate.of([growth_rate(rows["step"], rows["size"]) for _, rows in inside.groups("seed")])
 
 
-ROUND_OFF = Kind("round_off", RoundOffSettings, measure, draw, verdict)
+ROUND_OFF = ExperimentType("round_off", RoundOffSettings, measure, draw, verdict)

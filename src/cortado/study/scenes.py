@@ -1,4 +1,4 @@
-"""Scenes that differ from another one in a few values."""
+"""Variants of scenes, with a few values replaced."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""Gradients of one problem by many ways, with one interface: ``source(problem, parameters)``.
+"""Many ways to compute the gradient of a problem, with one interface: ``source(problem, parameters)``.
 
 `ByEstimator` (Warp's tape, the gather adjoint, a smoothed loss, any estimator), `WarpTangent`, `ReferenceAdjoint`,
 `ReferenceTangent` (each precision and method), and `FiniteDifference`, of any step, on either engine.
@@ -25,26 +25,27 @@ from cortado.study.reference_losses import reference_loss
 
 @dataclass(frozen=True, eq=False)
 class Norms:
-    """Of tangents or adjoints of the states of a run, over all particles; of several tangents that of all together."""
+    """Norms over all particles of the tangents or adjoints of each state of a run; of several tangents, the joint
+    norm."""
 
     positions: NDArray[np.float64]
     """(steps + 1,) of the positions of each state."""
     velocities: NDArray[np.float64]
-    """(steps + 1,)"""
+    """(steps + 1,) of the velocities of each state."""
 
 
 class Found(NamedTuple):
-    """What a source finds."""
+    """A loss and its gradient from a source."""
 
     loss: float
     gradient: Arrays
     """For each parameter an array of its shape."""
     history: Norms | None
-    """What grew on the way; None where a source does not go through the states."""
+    """None where a source does not differentiate state by state."""
 
 
 class Source(Protocol):
-    """A way to come by a gradient."""
+    """Computes the gradient of a problem."""
 
     def __call__(self, problem: Problem, parameters: Values) -> Found:
         """The loss of a problem and its gradient."""
@@ -71,7 +72,7 @@ class ReferenceAdjoint:
 
     precision: str = "float64"
     terms: reference.Terms | None = None
-    """Which parts of the derivative count; all, unless given."""
+    """The terms of the derivative that are kept; all where it is None."""
 
     def __call__(self, problem: Problem, parameters: Values) -> Found:
         engine = reference.Simulation(problem.simulation.scene, self.precision)
@@ -86,12 +87,12 @@ class Along(NamedTuple):
 
     loss: float
     slope: float
-    """Of the loss."""
+    """The derivative of the loss."""
     history: Norms
 
 
 class Forward(ABC):
-    """A source that goes along one direction at a time."""
+    """A source that computes derivatives along one direction at a time."""
 
     @abstractmethod
     def along(self, problem: Problem, parameters: Values, directions: Values) -> Along:
@@ -109,7 +110,7 @@ class Forward(ABC):
 
 
 def _units(shapes: Arrays) -> Iterator[tuple[str, tuple[int, ...], NDArray[np.float64]]]:
-    """Every number of every parameter: its name, its index, and the direction in which it alone changes."""
+    """For every component of every parameter: the name, the index, and the unit vector along it."""
     for name, array in shapes.items():
         for index in np.ndindex(array.shape):
             direction = np.zeros(array.shape)
@@ -125,7 +126,8 @@ class WarpTangent(Forward):
         norms = np.zeros((2, problem.steps + 1))
 
         def observe(step: int, dot: State) -> None:
-            norms[:, step] = [np.linalg.norm(array) for array in dot.numpy(problem.simulation.dimension)[:2]]
+            fields = dot.numpy(problem.simulation.dimension)
+            norms[:, step] = [np.linalg.norm(fields[name]) for name in ("positions", "velocities")]
 
         problem.tangents(parameters, directions, observe)
         return Along(problem.value(parameters), problem.tangent(parameters, directions), Norms(*norms))
@@ -139,7 +141,7 @@ class ReferenceTangent(Forward):
     method: str = "analytic"
     """One of `cortado.reference.METHODS`."""
     terms: reference.Terms | None = None
-    """Of the analytic derivative, which parts count; all, unless given."""
+    """The terms of the analytic derivative that are kept; all where it is None."""
     difference: float = 1e-6
     """Step of finite differences of the states, in directions."""
 
@@ -160,7 +162,7 @@ class ReferenceTangent(Forward):
 
 
 class Engine(Protocol):
-    """What runs forward."""
+    """An engine that runs forward."""
 
     def run(self, problem: Problem, parameters: Values) -> tuple[float, Any, Any]:
         """The loss, and positions and velocities (steps + 1, n, d), which can be subtracted from others."""
@@ -197,7 +199,7 @@ class FiniteDifference(Forward):
     step: float
     """In units of each parameter."""
     engine: Engine = Warp()
-    """What runs forward."""
+    """The engine that runs forward."""
 
     def along(self, problem: Problem, parameters: Values, directions: Values) -> Along:
         def run(step: float) -> tuple[float, Any, Any]:

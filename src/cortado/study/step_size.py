@@ -1,8 +1,8 @@
-"""Finite differences over their step: where they equal the exact derivative, and where they saturate.
+"""Finite differences as functions of their step h: where they equal the exact derivative, and where they saturate.
 
-A central difference of step h is at most (distance of two unrelated states) / (2 h): beyond that it says how large the
-attractor is, not how steep the map. Two predictions without a free number: it is right while h |dx/dg| is well below
-the scale of nonlinearity, and |difference| 2 h / distance tends to 1 as 2 h |dx/dg| / distance grows.
+A central difference of step h is at most (distance of two unrelated states) / (2 h), so that a large one measures the
+size of the attractor and not the derivative. Two predictions without a free parameter: it is right while h |dx/dg| is
+well below the scale of nonlinearity, and |difference| 2 h / distance tends to 1 as 2 h |dx/dg| / distance grows.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from cortado.figures.canvas import DASHED, FAINT, INK
 from cortado.reference import Simulation
 from cortado.scene.fields import Several, Vector, count, quantity
 from cortado.study.canvas import blank
+from cortado.study.ensembles import perturbed, side_by_side
 from cortado.study.estimates import Estimate, Line, geometric_mean, norms
-from cortado.study.experiment import Kind, Progress, SceneSettings
-from cortado.study.shades import shades
-from cortado.study.starts import perturbed, side_by_side
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings
+from cortado.study.palette import palette
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -34,22 +34,22 @@ THIN: dict[str, Any] = {"markersize": 3.5, "linewidth": 1.4}
 
 
 class StepSizeSettings(SceneSettings):
-    """Differences of several steps, at several horizons."""
+    """Settings of differences of several steps h, at several horizons."""
 
     direction: Vector[Annotated[float, quantity("m/s2")]]
-    """Of the change of gravity."""
+    """Direction of the change of gravity."""
     differences: Several[Annotated[float, quantity("m/s2", gt=0.0)]]
     horizons: Several[Annotated[int, count(1, 10_000)]]
-    """Steps."""
+    """Numbers of time steps."""
     seeds: Annotated[int, count(2, 100)]
-    """First states; two unrelated ones give the distance."""
+    """Number of first states; the distance is that of two of the runs."""
     perturbation: Annotated[float, quantity("spacings", gt=0.0)]
-    """Of the first positions."""
+    """Perturbation of the first positions [spacings]."""
 
 
 def measure(settings: StepSizeSettings, progress: Progress) -> Table:
     """Columns: seed, horizon, difference [m/s2], size = |difference quotient| [s2], exact = |dx/dg| [s2], error
-    (relative), distance [m] of the state to that from the next first state."""
+    (relative), distance [m] between the states of this run and of that with the next seed."""
     every, longest = reduce(gcd, settings.horizons), max(settings.horizons)
 
     def tangent(seed: int, **way: Any) -> Any:
@@ -87,12 +87,12 @@ def measure(settings: StepSizeSettings, progress: Progress) -> Table:
 
 
 def draw(table: Table, settings: StepSizeSettings) -> Figure:
-    """Sizes over the horizon, errors over the step, and all of it on one curve."""
+    """Sizes over the horizon, errors over the step h, and both scaled so that they lie on one curve."""
     figure = blank(15.0, 5.4)
     sizes, errors, law = figure.subplots(1, 3)
     figure.suptitle(settings.title)
     horizons, differences = table.values("horizon"), table.values("difference")
-    for difference, shade in zip(differences, shades(len(differences)), strict=True):
+    for difference, shade in zip(differences, palette(len(differences)), strict=True):
         found = [geometric_mean(table.where(difference=difference, horizon=horizon)["size"]) for horizon in horizons]
         sizes.semilogy(horizons, found, "o-", color=shade, label=f"step {difference:.0e}", **THIN)
         rows = table.where(difference=difference)
@@ -101,7 +101,7 @@ def draw(table: Table, settings: StepSizeSettings) -> Figure:
     sizes.semilogy(horizons, exact, color=INK, label="exact", **DASHED)
     sizes.set(title="Size over the horizon", xlabel="steps", ylabel="|dx / dg| [s²]")
     sizes.legend(fontsize=8)
-    for horizon, shade in zip(horizons, shades(len(horizons)), strict=True):
+    for horizon, shade in zip(horizons, palette(len(horizons)), strict=True):
         of_seeds = [table.where(difference=size, horizon=horizon)["error"] for size in differences]
         values = [geometric_mean(one) for one in of_seeds]
         errors.loglog(differences, values, "o-", color=shade, label=f"{horizon} steps", **THIN)
@@ -116,7 +116,7 @@ def draw(table: Table, settings: StepSizeSettings) -> Figure:
 
 
 def verdict(table: Table, settings: StepSizeSettings) -> list[str]:
-    """Whether exact derivatives are the limit, up to which step, and whether large steps saturate as predicted."""
+    """Whether exact derivatives are the limit of differences, up to which step h, and whether large steps saturate."""
     best = [rows["error"].min() for _, rows in table.groups("seed", "horizon")]
     last = max(settings.horizons)
     longest = [rows["error"].min() for _, rows in table.where(horizon=last).groups("seed")]
@@ -166,4 +166,4 @@ def _saturation(table: Table) -> np.ndarray:
     return 2.0 * table["difference"] * table["size"] / table["distance"]
 
 
-STEP_SIZE = Kind("step_size", StepSizeSettings, measure, draw, verdict)
+STEP_SIZE = ExperimentType("step_size", StepSizeSettings, measure, draw, verdict)

@@ -16,13 +16,13 @@ from cortado.losses.image_losses import psnr
 from cortado.optimisation.optimise import Record, optimise
 from cortado.scene.fields import Several, Text
 from cortado.study.canvas import blank
-from cortado.study.experiment import DeviceSettings, Kind, Progress
+from cortado.study.experiment import DeviceSettings, ExperimentType, Progress
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MOMENTS = 4
+PICTURES = 4
 """Pictures on the way, the first and the last of them included."""
 TARGET = "target"
 
@@ -55,7 +55,7 @@ def measure(settings: TaskSettings, progress: Progress) -> Table:
     history = _search(made, progress)
     last, target = max(made.targets.items())
     pictures = {TARGET: target}
-    for k in np.unique(np.linspace(0, len(history) - 1, MOMENTS).astype(int)).tolist():
+    for k in np.unique(np.linspace(0, len(history) - 1, PICTURES).astype(int)).tolist():
         states = made.problem.states(made.search.parameters(history[k].parameters), [last])
         pictures[f"iteration {k}"] = made.image(states[last])
     none = dict.fromkeys(("row", "column", "red", "green", "blue"), np.nan)
@@ -124,7 +124,7 @@ def draw(table: Table, settings: TaskSettings) -> "Figure":
 def verdict(table: Table, settings: TaskSettings) -> list[str]:
     losses, pictures = table.where(picture="")["loss"], _pictures(table)
     *way, target = pictures.values()
-    searches = load_task(settings.task, settings.overrides).optimise.extinctions
+    searches = load_task(settings.task, settings.overrides).optimise.extinction_schedule
     begun = len(losses) // len(searches) * (len(searches) - 1)
     found = [f"The picture comes from {psnr(way[0], target):.1f} to {psnr(way[-1], target):.1f} dB of the target."]
     if len(searches) > 1:
@@ -140,4 +140,4 @@ def verdict(table: Table, settings: TaskSettings) -> list[str]:
     return found
 
 
-TASK = Kind("task", TaskSettings, measure, draw, verdict)
+TASK = ExperimentType("task", TaskSettings, measure, draw, verdict)

@@ -1,4 +1,4 @@
-"""What the terms of the pressure force's derivative do to the exact tangent in one step."""
+"""The size of each term of the pressure force's derivative in one step, along the exact tangent."""
 
 from collections.abc import Mapping
 
@@ -10,8 +10,10 @@ from cortado.scene.scene import Scene
 
 
 def term_sizes(scene: Scene, steps: int, precision: str, cases: Mapping[str, Terms]) -> dict[str, NDArray[np.float64]]:
-    """For each choice of terms (steps,) norms over all particles of the derivative of the acceleration by pressure
-    along the exact tangent to the size of gravity."""
+    """For each choice of terms, norms (steps,) over all particles of the derivative of the pressure acceleration.
+
+    The derivative is along the exact tangent with respect to the size of gravity.
+    """
     engine = Simulation(scene, precision)
     gravity = np.array(scene.forces.gravity)
     at, along = {"gravity": gravity}, {"gravity": gravity / np.linalg.norm(gravity)}

@@ -1,8 +1,8 @@
-"""Adjoints that Warp's tape gets silently wrong, against right ones, over the horizon.
+"""Adjoints that Warp's tape gets silently wrong, compared with right ones over the horizon.
 
-The same step on the tape: with sums in functions, as Cortado has them; with those loops in one kernel that are linear
-after the sum, which must be as right; and with one that is not. All are compared with the gradient of the
-C++ engine, which shares no code with them.
+The same step is put on the tape in several ways: with sums in functions, as in Cortado; with loops in the kernel whose
+sums are used linearly, which must be just as right; and with a loop whose sum is not. All are compared with the
+gradient of the C++ engine, which shares no code with them.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from cortado.problem import Problem
 from cortado.scene.fields import Several, count, quantity
 from cortado.simulation import Simulation
 from cortado.study.canvas import blank
+from cortado.study.ensembles import perturbed
 from cortado.study.estimates import Estimate, geometric_mean, growth_rate
-from cortado.study.experiment import DeviceSettings, Kind, Progress, SceneSettings
+from cortado.study.experiment import DeviceSettings, ExperimentType, Progress, SceneSettings
 from cortado.study.one_kernel_loops import OneKernelTape
-from cortado.study.starts import perturbed
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-RIGHT, LINEAR, CLAMP, WALLS = "sums in functions", "linear after the loop", "clamp after it", "wall yield after it"
+RIGHT, LINEAR, CLAMP, WALLS = "sums in functions", "linear after the loop", "clamp after it", "wall relaxation after it"
 WAYS: dict[str, gradients.GradientEstimator] = {
     RIGHT: gradients.Tape(),
     LINEAR: OneKernelTape(("density", "force")),
@@ -43,15 +43,15 @@ PARAMETERS = ("gravity", "initial_positions")
 
 
 class WrongAdjointsSettings(SceneSettings, DeviceSettings):
-    """Gradients of the distance to the first state, from a state in the middle of a splash."""
+    """Settings. The loss is the distance from the first state, which is one in the middle of a splash."""
 
     start: Annotated[int, count(0, 10_000)]
-    """Steps before the first state."""
+    """Time steps before the first state."""
     horizons: Several[Annotated[int, count(1, 10_000)]]
-    """Steps from there."""
+    """Numbers of time steps after it."""
     seeds: Annotated[int, count(1, 100)]
     perturbation: Annotated[float, quantity("spacings", ge=0.0)]
-    """Of the positions at the very start."""
+    """Perturbation of the positions before the first step [spacings]."""
 
 
 def measure(settings: WrongAdjointsSettings, progress: Progress) -> Table:
@@ -118,7 +118,7 @@ def draw(table: Table, settings: WrongAdjointsSettings) -> Figure:
 
 
 def verdict(table: Table, settings: WrongAdjointsSettings) -> list[str]:
-    """How wrong each way is after one step and at the end, and whether it grows faster than the right one."""
+    """The error of each way after one step and at the end, and whether its gradient grows faster than the right one."""
     last = max(settings.horizons)
     sentences = []
     for way in WAYS:
@@ -141,10 +141,10 @@ def verdict(table: Table, settings: WrongAdjointsSettings) -> list[str]:
 
 
 def _rate(rows: Table) -> Estimate:
-    """Of the gradient's size, over the longer half of the horizons."""
+    """Growth of the gradient's norm over the longer half of the horizons."""
     half = np.median(rows["horizon"])
     late = rows.chosen(rows["horizon"] >= half)
     return Estimate.of([growth_rate(one["horizon"], one["size"]) for _, one in late.groups("seed")])
 
 
-WRONG_ADJOINTS = Kind("wrong_adjoints", WrongAdjointsSettings, measure, draw, verdict)
+WRONG_ADJOINTS = ExperimentType("wrong_adjoints", WrongAdjointsSettings, measure, draw, verdict)

@@ -1,7 +1,7 @@
-"""The report's equations as they are printed, against the derivative put right and finite differences.
+"""The derivative by the report's equations as printed, compared with the corrected one and with finite differences.
 
-Two questions: how wrong is one step of them, from states of the run; and how does their product grow over many, beside
-that of the right one?
+It measures the error of a single step, from states of the run, and the growth over many steps, beside that of the
+corrected derivative.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from cortado.figures.canvas import DASHED, INK, PALETTE
 from cortado.reference import History, Simulation
 from cortado.scene.fields import Vector, count, quantity
 from cortado.study.canvas import blank
+from cortado.study.ensembles import perturbed, side_by_side
 from cortado.study.estimates import Estimate, geometric_mean, growth_rate, norms
-from cortado.study.experiment import Kind, Progress, SceneSettings, Window
-from cortado.study.starts import perturbed, side_by_side
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Window
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -34,22 +34,22 @@ EXACT, DIFFERENCE, *PRINTED = NAMES
 
 
 class WrongDerivationSettings(SceneSettings):
-    """Tangents by several ways, over many steps and over single ones."""
+    """Settings of tangents by several methods, over many steps and over single ones."""
 
     direction: Vector[Annotated[float, quantity("m/s2")]]
-    """Of the change of gravity."""
+    """Direction of the change of gravity."""
     steps: Annotated[int, count(2, 10_000)]
     record_every: Annotated[int, count(1, 1000)]
-    """Steps between two rows, and between two states whose single step is tried."""
+    """Steps between two rows, and between two states from which a single step is measured."""
     window: Window
-    """Two: where growth rates are fitted."""
+    """Begin and end of the window in which growth rates are fitted."""
     seeds: Annotated[int, count(1, 100)]
     perturbation: Annotated[float, quantity("spacings", ge=0.0)]
-    """Of the first positions."""
+    """Perturbation of the first positions [spacings]."""
     difference: Annotated[float, quantity("m/s2", gt=0.0)]
     """Step of the finite differences over many steps."""
     single_difference: Annotated[float, quantity(gt=0.0)]
-    """The same over one step, in sizes of the tangent there."""
+    """Step of the finite differences over a single time step, relative to the size of the tangent."""
 
 
 def measure(settings: WrongDerivationSettings, progress: Progress) -> Table:
@@ -107,7 +107,7 @@ def _single(settings: WrongDerivationSettings, simulation: Simulation, run: Hist
 
 
 def draw(table: Table, settings: WrongDerivationSettings) -> Figure:
-    """Sizes over the steps, and errors of single steps."""
+    """Norms over the steps, and errors of single steps."""
     figure = blank(13.0, 5.4)
     sizes, singles = figure.subplots(1, 2)
     figure.suptitle(settings.title)
@@ -134,7 +134,7 @@ def draw(table: Table, settings: WrongDerivationSettings) -> Figure:
 
 
 def verdict(table: Table, settings: WrongDerivationSettings) -> list[str]:
-    """How wrong, how fast it grows, and how fast the right one does."""
+    """The error, the growth rate, and the growth rate of the corrected derivative."""
     late = table.chosen(table["step"] >= settings.window[0])
     rates = {method: _rate(table.where(method=method), settings) for method in NAMES}
     right = np.median(late.where(method=DIFFERENCE)["single"])
@@ -162,7 +162,7 @@ def verdict(table: Table, settings: WrongDerivationSettings) -> list[str]:
 
 
 def _rate(rows: Table, settings: WrongDerivationSettings) -> Estimate:
-    """Within the window; of what has overflowed before its end, over all steps until then."""
+    """Growth within the window, or over all steps before the norm overflows where that is earlier."""
     first, last = settings.window
     finite = rows.chosen(np.isfinite(rows["size"]))
     inside = rows.chosen((rows["step"] >= first) & (rows["step"] <= last))
@@ -174,4 +174,4 @@ def _percent(found: Estimate) -> str:
     return f"{Estimate(100.0 * found.value, 100.0 * found.error)} %"
 
 
-WRONG_DERIVATION = Kind("wrong_derivation", WrongDerivationSettings, measure, draw, verdict)
+WRONG_DERIVATION = ExperimentType("wrong_derivation", WrongDerivationSettings, measure, draw, verdict)

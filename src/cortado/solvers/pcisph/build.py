@@ -3,41 +3,28 @@
 from math import inf
 from typing import Any
 
-from cortado.device.neighbourhood import Discretisation
 from cortado.device.precision import Precision
 from cortado.discretise.discrete_scene import DiscreteScene
 from cortado.scene.scene import Scene
-from cortado.solvers.build import forces_of, nozzle_of, phases_of, search_of, walled_of
-from cortado.solvers.pcisph.parts import PressureSolve
+from cortado.solvers.build import particle_system
+from cortado.solvers.loop import LoopLimits
 from cortado.solvers.pcisph.solver import Pcisph
+from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FreeEnergy
 
 
-def build_pcisph(
-    scene: Scene, discrete: DiscreteScene, free_energy: FreeEnergy, precision: Precision, device: Any
-) -> Pcisph:
+def build(scene: Scene, discrete: DiscreteScene, free_energy: FreeEnergy, precision: Precision, device: Any) -> Solver:
     """The solver of a scene that is cut into particles, on a device."""
-    discretisation = Discretisation(discrete.kernel, precision)
-    return Pcisph(
-        discretisation,
-        discrete.lattice,
-        search_of(scene, discrete, discretisation, device),
-        forces_of(scene, discrete, discretisation, device),
-        _pressure(scene),
-        [*discrete.periods, *[0.0] * (3 - scene.dimension)],
-        phases_of(scene, discretisation, free_energy),
-        nozzle_of(scene, discrete),
-        walled_of(scene, discrete),
-    )
+    return Pcisph(particle_system(scene, discrete, free_energy, precision, device), pressure_limits(scene))
 
 
-def _pressure(scene: Scene) -> PressureSolve | None:
+def pressure_limits(scene: Scene) -> LoopLimits | None:
     """When the pressure loop may stop; None where no pressure acts."""
     solver = scene.solver
     if not scene.forces.pressure:
         return None
     greatest = solver.maximum_density_tolerance
-    return PressureSolve(
+    return LoopLimits(
         solver.minimum_iterations,
         solver.maximum_iterations,
         solver.density_tolerance,

@@ -1,8 +1,8 @@
-"""How much a heavy particle among lighter ones may be pushed by one pressure iteration.
+"""The density-ratio relaxation: a factor on the pressure correction of a heavy particle among lighter ones.
 
 delta is made for particles of one mass. The pressure of a particle with lighter neighbours moves these further, by
 the ratio of the masses, and where the answer of its own density is more than twice what is wanted the iteration
-diverges. So its yield is multiplied with
+diverges. So its pressure relaxation is multiplied with
 
     1 / (1 + e(t_i)),   t_i = V sum_j W_ij (m_i / m_j - 1),   e(t) = t^2 / (2 (t + a)) for t > 0, else 0,
 
@@ -60,14 +60,14 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
         return real(0.0)
 
     @wp.func
-    def excess_slope(t: real) -> real:
+    def excess_derivative(t: real) -> real:
         """e'(t)"""
         if t > real(0.0):
             return real(0.5) * t * (t + real(2.0) * a) / ((t + a) * (t + a))
         return real(0.0)
 
-    @wp.kernel(module=discretisation.module(True, "contrast"))
-    def contrast(
+    @wp.kernel(module=discretisation.module(True, "density_ratio"))
+    def density_ratio(
         s: neighbourhood,
         x: wp.array(dtype=vector),
         m: wp.array(dtype=real),
@@ -81,7 +81,7 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
         t[i] = s.volume * total
         y[i] = wall_y[i] / (real(1.0) + excess(s.volume * total))
 
-    @wp.kernel(module=discretisation.module(False, "contrast"), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, "density_ratio"), enable_backward=False)
     def density_ratio_tangent(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -105,9 +105,9 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
                 t_dot += wp.dot(gradient(x_ij, s), x_dot[i] - x_dot[j]) * (ratio - real(1.0))
                 t_dot += weight(x_ij, s) * ratio * (m_dot[i] / m_i - m_dot[j] / m[j])
         part = real(1.0) / (real(1.0) + excess(t[i]))
-        y_dot[i] = part * (wall_y_dot[i] - y[i] * excess_slope(t[i]) * s.volume * t_dot)
+        y_dot[i] = part * (wall_y_dot[i] - y[i] * excess_derivative(t[i]) * s.volume * t_dot)
 
-    @wp.kernel(module=discretisation.module(False, "contrast"), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, "density_ratio"), enable_backward=False)
     def factor_adjoint(
         s: neighbourhood,
         t: wp.array(dtype=real),
@@ -117,13 +117,13 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
         # out
         t_bar: wp.array(dtype=real),
     ):
-        """``y_bar`` becomes the adjoint of the yield beside walls."""
+        """``y_bar`` becomes the adjoint of the pressure relaxation beside walls."""
         i = s.first + wp.tid()
         part = real(1.0) / (real(1.0) + excess(t[i]))
-        t_bar[i] = -y_bar[i] * y[i] * part * excess_slope(t[i])
+        t_bar[i] = -y_bar[i] * y[i] * part * excess_derivative(t[i])
         y_bar[i] = y_bar[i] * part
 
-    @wp.kernel(module=discretisation.module(False, "contrast"), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, "density_ratio"), enable_backward=False)
     def density_ratio_adjoint(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -148,4 +148,4 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
         x_bar[i] = x_bar[i] + s.volume * x_sum
         m_bar[i] = m_bar[i] + s.volume * m_sum / m_i
 
-    return DensityRatioKernels(contrast, density_ratio_tangent, density_ratio_adjoint, factor_adjoint)
+    return DensityRatioKernels(density_ratio, density_ratio_tangent, density_ratio_adjoint, factor_adjoint)

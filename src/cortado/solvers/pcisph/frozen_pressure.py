@@ -47,7 +47,7 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
         x_i = x[i]
         c_i = c[i]
         push_bar_i = push_bar[i]
-        stretch = real(0.0)
+        divergence = real(0.0)
         work = real(0.0)
         for k in range(0, s.fluid_count[i], UNROLL):
             x_j = vectors(x, k, i, s)
@@ -55,20 +55,20 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
             push_bar_j = vectors(push_bar, k, i, s)
             for u in range(UNROLL):
                 g_ij = gradient(separation(x_i, x_j[u], s), s)
-                stretch += wp.dot(g_ij, push_bar_i - push_bar_j[u])
+                divergence += wp.dot(g_ij, push_bar_i - push_bar_j[u])
                 work += (c_i + c_j[u]) * wp.dot(g_ij, push_bar_i)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             g_ib = gradient(separation(x_i, s.wall_positions[b], s), s)
-            wall_stretch = s.wall_weights[b] * wp.dot(g_ib, push_bar_i)
-            stretch += wall_stretch
-            work += c_i * wall_stretch
+            wall_divergence = s.wall_weights[b] * wp.dot(g_ib, push_bar_i)
+            divergence += wall_divergence
+            work += c_i * wall_divergence
         m_i = m[i]
         p_i = p_out[i]
         delta = y[i] * stiffness / (time_step[0] * time_step[0])
         p_bar_i = real(0.0)
         if p_i > real(0.0):
-            p_bar_i = p_bar[i] - s.volume * stretch / (n[i] * n[i])
+            p_bar_i = p_bar[i] - s.volume * divergence / (n[i] * n[i])
         excess_bar = delta * p_bar_i
         excess = (p_i - p_in[i]) / delta
         m_bar[i] = m_bar[i] + (s.volume * work + excess_bar * (excess + rho_0[i])) / m_i

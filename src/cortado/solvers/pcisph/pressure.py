@@ -263,8 +263,8 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         x_i = x[i]
         c_i = c[i]
         push_bar_i = push_bar[i]
-        stretch = real(0.0)
-        bend = vector()
+        divergence = real(0.0)
+        hessian_products = vector()
         work = real(0.0)
         for k in range(0, s.fluid_count[i], UNROLL):
             x_j = vectors(x, k, i, s)
@@ -274,28 +274,28 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
                 x_ij = separation(x_i, x_j[u], s)
                 g_ij = gradient(x_ij, s)
                 u_ij = push_bar_i - push_bar_j[u]
-                stretch += wp.dot(g_ij, u_ij)
-                bend += (c_i + c_j[u]) * hessian_product(x_ij, u_ij, s)
+                divergence += wp.dot(g_ij, u_ij)
+                hessian_products += (c_i + c_j[u]) * hessian_product(x_ij, u_ij, s)
                 work += (c_i + c_j[u]) * wp.dot(g_ij, push_bar_i)
         for k in range(s.fluid_count[i], s.count[i]):
             b = s.neighbours[k, i]
             x_ib = separation(x_i, s.wall_positions[b], s)
             weight = s.wall_weights[b]
-            wall_stretch = weight * wp.dot(gradient(x_ib, s), push_bar_i)
-            stretch += wall_stretch
-            bend += (weight * c_i) * hessian_product(x_ib, push_bar_i, s)
-            work += c_i * wall_stretch
+            wall_divergence = weight * wp.dot(gradient(x_ib, s), push_bar_i)
+            divergence += wall_divergence
+            hessian_products += (weight * c_i) * hessian_product(x_ib, push_bar_i, s)
+            work += c_i * wall_divergence
         n_i = n[i]
         m_i = m[i]
         p_i = p_out[i]
         delta = y[i] * stiffness / (time_step[0] * time_step[0])
-        c_bar = -s.volume * stretch
+        c_bar = -s.volume * divergence
         p_bar_i = real(0.0)
         if p_i > real(0.0):
             p_bar_i = p_bar[i] + c_bar / (n_i * n_i)
         excess_bar = delta * p_bar_i
         excess = (p_i - p_in[i]) / delta
-        x_bar[i] = x_bar[i] - s.volume * bend
+        x_bar[i] = x_bar[i] - s.volume * hessian_products
         n_bar[i] = n_bar[i] - real(2.0) * c_i / n_i * c_bar
         m_bar[i] = m_bar[i] + (s.volume * work + excess_bar * (excess + rho_0[i])) / m_i
         rho_0_bar[i] = rho_0_bar[i] - excess_bar

@@ -1,41 +1,22 @@
 """PCISPH as a `Solver`: its steps, forward, and their derivatives."""
 
-from cortado.device.memory import gradient_parts
+from typing import Self
+
 from cortado.device.state import Parameters
-from cortado.restart import Elapsed
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint, PcisphTangent
-from cortado.solvers.pcisph.log import IterationLog
 from cortado.solvers.pcisph.steps import PcisphSteps
+from cortado.solvers.solver import StepAdjoint, StepTangent
 
 
 class Pcisph(PcisphSteps):
     """Predictive-corrective incompressible SPH; see `Solver`."""
 
-    def differentiable(self) -> "Pcisph":
+    def differentiable(self) -> Self:
         """The same solver over the same neighbour search, with other arrays."""
-        return Pcisph(
-            self.discretisation,
-            self.lattice,
-            self.search,
-            self.forces,
-            self.pressure,
-            self.periods,
-            self.mixture.phases,
-            self.emitter.nozzle if self.emitter else None,
-            self.containment.walled,
-            requires_grad=True,
-        )
+        return type(self)(self.system, self.limits, requires_grad=True)
 
-    def match(self, other: "Pcisph") -> None:
-        self.resize(other.search.capacity)
-        self.begin(Elapsed(), other.mixture.substeps)
-
-    def tangent(self, parameters_dot: Parameters) -> PcisphTangent:
+    def tangent(self, parameters_dot: Parameters) -> StepTangent:
         return PcisphTangent(self, parameters_dot)
 
-    def adjoint(self, steps: int, frozen_geometry: bool = False) -> PcisphAdjoint:
+    def adjoint(self, steps: int, frozen_geometry: bool = False) -> StepAdjoint:
         return PcisphAdjoint(self, steps, frozen_geometry)
-
-    def gradient_memory(self, log: IterationLog) -> dict[str, float]:
-        iterations = int(log.diagnostics["iterations"].max(initial=0))
-        return gradient_parts(self.particles, iterations, self.discretisation.precision.bytes)

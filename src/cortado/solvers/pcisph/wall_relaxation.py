@@ -1,9 +1,9 @@
-"""How much a particle beside a wall may be pushed by one pressure iteration.
+"""The pressure relaxation beside walls: a factor on the pressure correction of one iteration.
 
 delta is made for a particle with a filled neighbourhood. Beside a wall the same pressure moves a particle's own
 density further, by |S_i|^2 / (2 sum_j G_j . G_j of the prototype) with S_i = sum_b w_b G_ib, and where that is above 2
 the iteration overshoots and kicks it away. A particle that nears a wall within the step meets a steeper one than at the
-step's start, where S_i is taken, so that the answer counts twice. delta is multiplied by the yield
+step's start, where S_i is taken, so that the answer counts twice. delta is multiplied by the pressure relaxation
 
     y_i = 1 / (1 + |S_i|^2 / response),   response = sum_j G_j . G_j,
 
@@ -22,7 +22,7 @@ from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pai
 
 @cache
 def wall_kernels(discretisation: Discretisation) -> Kernels:
-    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the yield."""
+    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the pressure relaxation beside walls."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)

@@ -1,4 +1,4 @@
-"""Decisions of the pressure loop and records of a step, taken on the device."""
+"""Decisions of the loops of a step and records of them, taken on the device."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -16,8 +16,10 @@ class ConvergenceKernels:
 
     decide: Any
     """Whether to go on iterating."""
-    finish: Any
-    """A step."""
+    record: Any
+    """A loop that has ended; the last one of a step ends the step."""
+    count_step: Any
+    """The end of a step without loops."""
 
 
 @cache
@@ -46,9 +48,16 @@ def convergence_kernels(precision: Precision) -> ConvergenceKernels:
         iteration[0] = count
         active[0] = wp.where(count < most and (average > tolerance or sums[0][1] > greatest_tolerance), 1, 0)
 
+    @wp.func
+    def end_step(bad: wp.array(dtype=wp.int32), bad_step: wp.array(dtype=wp.int32), step: wp.array(dtype=wp.int32)):
+        if bad[0] != wp.static(NO_PARTICLE) and bad_step[0] < 0:
+            bad_step[0] = step[0]
+        step[0] = step[0] + 1
+
     @wp.kernel(module=module, enable_backward=False)
-    def finish(
+    def record(
         particles: int,
+        is_last: int,
         sums: wp.array(dtype=pair),
         bad: wp.array(dtype=wp.int32),
         # in and out
@@ -59,13 +68,21 @@ def convergence_kernels(precision: Precision) -> ConvergenceKernels:
         iterations: wp.array(dtype=wp.int32),
         errors: wp.array(dtype=pair),
     ):
-        """Record the step's iterations and its (average, greatest) density error, and count the step."""
+        """Record the loop's iterations and its (average, greatest) error, and after the last loop count the step."""
         n = step[0]
         iterations[n] = iteration[0]
         errors[n] = pair(sums[0][0] / real(particles), sums[0][1])
-        if bad[0] != wp.static(NO_PARTICLE) and bad_step[0] < 0:
-            bad_step[0] = n
         iteration[0] = 0
-        step[0] = n + 1
+        if is_last != 0:
+            end_step(bad, bad_step, step)
 
-    return ConvergenceKernels(decide, finish)
+    @wp.kernel(module=module, enable_backward=False)
+    def count_step(
+        bad: wp.array(dtype=wp.int32),
+        # in and out
+        bad_step: wp.array(dtype=wp.int32),
+        step: wp.array(dtype=wp.int32),
+    ):
+        end_step(bad, bad_step, step)
+
+    return ConvergenceKernels(decide, record, count_step)

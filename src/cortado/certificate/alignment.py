@@ -1,4 +1,4 @@
-"""Which gradient points the way: those of the estimators, against that of the loss smoothed over meaningful changes."""
+"""How well each estimator's gradient is aligned with that of the loss smoothed over meaningful perturbations."""
 
 from dataclasses import dataclass
 
@@ -10,22 +10,22 @@ from cortado.parameters.values import Arrays
 from cortado.problem import Problem
 
 MOST_NUMBERS = 12
-"""Numbers that a smoothed gradient is taken of: each costs two runs a sample."""
+"""Components that a smoothed gradient is computed for at most: each costs two runs a sample."""
 SAMPLES = 2
-ALIKE = 0.5
-"""Cosine below which a gradient does not point the way."""
+LEAST_COSINE = 0.5
+"""An estimator is advised only where the cosine of its gradient with the smoothed one is greater."""
 ESTIMATORS: tuple[GradientEstimator, ...] = (Exact(), AdjointViscosity(), FrozenGeometry())
 
 
 @dataclass(frozen=True)
 class Judged:
-    """An estimator's gradient beside the smoothed one, every number in units of its meaningful change."""
+    """An estimator's gradient beside the smoothed one, each component in units of its meaningful perturbation."""
 
     estimator: str
     """As it is written in Python, after ``gradients.``"""
     cosine: float
     size: float
-    """Over that of the smoothed gradient."""
+    """Its norm over that of the smoothed gradient."""
 
     @property
     def merit(self) -> float:
@@ -34,8 +34,8 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """How near gradients are to the smoothed one."""
+class Alignment:
+    """How well the gradients of several estimators are aligned with the smoothed one."""
 
     noise: float
     """Standard error of the smoothed gradient, relative."""
@@ -44,14 +44,17 @@ class Agreement:
 
     @property
     def best(self) -> Judged | None:
-        """The estimator, other than `Exact`, of the greatest merit among those that point the way, if any does."""
-        good = [judged for judged in self.estimators[1:] if judged.cosine > ALIKE]
+        """The estimator other than `Exact` that has the greatest merit; None where no cosine is large enough."""
+        good = [judged for judged in self.estimators[1:] if judged.cosine > LEAST_COSINE]
         return max(good, key=lambda judged: judged.merit, default=None)
 
 
-def agreement(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) -> Agreement | None:
-    """Of all these parameters together; None where they are too many numbers for a smoothed gradient, or where the loss
-    does not feel them."""
+def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) -> Alignment | None:
+    """The alignment for all these parameters together.
+
+    None where they have too many components for a smoothed gradient, where one of its runs diverges, and where the loss
+    does not depend on them.
+    """
     if sum(value.size for value in values.values()) > MOST_NUMBERS:
         return None
     spread = {name: float(size.mean()) for name, size in sizes.items()}
@@ -75,7 +78,7 @@ def agreement(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) ->
 
     if not length > 0.0:
         return None
-    return Agreement(float(np.linalg.norm(error)) / length, tuple(map(judged, ESTIMATORS)))
+    return Alignment(float(np.linalg.norm(error)) / length, tuple(map(judged, ESTIMATORS)))
 
 
 def _written(estimator: GradientEstimator, found: Estimate) -> str:

@@ -1,4 +1,4 @@
-"""Runs of a problem, judged at several steps on the way."""
+"""The loss of a problem, and its derivatives, as functions of the number of steps of the run."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,17 +11,18 @@ from cortado.device.state import State
 from cortado.errors import DivergedError
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint
 from cortado.losses.checked import as_loss
+from cortado.losses.loss import Adjoint, by_field
 from cortado.parameters.values import Arrays
 from cortado.problem import Problem
 
-MOMENTS = 25
-"""Steps at most at which a run is judged, where its loss is one of the last state."""
+SAMPLE_STEPS = 25
+"""Sample steps at most, where the loss is one of the last state."""
 ROUGH = (1e-1, 1e-2, 1e-3)
-"""Steps of differences of a loss in float32, in units of the direction."""
+"""Steps h of central differences of a loss in float32, in units of the direction."""
 ROUND_OFF = 1e-6
-"""Of such a loss, relative."""
-HEARD = 30.0
-"""How many times greater a difference has to be to mean something."""
+"""Relative round-off of a loss in float32."""
+ABOVE_ROUND_OFF = 30.0
+"""A difference of such losses counts where it is this many times greater than their round-off."""
 
 
 @dataclass(frozen=True)
@@ -29,55 +30,64 @@ class Tangent:
     """Derivatives along one direction, by forward mode."""
 
     losses: np.ndarray
-    """(moments,)"""
+    """(sample_steps,)"""
     slopes: np.ndarray
-    """(moments,) of the loss."""
+    """(sample_steps,) of the loss."""
     strain: np.ndarray
-    """(moments,) root mean square over particles of how far the tangents of a particle and of its nearest neighbour
-    part [m]."""
+    """(sample_steps,) distance between the tangent of a particle's position and that of its nearest neighbour [m], root
+    mean square over particles."""
 
 
-class Course:
-    """A problem whose loss is also asked at earlier steps: what it would be if the run ended there, or, where it is one
-    of several frames, of those so far."""
+class LossHistory:
+    """A problem whose loss is also computed at earlier steps, the sample steps, as if the run ended there.
+
+    A loss of several frames (`Frames`) is sampled at its frames; there it is the sum of those up to the sample step.
+    """
 
     def __init__(self, problem: Problem):
         loss, steps = problem.loss, problem.steps
         frames = loss.losses if isinstance(loss, Frames) else None
-        moments = range(steps + 1) if steps < MOMENTS else np.linspace(0, steps, MOMENTS + 1).round().astype(int)
+        every = steps < SAMPLE_STEPS
+        spread = range(steps + 1) if every else np.linspace(0, steps, SAMPLE_STEPS + 1).round().astype(int)
         self.problem = problem
-        self.moments = np.array(sorted(frames) if frames else list(moments)[min(1, steps) :])
-        """Steps at which the loss is asked, the last is that of the problem's own loss."""
-        by_moment = {int(m): frames[m] if frames else loss for m in self.moments}
-        self._losses = {m: one if isinstance(one, Rounded) else as_loss(one) for m, one in by_moment.items()}
+        self.sample_steps = np.array(sorted(frames) if frames else list(spread)[min(1, steps) :])
+        """(sample_steps,) numbers of steps after which the loss is computed; the last is the problem's own."""
+        by_step = {int(m): frames[m] if frames else loss for m in self.sample_steps}
+        self._losses = {m: one if isinstance(one, Rounded) else as_loss(one) for m, one in by_step.items()}
         self._total = np.cumsum if frames else np.asarray
 
     def difference(self, parameters: Arrays, along: Arrays, h: float) -> np.ndarray:
-        """(moments,) of the central difference of step h along a direction of all or some of the parameters; NaN where
-        a run diverges."""
-        changes = [
+        """(sample_steps,) central differences of step h along a direction of all or some of the parameters; NaN where a
+        run diverges."""
+        differences = [
             _change(loss, before, after) if isinstance(loss, Rounded) and h < 1.0 else _values(loss, before, after)
             for loss, before, after in self._beside(parameters, along, h)
         ]
-        return self._total(changes or np.full(len(self.moments), np.nan)) / (2.0 * h)
+        return self._total(differences or np.full(len(self.sample_steps), np.nan)) / (2.0 * h)
 
     def rough_miss(self, parameters: Arrays, along: Arrays) -> float:
-        """How far the adjoints of losses that are `Rounded` are from differences of their own values, relative, at the
-        step where they are nearest and in the median of moments; 0 where there is none, or round-off hides it."""
+        """Relative distance of the adjoints of `Rounded` losses from finite differences of their values.
+
+        It is the least over the steps h, and of these the median over sample steps; 0 where no loss is `Rounded`, or
+        where round-off is as large as the differences.
+        """
         if not any(isinstance(loss, Rounded) for loss in self._losses.values()):
             return 0.0
-        found = np.full((len(ROUGH), len(self.moments)), np.inf)
+        found = np.full((len(ROUGH), len(self.sample_steps)), np.inf)
         for row, h in zip(found, ROUGH, strict=True):
             for k, (loss, before, after) in enumerate(self._beside(parameters, along, h)):
                 if isinstance(loss, Rounded):
                     by_adjoint, by_value = _change(loss, before, after), _values(loss, before, after)
                     size, noise = max(abs(by_adjoint), abs(by_value)), ROUND_OFF * abs(loss.value(after))
-                    row[k] = abs(by_adjoint - by_value) / size if size > HEARD * noise else np.inf
+                    row[k] = abs(by_adjoint - by_value) / size if size > ABOVE_ROUND_OFF * noise else np.inf
         seen = found.min(axis=0)
         return float(np.median(seen[np.isfinite(seen)])) if np.isfinite(seen).any() else 0.0
 
     def _beside(self, parameters: Arrays, along: Arrays, h: float) -> Iterator[tuple[Loss, Snapshot, Snapshot]]:
-        """At every moment its loss, and the states a step of -h and of h away; none where a run diverges."""
+        """At every sample step its loss, and the states with parameters moved by -h and by h along the direction.
+
+        Nothing where a run diverges.
+        """
         try:
             behind, ahead = (
                 self.problem.states(
@@ -92,7 +102,7 @@ class Course:
 
     def tangent(self, parameters: Arrays, along: Arrays) -> Tangent:
         """Derivatives along a direction, which names all or some of the parameters."""
-        dots: dict[int, tuple[np.ndarray, ...]] = {}
+        dots: dict[int, Arrays] = {}
 
         def observe(step: int, dot: State) -> None:
             if step in self._losses:
@@ -103,7 +113,7 @@ class Course:
         for step, loss in self._losses.items():
             _, bar = loss.value_and_adjoint(ends[step])
             slopes.append(_product(bar, dots[step]) + _of_colours(bar, along))
-            strain.append(_strain(ends[step].positions, dots[step][0]))
+            strain.append(_strain(ends[step].positions, dots[step]["positions"]))
         return Tangent(self._judged(ends), self._total(slopes), np.array(strain))
 
     def _judged(self, ends: dict[int, Snapshot]) -> np.ndarray:
@@ -111,26 +121,26 @@ class Course:
 
 
 def _values(loss: Loss, before: Snapshot, after: Snapshot) -> float:
-    """By how much the loss of the latter state is greater."""
+    """The difference of a loss between two states."""
     return loss.value(after) - loss.value(before)
 
 
 def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
-    """The same by the loss's adjoints: the mean of both times the distance of the states, which is exact to second
-    order and has no round-off of the loss in it."""
+    """The same from the loss's adjoints: their mean times the difference of the states.
+
+    It is exact to second order, and free of the round-off of the loss's values.
+    """
     ends = (before, after)
     old, new = (end.state.numpy(end.dimension) for end in ends)
-    distance, colours = tuple(b - a for a, b in zip(old, new, strict=True)), {"colours": after.colours - before.colours}
+    distance, colours = {name: new[name] - old[name] for name in new}, {"colours": after.colours - before.colours}
     bars = [loss.value_and_adjoint(end)[1] for end in ends]
     return 0.5 * sum(_product(bar, distance) + _of_colours(bar, colours) for bar in bars)
 
 
-def _product(bar: State | SnapshotAdjoint | tuple[np.ndarray, ...], dot: tuple[np.ndarray, ...]) -> float:
+def _product(bar: Adjoint, dot: Arrays) -> float:
     """The adjoint of a state times its tangent."""
-    if isinstance(bar, SnapshotAdjoint):
-        return _product(bar.state, dot)
-    arrays = bar.numpy(dot[0].shape[1]) if isinstance(bar, State) else bar
-    return float(sum((a.astype(np.float64) * b).sum() for a, b in zip(arrays, dot, strict=False)))
+    arrays = by_field(bar, dot["positions"].shape[1])
+    return float(sum((array.astype(np.float64) * dot[name]).sum() for name, array in arrays.items()))
 
 
 def _of_colours(bar: object, along: Arrays) -> float:

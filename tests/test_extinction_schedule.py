@@ -16,7 +16,7 @@ from cortado.inverse.task import load_task
 from cortado.losses.image_losses import psnr
 from cortado.optimisation.optimisers import Adam
 
-STAGED = "optimise.extinctions=[0.25, 1.0]"
+STAGED = "optimise.extinction_schedule=[0.25, 1.0]"
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def covering(image, background, colour):
 
 @pytest.mark.parametrize("fineness", [0.5, 0.25])
 def test_a_layer_is_as_opaque_as_its_spacing_is_thick(file, monkeypatch, fineness):
-    """How fine the nodes are does not change how opaque the plane is; shares of the extinction do."""
+    """How fine the nodes are does not change how opaque the plane is; factors of the extinction do."""
     monkeypatch.setitem(cortado.render.scene_renderer.FINENESS, 2, fineness)
     task = load_task(file, [STAGED, "render.extinction=20.0", "problem.distance=squared_difference"])
     made = setup(task, "cpu", "float64")
@@ -70,18 +70,20 @@ def test_a_hidden_run_is_seen_through_the_same_fluid(tmp_path):
     made = setup(load_task(tmp_path / "task.toml", [STAGED]), "cpu", "float32")
     assert len(made.searches) == 2
     for search in made.searches:
-        assert search.problem.value(made.task.hidden) == pytest.approx(0.0, abs=1e-12)
+        assert search.problem.value(made.task.true_parameters) == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("shares", ["[]", "[0.5]", "[1.0, 1.0]", "[0.5, 0.25, 1.0]", "[0.0, 1.0]", '["a", 1.0]', "1.0"])
-def test_shares_grow_to_one(file, shares):
-    with pytest.raises(SceneError, match=r"optimise\.extinctions .*the last of them 1"):
-        load_task(file, [f"optimise.extinctions={shares}"])
+@pytest.mark.parametrize(
+    "schedule", ["[]", "[0.5]", "[1.0, 1.0]", "[0.5, 0.25, 1.0]", "[0.0, 1.0]", '["a", 1.0]', "1.0"]
+)
+def test_the_schedule_grows_to_one(file, schedule):
+    with pytest.raises(SceneError, match=r"optimise\.extinction_schedule .*the last of them 1"):
+        load_task(file, [f"optimise.extinction_schedule={schedule}"])
 
 
 def test_positions_have_no_extinction(tmp_path):
     (tmp_path / "task.toml").write_text(GOOD_TASK)
-    with pytest.raises(SceneError, match=r"optimise\.extinctions .*left out, as positions are compared"):
+    with pytest.raises(SceneError, match=r"optimise\.extinction_schedule .*left out, as positions are compared"):
         load_task(tmp_path / "task.toml", [STAGED])
 
 
@@ -96,17 +98,17 @@ def test_each_search_begins_where_the_last_one_ended(file):
 
 
 def test_searches_resume_bit_for_bit(file):
-    """Even when interrupted in the second one; and with other extinctions they are refused."""
+    """Even when interrupted in the second one; and with another schedule they are refused."""
     main(["optimise", "task.toml", "--set", STAGED, "--out", "whole"])
     main(["optimise", "task.toml", "--set", STAGED, "--out", "cut"])
-    log, metrics = Path("cut/checkpoint/1/evaluations.log"), Path("cut/metrics.jsonl")
+    log, metrics = Path("cut/checkpoint/1/replay.log"), Path("cut/metrics.jsonl")
     log.write_bytes(log.read_bytes()[: int(0.6 * log.stat().st_size)])
     metrics.write_text("".join(metrics.read_text().splitlines(keepends=True)[:7]))
     main(["optimise", "task.toml", "--set", STAGED, "--out", "cut", "--resume"])
-    for name in ("metrics.jsonl", "checkpoint/evaluations.log", "checkpoint/1/evaluations.log"):
+    for name in ("metrics.jsonl", "checkpoint/replay.log", "checkpoint/1/replay.log"):
         assert (Path("cut") / name).read_bytes() == (Path("whole") / name).read_bytes()
     with pytest.raises(SystemExit) as end:
-        main(["optimise", "task.toml", "--set", "optimise.extinctions=[0.5, 1.0]", "--out", "cut", "--resume"])
+        main(["optimise", "task.toml", "--set", "optimise.extinction_schedule=[0.5, 1.0]", "--out", "cut", "--resume"])
     assert end.value.code == 2
 
 
@@ -120,7 +122,9 @@ def test_thin_fluid_first_gathers_what_thick_fluid_leaves_behind(file):
         "render.resolution=[40, 40]",
         "optimise.bounds={initial_positions=[[0.0, 0.0], [1.0, 1.0]]}",
     ]
-    thick, thin = (_reached(file, [*scene, f"optimise.extinctions={s}"]) for s in ("[1.0]", "[0.0625, 0.25, 1.0]"))
+    thick, thin = (
+        _reached(file, [*scene, f"optimise.extinction_schedule={s}"]) for s in ("[1.0]", "[0.0625, 0.25, 1.0]")
+    )
     assert thick < 20.0 and thin > 28.0
 
 

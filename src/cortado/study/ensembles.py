@@ -1,4 +1,4 @@
-"""Where the study's runs start: first states a little apart, of which each gives one sample of a measurement."""
+"""Ensembles: runs from slightly different first states, each of which gives one sample of a measurement."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -11,20 +11,20 @@ from cortado.io.progress import Advance
 from cortado.reference import Simulation
 
 CORES = 2
-"""How many runs go on side by side; the engine leaves Python while it computes."""
+"""How many runs are computed at the same time; the engine releases Python's lock meanwhile."""
 
 
 def perturbed(simulation: Simulation, seed: int, perturbation: float) -> NDArray[np.float64]:
-    """First positions (n, d) [m], each coordinate moved by at most so many spacings; the scene's own without any.
+    """First positions (n, d) [m], each coordinate of the scene's moved at random by at most ``perturbation`` spacings.
 
-    Also for another reason: the scene's own first state may have a symmetry, which only round-off breaks.
+    A perturbation also breaks symmetries of the scene, which otherwise only round-off would break.
     """
     offsets = np.random.default_rng(seed).uniform(-1.0, 1.0, simulation.positions.shape)
     return simulation.positions + perturbation * simulation.scene.discretisation.spacing * offsets
 
 
 def side_by_side(tasks: Iterable[Callable[[], Any]], advance: Advance) -> list[Any]:
-    """The results of tasks, in their order."""
+    """The results of tasks that are computed at the same time, in the order of the tasks."""
     with ThreadPoolExecutor(CORES) as pool:
         pending = [pool.submit(task) for task in tasks]
         results = []

@@ -1,4 +1,4 @@
-"""What a meaningful change of a parameter is: one that an optimiser would make."""
+"""Meaningful perturbations of parameters: changes as large as those that an optimiser makes in one iteration."""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,11 +10,11 @@ from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import Arrays, Values
 from cortado.problem import Problem
 
-CHANGE = 0.05
-"""Of a parameter, in its own size, or in that of the flow: spacings, speeds of a fall."""
+PERTURBATION = 0.05
+"""Size of a meaningful perturbation, relative to that of the parameter or, for states, of the flow (`scales`)."""
 
 
-def point(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
+def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
     """The values of parameters, given as values or as names of the scene's."""
     simulation = problem.simulation
     values = simulation.parameters()
@@ -36,8 +36,11 @@ def point(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
 
 
 def everything(problem: Problem, chosen: Arrays) -> Arrays:
-    """Every parameter that can be moved both ways and makes a difference, tables step by step, at the chosen values and
-    else the scene's: not a viscosity or mobility of 0, nor what only acts between phases where there is but one."""
+    """Every parameter of the problem that acts and that can be both increased and decreased, with its values.
+
+    Values are the chosen ones, else the scene's; parameters over time have a row for each step. A viscosity of 0 cannot
+    be decreased and is left out; so is a mobility in a scene of one phase, where it does nothing.
+    """
     values = {**problem.simulation.parameters(), **chosen}
     found = {}
     for name, value in values.items():
@@ -57,16 +60,19 @@ def _moves_both_ways(name: str, value: np.ndarray) -> bool:
     return BY_NAME[name].range is not Range.NOT_NEGATIVE or bool((value > 0.0).all())
 
 
-def scales(problem: Problem, values: Arrays, change: float = CHANGE) -> Arrays:
-    """The size of a meaningful change of every number of these parameters."""
+def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION) -> Arrays:
+    """The size of a meaningful perturbation of every number of these parameters, in their shapes and units.
+
+    It is a part of the parameter's value; of the spacing for positions, of the speed of a fall for velocities.
+    """
     return {
-        name: np.broadcast_to(change * BY_NAME[name].change(problem.simulation, value), value.shape)
+        name: np.broadcast_to(perturbation * BY_NAME[name].change(problem.simulation, value), value.shape)
         for name, value in values.items()
     }
 
 
 def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """For every parameter a random direction of such a size; numbers simply grow."""
+    """For every parameter a random direction of the given size; one that is a single number is increased."""
     return {
         name: sizes[name] * (random.standard_normal(value.shape) if value.ndim else 1.0)
         for name, value in values.items()
@@ -74,7 +80,10 @@ def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Ar
 
 
 def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """The same, alike for neighbours and from step to step: what moves the fluid rather than its particles."""
+    """Random directions that are smooth in space and constant in time, which move the fluid as a whole.
+
+    An independent random number for each particle would only move particles against their neighbours.
+    """
     x = problem.simulation.positions - problem.simulation.positions.mean(axis=0)
     x = x / (np.abs(x).max() or 1.0)
     found = directions(values, sizes, random)

@@ -1,9 +1,9 @@
-"""Colours of an ordered family of curves: steps, horizons, precisions."""
+"""Colours for an ordered family of curves: steps, horizons, precisions."""
 
 Colour = tuple[float, float, float, float]
 
 
-def shades(count: int) -> list[Colour]:
+def palette(count: int) -> list[Colour]:
     """From dark to light, the lightest still readable on white."""
     from matplotlib import colormaps
 

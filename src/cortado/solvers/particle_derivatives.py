@@ -1,0 +1,117 @@
+"""Tangent and adjoint of what solvers of particles have in common; a solver adds those of its own loops."""
+
+import warp as wp
+
+from cortado.device.arrays import Fields
+from cortado.device.state import Parameters, State
+from cortado.solvers.particles import ParticleSolver
+from cortado.sph.carried import Carried
+from cortado.sph.emitter import EmitterAdjoint
+from cortado.sph.mixture import MixtureAdjoint, MixtureTangent
+from cortado.sph.parts import Adjoints, Shares, StepContext, Tangents
+
+
+class ParticleTangent:
+    """Forward mode of a step along tangents of the parameters, part by part, in the order of the step."""
+
+    def __init__(self, solver: ParticleSolver, parameters_dot: Parameters):
+        self._solver = solver
+        fields = Fields.zeros(solver.particles, solver.discretisation.precision, solver.device)
+        self.dot = Tangents(fields, parameters_dot)
+        """Of the sorted particles, once `sort` has been called, and of the parameters."""
+        self.carried_dot = Carried(solver.carried_fields, solver.layout)
+        self._accelerations_dot = [solver.vectors() for _ in range(len(solver.forces) + 1)]
+        self._mixture = MixtureTangent(solver.mixture)
+
+    def sort(self, context: StepContext, state_dot: State) -> None:
+        """Of `ParticleSolver.sort`."""
+        solver, d = self._solver, self.dot.fields
+        context.launch(
+            solver.integration.sort,
+            x_scene=state_dot.positions,
+            v_scene=state_dot.velocities,
+            m_scene=state_dot["reference_density"],
+            x=d["x"],
+            v=d["v"],
+            m=d["m"],
+        )
+        self.carried_dot.sort(context, state_dot)
+        context.launch(solver.density.tangent, *self.dot.named)
+        self._mixture.step(context, self.dot, state_dot.mass_fractions)
+
+    def accelerate(self, context: StepContext) -> wp.array:
+        """Of `ParticleSolver.accelerate`."""
+        for t, force in enumerate(self._solver.forces):
+            force.tangent(context, self.dot, self._accelerations_dot[t], self._accelerations_dot[t + 1])
+        return self._accelerations_dot[-1]
+
+    def unsort(
+        self, context: StepContext, x_dot: wp.array, v_dot: wp.array, state_dot: State, **carried_dot: wp.array
+    ) -> None:
+        """Of `ParticleSolver.unsort`."""
+        solver = self._solver
+        scene = {"x_scene": state_dot.positions, "v_scene": state_dot.velocities}
+        context.launch(solver.integration.unsort, x=x_dot, v=v_dot, **scene)
+        self.carried_dot.unsort(context, carried_dot, state_dot)
+        self._mixture.result(context, state_dot.mass_fractions)
+        if solver.emitter:
+            solver.emitter.tangent(context, self.dot.parameters, state_dot)
+
+
+class ParticleAdjoint:
+    """Reverse mode of steps, part by part, in the reverse order of a step; every neighbour sum is a gather, so that no
+    atomics are needed."""
+
+    def __init__(self, solver: ParticleSolver, steps: int):
+        precision, particles, device = solver.discretisation.precision, solver.particles, solver.device
+        mixture = solver.mixture
+        names = ["time_step", *mixture.shares, *(name for force in solver.forces for name in force.shares)]
+        self._solver = solver
+        self.bar = Adjoints(
+            Fields.zeros(particles, precision, device),
+            solver.new_parameters(steps),
+            Shares(names, particles, mixture.phases.count, precision, device),
+        )
+        """Adjoints; those of the parameters are complete after `collect`."""
+        self.carried_bar = Carried(solver.carried_fields, solver.layout)
+        """Of what the step carries on, once `unsort` has been called."""
+        self._mixture = MixtureAdjoint(mixture)
+        self._emitter = EmitterAdjoint(solver.emitter) if solver.emitter else None
+
+    def begin(self) -> None:
+        """Forget the adjoints of the parameters of an earlier way back."""
+        self.bar.shares.clear()
+        self.bar.parameters.clear()
+
+    def collect(self) -> Parameters:
+        """The adjoints of the parameters, of all steps since `begin`."""
+        self.bar.shares.collect(self.bar.parameters)
+        return self.bar.parameters
+
+    def unsort(self, context: StepContext, state_bar: State) -> State:
+        """Of `ParticleSolver.unsort`: the adjoints of positions and velocities without what the emitter prescribes, in
+        the scene's order."""
+        self.carried_bar.sort(context, state_bar)
+        if self._emitter is None:
+            return state_bar
+        self._emitter.step(context, state_bar, self.bar.parameters)
+        return self._emitter.free
+
+    def accelerate(self, context: StepContext, acceleration_bar: wp.array) -> None:
+        """Of `ParticleSolver.accelerate`, for the adjoint of its accelerations, (n,) vectors."""
+        for force in reversed(self._solver.forces):
+            force.adjoint(context, acceleration_bar, self.bar)
+
+    def mix(self, context: StepContext, state_bar: State) -> None:
+        """Of the mixture, and of the particles' masses, in `ParticleSolver.sort`."""
+        self._mixture.step(context, self.bar, state_bar.mass_fractions)
+        m_scene_bar = state_bar["reference_density"]
+        context.launch(self._solver.integration.collect_masses, *self.bar.named, m_scene_bar=m_scene_bar)
+
+    def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:
+        """Of the rest of `ParticleSolver.sort`."""
+        solver, b = self._solver, self.bar.fields
+        context.launch(solver.density.adjoint, *self.bar.named)
+        scene = {"x_scene": state_bar.positions, "v_scene": state_bar.velocities}
+        context.launch(solver.integration.unsort, x=b["x"], v=b["v"], **scene)
+        self.carried_bar.unsort(context, carried_bar, state_bar)

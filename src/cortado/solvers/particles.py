@@ -1,0 +1,231 @@
+"""What solvers of particles have in common: everything of a step but what makes the fluid incompressible.
+
+A solver of this kind is a `ParticleSolver` with loops of its own; `cortado.solvers.particle_derivatives` has the same
+for its tangent and its adjoint.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NoReturn, Self
+
+import warp as wp
+
+from cortado.device.arrays import Fields
+from cortado.device.fields import POSITIONS, VELOCITIES, StateField
+from cortado.device.launching import KernelLauncher
+from cortado.device.memory import gradient_parts
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type
+from cortado.device.neighbours import NeighbourSearch
+from cortado.device.state import Layout, Parameters, State
+from cortado.device.threads import Turn
+from cortado.discretise.discrete_scene import Lattice
+from cortado.errors import InputError
+from cortado.lattice.calibration import SKIN
+from cortado.solvers.containment import Containment, Walled
+from cortado.solvers.convergence import convergence_kernels
+from cortado.solvers.loop import IterationLog, Loop
+from cortado.solvers.solver import StepAdjoint, StepTangent
+from cortado.sph.carried import Carried
+from cortado.sph.density import density_kernels
+from cortado.sph.emitter import Emitter, Nozzle
+from cortado.sph.integration import integration_kernels
+from cortado.sph.mixture import Mixture, Phases
+from cortado.sph.parts import Force, StepContext
+
+
+@dataclass(frozen=True)
+class ParticleSystem:
+    """A scene as a solver of particles takes it, on a device: `cortado.solvers.build.particle_system` makes it."""
+
+    kind: str
+    """What scenes call the solver."""
+    discretisation: Discretisation
+    lattice: Lattice
+    search: NeighbourSearch
+    forces: Sequence[Force]
+    periods: Sequence[float]
+    """(3,) [m], 0 along an axis that is not periodic."""
+    phases: Phases
+    nozzle: Nozzle | None
+    walled: Walled
+
+
+class ParticleSolver:
+    """The steps of one set of particles on one device; their arrays are reused by every step.
+
+    The methods that `Solver` has are explained there. A solver of this kind has `step`, `reserve`, `replay` and
+    `write_state` of its own, and if it has derivatives `tangent`, `adjoint` and `differentiable`.
+    """
+
+    carried_fields: tuple[StateField, ...] = ()
+    """What the solver itself carries from step to step, of particles."""
+
+    def __init__(self, system: ParticleSystem, requires_grad: bool = False):
+        discretisation, search, phases, nozzle = system.discretisation, system.search, system.phases, system.nozzle
+        precision, particles, device = discretisation.precision, search.particles, search.device
+        self.system, self.discretisation, self.lattice, self.search = system, discretisation, system.lattice, search
+        self.particles, self.device, self.forces = particles, device, tuple(system.forces)
+        self.launch = KernelLauncher(particles, device, record_tape=requires_grad)
+        self.turn = Turn(device)
+        """Whose arrays these are now."""
+        self.density, self.integration = density_kernels(discretisation), integration_kernels(precision)
+        self.layout = Layout(particles, phases.count, precision, device)
+        self.mixture = Mixture(phases, precision, particles, device, requires_grad)
+        self.emitter = Emitter(nozzle, self.layout, requires_grad) if nozzle else None
+        self.carried = Carried(self.carried_fields, self.layout, requires_grad)
+        """Sorted, as they were at the start of the step."""
+        of_parts = (*self.mixture.fields, *(self.emitter.fields if self.emitter else ()))
+        self.state_fields = (POSITIONS, VELOCITIES, *of_parts, *self.carried_fields)
+        """What a state consists of."""
+        self.fields = Fields.zeros(particles, precision, device, requires_grad)
+        self._requires_grad = requires_grad
+        self.accelerations = [self.vectors() for _ in range(len(self.forces) + 1)]
+        """``accelerations[t]``: of the first t forces; the first is 0 and never written."""
+        self.loops: tuple[Loop, ...] = ()
+        """Those of a step, in the order in which they run."""
+        self.step_number = wp.zeros(1, dtype=wp.int32, device=device)
+        self.containment = Containment(system.walled, precision, self.launch, nozzle.first if nozzle else particles)
+        self._neighbourhood: Any = None
+        self._context: StepContext | None = None
+        self.generation = 0
+        """How often arrays, or the work of a step, were replaced; what was captured before is stale."""
+        self.resize(search.capacity)
+
+    def vectors(self) -> wp.array:
+        """(n,) vectors for a step or its derivative to work in, all 0."""
+        return self._array(self.discretisation.precision.vector)
+
+    def numbers(self) -> wp.array:
+        """(n,) numbers for a step or its derivative to work in, all 0."""
+        return self._array(self.discretisation.precision.real)
+
+    def _array(self, dtype: Any) -> wp.array:
+        return wp.zeros(self.particles, dtype=dtype, device=self.device, requires_grad=self._requires_grad)
+
+    def resize(self, capacity: int) -> None:
+        """Make room for neighbour lists of that length."""
+        if capacity != self.search.capacity:
+            self.search.allocate(capacity)
+            self.generation += 1
+        self._neighbourhood, self._context = _neighbourhood(self.system), None
+
+    def new_state(self, requires_grad: bool = False) -> State:
+        return self.layout.state(self.state_fields, requires_grad)
+
+    def new_parameters(self, steps: int, requires_grad: bool = False) -> Parameters:
+        return self.layout.parameters(steps, requires_grad)
+
+    def new_log(self, steps: int) -> IterationLog:
+        return IterationLog(steps, self.loops)
+
+    def set_substeps(self, substeps: int) -> None:
+        if substeps != self.mixture.substeps:
+            self.mixture.reserve(substeps)
+            self.generation += 1
+
+    def make_room(self) -> bool:
+        needed, capacity = self.search.needed, self.search.capacity
+        if needed <= capacity:
+            return False
+        self.resize(min(needed + needed // 8 + 1, 2 * capacity))
+        self.search.forget_needed()
+        return True
+
+    def match(self, other: Self) -> None:
+        self.resize(other.search.capacity)
+        self.set_substeps(other.mixture.substeps)
+
+    def reset(self) -> None:
+        for loop in self.loops:
+            loop.reset()
+        self.step_number.zero_()
+        self.containment.reset()
+
+    # ---- what a step is made of ----------------------------------------------------------------------------------
+
+    def context(self, parameters: Parameters) -> StepContext:
+        if self._context is None or self._context.parameters is not parameters:
+            order, step = self.search.order, self.step_number
+            self._context = StepContext(self.launch, self._neighbourhood, order, step, self.fields, parameters)
+        return self._context
+
+    def sort(self, state: State, parameters: Parameters) -> StepContext:
+        """Neighbours, density and mixture: how a step begins. It reads all of the state."""
+        context = self.context(parameters)
+        if self.emitter:
+            self.emitter.begin(context, state)
+        self.search.sort(state.positions)
+        scene = {"x_scene": state.positions, "v_scene": state.velocities, "m_scene": state["reference_density"]}
+        context.launch(self.integration.sort, **scene)
+        self.carried.sort(context, state)
+        self.search.fill(self._neighbourhood, self.fields["x"])
+        context.launch(self.density.forward)
+        self.mixture.diffuse(context, state.mass_fractions)
+        return context
+
+    def accelerate(self, context: StepContext) -> wp.array:
+        """(n,) vectors of the explicit forces [m / s2]."""
+        for t, force in enumerate(self.forces):
+            force.accelerate(context, self.accelerations[t], self.accelerations[t + 1])
+        return self.accelerations[-1]
+
+    def unsort(self, context: StepContext, x: wp.array, v: wp.array, new_state: State, **carried: wp.array) -> None:
+        """Write the new state from sorted positions and velocities, but for particles that the emitter prescribes, and
+        from what is ``carried`` to the next step, one array for each of `carried_fields`."""
+        free = self.emitter.free if self.emitter else new_state
+        context.launch(self.integration.unsort, x=x, v=v, x_scene=free.positions, v_scene=free.velocities)
+        self.carried.unsort(context, carried, new_state)
+        self.mixture.result(context, new_state.mass_fractions)
+        if self.emitter:
+            self.emitter.prescribe(context, new_state)
+
+    def end_step(self, x: wp.array, v: wp.array, new_state: State, log: IterationLog) -> None:
+        """Look for lost particles, given sorted positions and velocities after the step without what a nozzle leads;
+        record the loops, and count the step."""
+        f, containment = self.fields, self.containment
+        containment.look(self.search.order, f["x"], f["rho_0"], x, v, new_state)
+        for k, (loop, record) in enumerate(zip(self.loops, log.records, strict=True), 1):
+            loop.note(record, containment, self.step_number, is_last=k == len(self.loops))
+        if not self.loops:
+            self.launch(
+                convergence_kernels(self.discretisation.precision).count_step,
+                bad=containment.bad_particle,
+                bad_step=containment.bad_step,
+                step=self.step_number,
+                threads=1,
+            )
+
+    # ---- derivatives ---------------------------------------------------------------------------------------------
+
+    def tangent(self, parameters_dot: Parameters) -> StepTangent:
+        self._lacks("forward mode", "take differences of `Problem.value`")
+
+    def adjoint(self, steps: int, frozen_geometry: bool = False) -> StepAdjoint:
+        self._lacks("reverse mode", "try gradients.Tape, or gradients.RandomizedSmoothing, which only runs forward")
+
+    def differentiable(self) -> Self:
+        self._lacks("tape", "try gradients.RandomizedSmoothing, which only runs forward")
+
+    def _lacks(self, what: str, advice: str) -> NoReturn:
+        raise InputError(f'solver.kind is "{self.system.kind}", which has no {what}: {advice}, or another solver.')
+
+    def gradient_memory(self, log: IterationLog) -> dict[str, float]:
+        iterations = sum(int(record.counts.max(initial=0)) for record in log.records)
+        return gradient_parts(self.particles, iterations, self.discretisation.precision.bytes)
+
+
+def _neighbourhood(system: ParticleSystem) -> Any:
+    """What particles see, with the present arrays of the search."""
+    search, lattice, periods, precision = system.search, system.lattice, system.periods, system.discretisation.precision
+    s = neighbourhood_type(precision)()
+    s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
+    s.filling, s.count = search.filling, search.count
+    s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
+    s.support, s.reach = lattice.support, (1.0 + SKIN) * lattice.support
+    s.normalisation = lattice.normalisation
+    s.self_weight, s.volume, s.response_scale = lattice.self_weight, lattice.volume, lattice.response**-0.5
+    s.laplacian_correction = lattice.laplacian_correction
+    s.periodic = int(any(periods))
+    s.period = precision.vector(*periods)
+    s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in periods))
+    return s

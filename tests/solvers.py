@@ -1,0 +1,192 @@
+"""Solvers that are not Cortado's: what the protocol promises holds for them too.
+
+`Remembering` is PCISPH with a second loop and a memory of the fluid's velocity that goes on from step to step, as a
+warm start does; `Falling` has no loops, and no derivatives.
+"""
+
+from functools import cache
+from math import inf
+from types import SimpleNamespace
+
+import warp as wp
+
+from cortado.device.fields import Entry, StateField
+from cortado.solvers.build import particle_system
+from cortado.solvers.loop import Loop, LoopLimits
+from cortado.solvers.particles import ParticleSolver
+from cortado.solvers.pcisph.build import pressure_limits
+from cortado.solvers.pcisph.derivatives import PcisphAdjoint, PcisphTangent
+from cortado.solvers.pcisph.solver import Pcisph
+
+MEMORY = "memory"
+
+
+@cache
+def memory_kernels(precision):
+    """w <- (w + v) / 2 until w is near v, and then v <- v - 0.3 w, with derivatives of k rounds at once."""
+    real, vector, pair = precision.real, precision.vector, precision.pair
+    module = wp.get_module(f"tests_memory_{precision.name}")
+
+    @wp.kernel(module=module)
+    def remember(
+        v: wp.array(dtype=vector),
+        w_in: wp.array(dtype=vector),
+        w_out: wp.array(dtype=vector),
+        error: wp.array(dtype=pair),
+    ):
+        i = wp.tid()
+        w = real(0.5) * (w_in[i] + v[i])
+        w_out[i] = w
+        gap = wp.length(v[i] - w)
+        error[i] = pair(gap, gap)
+
+    @wp.kernel(module=module)
+    def drag(v: wp.array(dtype=vector), w: wp.array(dtype=vector), v_out: wp.array(dtype=vector)):
+        i = wp.tid()
+        v_out[i] = v[i] - real(0.3) * w[i]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def tangent(
+        left: real,
+        v_dot: wp.array(dtype=vector),
+        w_dot: wp.array(dtype=vector),
+        v_out_dot: wp.array(dtype=vector),
+        w_out_dot: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        w = left * w_dot[i] + (real(1.0) - left) * v_dot[i]
+        w_out_dot[i] = w
+        v_out_dot[i] = v_dot[i] - real(0.3) * w
+
+    @wp.kernel(module=module, enable_backward=False)
+    def adjoint(
+        order: wp.array(dtype=wp.int32),
+        left: real,
+        w_out_bar: wp.array(dtype=vector),
+        v_scene_bar: wp.array(dtype=vector),
+        w_bar: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        p = order[i]
+        total = w_out_bar[i] - real(0.3) * v_scene_bar[p]
+        v_scene_bar[p] = v_scene_bar[p] + (real(1.0) - left) * total
+        w_bar[i] = left * total
+
+    return SimpleNamespace(remember=remember, drag=drag, tangent=tangent, adjoint=adjoint)
+
+
+class Remembering(Pcisph):
+    carried_fields = (StateField(MEMORY, "m/s", Entry.VECTOR),)
+
+    def __init__(self, system, limits, requires_grad=False):
+        super().__init__(system, limits, requires_grad)
+        precision = self.discretisation.precision
+        rounds = LoopLimits(minimum_iterations=1, maximum_iterations=9, tolerance=0.008, greatest_tolerance=inf)
+        self.memory_kernels = memory_kernels(precision)
+        self.memory_loop = Loop(rounds, precision, self.launch, "memory_iterations", "memory_errors")
+        self.loops = (*self.loops, self.memory_loop)
+        self.memories, self.v = [self.vectors()], self.vectors()
+
+    def step(self, state, new_state, parameters, log):
+        context = self.predict(state, parameters)
+        self.pressure_loop.run(lambda k: self.iterate(k, 0, context))
+        self.memory_loop.run(lambda k: self.remember(k, 0, 0))
+        self.write_state((0, 0), parameters, new_state)
+        self.end_step(self.iterates.x_star[0], self.v, new_state, log)
+
+    def reserve(self, counts):
+        iterations, rounds = counts
+        super().reserve((iterations,))
+        while len(self.memories) <= rounds:
+            self.memories.append(self.vectors())
+
+    def replay(self, state, parameters, counts):
+        self.reserve(counts)
+        iterations, rounds = counts
+        context = self.predict(state, parameters)
+        for k in range(iterations):
+            self.iterate(k, k + 1, context)
+        for k in range(rounds):
+            self.remember(k, k + 1, iterations)
+
+    def write_state(self, counts, parameters, new_state):
+        iterations, rounds = counts
+        v, memory = self.iterates.v_star[iterations], self.memories[rounds]
+        self.launch(self.memory_kernels.drag, v=v, w=memory, v_out=self.v)
+        self.unsort(self.context(parameters), self.iterates.x_star[iterations], self.v, new_state, memory=memory)
+
+    def remember(self, k, slot, iterations):
+        before = self.carried[MEMORY] if k == 0 else self.memories[max(slot - 1, 0)]
+        known = {"v": self.iterates.v_star[iterations], "error": self.memory_loop.errors}
+        self.launch(self.memory_kernels.remember, known, w_in=before, w_out=self.memories[slot])
+
+    def tangent(self, parameters_dot):
+        return RememberingTangent(self, parameters_dot)
+
+    def adjoint(self, steps, frozen_geometry=False):
+        return RememberingAdjoint(self, steps, frozen_geometry)
+
+
+class RememberingTangent(PcisphTangent):
+    def __init__(self, solver, parameters_dot):
+        super().__init__(solver, parameters_dot)
+        self.v_dot, self.memory_dot = solver.vectors(), solver.vectors()
+
+    def step(self, counts, state_dot, parameters):
+        iterations, self.rounds = counts
+        super().step((iterations,), state_dot, parameters)
+
+    def unsort(self, context, x_dot, v_dot, state_dot):
+        new = {"v_out_dot": self.v_dot, "w_out_dot": self.memory_dot}
+        old = {"v_dot": v_dot, "w_dot": self.carried_dot[MEMORY]}
+        context.launch(self._solver.memory_kernels.tangent, left=0.5**self.rounds, **old, **new)
+        super().unsort(context, x_dot, self.v_dot, state_dot, memory=self.memory_dot)
+
+
+class RememberingAdjoint(PcisphAdjoint):
+    def __init__(self, solver, steps, frozen_geometry):
+        super().__init__(solver, steps, frozen_geometry)
+        self.memory_bar = solver.vectors()
+
+    def step(self, counts, state_bar, parameters):
+        iterations, self.rounds = counts
+        super().step((iterations,), state_bar, parameters)
+
+    def unsort(self, context, state_bar):
+        free_bar = super().unsort(context, state_bar)
+        bars = {"w_out_bar": self.carried_bar[MEMORY], "v_scene_bar": free_bar.velocities, "w_bar": self.memory_bar}
+        context.launch(self._solver.memory_kernels.adjoint, left=0.5**self.rounds, **bars)
+        return free_bar
+
+    def sort(self, context, state_bar):
+        super().sort(context, state_bar, memory=self.memory_bar)
+
+
+class Falling(ParticleSolver):
+    def __init__(self, system):
+        super().__init__(system)
+        self.x, self.v = self.vectors(), self.vectors()
+
+    def step(self, state, new_state, parameters, log):
+        self.replay(state, parameters, ())
+        self.write_state((), parameters, new_state)
+        self.end_step(self.x, self.v, new_state, log)
+
+    def reserve(self, counts):
+        pass
+
+    def replay(self, state, parameters, counts):
+        context = self.sort(state, parameters)
+        new = {"x_star": self.x, "v_star": self.v}
+        context.launch(self.integration.predict, acceleration=self.accelerate(context), **new)
+
+    def write_state(self, counts, parameters, new_state):
+        self.unsort(self.context(parameters), self.x, self.v, new_state)
+
+
+def build_remembering(scene, discrete, free_energy, precision, device):
+    return Remembering(particle_system(scene, discrete, free_energy, precision, device), pressure_limits(scene))
+
+
+def build_falling(scene, discrete, free_energy, precision, device):
+    return Falling(particle_system(scene, discrete, free_energy, precision, device))
