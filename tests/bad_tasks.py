@@ -175,7 +175,7 @@ BAD_TASKS = [
     ("more knots than steps", _START, f"{_ROWS}\nknots = 6", "optimise.knots"),
     ("logarithm of a negative number", _RATE, f'{_RATE}\nlogarithmic = ["gravity"]', "optimise.start.gravity"),
     ("logarithm of what is not optimised", _RATE, f'{_RATE}\nlogarithmic = ["viscosity"]', "optimise.logarithmic"),
-    ("logarithm of an unknown parameter", _RATE, f'{_RATE}\nlogarithmic = ["wind"]', "optimise.logarithmic"),
+    ("logarithm of an unknown parameter", _RATE, f'{_RATE}\nlogarithmic = ["wind"]', "optimise.logarithmic[0]"),
     ("logarithm in text", _RATE, f'{_RATE}\nlogarithmic = "gravity"', "optimise.logarithmic"),
     ("logarithm of fractions", _TABLES, _both("mass_fractions", _PURE, 'logarithmic = ["mass_fractions"]'),
      "optimise.logarithmic"),

@@ -20,14 +20,14 @@ LAYERS = """
     io.terminal io.usage io.video io.vtkhdf_layout io.vtkhdf
     lattice lattice.shapes lattice.pairs lattice.region lattice.smoothing lattice.calibration
     parameters parameters.reference_density parameters.registry parameters.table parameters.tilt parameters.values
-    scene scene.fields scene.point_reader scene.points scene.tables scene.fluids scene.emitter scene.mixture
-    scene.render scene.toml
+    scene scene.fields scene.sentences scene.point_reader scene.points scene.tables scene.fluids scene.emitter
+    scene.mixture scene.render scene.toml
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights
     scene.containers scene.model scene.stability
-    device device.kernels device.memory device.precision device.lanes device.reduction device.silence
-    device.kernel_cache device.smoothing device.neighbourhood device.arrays device.fields device.state device.threads
-    device.launching device.cells device.neighbours
+    device device.cores device.kernels device.memory device.precision device.lanes device.reduction device.silence
+    device.kernel_cache device.smoothing device.neighbourhood device.arrays device.fields device.state
+    device.threads device.launching device.cells device.neighbours
     scene.checks scene.scene
     parameters.checks
     discretise.sampling discretise.discrete_scene

@@ -151,7 +151,7 @@ def test_any_number_of_threads_gives_the_same_bits(monkeypatch):
     def once(cores, parts):
         monkeypatch.setattr(launching, "LEAST_PART", 125 // parts)
         monkeypatch.setattr(launching, "LEAST_SHARED_PART", 125 // parts if parts > cores else 125)
-        monkeypatch.setattr(launching.os, "sched_getaffinity", lambda _: range(cores), raising=False)
+        monkeypatch.setattr(launching, "usable_cores", lambda: cores)
         simulation = Simulation(splash(minimum_iterations=2, maximum_iterations=20), precision="float64")
         assert simulation.solver.launch.parts == parts
         assert simulation.solver.launch.capturable == (parts == 1)

@@ -82,7 +82,7 @@ def set_parts(monkeypatch, cores, parts, particles):
     """Launches over so many particles are cut into so many ranges from now on."""
     monkeypatch.setattr(launching, "LEAST_PART", particles // parts)
     monkeypatch.setattr(launching, "LEAST_SHARED_PART", particles // parts if parts > cores else particles)
-    monkeypatch.setattr(launching.os, "sched_getaffinity", lambda _: range(cores), raising=False)
+    monkeypatch.setattr(launching, "usable_cores", lambda: cores)
     launcher = KernelLauncher(particles, launching.wp.get_device("cpu"), record_tape=False)
     assert launcher.parts == parts
 

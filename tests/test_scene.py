@@ -4,6 +4,7 @@ import copy
 import pickle
 import tomllib
 import warnings
+from datetime import date
 from math import sqrt
 
 import numpy as np
@@ -63,7 +64,7 @@ def test_what_is_left_out_has_a_default():
 def test_a_scene_can_be_built_from_parts():
     fluid = BoxFluid(lower=np.zeros(2), upper=(np.float32(1.0), 0.5), phase="water")
     scene = Scene(**plane(fluid=[fluid], discretisation=Discretisation(spacing=0.1)))
-    assert scene == Scene(**plane()) and fluid.velocity == ()
+    assert scene == Scene(**plane()) and fluid.velocity == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("data", [good_data(), full_data(), plane()])
@@ -146,6 +147,12 @@ def test_a_misspelt_key_is_told_the_right_one():
         scene_from_dict(data, "scene.toml")
     wanted = "scene.toml: solver.timestep is not a key of [solver]; did you mean time_step?"
     assert str(caught.value) == wanted
+
+
+@pytest.mark.parametrize("fluid", [np.zeros(2), date(2020, 1, 1), 3, Mixture()], ids=str)
+def test_a_fluid_that_is_no_table_is_a_sentence(fluid):
+    with pytest.raises(SceneError, match=r"^fluid\[0\] is .*, but must be a table\.$"):
+        Scene(**plane(fluid=[fluid]))
 
 
 def test_parts_built_in_python_raise_the_same_error():

@@ -179,6 +179,7 @@ GOOD = (EXPERIMENTS / "figure_6.toml").read_text().replace("scenes/", f"{EXPERIM
     [
         ('kind = "forces"', 'kind = "force"', ["experiment.toml: kind is 'force'", '"forces"']),
         ('kind = "forces"', "", ["kind is missing"]),
+        ('kind = "forces"', 'kind = ["forces"]', ["experiment.toml: kind is ['forces']", '"forces"']),
         ("steps = 400", "steps = 4", ["experiment.toml: steps is 4", "from 8"]),
         ("steps = 400", "step = 400", ["step is not a key", "did you mean steps?"]),
         ("impact = 150", "", ["impact is missing", "a whole number"]),

@@ -1,6 +1,5 @@
 """Launches of kernels with arguments by name, and sums over particles in a fixed order."""
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import wait
 from contextlib import nullcontext
@@ -8,6 +7,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.cores import usable_cores
 from cortado.device.lanes import lanes_of
 from cortado.device.precision import Precision
 from cortado.device.reduction import add_kernel, sum_and_maximum_kernel, sum_kernel
@@ -71,8 +71,7 @@ class KernelLauncher:
     def __init__(self, particles: int, device: Any, record_tape: bool):
         """``record_tape`` False keeps launches off a tape that a user may have open."""
         self.particles, self.device, self._record_tape = particles, device, record_tape
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self._cores = min(cores, MOST_CORES) if device.is_cpu and not record_tape else 1
+        self._cores = min(usable_cores(), MOST_CORES) if device.is_cpu and not record_tape else 1
         each = min(PARTS_A_CORE, MOST_PARTS // self._cores, particles // (self._cores * LEAST_SHARED_PART))
         most = self._cores * max(each, 1) if self._cores > 1 else 1
         self.parts = max(min(most, particles // LEAST_PART), 1)

@@ -1,19 +1,29 @@
 """The tables [problem] and [optimise] of a task, with the field types that only they have."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
 from itertools import pairwise
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import (
+    BeforeValidator,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WithJsonSchema,
+    WrapValidator,
+    model_validator,
+)
 
 from cortado.errors import Words
 from cortado.gradients import AdjointEstimator, AdjointViscosity, EnsembleMean, Exact, FrozenGeometry, GradientEstimator
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, Optimiser
-from cortado.parameters.values import NAMES
-from cortado.scene.fields import MISSING, Choice, Count, FieldType, Quantity, Text, as_number, as_sequence, field_error
+from cortado.parameters.values import NAMES, UNITS
+from cortado.scene.fields import MISSING, OneOf, Several, Text, as_number, count, field_error, quantity
+from cortado.scene.sentences import wanted
 from cortado.scene.tables import Table
 
 OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
@@ -32,59 +42,27 @@ RANDOM = "random"
 CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
 
 
-@dataclass(frozen=True)
-class Values(FieldType):
-    """Parameters by name, each a number, a list of numbers, or a list of lists of numbers."""
-
-    random: bool = False
-    """Whether `CAN_BE_RANDOM` may be the word "random"."""
-
-    wanted = f"a table of at least one parameter out of {', '.join(NAMES)}"
-
-    def check(self, value: Any) -> dict[str, Any]:
-        if not isinstance(value, Mapping) or not value:
-            raise field_error((), Words("empty") if value == {} else value, self.wanted)
-        return {name: self._array(name, entry) for name, entry in value.items()}
-
-    def _array(self, name: str, value: Any) -> Any:
+def _arrays(values: Any, words: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Values by name as arrays, or as one of the words where a parameter can be random; raises a `field_error`."""
+    if not isinstance(values, Mapping) or not values:
+        raise field_error((), Words("empty") if values == {} else values, wanted(_VALUES))
+    found = {}
+    for name, value in values.items():
         if name not in NAMES:
             raise field_error((name,), Words("unknown"), f"one of {', '.join(NAMES)}")
-        if self.random and name in CAN_BE_RANDOM and value == RANDOM:
-            return value
-        wanted = "made of finite numbers: one, a list of them, or a list of lists of one length"
-        if not _is_numeric(value):
-            raise field_error((name,), value, wanted)
-        try:
-            return np.array(value, dtype=np.float64)
-        except ValueError:
-            raise field_error((name,), value, wanted) from None
+        is_word = name in CAN_BE_RANDOM and isinstance(value, str) and value in words
+        found[name] = value if is_word else _array(name, value)
+    return found
 
 
-@dataclass(frozen=True)
-class Names(FieldType):
-    """A list of parameters."""
-
-    wanted = f"a list of parameters out of {', '.join(NAMES)}"
-
-    def check(self, value: Any) -> tuple[str, ...]:
-        if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) and name in NAMES for name in value):
-            raise field_error((), value, self.wanted)
-        return tuple(value)
-
-
-@dataclass(frozen=True)
-class Schedule(FieldType):
-    """A continuation schedule: factors that grow to 1."""
-
-    wanted = "a list of numbers greater than 0, each greater than the one before, the last of them 1"
-
-    def check(self, value: Any) -> tuple[float, ...]:
-        numbers = [as_number(entry) for entry in as_sequence(value) or ()]
-        factors = [number for number in numbers if number is not None and number > 0.0]
-        growing = all(a < b for a, b in pairwise(factors))
-        if not factors or len(factors) < len(numbers) or not growing or factors[-1] != 1.0:
-            raise field_error((), value, self.wanted)
-        return tuple(factors)
+def _array(name: str, value: Any) -> Any:
+    finite = "made of finite numbers: one, a list of them, or a list of lists of one length"
+    if not _is_numeric(value):
+        raise field_error((name,), value, finite)
+    try:
+        return np.array(value, dtype=np.float64)
+    except ValueError:
+        raise field_error((name,), value, finite) from None
 
 
 def _is_numeric(value: Any) -> bool:
@@ -94,26 +72,52 @@ def _is_numeric(value: Any) -> bool:
     return as_number(value) is not None
 
 
+def _growing(value: Any, check: ValidatorFunctionWrapHandler) -> tuple[float, ...]:
+    """Factors that grow to 1; raises a `field_error`."""
+    with suppress(ValidationError):
+        factors = check(value)
+        if factors[-1] == 1.0 and all(a < b for a, b in pairwise(factors)):
+            return factors
+    words = "a list of numbers greater than 0, each greater than the one before, the last of them 1"
+    raise field_error((), value, words)
+
+
+_VALUES: Any = {
+    "type": "object",
+    "minProperties": 1,
+    "additionalProperties": False,
+    "properties": {
+        name: {"anyOf": [{"type": "number"}, {"type": "array"}], "unit": unit or "-"} for name, unit in UNITS.items()
+    },
+}
+Values = Annotated[dict[str, Any], BeforeValidator(_arrays), WithJsonSchema(_VALUES)]
+"""Parameters by name, each a number, a list of numbers, or a list of lists of numbers."""
+Start = Annotated[dict[str, Any], BeforeValidator(partial(_arrays, words=(RANDOM,))), WithJsonSchema(_VALUES)]
+"""Values, of which some may be the word "random"."""
+Schedule = Annotated[Several[Annotated[float, quantity(gt=0.0, le=1.0)]], WrapValidator(_growing)]
+"""A continuation schedule: factors that grow to 1."""
+
+
 class ProblemTable(Table):
     """[problem]: a number of steps, and a target: the end of a run with true parameters, or a picture."""
 
-    steps: Annotated[int, Count(0, 10_000_000)]
+    steps: Annotated[int, count(0, 10_000_000)]
     """Time steps; 0 for a loss of the first state."""
-    loss: Annotated[str, Choice(("positions", "image"))] = "positions"
+    loss: Literal["positions", "image"] = "positions"
     """What is compared with the target: positions of particles, or images."""
-    distance: Annotated[str, Choice(tuple(DISTANCES))] = "squared_difference"
+    distance: Annotated[str, OneOf(DISTANCES)] = "squared_difference"
     """How images are compared."""
-    frames: Annotated[int, Count(1, 10_000)] = 1
+    frames: Annotated[int, count(1, 10_000)] = 1
     """Number of states that are compared, evenly spaced up to the last one."""
-    target: Annotated[dict[str, Any] | None, Values()] = None
+    target: Values | None = None
     """The true parameters: the target is what a run with them makes."""
-    picture: Annotated[str | None, Text()] = None
+    picture: Text | None = None
     """"heart", "rosetta", or a file with a picture, beside the task's own."""
 
     @model_validator(mode="after")
     def _check_target(self) -> Self:
         if self.picture is None and self.target is None:
-            raise field_error(("target",), MISSING, f"{Values.wanted}, as there is no picture")
+            raise field_error(("target",), MISSING, f"{wanted(_VALUES)}, as there is no picture")
         if self.picture is not None and self.target is not None:
             raise field_error(("picture",), self.picture, "left out, as there is a target")
         if self.picture is not None and self.loss != "image":
@@ -137,26 +141,26 @@ class ProblemTable(Table):
 class CheckTable(Table):
     """[optimise.check]: what the estimate has to reach."""
 
-    loss_reduction: Annotated[float, Quantity(least=1.0)] = 1.0
+    loss_reduction: Annotated[float, quantity(ge=1.0)] = 1.0
     """First loss / best loss."""
-    parameter_error: Annotated[float, Quantity(above=0.0)] = 1e50
+    parameter_error: Annotated[float, quantity(gt=0.0)] = 1e50
     """Largest relative distance (L2) of an estimated parameter from its true value."""
-    psnr: Annotated[float, Quantity("dB", least=0.0)] = 0.0
+    psnr: Annotated[float, quantity("dB", ge=0.0)] = 0.0
     """Peak signal-to-noise ratio of the image of the estimate to the target."""
 
 
 class GradientTable(Table):
     """[optimise.gradient]: which gradient the search follows, see docs/gradients.md."""
 
-    name: Annotated[str, Choice(tuple(ESTIMATORS))] = "exact"
+    name: Annotated[str, OneOf(ESTIMATORS)] = "exact"
     """Name of the estimator."""
-    strength: Annotated[float | None, Quantity(above=0.0, most=1.0)] = None
+    strength: Annotated[float, quantity(gt=0.0, le=1.0)] | None = None
     """Strength of `AdjointViscosity`; None: chosen at the start of a search."""
-    samples: Annotated[int, Count(1, 10_000)] = 1
+    samples: Annotated[int, count(1, 10_000)] = 1
     """Runs of the ensemble over which the gradient is averaged."""
-    spread: Annotated[dict[str, Any] | None, Values()] = None
+    spread: Values | None = None
     """Width of the ensemble in each parameter, by name, in the units of what is searched."""
-    position_noise: Annotated[float, Quantity("spacings", least=0.0)] = EnsembleMean.position_noise
+    position_noise: Annotated[float, quantity("spacings", ge=0.0)] = EnsembleMean.position_noise
     """Standard deviation of the perturbations of first positions in the ensemble."""
 
     @model_validator(mode="after")
@@ -195,24 +199,24 @@ class GradientTable(Table):
 class OptimiseTable(Table):
     """[optimise]: the start of the search, its algorithm, and its length."""
 
-    start: Annotated[dict[str, Any], Values(random=True)]
+    start: Start
     """Parameters with which the search starts; these are optimised."""
-    knots: Annotated[int | None, Count(2, 10_000_000)] = None
+    knots: Annotated[int, count(2, 10_000_000)] | None = None
     """Number of free rows between which parameters over time are interpolated; None: one row for each step."""
-    logarithmic: Annotated[tuple[str, ...], Names()] = ()
+    logarithmic: tuple[Annotated[str, OneOf(NAMES)], ...] = ()
     """Parameters that are searched by their logarithm."""
-    bounds: Annotated[dict[str, Any] | None, Values()] = None
+    bounds: Values | None = None
     """By name: two entries, the lower and the upper bound."""
-    extinction_schedule: Annotated[tuple[float, ...], Schedule()] = (1.0,)
+    extinction_schedule: Schedule = (1.0,)
     """A continuation schedule: one search for each factor, which starts where the last one ended and sees the fluid
     with the scene's extinction times that factor. A picture of thinner fluid shows what is behind its surface."""
-    optimiser: Annotated[str, Choice(tuple(OPTIMISERS))] = "adam"
+    optimiser: Annotated[str, OneOf(OPTIMISERS)] = "adam"
     """Name of the algorithm."""
-    learning_rate: Annotated[float, Quantity(above=0.0)]
+    learning_rate: Annotated[float, quantity("units of the parameters", gt=0.0)]
     """In units of the parameters; for L-BFGS the size of its first step."""
-    tolerance: Annotated[float | None, Quantity(above=0.0, most=0.5)] = None
+    tolerance: Annotated[float, quantity(gt=0.0, le=0.5)] | None = None
     """L-BFGS ends where the gradient is this part of the first one; None: where round-off stops it."""
-    iterations: Annotated[int, Count(1, 10_000_000)]
+    iterations: Annotated[int, count(1, 10_000_000)]
     """Updates at most, of each search."""
     gradient: GradientTable = GradientTable()
     """The gradient that the search follows."""

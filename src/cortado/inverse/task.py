@@ -16,7 +16,7 @@ from cortado.parameters.registry import BY_NAME, Range
 from cortado.parameters.values import OVER_TIME, SUM_TOLERANCE, Arrays, is_too_small
 from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, scene_from_dict
-from cortado.scene.tables import sentences
+from cortado.scene.sentences import sentences
 from cortado.scene.toml import read_toml
 
 
@@ -41,7 +41,7 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
     data = read_toml(path, overrides)
     scene = scene_from_dict(data, file)
     try:
-        with sentences():
+        with sentences(TaskTables):
             tables = TaskTables.model_validate({key: data[key] for key in TaskTables.model_fields if key in data})
         problem, optimise = tables.problem, tables.optimise
         true, steps = problem.target or {}, problem.steps

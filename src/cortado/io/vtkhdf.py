@@ -1,6 +1,6 @@
 """Frames of particles in one temporal VTKHDF file, which ParaView opens and a killed run leaves readable.
 
-A frame is written at the places of its datasets (`Layout`) without HDF5, so that no cache holds anything back.
+A frame is written at the places of its datasets (`Layout`) without HDF5, which a full disk can kill.
 Then one number of eight bytes counts it, and carries the CRC-32 of all frames so far: a SIGKILL comes before or
 after it. The checksums are not those of HDF5, which need datasets in chunks, whose index a killed process
 leaves half written.

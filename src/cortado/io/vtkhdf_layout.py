@@ -5,7 +5,9 @@ datasets that count points and cells have two parts: one with all particles, and
 not there yet is the empty part. One number in `PartOffsets` makes it appear, so that a program that reads the
 file, such as ParaView, finds every size as it was when it looked first.
 
-HDF5 does not get on with a full disk; so it lays the file out in memory, and plain writes take it to the disk.
+HDF5 lays the file out in memory, and plain writes take it to the disk. With writes of HDF5 a file would be as readable
+after a kill, but a full disk then ends the process with a segmentation fault, always while the file is laid out and
+often later (HDF5 2.0). Its mode for one writer and many readers leaves files of killed writers that VTK does not open.
 
 Format: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/vtkhdf_specifications.html
 """

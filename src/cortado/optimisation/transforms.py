@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from scipy.special import softmax
 
 from cortado.arrays import as_numbers
 from cortado.errors import InputError
@@ -55,8 +56,7 @@ class Softmax:
     """p_k = exp(u_k) / sum_l exp(u_l), row by row: fractions (n, phases) that add up to 1."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
-        powers = np.exp(u - u.max(axis=1, keepdims=True))
-        return powers / powers.sum(axis=1, keepdims=True)
+        return softmax(u, axis=1)
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
         u = np.log(np.maximum(parameter, SMALLEST))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cortado.device.cores import usable_cores
 from cortado.discretise.discrete_scene import DiscreteScene, discretise
 from cortado.errors import DivergedError, InputError, shown
 from cortado.lattice.calibration import SKIN
@@ -80,7 +81,7 @@ class Simulation:
         self._region = scene.container.region(scene.dimension).opened(discrete.periods)
         if threads is None:
             least = LEAST_PARALLEL.get(precision, 1000)
-            threads = min(len(os.sched_getaffinity(0)), 1 + len(self.positions) // least)
+            threads = min(usable_cores(), 1 + len(self.positions) // least)
         self.threads = _positive("threads", threads)
         self._engine = extension().make_engine(precision, _engine_scene(scene, discrete), self.threads)
 

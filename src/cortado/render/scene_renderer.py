@@ -13,7 +13,7 @@ from cortado.render.renderer import Renderer
 from cortado.render.views import TopView, View, Volume
 from cortado.scene.render import Render
 from cortado.scene.scene import Scene
-from cortado.scene.tables import sentences
+from cortado.scene.sentences import sentences
 
 UP = {2: 2, 3: 1}
 """The axis that points upwards, by dimension; in 2-D the one that the plane lacks."""
@@ -77,7 +77,7 @@ def _table(scene: Scene, settings: dict[str, Any]) -> Render:
     if settings.get("view", given.get("view")) != given.get("view"):
         given = {name: value for name, value in given.items() if name not in CAMERA}
     resolved = Annotated[Render, AfterValidator(lambda table: table.in_dimension(scene.dimension))]
-    with sentences():
+    with sentences(Scene):
         return TypeAdapter(dict[str, resolved]).validate_python({"render": {**given, **settings}})["render"]
 
 

@@ -15,7 +15,7 @@ from cortado.scene.fields import FieldPath, field_error
 from cortado.scene.fluids import Body, Fluid, PointsFluid
 from cortado.scene.mixture import Mixture
 from cortado.scene.model import SceneTables
-from cortado.scene.tables import field_name
+from cortado.scene.sentences import field_name
 
 MOST_PARTICLES = 2e8
 FURTHEST = 1e9

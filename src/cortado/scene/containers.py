@@ -11,8 +11,8 @@ from cortado.discretise.walls.points import box_walls, cup_walls
 from cortado.errors import Words
 from cortado.lattice.region import Region
 from cortado.lattice.shapes import Points
-from cortado.scene.fields import Choice, Components, FieldPath, Flag, Quantity, Shaped, field_error
-from cortado.scene.fluids import INDEX_OF_AXIS, LENGTH, check_order, refuse_plane
+from cortado.scene.fields import FieldPath, Flag, Length, Vector, field_error, quantity
+from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
 from cortado.scene.tables import Table
 
 
@@ -74,13 +74,13 @@ class BoxContainer(Container):
     """A box, closed on all sides along which it is not periodic."""
 
     shape: Literal["box"] = "box"
-    lower: Annotated[tuple[float, ...], Components(LENGTH)]
+    lower: Vector[Length]
     """(d,) [m]"""
-    upper: Annotated[tuple[float, ...], Components(LENGTH)]
+    upper: Vector[Length]
     """(d,) [m]"""
-    periodic: Annotated[tuple[bool, ...], Components(Flag(), default=(False, False, False))] = ()
+    periodic: Vector[Flag] = (False, False, False)
     """(d,) whether what leaves on one side of an axis comes back on the other."""
-    slip: Annotated[str, Choice(("free", "no"))] = "free"
+    slip: Literal["free", "no"] = "free"
     """"no": the viscous force acts between fluid and wall; "free": it does not."""
 
     @model_validator(mode="after")
@@ -109,17 +109,17 @@ class CylinderContainer(Container):
     """A cup, in 3-D."""
 
     shape: Literal["cylinder"] = "cylinder"
-    base: Annotated[tuple[float, ...], Components(LENGTH)]
+    base: Vector[Length]
     """(3,) centre of the bottom [m]"""
-    radius: Annotated[float, Quantity("m", above=0.0)]
+    radius: Annotated[float, quantity("m", gt=0.0)]
     """[m]"""
-    height: Annotated[float, Quantity("m", above=0.0)]
+    height: Annotated[float, quantity("m", gt=0.0)]
     """From the base, along the axis [m]."""
-    axis: Annotated[str, Choice(("x", "y", "z"))] = "y"
+    axis: Literal["x", "y", "z"] = "y"
     """The axis of space along which it stands."""
-    lid: Annotated[bool, Flag()] = True
+    lid: Flag = True
     """Whether it is closed on top; without a lid, fluid may be above the rim."""
-    slip: Annotated[str, Choice(("free", "no"))] = "free"
+    slip: Literal["free", "no"] = "free"
     """"no": the viscous force acts between fluid and wall; "free": it does not."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
@@ -149,10 +149,7 @@ class CylinderContainer(Container):
         return Places(self.base + np.roll(upright.points, turn, axis=1), np.roll(upright.axes, turn, axis=2))
 
 
-AnyContainer = Annotated[
-    Annotated[BoxContainer | CylinderContainer | NoContainer, Field(discriminator="shape")],
-    Shaped(("box", "cylinder", "none")),
-]
+AnyContainer = Annotated[BoxContainer | CylinderContainer | NoContainer, Field(discriminator="shape")]
 
 
 def check_length(container: Container, spacing: float, support_radius: float) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import field_validator
 
 from cortado.lattice.shapes import ROUND_OFF, Points, across, disc, disc_cells
-from cortado.scene.fields import GREATEST, Components, Quantity, field_error
-from cortado.scene.fluids import LENGTH, Body
+from cortado.scene.fields import GREATEST, Length, Vector, field_error, quantity
+from cortado.scene.fluids import Body
 
 
 @dataclass(frozen=True)
@@ -33,15 +33,15 @@ class EmitterSample:
 class Emitter(Body):
     """An opening, a disc or in 2-D a line, out of which a column of fluid comes with one speed."""
 
-    outlet: Annotated[tuple[float, ...], Components(LENGTH)]
+    outlet: Vector[Length]
     """(d,) centre of the opening [m]"""
-    direction: Annotated[tuple[float, ...], Components(Quantity(), default=(0.0, -1.0, 0.0))] = ()
+    direction: Vector[Annotated[float, quantity()]] = (0.0, -1.0, 0.0)
     """(d,) of the flow, a unit vector once read"""
-    radius: Annotated[float, Quantity("m", above=0.0)]
+    radius: Annotated[float, quantity("m", gt=0.0)]
     """Of the opening [m]."""
-    length: Annotated[float, Quantity("m", above=0.0)]
+    length: Annotated[float, quantity("m", gt=0.0)]
     """Of the column that waits upstream of the opening [m]."""
-    flow_rate: Annotated[float, Quantity("m3/s (m2/s in 2-D)", above=0.0)]
+    flow_rate: Annotated[float, quantity("m3/s (m2/s in 2-D)", gt=0.0)]
     """Volume that comes out in a second [m3/s], in 2-D [m2/s]."""
 
     @field_validator("direction")

@@ -9,18 +9,17 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from cortado.lattice.region import Region
 from cortado.lattice.shapes import ROUND_OFF, Block, Points, block_about, block_between, corners
-from cortado.scene.fields import Choice, Components, FieldPath, Quantity, Shaped, Text, field_error
+from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
 from cortado.scene.points import read_points
 from cortado.scene.tables import Table
 
-LENGTH = Quantity("m")
 INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
 
 
 class Body(Table):
     """Particles of one phase: a body of fluid, or what an emitter holds."""
 
-    phase: Annotated[str, Text()]
+    phase: Text
     """Name of its phase."""
 
     @abstractmethod
@@ -39,7 +38,7 @@ class Body(Table):
 class Fluid(Body):
     """A body of fluid."""
 
-    velocity: Annotated[tuple[float, ...], Components(Quantity("m/s"), default=(0.0, 0.0, 0.0))] = ()
+    velocity: Vector[Annotated[float, quantity("m/s")]] = (0.0, 0.0, 0.0)
     """(d,) [m/s]"""
 
     def corners(self, spacing: float) -> Points:
@@ -85,9 +84,9 @@ class BoxFluid(LatticeFluid):
     """A box, filled with particles at ``lower + (i + 1/2) spacing``."""
 
     shape: Literal["box"] = "box"
-    lower: Annotated[tuple[float, ...], Components(LENGTH)]
+    lower: Vector[Length]
     """(d,) [m]"""
-    upper: Annotated[tuple[float, ...], Components(LENGTH)]
+    upper: Vector[Length]
     """(d,) [m]"""
 
     @model_validator(mode="after")
@@ -106,9 +105,9 @@ class SphereFluid(LatticeFluid):
     """A sphere, or a disc in 2-D."""
 
     shape: Literal["sphere"] = "sphere"
-    centre: Annotated[tuple[float, ...], Components(LENGTH)]
+    centre: Vector[Length]
     """(d,) [m]"""
-    radius: Annotated[float, Quantity("m", above=0.0)]
+    radius: Annotated[float, quantity("m", gt=0.0)]
     """[m]"""
 
     def block(self, spacing: float) -> Block:
@@ -122,13 +121,13 @@ class CylinderFluid(LatticeFluid):
     """A cylinder, in 3-D."""
 
     shape: Literal["cylinder"] = "cylinder"
-    base: Annotated[tuple[float, ...], Components(LENGTH)]
+    base: Vector[Length]
     """(3,) centre of the bottom [m]"""
-    radius: Annotated[float, Quantity("m", above=0.0)]
+    radius: Annotated[float, quantity("m", gt=0.0)]
     """[m]"""
-    height: Annotated[float, Quantity("m", above=0.0)]
+    height: Annotated[float, quantity("m", gt=0.0)]
     """From the base, along the axis [m]."""
-    axis: Annotated[str, Choice(("x", "y", "z"))] = "y"
+    axis: Literal["x", "y", "z"] = "y"
     """The axis of space along which it stands."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
@@ -152,7 +151,7 @@ class PointsFluid(Fluid):
     """Particles at the positions that a file holds."""
 
     shape: Literal["points"] = "points"
-    file: Annotated[str, Text()]
+    file: Text
     """An array (n, d) [m] as .npy, or a .vtk, .vtp or .vtkhdf file, of which the first step is read; beside the scene
     file, and absolute once read."""
 
@@ -179,10 +178,7 @@ class PointsFluid(Fluid):
         return self.points().copy()
 
 
-AnyFluid = Annotated[
-    Annotated[BoxFluid | CylinderFluid | SphereFluid | PointsFluid, Field(discriminator="shape")],
-    Shaped(("box", "cylinder", "sphere", "points")),
-]
+AnyFluid = Annotated[BoxFluid | CylinderFluid | SphereFluid | PointsFluid, Field(discriminator="shape")]
 
 
 def check_order(lower: tuple[float, ...], upper: tuple[float, ...]) -> None:

@@ -1,23 +1,23 @@
 """How the phases of a scene mix, or stay apart."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
-from cortado.scene.fields import Choice, Quantity
+from cortado.scene.fields import quantity
 from cortado.scene.tables import Table
 
 
 class Mixture(Table):
     """The Cahn-Hilliard equation that the mass fractions follow (Yang et al. 2015); the scene's phases, in order."""
 
-    free_energy: Annotated[str, Choice(("double_well", "miscible"))] = "double_well"
+    free_energy: Literal["double_well", "miscible"] = "double_well"
     """"double_well": phases separate, into pure ones; "miscible": they mix, by Fick's law."""
-    strength: Annotated[float, Quantity(above=0.0)] = 1.0
+    strength: Annotated[float, quantity(gt=0.0)] = 1.0
     """alpha, the factor of the free energy."""
-    mobility: Annotated[float, Quantity("m2/s", least=0.0)] = 0.0
+    mobility: Annotated[float, quantity("m2/s", ge=0.0)] = 0.0
     """M [m2/s]; at 0 nothing diffuses, and each particle keeps its phase."""
-    mobility_form: Annotated[str, Choice(("degenerate", "constant"))] = "degenerate"
+    mobility_form: Literal["degenerate", "constant"] = "degenerate"
     """"degenerate": phases exchange only where they touch; "constant": everywhere alike."""
-    interface_width: Annotated[float, Quantity("m", above=0.0)] | None = None
+    interface_width: Annotated[float, quantity("m", gt=0.0)] | None = None
     """epsilon [m]; one spacing if None. An interface is 4.39 epsilon / sqrt(alpha) wide, from 10 % to 90 %."""
 
     def width(self, spacing: float) -> float:

@@ -3,14 +3,14 @@
 Vectors have as many components as the scene has dimensions. Whatever is wrong raises a `SceneError`, one sentence.
 """
 
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationInfo, create_model, field_validator, model_validator
 
 from cortado.parameters.registry import PARAMETERS
 from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import Emitter
-from cortado.scene.fields import COLOUR, Choice, Components, Count, Flag, Quantity, Tables, Text, field_error
+from cortado.scene.fields import Colour, Flag, OneOf, Several, Text, Vector, count, field_error, quantity
 from cortado.scene.fluids import AnyFluid
 from cortado.scene.mixture import Mixture
 from cortado.scene.render import Render
@@ -23,11 +23,11 @@ OTHER_TABLES = ("problem", "optimise")
 class Discretisation(Table):
     """How the fluid is cut into particles."""
 
-    spacing: Annotated[float, Quantity("m", above=0.0)]
+    spacing: Annotated[float, quantity("m", gt=0.0)]
     """Distance between particles at rest [m]."""
-    support: Annotated[float, Quantity(least=1.2, most=4.0)] = 2.0
+    support: Annotated[float, quantity(ge=1.2, le=4.0)] = 2.0
     """Support radius / spacing."""
-    kernel: Annotated[str, Choice(("cubic_spline", "wendland_c2", "wendland_c4"))] = "cubic_spline"
+    kernel: Literal["cubic_spline", "wendland_c2", "wendland_c4"] = "cubic_spline"
     """Name of the smoothing kernel."""
 
     @property
@@ -39,31 +39,31 @@ class Discretisation(Table):
 class Phase(Table):
     """A material."""
 
-    name: Annotated[str, Text()]
+    name: Text
     """What fluids call it."""
-    rest_density: Annotated[float, Quantity("kg/m3", above=0.0)]
+    rest_density: Annotated[float, quantity("kg/m3", gt=0.0)]
     """[kg/m3]"""
-    viscosity: Annotated[float, Quantity("Pa s", least=0.0)]
+    viscosity: Annotated[float, quantity("Pa s", ge=0.0)]
     """Dynamic [Pa s]."""
-    colour: Annotated[tuple[float, ...], COLOUR] = (0.1, 0.3, 0.8)
+    colour: Colour = (0.1, 0.3, 0.8)
     """(3,) red, green and blue, each from 0 to 1."""
 
 
 class FixedForces(Table):
     """The forces that every scene has."""
 
-    gravity: Annotated[tuple[float, ...], Components(Quantity("m/s2"), default=(0.0, -9.81, 0.0))] = ()
+    gravity: Vector[Annotated[float, quantity("m/s2")]] = (0.0, -9.81, 0.0)
     """(d,) [m/s2]"""
-    viscosity: Annotated[str, Choice(("pairwise", "laminar", "none"))] = "pairwise"
-    """"pairwise": the report's equation 10; "laminar": Morris et al. (1997)."""
-    pressure: Annotated[bool, Flag()] = True
+    viscosity: Literal["pairwise", "laminar", "none"] = "pairwise"
+    """"pairwise": that of Monaghan (2005); "laminar": Morris et al. (1997)."""
+    pressure: Flag = True
     """Whether the fluid resists compression."""
 
 
 _OPTIONAL: dict[str, Any] = {
-    parameter.name: (Annotated[float, Quantity(parameter.unit, least=0.0)] | None, None)
-    for parameter in PARAMETERS
-    if parameter.is_optional
+    p.name: (Annotated[float, quantity(p.unit, ge=0.0)] | None, Field(None, description=p.meaning))
+    for p in PARAMETERS
+    if p.is_optional
 }
 Forces: Any = create_model("Forces", __base__=FixedForces, __module__=__name__, **_OPTIONAL)
 """Which forces act: `FixedForces`, and the optional ones of the registry of parameters."""
@@ -76,17 +76,17 @@ SOLVERS = {"pcisph": "cortado.solvers.pcisph.build"}
 class Solver(Table):
     """How a step is solved."""
 
-    kind: Annotated[str, Choice(tuple(SOLVERS))] = "pcisph"
+    kind: Annotated[str, OneOf(SOLVERS)] = "pcisph"
     """Name of the algorithm."""
-    time_step: Annotated[float, Quantity("s", above=0.0)]
+    time_step: Annotated[float, quantity("s", gt=0.0)]
     """[s]"""
-    minimum_iterations: Annotated[int, Count(1, 1_000_000)] = 3
+    minimum_iterations: Annotated[int, count(1, 1_000_000)] = 3
     """Pressure iterations of a step, at least."""
-    maximum_iterations: Annotated[int, Count(1, 1_000_000)] = 50
+    maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
     """Pressure iterations of a step, at most."""
-    density_tolerance: Annotated[float, Quantity(least=0.0)] = 0.01
+    density_tolerance: Annotated[float, quantity(ge=0.0)] = 0.01
     """On the average of (rho - rho_0) / rho_0."""
-    maximum_density_tolerance: Annotated[float, Quantity(least=0.0)] | None = None
+    maximum_density_tolerance: Annotated[float, quantity(ge=0.0)] | None = None
     """On the maximum of (rho - rho_0) / rho_0; not used if None."""
 
     @model_validator(mode="after")
@@ -101,15 +101,15 @@ class SceneTables(Table):
     """Everything that a simulation starts from, each table right in itself."""
 
     beside: ClassVar = OTHER_TABLES
-    name: Annotated[str, Text()] = "scene"
+    name: Text = "scene"
     """Shown in titles."""
-    dimension: Annotated[int, Count(2, 3)]
+    dimension: Annotated[int, count(2, 3)]
     """2 or 3; d below."""
     discretisation: Discretisation
     """How the fluid is cut into particles."""
-    phase: Annotated[tuple[Phase, ...], Tables("phase")]
+    phase: Several[Phase]
     """The materials: in this order the components of mass fractions."""
-    fluid: Annotated[tuple[AnyFluid, ...], Tables("fluid")]
+    fluid: Several[AnyFluid]
     """The bodies of fluid; particles come in this order."""
     emitter: Emitter | None = None
     """An emitter, out of which fluid comes; its particles come after those of all fluids."""

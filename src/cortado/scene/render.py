@@ -1,32 +1,32 @@
 """How pictures of a scene are taken."""
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from cortado.scene.fields import COLOUR, MISSING, Choice, Count, FieldPath, Parts, Quantity, field_error
+from cortado.scene.fields import MISSING, Colour, FieldPath, Length, components, count, field_error, quantity
 from cortado.scene.tables import Table
 
-PIXELS = Parts(Count(8, 4096), ("columns", "rows"))
-PLACE = Parts(Quantity("m"), ("x", "y", "z"))
+Pixels = Annotated[tuple[Annotated[int, count(8, 4096)], ...], components("columns", "rows")]
+Place = Annotated[tuple[Length, ...], components("x", "y", "z")]
 
 
 class Render(Table):
     """The view, and for a view of the volume its camera."""
 
-    view: Annotated[str, Choice(("top", "volume", "plane"))] = "top"
+    view: Literal["top", "volume", "plane"] = "top"
     """"top": from above; "volume": through a camera; "plane": the plane itself, in 2-D, where it is the default."""
-    resolution: Annotated[tuple[int, ...], PIXELS] = (128, 128)
+    resolution: Pixels = (128, 128)
     """(2,) columns and rows of pixels"""
-    background: Annotated[tuple[float, ...], COLOUR] = (1.0, 1.0, 1.0)
+    background: Colour = (1.0, 1.0, 1.0)
     """(3,) red, green and blue, each from 0 to 1"""
-    extinction: Annotated[float, Quantity("1/m", above=0.0)] | None = None
+    extinction: Annotated[float, quantity("1/m", gt=0.0)] | None = None
     """How quickly light fades in fluid [1/m]; left to the renderer if None."""
-    position: Annotated[tuple[float, ...], PLACE] | None = Field(default=None, validate_default=True)
+    position: Place | None = Field(default=None, validate_default=True)
     """(3,) where the camera is [m]; for a view of the volume, which needs it"""
-    look_at: Annotated[tuple[float, ...], PLACE] | None = Field(default=None, validate_default=True)
+    look_at: Place | None = Field(default=None, validate_default=True)
     """(3,) the middle of the picture [m]; for a view of the volume, which needs it"""
-    field_of_view: Annotated[float, Quantity("degrees", above=0.0, most=170.0)] | None = Field(
+    field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=170.0)] | None = Field(
         default=None, validate_default=True
     )
     """The angle that the width of the picture spans [degrees]; for a view of the volume, 40 if left out."""
@@ -40,7 +40,7 @@ class Render(Table):
         if value is None and view == "volume":
             if info.field_name == "field_of_view":
                 return 40.0
-            raise field_error((), MISSING, f'{PLACE.wanted}, as the view is "volume"')
+            raise field_error((), MISSING, 'a list of 3 components: x, y and z, as the view is "volume"')
         return value
 
     @model_validator(mode="after")

@@ -15,8 +15,8 @@ from pydantic import model_validator
 from cortado.errors import CortadoWarning, InputError, SceneError, shown
 from cortado.scene.checks import check_scene
 from cortado.scene.model import OTHER_TABLES, SceneTables
+from cortado.scene.sentences import sentences
 from cortado.scene.stability import stability_limit
-from cortado.scene.tables import sentences
 from cortado.scene.toml import read_toml
 
 
@@ -74,7 +74,7 @@ def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
         data = {key: value for key, value in data.items() if key not in OTHER_TABLES}
     folder = Path(file).parent if file else Path()
     try:
-        with sentences():
+        with sentences(Scene):
             return Scene.model_validate(data, context={"folder": folder})
     except SceneError as error:
         raise (error.in_file(file) if file else error) from None

@@ -65,6 +65,11 @@ def growth_rate(steps: ArrayLike, sizes: ArrayLike) -> float:
     return float(np.polyfit(steps, np.log(sizes), 1)[0]) if len(steps) >= 3 else float("nan")
 
 
+def geometric_mean(values: ArrayLike) -> float:
+    """The geometric mean of positive values; a value that underflowed to 0 counts as 1e-300."""
+    return float(np.exp(np.log(np.maximum(values, 1e-300)).mean()))
+
+
 def norms(vectors: ArrayLike) -> NDArray[np.float64]:
     """Euclidean norms (frames,) of (frames, n, d); inf where a square overflows."""
     with np.errstate(over="ignore", invalid="ignore"):

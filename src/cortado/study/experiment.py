@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 from cortado.io.progress import Advance
-from cortado.scene import fields, tables
-from cortado.scene.fields import Text, as_sequence, field_error
+from cortado.scene import tables
+from cortado.scene.fields import Text, components, quantity
 from cortado.scene.scene import Scene
 from cortado.study.tables import Table
 
@@ -21,7 +21,7 @@ class Settings(tables.Table):
     Their field types are those of `cortado.scene.fields`, which make sentences of errors.
     """
 
-    title: Annotated[str, Text()]
+    title: Text
     """The title of the picture."""
 
     def identity(self) -> dict[str, Any]:
@@ -40,25 +40,11 @@ class SceneSettings(Settings):
 class DeviceSettings(Settings):
     """Settings of an experiment that runs on a device; the others use the reference engine."""
 
-    device: Annotated[str, Text()] = "cpu"
+    device: Text = "cpu"
     """"cpu", or "cuda:0" for the first GPU."""
 
 
-@dataclass(frozen=True)
-class Several(fields.FieldType):
-    """A list of at least one value: ``Annotated[tuple[float, ...], Several(Quantity("s", above=0.0))]``."""
-
-    entry: fields.FieldType
-
-    @property
-    def wanted(self) -> str:
-        return f"a list of at least one entry, each {self.entry.wanted}"
-
-    def check(self, value: Any) -> tuple[Any, ...]:
-        entries = as_sequence(value)
-        if not entries:
-            raise field_error((), value, self.wanted)
-        return fields.Components(self.entry).check(entries)
+Window = Annotated[tuple[Annotated[float, quantity("steps", ge=0.0)], ...], components("first", "last")]
 
 
 class Progress(Protocol):

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from cortado.errors import SceneError
-from cortado.scene.fields import MISSING, Choice
+from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, scene_from_dict
-from cortado.scene.tables import sentences
+from cortado.scene.sentences import sentences, wanted
 from cortado.scene.toml import read_toml
 from cortado.study.experiment import Experiment
 from cortado.study.registry import EXPERIMENT_TYPES
@@ -31,13 +31,13 @@ def load_experiment(path: str | os.PathLike[str], reduced: bool = False, overrid
     if reduced:
         data |= replaced
     name = data.pop("kind", MISSING)
-    if name not in EXPERIMENT_TYPES:
-        raise SceneError(file, "kind", name, Choice(tuple(EXPERIMENT_TYPES)).wanted)
+    if not isinstance(name, str) or name not in EXPERIMENT_TYPES:
+        raise SceneError(file, "kind", name, wanted({"enum": list(EXPERIMENT_TYPES)}))
     experiment_type = EXPERIMENT_TYPES[name]
     if "scene" in experiment_type.settings.model_fields and "scene" in data:
         data["scene"] = _scene(data["scene"], file)
     try:
-        with sentences():
+        with sentences(experiment_type.settings):
             settings = experiment_type.settings.model_validate(data, context={"folder": Path(file).parent})
     except SceneError as error:
         raise error.in_file(file) from None

@@ -8,10 +8,10 @@ import numpy as np
 
 from cortado.figures.canvas import DASHED, PALETTE
 from cortado.reference import Terms
-from cortado.scene.fields import Choice, Count, Quantity
+from cortado.scene.fields import OneOf, Several, count, quantity
 from cortado.study.canvas import blank
 from cortado.study.comparison import growth
-from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Several
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings
 from cortado.study.gravity_tangents import COST, LABEL, along_gravity, row
 from cortado.study.scenes import varied
 from cortado.study.sources import ReferenceTangent
@@ -50,13 +50,13 @@ ABLATIONS = {
 class Forces(SceneSettings):
     """Settings."""
 
-    steps: Annotated[int, Count(8, 1_000_000)]
+    steps: Annotated[int, count(8, 1_000_000)]
     """Steps of the run."""
-    precision: Annotated[str, Choice(tuple(COST))] = "float64"
+    precision: Annotated[str, OneOf(COST)] = "float64"
     """Precision of the reference engine."""
-    differences: Annotated[tuple[float, ...], Several(Quantity("m/s2", above=0.0))] = ()
+    differences: Several[Annotated[float, quantity("m/s2", gt=0.0)]] = ()
     """Steps of finite differences [m / s2]; without any, the picture is of the analytic derivative."""
-    impact: Annotated[int, Count(0, 1_000_000)]
+    impact: Annotated[int, count(0, 1_000_000)]
     """The step from which on growth is measured: when the fluid has hit the floor."""
 
 

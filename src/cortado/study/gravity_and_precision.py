@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from cortado.figures.canvas import DASHED, FAINT, PALETTE
-from cortado.scene.fields import Choice, Count, Quantity
+from cortado.scene.fields import OneOf, Several, count, quantity
 from cortado.study.canvas import blank
-from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Several
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings
 from cortado.study.gravity_tangents import COST, LABEL, along_gravity
 from cortado.study.sources import ReferenceTangent
 from cortado.study.tables import Table
@@ -22,13 +22,13 @@ DIFFERENCES, ANALYTIC = "finite differences", "analytic"
 class GravityAndPrecision(SceneSettings):
     """Settings."""
 
-    steps: Annotated[int, Count(1, 1_000_000)]
+    steps: Annotated[int, count(1, 1_000_000)]
     """Number of steps after which the gradient is measured."""
-    gravities: Annotated[tuple[float, ...], Several(Quantity("m/s2", above=0.0))]
+    gravities: Several[Annotated[float, quantity("m/s2", gt=0.0)]]
     """Sizes of gravity, in the direction of the scene's [m / s2]."""
-    precisions: Annotated[tuple[str, ...], Several(Choice(tuple(COST)))]
+    precisions: Several[Annotated[str, OneOf(COST)]]
     """Precisions; the last one is the reference for the others."""
-    difference: Annotated[float, Quantity("m/s2", above=0.0)]
+    difference: Annotated[float, quantity("m/s2", gt=0.0)]
     """Step of the finite differences [m / s2]."""
 
 

@@ -1,6 +1,6 @@
 """The report's Figure 3: the gradient of an image's loss by autograd and by finite differences, over the horizon."""
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
@@ -9,11 +9,11 @@ from cortado.gradients import Exact, Tape
 from cortado.losses import FinalPositions, Image
 from cortado.problem import Problem
 from cortado.render.scene_renderer import scene_renderer
-from cortado.scene.fields import Choice, Components, Count, Quantity
+from cortado.scene.fields import Several, Vector, count, quantity
 from cortado.simulation import Simulation
 from cortado.study.canvas import blank
 from cortado.study.comparison import growth
-from cortado.study.experiment import DeviceSettings, ExperimentType, Progress, SceneSettings, Several
+from cortado.study.experiment import DeviceSettings, ExperimentType, Progress, SceneSettings
 from cortado.study.sources import ByEstimator, FiniteDifference, Source, Warp
 from cortado.study.tables import Table
 
@@ -28,13 +28,13 @@ SAME = 0.1
 class ImageHorizon(DeviceSettings, SceneSettings):
     """Settings."""
 
-    horizons: Annotated[tuple[int, ...], Several(Count(1, 1_000_000))]
+    horizons: Several[Annotated[int, count(1, 1_000_000)]]
     """Numbers of steps, growing."""
-    true_gravity: Annotated[tuple[float, ...], Components(Quantity("m/s2"))]
+    true_gravity: Vector[Annotated[float, quantity("m/s2")]]
     """(d,) the true gravity, whose picture is the target [m / s2]; the gradient is taken at the scene's own."""
-    differences: Annotated[tuple[float, ...], Several(Quantity("m/s2", above=0.0))]
+    differences: Several[Annotated[float, quantity("m/s2", gt=0.0)]]
     """Steps of finite differences [m / s2]."""
-    precision: Annotated[str, Choice(("float32", "float64"))] = "float32"
+    precision: Literal["float32", "float64"] = "float32"
     """Precision of the simulation."""
 
 

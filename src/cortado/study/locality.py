@@ -17,12 +17,12 @@ import numpy as np
 from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE
 from cortado.lattice.smoothing import smoothing_kernel
 from cortado.reference import History, Simulation
-from cortado.scene.fields import Components, Count, Quantity
+from cortado.scene.fields import Vector, count, quantity
 from cortado.study import spatial_scales
 from cortado.study.canvas import blank
 from cortado.study.ensembles import perturbed, side_by_side
-from cortado.study.estimates import Estimate, growth_rate
-from cortado.study.experiment import ExperimentType, Progress, SceneSettings
+from cortado.study.estimates import Estimate, geometric_mean, growth_rate
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Window
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -35,18 +35,18 @@ SIZES = {"size": "all particles", "modes size": "longest waves", "common size": 
 class LocalitySettings(SceneSettings):
     """Settings of the decomposition of tangents by scale."""
 
-    direction: Annotated[tuple[float, ...], Components(Quantity("m/s2"))]
+    direction: Vector[Annotated[float, quantity("m/s2")]]
     """Direction of the change of gravity."""
-    change: Annotated[float, Quantity("m/s2", above=0.0)]
+    change: Annotated[float, quantity("m/s2", gt=0.0)]
     """The change of gravity that is not small, in both directions."""
-    steps: Annotated[int, Count(2, 10_000)]
-    record_every: Annotated[int, Count(1, 1000)]
-    window: Annotated[tuple[float, ...], Components(Quantity("steps", least=0.0))]
+    steps: Annotated[int, count(2, 10_000)]
+    record_every: Annotated[int, count(1, 1000)]
+    window: Window
     """Begin and end of the window in which rates are fitted and fractions averaged."""
-    long_modes: Annotated[int, Count(1, 10_000)]
+    long_modes: Annotated[int, count(1, 10_000)]
     """Number of cosine modes that count as long waves."""
-    seeds: Annotated[int, Count(1, 100)]
-    perturbation: Annotated[float, Quantity("spacings", least=0.0)]
+    seeds: Annotated[int, count(1, 100)]
+    perturbation: Annotated[float, quantity("spacings", ge=0.0)]
     """Perturbation of the first positions [spacings]."""
 
 
@@ -129,9 +129,9 @@ def draw(table: Table, settings: LocalitySettings) -> Figure:
         spread.plot(table.values("step"), count, label=vector, **style)
     spectrum.set(title="Energy in the longest waves", xlabel="cosine modes of the box", ylabel="share")
     spectrum.legend(fontsize=9)
-    for k, (quantity, name) in enumerate(SIZES.items()):
+    for k, (size, name) in enumerate(SIZES.items()):
         for vector, style in ((GRAVITY, {}), (CHANGE, DASHED)):
-            sizes = [_mean(rows, logarithmic=True) for rows in _by_step(table, vector, quantity)]
+            sizes = [_mean(rows, logarithmic=True) for rows in _by_step(table, vector, size)]
             label = name if vector == GRAVITY else None
             growth.semilogy(table.values("step"), sizes, color=PALETTE[k], label=label, **style)
     growth.plot([], [], color=FAINT, label=f"change of {settings.change:g} m/s²", **DASHED)
@@ -195,7 +195,7 @@ def _by_step(table: Table, vector: str, quantity: str) -> Iterator[Table]:
 
 
 def _mean(rows: Table, logarithmic: bool = False) -> float:
-    return float(np.exp(np.log(rows["value"]).mean()) if logarithmic else rows["value"].mean())
+    return geometric_mean(rows["value"]) if logarithmic else float(rows["value"].mean())
 
 
 def _rate(inside: Table, vector: str, quantity: str) -> Estimate:

@@ -9,64 +9,64 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from cortado.reference import Simulation, Terms
 from cortado.scene import tables
-from cortado.scene.fields import Choice, Components, Count, Quantity, Tables, Text
+from cortado.scene.fields import Several, Text, components, count, quantity
 from cortado.scene.scene import Scene
 from cortado.study.ensembles import perturbed, side_by_side
 from cortado.study.estimates import growth_rate, norms
-from cortado.study.experiment import Progress, SceneSettings, Several
+from cortado.study.experiment import Progress, SceneSettings
 from cortado.study.lyapunov_spectrum import growth_by_segment
 from cortado.study.scenes import varied
 from cortado.study.tables import Table
 
-Term = Choice(("viscosity", "pressure", "hessian", "density"))
+Term = Literal["viscosity", "pressure", "hessian", "density"]
 
 
 class Variant(tables.Table):
     """A variant of the scene or of the derivative, which differs in one setting."""
 
-    panel: Annotated[str, Text()]
+    panel: Text
     """The panel of the picture in which it is drawn."""
-    label: Annotated[str, Text()]
+    label: Text
     """Label of a curve in the panel, or of a bar where there is no ``x``."""
-    x: Annotated[float | None, Quantity()] = None
+    x: Annotated[float, quantity()] | None = None
     """Its place on the curve."""
     scene: Mapping[str, Any] = Field(default_factory=dict)
     """Replacements in the scene."""
-    without: Annotated[tuple[str, ...], Several(Term)] = ()
+    without: Several[Term] = ()
     """Terms of the tangent that are left out (`cortado.reference.Terms`)."""
 
 
 class LyapunovSettings(SceneSettings):
     """Exponents of the scene and of its variants."""
 
-    fall: Annotated[float, Quantity("m", above=0.0)]
+    fall: Annotated[float, quantity("m", gt=0.0)]
     """Height of the fall. Times are in units of its duration, (2 fall / g)^(1/2), so that variants with another gravity
     are compared at the same stage."""
-    window: Annotated[tuple[float, ...], Components(Quantity("falls", least=0.0))]
+    window: Annotated[tuple[Annotated[float, quantity("falls", ge=0.0)], ...], components("first", "last")]
     """Begin and end of the window in which exponents are measured."""
-    seeds: Annotated[int, Count(1, 100)]
-    perturbation: Annotated[float, Quantity("spacings", least=0.0)]
+    seeds: Annotated[int, count(1, 100)]
+    perturbation: Annotated[float, quantity("spacings", ge=0.0)]
     """Perturbation of the first positions [spacings]."""
-    vectors: Annotated[int, Count(1, 1000)]
+    vectors: Annotated[int, count(1, 1000)]
     """Number of tangents for a variant."""
-    spectrum: Annotated[int, Count(1, 10_000)]
+    spectrum: Annotated[int, count(1, 10_000)]
     """Number of tangents for the scene itself, with one seed."""
-    segment: Annotated[int, Count(1, 1000)]
+    segment: Annotated[int, count(1, 1000)]
     """Steps between two orthonormalisations."""
-    velocity_time: Annotated[float, Quantity("s", above=0.0)]
+    velocity_time: Annotated[float, quantity("s", gt=0.0)]
     """Factor of velocities in the norm of a tangent."""
-    separation: Annotated[float, Quantity("m", above=0.0)]
+    separation: Annotated[float, quantity("m", gt=0.0)]
     """Distance of two runs at the start, in each coordinate."""
-    linear: Annotated[float, Quantity("m", above=0.0)]
+    linear: Annotated[float, quantity("m", gt=0.0)]
     """Distance of two runs, over all particles, up to which their divergence is measured."""
-    variants: Annotated[tuple[Variant, ...], Tables("variants")]
+    variants: Several[Variant]
 
 
 def window_steps(settings: LyapunovSettings, scene: Scene) -> tuple[int, int]:

@@ -10,10 +10,10 @@ import numpy as np
 
 from cortado.figures.canvas import PALETTE
 from cortado.reference import Terms
-from cortado.scene.fields import Choice, Count
+from cortado.scene.fields import OneOf, Several, count
 from cortado.study.canvas import blank
 from cortado.study.comparison import growth
-from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Several
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings
 from cortado.study.gravity_tangents import COST, LABEL, along_gravity, row
 from cortado.study.sources import ReferenceTangent
 from cortado.study.tables import Table
@@ -30,11 +30,11 @@ PROPAGATED, ONE_STEP = "propagated", "in one step"
 class PressureTerms(SceneSettings):
     """Settings."""
 
-    steps: Annotated[int, Count(8, 1_000_000)]
+    steps: Annotated[int, count(8, 1_000_000)]
     """Steps of the run."""
-    precisions: Annotated[tuple[str, ...], Several(Choice(tuple(COST)))]
+    precisions: Several[Annotated[str, OneOf(COST)]]
     """Precisions of the reference engine."""
-    impact: Annotated[int, Count(0, 1_000_000)]
+    impact: Annotated[int, count(0, 1_000_000)]
     """The step from which on growth is measured: when the fluid has hit the floor."""
 
 

@@ -15,11 +15,11 @@ import numpy as np
 
 from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE
 from cortado.reference import Digits, History, Simulation
-from cortado.scene.fields import Choice, Components, Count, Quantity
+from cortado.scene.fields import OneOf, Several, Vector, count, quantity
 from cortado.study.canvas import blank
 from cortado.study.ensembles import perturbed, side_by_side
 from cortado.study.estimates import Estimate, Line, growth_rate, norms
-from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Several
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Window
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -32,20 +32,20 @@ ROUND_OFF_UNIT = {"float32": 2.0**-24, "float64": 2.0**-53, "float80": 2.0**-64,
 class RoundOffSettings(SceneSettings):
     """Settings of tangents in several precisions."""
 
-    direction: Annotated[tuple[float, ...], Components(Quantity("m/s2"))]
+    direction: Vector[Annotated[float, quantity("m/s2")]]
     """Direction of the change of gravity."""
-    precisions: Annotated[tuple[str, ...], Several(Choice(tuple(ROUND_OFF_UNIT)))]
-    reference: Annotated[str, Choice(tuple(ROUND_OFF_UNIT))]
+    precisions: Several[Annotated[str, OneOf(ROUND_OFF_UNIT)]]
+    reference: Annotated[str, OneOf(ROUND_OFF_UNIT)]
     """The precision of the reference run."""
-    steps: Annotated[int, Count(2, 10_000)]
-    record_every: Annotated[int, Count(1, 1000)]
+    steps: Annotated[int, count(2, 10_000)]
+    record_every: Annotated[int, count(1, 1000)]
     """Steps between two rows."""
-    threshold: Annotated[float, Quantity(above=0.0, most=1.0)]
+    threshold: Annotated[float, quantity(gt=0.0, le=1.0)]
     """Relative error beyond which a tangent counts as different from the reference."""
-    window: Annotated[tuple[float, ...], Components(Quantity("steps", least=0.0))]
+    window: Window
     """Begin and end of the window in which the growth rate is fitted."""
-    seeds: Annotated[int, Count(1, 100)]
-    perturbation: Annotated[float, Quantity("spacings", least=0.0)]
+    seeds: Annotated[int, count(1, 100)]
+    perturbation: Annotated[float, quantity("spacings", ge=0.0)]
     """Perturbation of the first positions [spacings]."""
 
 

@@ -15,11 +15,11 @@ import numpy as np
 
 from cortado.figures.canvas import DASHED, FAINT, INK
 from cortado.reference import Simulation
-from cortado.scene.fields import Components, Count, Quantity
+from cortado.scene.fields import Several, Vector, count, quantity
 from cortado.study.canvas import blank
 from cortado.study.ensembles import perturbed, side_by_side
-from cortado.study.estimates import Estimate, Line, norms
-from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Several
+from cortado.study.estimates import Estimate, Line, geometric_mean, norms
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings
 from cortado.study.palette import palette
 from cortado.study.tables import Table
 
@@ -36,14 +36,14 @@ THIN: dict[str, Any] = {"markersize": 3.5, "linewidth": 1.4}
 class StepSizeSettings(SceneSettings):
     """Settings of differences of several steps h, at several horizons."""
 
-    direction: Annotated[tuple[float, ...], Components(Quantity("m/s2"))]
+    direction: Vector[Annotated[float, quantity("m/s2")]]
     """Direction of the change of gravity."""
-    differences: Annotated[tuple[float, ...], Several(Quantity("m/s2", above=0.0))]
-    horizons: Annotated[tuple[int, ...], Several(Count(1, 10_000))]
+    differences: Several[Annotated[float, quantity("m/s2", gt=0.0)]]
+    horizons: Several[Annotated[int, count(1, 10_000)]]
     """Numbers of time steps."""
-    seeds: Annotated[int, Count(2, 100)]
+    seeds: Annotated[int, count(2, 100)]
     """Number of first states; the distance is that of two of the runs."""
-    perturbation: Annotated[float, Quantity("spacings", above=0.0)]
+    perturbation: Annotated[float, quantity("spacings", gt=0.0)]
     """Perturbation of the first positions [spacings]."""
 
 
@@ -93,16 +93,17 @@ def draw(table: Table, settings: StepSizeSettings) -> Figure:
     figure.suptitle(settings.title)
     horizons, differences = table.values("horizon"), table.values("difference")
     for difference, shade in zip(differences, palette(len(differences)), strict=True):
-        found = [_mean(table.where(difference=difference, horizon=horizon)["size"]) for horizon in horizons]
+        found = [geometric_mean(table.where(difference=difference, horizon=horizon)["size"]) for horizon in horizons]
         sizes.semilogy(horizons, found, "o-", color=shade, label=f"step {difference:.0e}", **THIN)
         rows = table.where(difference=difference)
         law.loglog(_strength(rows), _saturation(rows), "o", markersize=3.5, color=shade, alpha=0.7)
-    exact = [_mean(table.where(horizon=horizon)["exact"]) for horizon in horizons]
+    exact = [geometric_mean(table.where(horizon=horizon)["exact"]) for horizon in horizons]
     sizes.semilogy(horizons, exact, color=INK, label="exact", **DASHED)
     sizes.set(title="Size over the horizon", xlabel="steps", ylabel="|dx / dg| [s²]")
     sizes.legend(fontsize=8)
     for horizon, shade in zip(horizons, palette(len(horizons)), strict=True):
-        values = [_mean(table.where(difference=difference, horizon=horizon)["error"]) for difference in differences]
+        of_seeds = [table.where(difference=size, horizon=horizon)["error"] for size in differences]
+        values = [geometric_mean(one) for one in of_seeds]
         errors.loglog(differences, values, "o-", color=shade, label=f"{horizon} steps", **THIN)
     errors.axhline(AGREES, **DASHED, color=FAINT)
     errors.set(title="Error over the step", xlabel="step h [m/s²]", ylabel="relative error")
@@ -134,15 +135,16 @@ def verdict(table: Table, settings: StepSizeSettings) -> list[str]:
         slope = Line.through(np.log(sizes), np.log(ends)).slope
         sentences.append(
             f"The largest step that agrees within {AGREES:.0%} falls as |dx/dg| to the power {slope} (-1 expected): it "
-            f"moves the particles by {_mean(reach):.0e} m in all, times or over {np.exp(np.log(reach).std()):.0f}."
+            f"moves the particles by {geometric_mean(reach):.0e} m in all, times or over "
+            f"{np.exp(np.log(reach).std()):.0f}."
         )
     saturated = table.chosen(_strength(table) > SATURATED)
     if len(saturated) >= 3:
         slope = Line.through(np.log(saturated["difference"]), np.log(saturated["size"])).slope
-        by_seed = [np.exp(np.log(_saturation(rows)).mean()) for _, rows in saturated.groups("seed")]
+        by_seed = [geometric_mean(_saturation(rows)) for _, rows in saturated.groups("seed")]
         factor = Estimate.of(by_seed)
         flat = table.where(difference=max(settings.differences), horizon=last)
-        ratio = _mean(flat["exact"] / flat["size"])
+        ratio = geometric_mean(flat["exact"] / flat["size"])
         sentences.append(
             f"Beyond, differences saturate: their size goes as the step to the power {slope} (-1 expected), and is "
             f"{factor} times D / (2 h) (1 expected), D the distance of two unrelated states. At {last} steps the exact "
@@ -162,11 +164,6 @@ def _strength(table: Table) -> np.ndarray:
 
 def _saturation(table: Table) -> np.ndarray:
     return 2.0 * table["difference"] * table["size"] / table["distance"]
-
-
-def _mean(values: np.ndarray) -> float:
-    """The geometric mean."""
-    return float(np.exp(np.log(np.maximum(values, 1e-300)).mean()))
 
 
 STEP_SIZE = ExperimentType("step_size", StepSizeSettings, measure, draw, verdict)

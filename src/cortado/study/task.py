@@ -1,7 +1,7 @@
 """The report's Figures 1 and 2: an optimisation task from ``examples/``, its loss and its pictures on the way."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import ValidationInfo, field_validator
@@ -14,9 +14,9 @@ from cortado.inverse.task import load_task
 from cortado.io.srgb import to_srgb
 from cortado.losses.image_losses import psnr
 from cortado.optimisation.optimise import Record, optimise
-from cortado.scene.fields import Choice, Text
+from cortado.scene.fields import Several, Text
 from cortado.study.canvas import blank
-from cortado.study.experiment import DeviceSettings, ExperimentType, Progress, Several
+from cortado.study.experiment import DeviceSettings, ExperimentType, Progress
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -30,11 +30,11 @@ TARGET = "target"
 class TaskSettings(DeviceSettings):
     """Settings."""
 
-    task: Annotated[str, Text()]
+    task: Text
     """The task's file, relative to this one; its loss must be one of images."""
-    overrides: Annotated[tuple[str, ...], Several(Text())] = ()
+    overrides: Several[Text] = ()
     """Replacements in it, such as "optimise.iterations=20"."""
-    precision: Annotated[str, Choice(("float32", "float64"))] = "float32"
+    precision: Literal["float32", "float64"] = "float32"
     """Of the simulation."""
 
     @field_validator("task")

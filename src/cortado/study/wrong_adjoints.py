@@ -14,12 +14,12 @@ import numpy as np
 from cortado import gradients, losses, reference
 from cortado.figures.canvas import DASHED, INK, PALETTE
 from cortado.problem import Problem
-from cortado.scene.fields import Count, Quantity
+from cortado.scene.fields import Several, count, quantity
 from cortado.simulation import Simulation
 from cortado.study.canvas import blank
 from cortado.study.ensembles import perturbed
-from cortado.study.estimates import Estimate, growth_rate
-from cortado.study.experiment import DeviceSettings, ExperimentType, Progress, SceneSettings, Several
+from cortado.study.estimates import Estimate, geometric_mean, growth_rate
+from cortado.study.experiment import DeviceSettings, ExperimentType, Progress, SceneSettings
 from cortado.study.one_kernel_loops import OneKernelTape
 from cortado.study.tables import Table
 
@@ -45,12 +45,12 @@ PARAMETERS = ("gravity", "initial_positions")
 class WrongAdjointsSettings(SceneSettings, DeviceSettings):
     """Settings. The loss is the distance from the first state, which is one in the middle of a splash."""
 
-    start: Annotated[int, Count(0, 10_000)]
+    start: Annotated[int, count(0, 10_000)]
     """Time steps before the first state."""
-    horizons: Annotated[tuple[int, ...], Several(Count(1, 10_000))]
+    horizons: Several[Annotated[int, count(1, 10_000)]]
     """Numbers of time steps after it."""
-    seeds: Annotated[int, Count(1, 100)]
-    perturbation: Annotated[float, Quantity("spacings", least=0.0)]
+    seeds: Annotated[int, count(1, 100)]
+    perturbation: Annotated[float, quantity("spacings", ge=0.0)]
     """Perturbation of the positions before the first step [spacings]."""
 
 
@@ -102,15 +102,15 @@ def draw(table: Table, settings: WrongAdjointsSettings) -> Figure:
     horizons = table.values("horizon")
     for axes, parameter in zip(errors, PARAMETERS, strict=True):
         for way in WAYS:
-            found = [_mean(table.where(parameter=parameter, way=way, horizon=h)["error"]) for h in horizons]
+            found = [geometric_mean(table.where(parameter=parameter, way=way, horizon=h)["error"]) for h in horizons]
             axes.loglog(horizons, found, **{"marker": "o", "markersize": 4, "label": way, **STYLES[way]})
         axes.set(title=f"Gradient by {parameter.replace('_', ' ')}", xlabel="steps", ylabel="relative error")
     errors[0].legend(fontsize=9)
     for way in WAYS:
         rows = table.where(parameter="gravity", way=way)
-        found = [_mean(rows.where(horizon=horizon)["size"]) for horizon in horizons]
+        found = [geometric_mean(rows.where(horizon=horizon)["size"]) for horizon in horizons]
         sizes.loglog(horizons, found, **{"marker": "o", "markersize": 4, **STYLES[way]})
-    exact = [_mean(table.where(parameter="gravity", horizon=horizon)["exact"]) for horizon in horizons]
+    exact = [geometric_mean(table.where(parameter="gravity", horizon=horizon)["exact"]) for horizon in horizons]
     sizes.loglog(horizons, exact, color=INK, label="C++ engine", **DASHED)
     sizes.set(title="Size of the gradient by gravity", xlabel="steps", ylabel="|dL / dg| [m s²]")
     sizes.legend(fontsize=9)
@@ -125,7 +125,7 @@ def verdict(table: Table, settings: WrongAdjointsSettings) -> list[str]:
         for parameter in PARAMETERS:
             rows = table.where(way=way, parameter=parameter)
             text = ", ".join(
-                f"{_mean(rows.where(horizon=horizon)['error']):.1g} after {horizon}"
+                f"{geometric_mean(rows.where(horizon=horizon)['error']):.1g} after {horizon}"
                 for horizon in (min(settings.horizons), sorted(settings.horizons)[len(settings.horizons) // 2], last)
             )
             name = f"{way[0].upper()}{way[1:]}"
@@ -145,11 +145,6 @@ def _rate(rows: Table) -> Estimate:
     half = np.median(rows["horizon"])
     late = rows.chosen(rows["horizon"] >= half)
     return Estimate.of([growth_rate(one["horizon"], one["size"]) for _, one in late.groups("seed")])
-
-
-def _mean(values: np.ndarray) -> float:
-    """The geometric mean."""
-    return float(np.exp(np.log(np.maximum(values, 1e-300)).mean()))
 
 
 WRONG_ADJOINTS = ExperimentType("wrong_adjoints", WrongAdjointsSettings, measure, draw, verdict)

@@ -13,11 +13,11 @@ import numpy as np
 
 from cortado.figures.canvas import DASHED, INK, PALETTE
 from cortado.reference import History, Simulation
-from cortado.scene.fields import Components, Count, Quantity
+from cortado.scene.fields import Vector, count, quantity
 from cortado.study.canvas import blank
 from cortado.study.ensembles import perturbed, side_by_side
-from cortado.study.estimates import Estimate, growth_rate, norms
-from cortado.study.experiment import ExperimentType, Progress, SceneSettings
+from cortado.study.estimates import Estimate, geometric_mean, growth_rate, norms
+from cortado.study.experiment import ExperimentType, Progress, SceneSettings, Window
 from cortado.study.tables import Table
 
 if TYPE_CHECKING:
@@ -36,19 +36,19 @@ EXACT, DIFFERENCE, *PRINTED = NAMES
 class WrongDerivationSettings(SceneSettings):
     """Settings of tangents by several methods, over many steps and over single ones."""
 
-    direction: Annotated[tuple[float, ...], Components(Quantity("m/s2"))]
+    direction: Vector[Annotated[float, quantity("m/s2")]]
     """Direction of the change of gravity."""
-    steps: Annotated[int, Count(2, 10_000)]
-    record_every: Annotated[int, Count(1, 1000)]
+    steps: Annotated[int, count(2, 10_000)]
+    record_every: Annotated[int, count(1, 1000)]
     """Steps between two rows, and between two states from which a single step is measured."""
-    window: Annotated[tuple[float, ...], Components(Quantity("steps", least=0.0))]
+    window: Window
     """Begin and end of the window in which growth rates are fitted."""
-    seeds: Annotated[int, Count(1, 100)]
-    perturbation: Annotated[float, Quantity("spacings", least=0.0)]
+    seeds: Annotated[int, count(1, 100)]
+    perturbation: Annotated[float, quantity("spacings", ge=0.0)]
     """Perturbation of the first positions [spacings]."""
-    difference: Annotated[float, Quantity("m/s2", above=0.0)]
+    difference: Annotated[float, quantity("m/s2", gt=0.0)]
     """Step of the finite differences over many steps."""
-    single_difference: Annotated[float, Quantity(above=0.0)]
+    single_difference: Annotated[float, quantity(gt=0.0)]
     """Step of the finite differences over a single time step, relative to the size of the tangent."""
 
 
@@ -146,7 +146,7 @@ def verdict(table: Table, settings: WrongDerivationSettings) -> list[str]:
         rows = late.where(method=method)
         by_seed = Estimate.of([np.median(one["single"]) for _, one in rows.groups("seed")])
         last = rows.where(step=settings.steps)["size"] / late.where(method=EXACT, step=settings.steps)["size"]
-        factor = np.exp(np.log(last).mean())
+        factor = geometric_mean(last)
         name = NAMES[method][0].upper() + NAMES[method][1:]
         times = f"{factor:.1g} times the exact one's" if np.isfinite(factor) else "beyond float64"
         sentences.append(

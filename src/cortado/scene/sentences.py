@@ -1,0 +1,124 @@
+"""Turns an error in a table into a sentence, a `SceneError`, with words from the JSON schema of the table."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from cortado.errors import LONGEST, SceneError, shown
+from cortado.scene.fields import GREATEST, MISSING, FieldPath
+
+Schema = Mapping[str, Any]
+
+
+@contextmanager
+def sentences(model: type[BaseModel]) -> Iterator[None]:
+    """Turn the first error that pydantic reports of a model into a `SceneError`."""
+    try:
+        yield
+    except ValidationError as error:
+        raise _scene_error(error, model) from None
+
+
+def field_name(path: FieldPath) -> str:
+    """``("fluid", 0, "upper")`` as ``fluid[0].upper``."""
+    text = ""
+    for part in path:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        else:
+            name = part if part.replace("-", "_").isidentifier() and len(part) < LONGEST else shown(part)
+            text += f".{name}" if text else name
+    return text
+
+
+def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
+    first = error.errors(include_url=False)[0]
+    schema, path = _schema_at(model.model_json_schema(), first["loc"])
+    if first["type"] == "scene":
+        own = first["ctx"]["error"]
+        path, sentence = [*path, *own.path], own.sentence
+        if sentence:
+            sentence = sentence.replace("{table}", f"[{field_name(path[:-1])}]" if path[1:] else "the scene")
+        return SceneError(None, field_name(path), own.found, own.wanted, sentence)
+    found, words = first["input"], wanted(schema, field_name(path[-1:]))
+    if first["type"] == "missing":
+        found = MISSING
+    elif "discriminator" in schema and isinstance(found, Mapping):
+        union = schema["discriminator"]
+        path, found = [*path, union["propertyName"]], found.get(union["propertyName"], MISSING)
+        words = _any_of(union["mapping"])
+    elif first["type"] in ("float_type", "finite_number"):
+        words = f"a finite number{'' if words.startswith('a ') else f', {words}'}"
+    elif first["type"] in ("less_than_equal", "greater_than_equal") and _is_out_of_size(found, schema):
+        words = f"a number between {1.0 / GREATEST:g} and {GREATEST:g} in size"
+    return SceneError(None, field_name(path), found, words)
+
+
+def _is_out_of_size(number: float, schema: Schema) -> bool:
+    """Whether it is too large or, above 0, too small for any quantity."""
+    tiny = 0.0 < number < schema["minimum"] == 1.0 / GREATEST
+    return schema["type"] == "number" and (tiny or abs(number) > GREATEST)
+
+
+def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | int]]:
+    """The part of a JSON schema that a location of pydantic's leads to, and the path to it. A location names the member
+    of a union too; a path does not."""
+    part, path = whole, list[str | int]()
+    for step in location:
+        if "discriminator" in part:
+            part = {"$ref": part["discriminator"]["mapping"][step]}
+        else:
+            part = part["items"] if isinstance(step, int) else part["properties"][step]
+            path.append(step)
+        if "anyOf" in part:  # a value, or nothing
+            part = part["anyOf"][0]
+        if "$ref" in part:
+            part = whole["$defs"][part["$ref"].rpartition("/")[2]]
+    return part, path
+
+
+# ---- words -------------------------------------------------------------------------------------------------------
+
+
+def wanted(schema: Schema, name: str = "") -> str:
+    """What a value must be, in words, from its part of a JSON schema; ``name`` is that of its field."""
+    match schema:
+        case {"enum": names}:
+            return _any_of(names)
+        case {"const": constant}:
+            return _any_of([constant])
+        case {"type": "number"}:
+            return _limits(schema)
+        case {"type": "integer", "minimum": least, "maximum": most}:
+            return f"a whole number from {least} to {most}"
+        case {"type": "boolean"}:
+            return "true or false"
+        case {"type": "string"}:
+            return "a text that is not empty"
+        case {"type": "array", "components": [*first, last]}:
+            return f"a list of {len(first) + 1} components: {', '.join(first)} and {last}"
+        case {"type": "array", "items": {"$ref": _} | {"discriminator": _}}:
+            return f"a list of at least one table, each written [[{name}]]"
+        case {"type": "array", "items": items, "maxItems": _}:
+            return f"a list with one component for each axis, each {wanted(items)}"
+        case {"type": "array", "items": items}:
+            return f"a list{' of at least one entry' if 'minItems' in schema else ''}, each {wanted(items)}"
+        case {"minProperties": _, "properties": properties}:
+            return f"a table of at least one parameter out of {', '.join(properties)}"
+    return "a table"
+
+
+def _any_of(names: Iterable[str]) -> str:
+    return " or ".join(f'"{name}"' for name in names)
+
+
+def _limits(schema: Schema) -> str:
+    """What a number must be."""
+    unit = "" if schema["unit"] == "-" else f" {schema['unit']}"
+    least, most = schema["minimum"], schema["maximum"]
+    limits = [f"greater than {schema['exclusiveMinimum']:g}{unit}"] if "exclusiveMinimum" in schema else []
+    limits += [f"at least {least:g}{unit}"] if least not in (-GREATEST, 1.0 / GREATEST) else []
+    limits += [f"at most {most:g}{unit}"] if most != GREATEST else []
+    return " and ".join(limits) or f"a number{unit and f' in{unit}'}"
