@@ -26,7 +26,8 @@ from cortado.parameters.reference_density import (
     reference_density_tangent,
 )
 from cortado.solvers.pcisph.density_ratio_relaxation import density_ratio_kernels
-from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
+from cortado.solvers.pcisph.pressure import pressure_kernels
+from cortado.solvers.pcisph.pressure_force import pressure_force_kernels
 from cortado.solvers.pcisph.wall_relaxation import wall_kernels
 from cortado.sph.density import density_kernels
 from cortado.sph.diffusion import Diffusion, diffusion_kernels

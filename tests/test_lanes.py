@@ -11,7 +11,8 @@ from cortado.device.neighbourhood import Discretisation
 from cortado.device.neighbours import fill_kernel
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.lattice.smoothing import CUBIC_SPLINE, WENDLAND_C4
-from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
+from cortado.solvers.pcisph.pressure import pressure_kernels
+from cortado.solvers.pcisph.pressure_force import pressure_force_kernels
 from cortado.solvers.pcisph.wall_relaxation import wall_kernels
 from cortado.sph.carried import order_kernels
 from cortado.sph.density import density_kernels

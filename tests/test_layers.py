@@ -37,6 +37,7 @@ LAYERS = """
     solvers solvers.containment_kernels solvers.containment solvers.solver solvers.convergence solvers.loop
     solvers.particles solvers.particle_derivatives solvers.build solvers.pcisph
     solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure solvers.pcisph.pressure
+    solvers.pcisph.pressure_force
     solvers.pcisph.wall_relaxation solvers.pcisph.parts solvers.pcisph.steps solvers.pcisph.derivatives
     solvers.pcisph.solver solvers.pcisph.build
     reference.digits reference.engine reference.histories reference.losses reference.simulation reference

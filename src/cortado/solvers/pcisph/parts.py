@@ -8,7 +8,8 @@ import warp as wp
 from cortado.device.kernels import Kernels
 from cortado.device.neighbourhood import Discretisation
 from cortado.solvers.pcisph.density_ratio_relaxation import DensityRatioKernels, density_ratio_kernels
-from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels
+from cortado.solvers.pcisph.pressure import pressure_kernels
+from cortado.solvers.pcisph.pressure_force import pressure_force_kernels
 from cortado.solvers.pcisph.wall_relaxation import wall_kernels
 
 
