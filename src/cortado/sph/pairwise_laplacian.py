@@ -27,6 +27,7 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, factor, factor_gradient = pair.separation, pair.factor, pair.factor_gradient
+    vectors, numbers = pair.vectors, pair.numbers
     LANES = discretisation.lanes
     lanes = lane_functions(discretisation.precision, LANES)
     lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
@@ -47,10 +48,12 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
         u_i = u[i]
         total = fractions()
         for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
+            x_j = vectors(x, k, i, s)
+            n_j = numbers(n, k, i, s)
+            w_j = numbers(w, k, i, s)
             for t in range(UNROLL):
-                j = s.neighbours[k + t, i]
-                weight = (w_i / n[j] + w[j] / n_i) * factor(separation(x_i, x[j], s), s)
-                total += weight * (u_i - u[j])
+                weight = (w_i / n_j[t] + w_j[t] / n_i) * factor(separation(x_i, x_j[t], s), s)
+                total += weight * (u_i - u[s.neighbours[k + t, i]])
         return add_up_fractions(total)
 
     @wp.func
@@ -105,17 +108,20 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
         u_bar = fractions()
         own = real(0.0)
         for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
+            x_j = vectors(x, k, i, s)
+            n_j = numbers(n, k, i, s)
+            w_j = numbers(w, k, i, s)
             for t in range(UNROLL):
                 j = s.neighbours[k + t, i]
-                x_ij = separation(x_i, x[j], s)
+                x_ij = separation(x_i, x_j[t], s)
                 f = factor(x_ij, s)
-                weight = w_i / n[j] + w[j] / n_i
+                weight = w_i / n_j[t] + w_j[t] / n_i
                 u_ij = u_i - u[j]
                 y_ij = y_i - y[j]
                 work = wp.dot(u_ij, y_ij)
                 x_bar += (weight * work) * factor_gradient(x_ij, s)
-                n_bar -= w[j] * f * work
-                w_bar += f * work / n[j]
+                n_bar -= w_j[t] * f * work
+                w_bar += f * work / n_j[t]
                 u_bar += (weight * f) * y_ij
                 own += weight * f * wp.dot(u_ij, y_i)
         x_bar = add_up_vectors(x_bar)

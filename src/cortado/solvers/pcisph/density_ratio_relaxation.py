@@ -39,6 +39,7 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, weight, gradient = pair.separation, pair.weight, pair.gradient
+    vectors, numbers = pair.vectors, pair.numbers
     LANES = discretisation.lanes
     lanes = lane_functions(discretisation.precision, LANES)
     lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
@@ -51,9 +52,10 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
         m_i = m[i]
         total = real(0.0)
         for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
+            x_j = vectors(x, k, i, s)
+            m_j = numbers(m, k, i, s)
             for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
-                total += weight(separation(x_i, x[j], s), s) * (m_i / m[j] - real(1.0))
+                total += weight(separation(x_i, x_j[u], s), s) * (m_i / m_j[u] - real(1.0))
         return add_up(total)
 
     @wp.func
@@ -143,16 +145,20 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
         m_bar: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
+        x_i = x[i]
         m_i = m[i]
+        t_bar_i = t_bar[i]
         x_sum = vector()
         m_sum = real(0.0)
         for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
+            x_j = vectors(x, k, i, s)
+            m_j = numbers(m, k, i, s)
+            t_bar_j = numbers(t_bar, k, i, s)
             for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
-                x_ij = separation(x[i], x[j], s)
-                own = t_bar[i] * m_i / m[j]
-                other = t_bar[j] * m[j] / m_i
-                x_sum += (own - t_bar[i] + other - t_bar[j]) * gradient(x_ij, s)
+                x_ij = separation(x_i, x_j[u], s)
+                own = t_bar_i * m_i / m_j[u]
+                other = t_bar_j[u] * m_j[u] / m_i
+                x_sum += (own - t_bar_i + other - t_bar_j[u]) * gradient(x_ij, s)
                 m_sum += weight(x_ij, s) * (own - other)
         x_sum = add_up_vectors(x_sum)
         m_sum = add_up(m_sum)
