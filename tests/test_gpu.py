@@ -5,22 +5,23 @@ import pytest
 import warp as wp
 
 from cortado import Problem, Simulation, gradients, losses
-from scenes import plane, plane_of_three, splash, two_layers
+from scenes import HONEY, plane, plane_of_three, splash, two_layers
 
 pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
 
 GRAVITY = np.array([0.5, -9.81, 0.2])
+EXACT = gradients.Exact()
 TOLERANT = {"minimum_iterations": 2, "maximum_iterations": 40, "density_tolerance": 1e-3}
 
 
-def evaluate(made, device, precision="float64", steps=60):
+def evaluate(made, device, precision="float64", steps=60, estimator=EXACT):
     """Last positions, iterations, loss and gradient."""
     simulation = Simulation(made, device, precision)
     problem = Problem(simulation, steps, losses.FinalPositions(simulation.positions))
     point = {**simulation.parameters(), "gravity": GRAVITY[: simulation.dimension]}
     point.pop("colours")
     for _ in range(3):  # the second time captures graphs, the third replays them
-        loss, gradient = problem.value_and_gradient(point)
+        loss, gradient = problem.value_and_gradient(point, estimator)
     tangent = problem.tangent(point, {"gravity": np.ones(simulation.dimension)})
     iterations = problem.iterations()
     end = problem.end(point)
@@ -40,6 +41,11 @@ SCENES = {
     "plane": plane(),
     "two fluids": two_layers(),
     "three fluids": plane_of_three(),
+    "surface tension": plane(
+        phase=[HONEY],
+        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "honey"}],
+        forces={"gravity": [0.0, -9.81], "surface_tension": 3.0},
+    ),
 }
 
 
@@ -63,6 +69,17 @@ def test_any_number_of_lanes_computes_the_same(name, lanes, monkeypatch):
     monkeypatch.setattr("cortado.solvers.build.lanes_for", lambda particles, device: lanes)
     for found, one in zip(evaluate(SCENES[name], "cuda:0", steps=20), wanted, strict=True):
         assert np.linalg.norm(found - one) <= 1e-9 * np.linalg.norm(one)
+
+
+@pytest.mark.parametrize("estimator", [gradients.AdjointViscosity(0.1), gradients.FrozenGeometry()], ids=repr)
+@pytest.mark.parametrize("name", ["fixed", "two fluids"])
+def test_estimators_compute_the_same_with_lanes(name, estimator, monkeypatch):
+    found = []
+    for lanes in (1, 8):
+        monkeypatch.setattr("cortado.solvers.build.lanes_for", lambda particles, device, lanes=lanes: lanes)
+        found.append(evaluate(SCENES[name], "cuda:0", steps=20, estimator=estimator))
+    for one, several in zip(*found, strict=True):
+        assert np.linalg.norm(several - one) <= 1e-9 * np.linalg.norm(one)
 
 
 @pytest.mark.parametrize("name", ["fixed", "two fluids"])

@@ -10,13 +10,19 @@ from cortado.device.lanes import LANES, lanes_for, lanes_of
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.neighbours import fill_kernel
 from cortado.device.precision import FLOAT32, FLOAT64
+from cortado.gradients.filter_kernels import adjoint_filter_kernels
 from cortado.lattice.smoothing import CUBIC_SPLINE, WENDLAND_C4
+from cortado.solvers.pcisph.density_ratio_relaxation import density_ratio_kernels
+from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.pcisph.pressure import pressure_kernels
 from cortado.solvers.pcisph.pressure_force import pressure_force_kernels
 from cortado.solvers.pcisph.wall_relaxation import wall_kernels
 from cortado.sph.carried import order_kernels
 from cortado.sph.density import density_kernels
+from cortado.sph.diffusion import Diffusion, diffusion_kernels
+from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
 from cortado.sph.pair_forces import laminar, pairwise
+from cortado.sph.surface_stress import normal_kernels, surface_tension_kernels
 from cortado.sph.viscosity import viscosity_kernels
 
 
@@ -36,7 +42,12 @@ def test_few_particles_get_many_lanes_and_a_cpu_has_one():
 
 
 def kernels_of(discretisation):
-    """Every kernel that is made for lanes."""
+    """Every kernel that is made for lanes; mixtures of two and of three phases."""
+    mixtures = [
+        diffusion_kernels(Diffusion(discretisation, *kinds))
+        for kinds in ((2, DOUBLE_WELL, DEGENERATE), (3, MISCIBLE, CONSTANT))
+    ]
+    filters = adjoint_filter_kernels(discretisation)
     families = [
         density_kernels(discretisation),
         pressure_kernels(discretisation),
@@ -44,9 +55,14 @@ def kernels_of(discretisation):
         wall_kernels(discretisation),
         viscosity_kernels(discretisation, pairwise),
         viscosity_kernels(discretisation, laminar),
+        density_ratio_kernels(discretisation),
+        normal_kernels(discretisation),
+        surface_tension_kernels(discretisation),
+        *(kernels for mixture in mixtures for kernels in (mixture.potential, mixture.flux)),
     ]
     kernels = [kernel for family in families for kernel in (family.forward, family.tangent, family.adjoint)]
-    return [fill_kernel(discretisation), *kernels]
+    alone = [fill_kernel(discretisation), frozen_force_adjoint(discretisation), filters.crowd, filters.average]
+    return [*alone, *kernels]
 
 
 def compiles(module, folder):

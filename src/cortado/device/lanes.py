@@ -63,6 +63,25 @@ def lane_functions(precision: Precision, lanes: int) -> LaneFunctions:
     return _of_one(precision) if lanes == 1 else _of_several(precision, lanes)
 
 
+@cache
+def fraction_sum(precision: Precision, phases: int, lanes: int) -> Any:
+    """A Warp function: the sum over the lanes of a vector of one number for each phase."""
+    fractions, add_up = precision.fractions(phases), lane_functions(precision, lanes).add_up
+
+    @wp.func
+    def same(x: fractions) -> fractions:
+        return x
+
+    @wp.func
+    def add_up_fractions(x: fractions) -> fractions:
+        result = fractions()
+        for k in range(wp.static(phases)):
+            result[k] = add_up(x[k])
+        return result
+
+    return same if lanes == 1 else add_up_fractions
+
+
 def _of_one(precision: Precision) -> LaneFunctions:
     real, vector = precision.real, precision.vector
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 
@@ -39,6 +40,9 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, weight, vectors, numbers = pair.separation, pair.weight, pair.vectors, pair.numbers
+    LANES = discretisation.lanes
+    lanes = lane_functions(discretisation.precision, LANES)
+    lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
     module = discretisation.module(False, "adjoint_filters")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -49,13 +53,18 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
         most: wp.array(dtype=real),
     ):
         """max(s_i, W(h / 2))"""
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         x_i = x[i]
-        total = -real(s.filling[i]) * s.self_weight
-        for k in range(0, s.fluid_count[i], UNROLL):
+        total = real(0.0)
+        if lane() == 0:
+            total = -real(s.filling[i]) * s.self_weight
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             for u in range(UNROLL):
                 total += weight(separation(x_i, x_j[u], s), s)
+        total = add_up(total)
+        if lane() > 0:
+            return
         most[i] = wp.max(total, weight(vector(real(0.5) * s.support, real(0.0), real(0.0)), s))
 
     @wp.kernel(module=module, enable_backward=False)
@@ -70,20 +79,24 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
         a_new: wp.array(dtype=vector),
     ):
         """``x`` and ``most`` are sorted, ``a`` is in the scene's order. A strength of 0 copies bit for bit."""
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         x_i = x[i]
         most_i = most[i]
         a_i = a[order[i]]
         if strength[0] == real(0.0):
-            a_new[order[i]] = a_i
+            if lane() == 0:
+                a_new[order[i]] = a_i
             return
         total = vector()
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             most_j = numbers(most, k, i, s)
             for u in range(UNROLL):
                 w_ij = weight(separation(x_i, x_j[u], s), s) / wp.max(most_i, most_j[u])
                 total += w_ij * (a[order[s.neighbours[k + u, i]]] - a_i)
+        total = add_up_vectors(total)
+        if lane() > 0:
+            return
         a_new[order[i]] = a_i + strength[0] * total
 
     @wp.kernel(module=module, enable_backward=False)

@@ -19,6 +19,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.kernels import Kernels
+from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import Discretisation, neighbourhood_type
 from cortado.sph.free_energy import FreeEnergy, Mobility
 from cortado.sph.pairwise_laplacian import pairwise_laplacian_functions
@@ -57,6 +58,8 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
     neighbourhood = neighbourhood_type(precision)
     sums = pairwise_laplacian_functions(discretisation, phases)
     spread, spread_tangent, spread_adjoint = sums.spread, sums.spread_tangent, sums.spread_adjoint
+    LANES = discretisation.lanes
+    lane = lane_functions(precision, LANES).lane
     energy, form = diffusion.energy.functions(precision, phases), diffusion.mobility.functions(precision, phases)
     energy_gradient, energy_hessian_product = energy.gradient, energy.hessian_product
     mobile, mobile_gradient = form.value, form.gradient
@@ -87,8 +90,10 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         w: wp.array(dtype=real),
     ):
         """``w``: m M of a particle."""
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = spread(i, x, n, m, c, s)
+        if lane() > 0:
+            return
         stiffness = interface_width[0] * interface_width[0] * s.volume / m[i]
         chi[i] = strength * project(energy_gradient(c[i])) - stiffness * total
         w[i] = m[i] * mobility[0] * mobile(c[i])
@@ -107,8 +112,10 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         # out
         c_new: wp.array(dtype=fractions),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = spread(i, x, n, w, chi, s)
+        if lane() > 0:
+            return
         c_new[i] = c[i] + (time_step[0] / real(substeps) * s.volume / m[i]) * total
 
     @wp.kernel(module=diffusion.module(False), enable_backward=False)
@@ -131,9 +138,11 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         chi_dot: wp.array(dtype=fractions),
         w_dot: wp.array(dtype=real),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = spread(i, x, n, m, c, s)
         total_dot = spread_tangent(i, x, x_dot, n, n_dot, m, m_dot, c, c_dot, s)
+        if lane() > 0:
+            return
         width = interface_width[0]
         scale = s.volume / m[i]
         stiffness = width * width * scale
@@ -166,9 +175,11 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         # out
         c_new_dot: wp.array(dtype=fractions),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = spread(i, x, n, w, chi, s)
         total_dot = spread_tangent(i, x, x_dot, n, n_dot, w, w_dot, chi, chi_dot, s)
+        if lane() > 0:
+            return
         scale = time_step[0] / real(substeps) * s.volume / m[i]
         change = time_step_dot[0] / time_step[0] - m_dot[i] / m[i]
         c_new_dot[i] = c_dot[i] + scale * (total_dot + change * total)
@@ -212,8 +223,10 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         z: wp.array(dtype=fractions),
     ):
         """``z``: the adjoint of the potential's raw sum."""
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         x_sum, n_sum, w_bar, chi_bar, own = spread_adjoint(i, x, n, w, chi, y, s)
+        if lane() > 0:
+            return
         m_i = m[i]
         m_0 = mobility[0]
         mobile_i = mobile(c[i])
@@ -244,8 +257,10 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         c_bar: wp.array(dtype=fractions),
         interface_width_bar: wp.array(dtype=real),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         x_sum, n_sum, m_sum, c_sum, own = spread_adjoint(i, x, n, m, c, z, s)
+        if lane() > 0:
+            return
         x_bar[i] = x_bar[i] + x_sum
         n_bar[i] = n_bar[i] + n_sum
         m_bar[i] = m_bar[i] + m_sum - own / m[i]

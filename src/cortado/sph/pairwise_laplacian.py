@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.lanes import fraction_sum, lane_functions
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 
@@ -26,6 +27,11 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, factor, factor_gradient = pair.separation, pair.factor, pair.factor_gradient
+    vectors, numbers = pair.vectors, pair.numbers
+    LANES = discretisation.lanes
+    lanes = lane_functions(discretisation.precision, LANES)
+    lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
+    add_up_fractions = fraction_sum(discretisation.precision, phases, LANES)
 
     @wp.func
     def spread(
@@ -41,12 +47,14 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
         w_i = w[i]
         u_i = u[i]
         total = fractions()
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
+            x_j = vectors(x, k, i, s)
+            n_j = numbers(n, k, i, s)
+            w_j = numbers(w, k, i, s)
             for t in range(UNROLL):
-                j = s.neighbours[k + t, i]
-                weight = (w_i / n[j] + w[j] / n_i) * factor(separation(x_i, x[j], s), s)
-                total += weight * (u_i - u[j])
-        return total
+                weight = (w_i / n_j[t] + w_j[t] / n_i) * factor(separation(x_i, x_j[t], s), s)
+                total += weight * (u_i - u[s.neighbours[k + t, i]])
+        return add_up_fractions(total)
 
     @wp.func
     def spread_tangent(
@@ -65,7 +73,7 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
         n_i = n[i]
         w_i = w[i]
         total = fractions()
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             for t in range(UNROLL):
                 j = s.neighbours[k + t, i]
                 x_ij = separation(x_i, x[j], s)
@@ -76,7 +84,7 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
                 f_dot = wp.dot(factor_gradient(x_ij, s), x_dot[i] - x_dot[j])
                 total += (weight_dot * f + weight * f_dot) * (u[i] - u[j])
                 total += (weight * f) * (u_dot[i] - u_dot[j])
-        return total
+        return add_up_fractions(total)
 
     @wp.func
     def spread_adjoint(
@@ -99,20 +107,28 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
         w_bar = real(0.0)
         u_bar = fractions()
         own = real(0.0)
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
+            x_j = vectors(x, k, i, s)
+            n_j = numbers(n, k, i, s)
+            w_j = numbers(w, k, i, s)
             for t in range(UNROLL):
                 j = s.neighbours[k + t, i]
-                x_ij = separation(x_i, x[j], s)
+                x_ij = separation(x_i, x_j[t], s)
                 f = factor(x_ij, s)
-                weight = w_i / n[j] + w[j] / n_i
+                weight = w_i / n_j[t] + w_j[t] / n_i
                 u_ij = u_i - u[j]
                 y_ij = y_i - y[j]
                 work = wp.dot(u_ij, y_ij)
                 x_bar += (weight * work) * factor_gradient(x_ij, s)
-                n_bar -= w[j] * f * work
-                w_bar += f * work / n[j]
+                n_bar -= w_j[t] * f * work
+                w_bar += f * work / n_j[t]
                 u_bar += (weight * f) * y_ij
                 own += weight * f * wp.dot(u_ij, y_i)
+        x_bar = add_up_vectors(x_bar)
+        n_bar = add_up(n_bar)
+        w_bar = add_up(w_bar)
+        u_bar = add_up_fractions(u_bar)
+        own = add_up(own)
         return x_bar, n_bar / (n_i * n_i), w_bar, u_bar, own
 
     return PairwiseLaplacian(spread=spread, spread_tangent=spread_tangent, spread_adjoint=spread_adjoint)

@@ -19,6 +19,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.kernels import Kernels
+from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 PART = 2.0 / 3.0
@@ -100,17 +101,20 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
     pair, functions = pair_functions(discretisation), tension_functions(discretisation)
     separation, vectors = pair.separation, pair.vectors
     arrow, arrow_change = functions.arrow, functions.arrow_change
+    LANES = discretisation.lanes
+    lanes = lane_functions(discretisation.precision, LANES)
+    lane, add_up_vectors = lanes.lane, lanes.add_up_vectors
 
     @wp.func
     def arrows(i: int, x: wp.array(dtype=vector), s: neighbourhood) -> vector:
         x_i = x[i]
         h2 = s.support * s.support
         total = vector()
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             for u in range(UNROLL):
                 total += arrow(separation(x_i, x_j[u], s), h2)
-        return total
+        return add_up_vectors(total)
 
     @wp.func
     def change(i: int, x: wp.array(dtype=vector), v: wp.array(dtype=vector), s: neighbourhood) -> vector:
@@ -119,12 +123,12 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
         v_i = v[i]
         h2 = s.support * s.support
         total = vector()
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             v_j = vectors(v, k, i, s)
             for u in range(UNROLL):
                 total += arrow_change(separation(x_i, x_j[u], s), v_i - v_j[u], h2)
-        return total
+        return add_up_vectors(total)
 
     @wp.kernel(module=discretisation.module(True, "surface_tension"))
     def normal(
@@ -134,8 +138,10 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
         # out
         normals: wp.array(dtype=vector),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = arrows(i, x, s)
+        if lane() > 0:
+            return
         normals[i] = inverse * total
 
     @wp.kernel(module=discretisation.module(False, "surface_tension"), enable_backward=False)
@@ -147,8 +153,11 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
         # out
         normals_dot: wp.array(dtype=vector),
     ):
-        i = s.first + wp.tid()
-        normals_dot[i] = inverse * change(i, x, x_dot, s)
+        i = s.first + wp.tid() // LANES
+        total = change(i, x, x_dot, s)
+        if lane() > 0:
+            return
+        normals_dot[i] = inverse * total
 
     @wp.kernel(module=discretisation.module(False, "surface_tension"), enable_backward=False)
     def normal_adjoint(
@@ -159,8 +168,11 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
         # in and out
         x_bar: wp.array(dtype=vector),
     ):
-        i = s.first + wp.tid()
-        x_bar[i] = x_bar[i] + inverse * change(i, x, normals_bar, s)
+        i = s.first + wp.tid() // LANES
+        total = change(i, x, normals_bar, s)
+        if lane() > 0:
+            return
+        x_bar[i] = x_bar[i] + inverse * total
 
     return Kernels(normal, normal_tangent, normal_adjoint)
 
@@ -174,6 +186,9 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
     separation, vectors, numbers = pair.separation, pair.vectors, pair.numbers
     pull, pull_derivative = functions.pull, functions.pull_derivative
     stress, stress_change, stress_derivative = functions.stress, functions.stress_change, functions.stress_derivative
+    LANES = discretisation.lanes
+    lanes = lane_functions(discretisation.precision, LANES)
+    lane, add_up_vectors = lanes.lane, lanes.add_up_vectors
 
     @wp.func
     def pulls(i: int, x: wp.array(dtype=vector), normals: wp.array(dtype=vector), s: neighbourhood) -> vector:
@@ -181,13 +196,13 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         n_i = normals[i]
         h2 = s.support * s.support
         total = vector()
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             n_j = vectors(normals, k, i, s)
             for u in range(UNROLL):
                 x_ij = separation(x_i, x_j[u], s)
                 total += pull(x_ij, h2) * (stress(n_i, x_ij) + stress(n_j[u], x_ij))
-        return total
+        return add_up_vectors(total)
 
     @wp.func
     def pulls_change(
@@ -202,7 +217,7 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         n_i = normals[i]
         h2 = s.support * s.support
         total = vector()
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             for u in range(UNROLL):
                 j = s.neighbours[k + u, i]
                 x_ij = separation(x_i, x[j], s)
@@ -211,7 +226,7 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
                 total += pull_dot * (stress(n_i, x_ij) + stress(normals[j], x_ij))
                 turn = stress_change(n_i, normals_dot[i], x_ij) + stress_change(normals[j], normals_dot[j], x_ij)
                 total += pull(x_ij, h2) * (turn + stress(n_i, x_dot_ij) + stress(normals[j], x_dot_ij))
-        return total
+        return add_up_vectors(total)
 
     @wp.kernel(module=discretisation.module(True, "surface_tension"))
     def accelerate(
@@ -225,8 +240,10 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         # out
         acceleration: wp.array(dtype=vector),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = pulls(i, x, normals, s)
+        if lane() > 0:
+            return
         acceleration[i] = acceleration_in[i] - (scale * surface_tension[0] / m[i]) * total
 
     @wp.kernel(module=discretisation.module(False, "surface_tension"), enable_backward=False)
@@ -245,10 +262,12 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         # out
         acceleration_dot: wp.array(dtype=vector),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         sigma = surface_tension[0]
         rate = surface_tension_dot[0] - sigma * m_dot[i] / m[i]
         total = rate * pulls(i, x, normals, s) + sigma * pulls_change(i, x, x_dot, normals, normals_dot, s)
+        if lane() > 0:
+            return
         acceleration_dot[i] = acceleration_in_dot[i] - (scale / m[i]) * total
 
     @wp.kernel(module=discretisation.module(False, "surface_tension"), enable_backward=False)
@@ -268,7 +287,7 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         normals_bar: wp.array(dtype=vector),
     ):
         """w is the adjoint of a force."""
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         x_i = x[i]
         n_i = normals[i]
         w_i = acceleration_bar[i] / m[i]
@@ -276,7 +295,7 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         total = vector()
         x_sum = vector()
         n_sum = vector()
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             n_j = vectors(normals, k, i, s)
             m_j = numbers(m, k, i, s)
@@ -290,6 +309,11 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
                 x_sum += g * (stress(n_i, w_ij) + stress(n_j[u], w_ij))
                 x_sum += (pull_derivative(x_ij, h2) * wp.dot(force, w_ij) / h2) * x_ij
                 n_sum += g * stress_derivative(n_i, w_ij, x_ij)
+        total = add_up_vectors(total)
+        x_sum = add_up_vectors(x_sum)
+        n_sum = add_up_vectors(n_sum)
+        if lane() > 0:
+            return
         sigma = surface_tension[0]
         work = scale * wp.dot(total, w_i)
         x_bar[i] = x_bar[i] - (scale * sigma) * x_sum

@@ -17,6 +17,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.kernels import Kernels
+from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 SOFTNESS = 0.2
@@ -38,6 +39,10 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, weight, gradient = pair.separation, pair.weight, pair.gradient
+    vectors, numbers = pair.vectors, pair.numbers
+    LANES = discretisation.lanes
+    lanes = lane_functions(discretisation.precision, LANES)
+    lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
     a = wp.constant(real(SOFTNESS))
 
     @wp.func
@@ -46,11 +51,12 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
         x_i = x[i]
         m_i = m[i]
         total = real(0.0)
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
+            x_j = vectors(x, k, i, s)
+            m_j = numbers(m, k, i, s)
             for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
-                total += weight(separation(x_i, x[j], s), s) * (m_i / m[j] - real(1.0))
-        return total
+                total += weight(separation(x_i, x_j[u], s), s) * (m_i / m_j[u] - real(1.0))
+        return add_up(total)
 
     @wp.func
     def excess(t: real) -> real:
@@ -76,8 +82,10 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
         t: wp.array(dtype=real),
         y: wp.array(dtype=real),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         total = density_ratio_sum(i, x, m, s)
+        if lane() > 0:
+            return
         t[i] = s.volume * total
         y[i] = wall_y[i] / (real(1.0) + excess(s.volume * total))
 
@@ -94,16 +102,19 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
         # out
         y_dot: wp.array(dtype=real),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         m_i = m[i]
         t_dot = real(0.0)
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             for u in range(UNROLL):
                 j = s.neighbours[k + u, i]
                 x_ij = separation(x[i], x[j], s)
                 ratio = m_i / m[j]
                 t_dot += wp.dot(gradient(x_ij, s), x_dot[i] - x_dot[j]) * (ratio - real(1.0))
                 t_dot += weight(x_ij, s) * ratio * (m_dot[i] / m_i - m_dot[j] / m[j])
+        t_dot = add_up(t_dot)
+        if lane() > 0:
+            return
         part = real(1.0) / (real(1.0) + excess(t[i]))
         y_dot[i] = part * (wall_y_dot[i] - y[i] * excess_derivative(t[i]) * s.volume * t_dot)
 
@@ -133,18 +144,26 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
         x_bar: wp.array(dtype=vector),
         m_bar: wp.array(dtype=real),
     ):
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
+        x_i = x[i]
         m_i = m[i]
+        t_bar_i = t_bar[i]
         x_sum = vector()
         m_sum = real(0.0)
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
+            x_j = vectors(x, k, i, s)
+            m_j = numbers(m, k, i, s)
+            t_bar_j = numbers(t_bar, k, i, s)
             for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
-                x_ij = separation(x[i], x[j], s)
-                own = t_bar[i] * m_i / m[j]
-                other = t_bar[j] * m[j] / m_i
-                x_sum += (own - t_bar[i] + other - t_bar[j]) * gradient(x_ij, s)
+                x_ij = separation(x_i, x_j[u], s)
+                own = t_bar_i * m_i / m_j[u]
+                other = t_bar_j[u] * m_j[u] / m_i
+                x_sum += (own - t_bar_i + other - t_bar_j[u]) * gradient(x_ij, s)
                 m_sum += weight(x_ij, s) * (own - other)
+        x_sum = add_up_vectors(x_sum)
+        m_sum = add_up(m_sum)
+        if lane() > 0:
+            return
         x_bar[i] = x_bar[i] + s.volume * x_sum
         m_bar[i] = m_bar[i] + s.volume * m_sum / m_i
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 
@@ -18,6 +19,9 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     separation, gradient, vectors, numbers = pair.separation, pair.gradient, pair.vectors, pair.numbers
+    LANES = discretisation.lanes
+    lanes = lane_functions(discretisation.precision, LANES)
+    lane, add_up = lanes.lane, lanes.add_up
 
     @wp.kernel(module=discretisation.module(False, "frozen_pressure"), enable_backward=False)
     def adjoint(
@@ -43,13 +47,13 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
         r: wp.array(dtype=real),
     ):
         """From ``push_bar``, the adjoint of the pressure acceleration over m, to those of p and (r) of n*."""
-        i = s.first + wp.tid()
+        i = s.first + wp.tid() // LANES
         x_i = x[i]
         c_i = c[i]
         push_bar_i = push_bar[i]
         divergence = real(0.0)
         work = real(0.0)
-        for k in range(0, s.fluid_count[i], UNROLL):
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             c_j = numbers(c, k, i, s)
             push_bar_j = vectors(push_bar, k, i, s)
@@ -57,12 +61,16 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
                 g_ij = gradient(separation(x_i, x_j[u], s), s)
                 divergence += wp.dot(g_ij, push_bar_i - push_bar_j[u])
                 work += (c_i + c_j[u]) * wp.dot(g_ij, push_bar_i)
-        for k in range(s.fluid_count[i], s.count[i]):
+        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
             b = s.neighbours[k, i]
             g_ib = gradient(separation(x_i, s.wall_positions[b], s), s)
             wall_divergence = s.wall_weights[b] * wp.dot(g_ib, push_bar_i)
             divergence += wall_divergence
             work += c_i * wall_divergence
+        divergence = add_up(divergence)
+        work = add_up(work)
+        if lane() > 0:
+            return
         m_i = m[i]
         p_i = p_out[i]
         delta = y[i] * stiffness / (time_step[0] * time_step[0])
