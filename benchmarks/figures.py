@@ -51,8 +51,8 @@ def tables(run: Run) -> str:
     """What the document says of a run."""
     around, settings, rows = run["environment"], run["settings"], own_rows(run)
     names = [name for name in run["sizes"][0]["measured"] if name != "Cortado"]
-    busy = [row["environment"]["cores_busy_elsewhere"] for row in rows]
-    others = "" if None in busy else f", {min(busy):g} to {max(busy):g} of them busy with other processes"
+    busy = [row["cores_busy_elsewhere"] for size in run["sizes"] for row in size["measured"].values()]
+    others = "" if None in busy else f", {min(busy):g} to {max(busy):g} of them busy with other processes meanwhile"
     lines = [
         f"{around['device']}, {around['cores']} cores{others}; {around['date'][:10]}, Cortado {around['cortado']}, "
         f"Warp {around['warp']}, {settings['precision']}, medians of {settings['repeats']} times {settings['steps']} "

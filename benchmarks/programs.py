@@ -1,12 +1,15 @@
 """Programs that benchmarks run, each in a process of its own, so that none keeps memory or threads from the others."""
 
 import json
+import resource
 import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from cortado.bench.environment import OtherProcesses
 
 PEERS = Path(__file__).parent / "peers"
 
@@ -32,10 +35,19 @@ class Program:
         return subprocess.run([self.python, "-c", f"import {self.module}"], capture_output=True).returncode == 0
 
     def run(self, particles: int, steps: int, repeats: int, timeout: float, environment: dict[str, str]) -> Any:
-        """What it measures, read from the JSON that it prints; raises `ProgramError`."""
+        """What it measures, read from the JSON that it prints, and how busy the machine was meanwhile; raises
+        `ProgramError`."""
         numbers = {"--particles": particles, "--steps": steps, "--repeats": repeats}
         options = [word for name, value in numbers.items() for word in (name, str(value))]
-        return last_json([self.python, *self.words, *options, "--json"], timeout, environment)
+        others = OtherProcesses(_seconds_of_children)
+        found = last_json([self.python, *self.words, *options, "--json"], timeout, environment)
+        return {**found, "cores_busy_elsewhere": others.busy_cores()}
+
+
+def _seconds_of_children() -> float:
+    """Processor time of the programs that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def last_json(command: Sequence[str], timeout: float, environment: dict[str, str]) -> Any:

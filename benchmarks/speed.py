@@ -9,11 +9,16 @@ import json
 import os
 import re
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 from programs import Program, ProgramError, cortado, peers
 
+from cortado.bench.environment import OtherProcesses
+
+QUIET, LOOK = 0.2, 3.0
+"""Cores that others keep busy at most on a quiet machine, and the seconds for which they are watched."""
 RESULTS = Path(__file__).parent / "results"
 Row = dict[str, Any]
 
@@ -26,6 +31,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--repeats", type=int, default=5, help="the median of so many counts")
     parser.add_argument("--rounds", type=int, default=1, help="turns of each program; the middle one counts")
+    parser.add_argument("--patience", type=float, default=0.0, help="seconds to wait for a quiet machine each time")
     parser.add_argument("--timeout", type=float, default=1200.0, help="seconds that a program may take")
     parser.add_argument("--jax-python", default=sys.executable, help="an interpreter that has jax")
     parser.add_argument("--splishsplash-python", default=sys.executable, help="one that has pysplishsplash")
@@ -44,6 +50,7 @@ def measure_size(programs: list[Program], particles: int, given: argparse.Namesp
         for program in programs:
             if program.name in failed:
                 continue
+            wait_for_quiet(given.patience)
             try:
                 found = program.run(particles, given.steps, given.repeats, given.timeout, environment)
             except ProgramError as error:
@@ -55,6 +62,16 @@ def measure_size(programs: list[Program], particles: int, given: argparse.Namesp
         "measured": {name: middle(rows) for name, rows in turns.items() if rows},
         "failed": failed,
     }
+
+
+def wait_for_quiet(patience: float) -> None:
+    """Wait until other processes leave the cores alone, or until the patience [s] is at an end."""
+    end = time.perf_counter() + patience
+    while time.perf_counter() < end:
+        others = OtherProcesses()
+        time.sleep(LOOK)
+        if (others.busy_cores() or 0.0) < QUIET:
+            return
 
 
 def flat(found: Row) -> Row:

@@ -1,6 +1,8 @@
 """`cortado bench` and what it is made of: what it says adds up. How fast Cortado is, it says on the day."""
 
 import json
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import warp as wp
 
 from cortado import Simulation
 from cortado.bench.dam_break import measure_dam_break, with_floors
+from cortado.bench.environment import OtherProcesses
 from cortado.bench.floor import copy_bandwidth, least_bytes, sums_over_neighbours
 from cortado.bench.memory import ESTIMATED
 from cortado.bench.passes import AGAIN, PassTimer
@@ -154,6 +157,16 @@ def test_a_long_launch_is_not_repeated_often():
 
     assert LaunchTimer(launcher, 2)(work) > 0.0
     assert len(calls) < 100
+
+
+@pytest.mark.skipif(not Path("/proc/stat").exists(), reason="the system does not say how busy it is")
+def test_ones_own_time_is_not_that_of_others():
+    others, every = OtherProcesses(), OtherProcesses(lambda: 0.0)
+    end = time.perf_counter() + 0.3
+    while time.perf_counter() < end:
+        pass
+    others_busy, all_busy = others.busy_cores(), every.busy_cores()
+    assert all_busy is not None and others_busy is not None and 0.0 <= others_busy < all_busy
 
 
 def test_the_bandwidth_is_that_of_memory():

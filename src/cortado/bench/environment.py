@@ -3,6 +3,7 @@
 import os
 import platform
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib import metadata
@@ -11,16 +12,12 @@ from typing import Any
 
 from cortado import __version__
 
-LOOK = 0.3
-"""[s] for which the other processes are watched."""
-
 
 def environment() -> dict[str, Any]:
-    """The machine, the versions that matter, the date, and what else the machine is doing."""
+    """The machine, the versions that matter, and the date."""
     return {
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "cores_busy_elsewhere": _busy_cores(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "cortado": __version__,
@@ -30,20 +27,29 @@ def environment() -> dict[str, Any]:
     }
 
 
-def _busy_cores() -> float | None:
-    """How many cores other processes keep busy while this one sleeps; None where the system does not say."""
-    with suppress(OSError, ValueError):
-        before = _processor_ticks()
-        time.sleep(LOOK)
-        total, idle = (after - first for after, first in zip(_processor_ticks(), before, strict=True))
-        return round((os.cpu_count() or 1) * (1.0 - idle / total), 2) if total else None
-    return None
+class OtherProcesses:
+    """Watches how many cores the other processes of the machine keep busy, from when it is made."""
 
+    def __init__(self, own_seconds: Callable[[], float] = time.process_time):
+        """``own_seconds``: processor time [s] that is not others'."""
+        self._own_seconds = own_seconds
+        self._before = self._now()
 
-def _processor_ticks() -> tuple[int, int]:
-    """All ticks of all cores since the machine started, and those in which they had nothing to do."""
-    ticks = [int(word) for word in Path("/proc/stat").read_text().splitlines()[0].split()[1:]]
-    return sum(ticks[:8]), ticks[3] + ticks[4]
+    def busy_cores(self) -> float | None:
+        """On average since then; None where the system does not say. The machine counts in hundredths of a second."""
+        now = self._now()
+        if now is None or self._before is None:
+            return None
+        wall, busy, own = (after - before for after, before in zip(now, self._before, strict=True))
+        return round(max(busy - own, 0.0) / wall, 2)
+
+    def _now(self) -> tuple[float, float, float] | None:
+        """Wall time, the time that all cores of the machine were busy, and our own part of it [s]."""
+        with suppress(OSError, ValueError):
+            ticks = [int(word) for word in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
+            busy = (sum(ticks) - ticks[3] - ticks[4]) / os.sysconf("SC_CLK_TCK")  # but for idle and waiting for disks
+            return time.perf_counter(), busy, self._own_seconds()
+        return None
 
 
 def _processor() -> str:

@@ -10,7 +10,7 @@ def as_text(found: Mapping[str, Any]) -> str:
     """What `cortado bench` prints: a block for each size."""
     around = found["environment"]
     busy = around["cores_busy_elsewhere"]
-    others = "" if busy is None else f", {busy:g} of them busy with other processes at the start"
+    others = "" if busy is None else f", {busy:g} of them busy with other processes"
     lines = [
         f"{around['device']}, {around['cores']} cores{others}; Warp {around['warp']}",
         f"copy bandwidth {found['copy_bandwidth_gb_per_s']:.4g} GB/s, "
