@@ -1,7 +1,7 @@
 """Redraw and rewrite what `docs/performance.md` shows: ``python benchmarks/figures.py benchmarks/results/*.json``.
 
-Of each kind of device, CPU and GPU, the last run of the last file given is shown: a table between the comments that
-mark its place in the document, and a log-log figure beside it.
+Of each kind of device, CPU and GPU, the last file given is shown, and of each size the last run in it: tables between
+the comments that mark their place in the document, and a log-log figure.
 """
 
 import json
@@ -16,6 +16,12 @@ DOCS = Path(__file__).parents[1] / "docs"
 PAGE = DOCS / "performance.md"
 MISSING = "*No results file of this kind is there yet.*"
 Run = dict[str, Any]
+
+
+def latest(runs: list[Run]) -> Run:
+    """The last run, with the sizes that earlier runs on the same device have beyond its own."""
+    sizes = {size["particles"]: size for run in runs for size in run["sizes"]}
+    return {**runs[-1], "sizes": [sizes[particles] for particles in sorted(sizes)]}
 
 
 def kind(run: Run) -> str:
@@ -51,18 +57,17 @@ def tables(run: Run) -> str:
     """What the document says of a run."""
     around, settings, rows = run["environment"], run["settings"], own_rows(run)
     names = [name for name in run["sizes"][0]["measured"] if name != "Cortado"]
-    busy = [row["cores_busy_elsewhere"] for size in run["sizes"] for row in size["measured"].values()]
-    others = "" if None in busy else f", {min(busy):g} to {max(busy):g} of them busy with other processes meanwhile"
     lines = [
-        f"{around['device']}, {around['cores']} cores{others}; {around['date'][:10]}, Cortado {around['cortado']}, "
+        f"{around['device']}, {around['cores']} cores; {around['date'][:10]}, Cortado {around['cortado']}, "
         f"Warp {around['warp']}, {settings['precision']}, medians of {settings['repeats']} times {settings['steps']} "
-        f"steps, the middle of {settings['rounds']} turns. Copy bandwidth "
+        f"steps, of several turns the quietest. Copy bandwidth "
         f"{rows[-1]['copy_bandwidth_gb_per_s']:.3g} GB/s; an empty launch takes {rows[-1]['empty_launch_us']:.2g} us.",
         "",
-        "Milliseconds a step, forward / with the gradient:",
+        "Milliseconds a step, forward / with the gradient. *Others*: cores that other processes kept busy while each",
+        "of the programs ran, in the order of the columns.",
         "",
-        "| particles | Cortado | its floor | step alone | " + " | ".join(names) + (" |" if names else ""),
-        "|---|---|---|---|" + "---|" * len(names),
+        "| particles | Cortado | its floor | step alone | " + " | ".join([*names, "others"]) + " |",
+        "|---|---|---|---|" + "---|" * (len(names) + 1),
     ]
     for size in run["sizes"]:
         own = size["measured"].get("Cortado")
@@ -70,6 +75,8 @@ def tables(run: Run) -> str:
             floors = f"{own['rollout']['floor_ms']:.3g} / {own['gradient']['floor_ms']:.3g}"
             cells = [f"{own['particles']:,}", both(own), floors, f"{own['step']['ms']:.3g}"]
             cells += [both(size["measured"].get(name), own) for name in names]
+            busy = [row["cores_busy_elsewhere"] for row in size["measured"].values()]
+            cells.append("not known" if None in busy else ", ".join(f"{cores:.1f}" for cores in busy))
             lines.append(f"| {' | '.join(cells)} |")
     for size in run["sizes"]:
         lines += [f"\n{name}, {size['particles']:,} particles: {why}." for name, why in size["failed"].items()]
@@ -127,7 +134,7 @@ def rewritten(page: str, name: str, text: str) -> str:
 
 
 def main() -> None:
-    runs = [json.loads(Path(file).read_text())["runs"][-1] for file in sys.argv[1:]]
+    runs = [latest(json.loads(Path(file).read_text())["runs"]) for file in sys.argv[1:]]
     last = {kind(run): run for run in runs}
     page = PAGE.read_text(encoding="utf-8")
     for name in ("cpu", "gpu"):

@@ -30,7 +30,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--precision", default="float32")
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--repeats", type=int, default=5, help="the median of so many counts")
-    parser.add_argument("--rounds", type=int, default=1, help="turns of each program; the middle one counts")
+    parser.add_argument("--rounds", type=int, default=1, help="turns of each program; the quietest counts")
     parser.add_argument("--patience", type=float, default=0.0, help="seconds to wait for a quiet machine each time")
     parser.add_argument("--timeout", type=float, default=1200.0, help="seconds that a program may take")
     parser.add_argument("--jax-python", default=sys.executable, help="an interpreter that has jax")
@@ -41,7 +41,7 @@ def arguments() -> argparse.Namespace:
 
 
 def measure_size(programs: list[Program], particles: int, given: argparse.Namespace) -> Row:
-    """Every program's middle turn at one size, and why it has none."""
+    """Every program's quietest turn at one size, and why it has none."""
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"} if given.device == "cpu" else dict(os.environ)
     environment["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"  # so that the memory that JAX needs is seen
     turns: dict[str, list[Row]] = {program.name: [] for program in programs}
@@ -59,7 +59,7 @@ def measure_size(programs: list[Program], particles: int, given: argparse.Namesp
             turns[program.name].append(flat(found))
     return {
         "particles": particles,
-        "measured": {name: middle(rows) for name, rows in turns.items() if rows},
+        "measured": {name: quietest(rows) for name, rows in turns.items() if rows},
         "failed": failed,
     }
 
@@ -82,9 +82,9 @@ def flat(found: Row) -> Row:
     return {**found["sizes"][0], **machine}
 
 
-def middle(rows: list[Row]) -> Row:
-    """The turn whose rollout took the median of the times."""
-    return sorted(rows, key=lambda row: row["rollout"]["ms"])[len(rows) // 2]
+def quietest(rows: list[Row]) -> Row:
+    """The turn during which other processes kept the cores least busy; the first where the system does not say."""
+    return min(rows, key=lambda row: row["cores_busy_elsewhere"] or 0.0)
 
 
 def table(size: Row) -> str:

@@ -7,6 +7,9 @@ DFSPH as many as its own tolerances ask for. What differs from Cortado: walls ar
 particle has fewer neighbours; and its particles have 0.8 of the volume of a cell of this lattice, so that the pressure
 is 0 until the block has been compressed, which changes nothing in the work of an iteration.
 
+Threads that wait sleep, unless the environment has OMP_WAIT_POLICY=active: beside other processes, threads that spin
+made a step take up to four times as long.
+
 It is the package `pysplishsplash`. Where its import crashes, its own libGLX, libOpenGL and libGLdispatch do not get on
 with those of the system: put links to the system's in their place, in the folder ``pysplishsplash.libs``.
 """
@@ -109,7 +112,8 @@ def measure(particles: int, method: str, steps: int, repeats: int) -> dict[str, 
     import pysplishsplash as sph
 
     edge, timed = max(round(particles ** (1 / 3)), 2), steps * repeats
-    times = []
+    times: list[float] = []
+    iterations: list[int] = []
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "cube.obj").write_text(CUBE)
         file = Path(folder) / "scene.json"
@@ -117,8 +121,15 @@ def measure(particles: int, method: str, steps: int, repeats: int) -> dict[str, 
         base = sph.Exec.SimulatorBase()
         base.init(sceneFile=str(file), useGui=False, initialPause=False, outputDir=folder, useCache=False)
         base.initSimulation()
-        model = sph.Simulation.getCurrent().getFluidModel(0)
-        base.setTimeStepCB(lambda: times.append(time.perf_counter()))
+        simulation = sph.Simulation.getCurrent()
+        solver = simulation.getTimeStep()
+        number = next(n for n in range(solver.numParameters()) if solver.getName(n) == "iterations")
+
+        def note() -> None:
+            times.append(time.perf_counter())
+            iterations.append(solver.getValueUInt(number))
+
+        base.setTimeStepCB(note)
         base.runSimulation()
     spent = [after - before for before, after in zip(times[WARM:-1], times[WARM + 1 :], strict=True)]
     return {
@@ -126,9 +137,10 @@ def measure(particles: int, method: str, steps: int, repeats: int) -> dict[str, 
         "version": f"pysplishsplash {metadata.version('pysplishsplash')}",
         "device": "cpu",
         "threads": int(os.environ["OMP_NUM_THREADS"]),
-        "particles": model.numActiveParticles(),
+        "particles": simulation.getFluidModel(0).numActiveParticles(),
         "steps": steps,
         "repeats": repeats,
+        "iterations_per_step": median(iterations[WARM:]),
         "rollout": {"ms": 1e3 * median(spent)},
     }
 
@@ -143,6 +155,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="one line of JSON at the end")
     given = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = str(given.threads)
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     row = measure(given.particles, given.method, given.steps, given.repeats)
     print(json.dumps(row) if given.json else "\n".join(f"{name:30} {value}" for name, value in row.items()))
     sys.stdout.flush()
