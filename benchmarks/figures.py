@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from matplotlib.ticker import NullFormatter
+
 from cortado.figures.canvas import DASHED, PALETTE, drawing
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -49,6 +51,7 @@ def draw(run: Run, file: Path) -> None:
             floors = [row["particles"] for row in rows], [row[what]["floor_ms"] for row in rows]
             panel.loglog(*floors, color=PALETTE[0], label="Cortado's floor", **DASHED)
             panel.set(xlabel="particles", title=title)
+            panel.xaxis.set_minor_formatter(NullFormatter())
         panels[0].set_ylabel("ms a step")
         panels[0].legend()
 
@@ -94,6 +97,11 @@ def both(row: Run | None, own: Run | None = None) -> str:
     return " / ".join(words) or "-"
 
 
+def short(value: float) -> str:
+    """Two digits at least, and no powers of ten."""
+    return f"{value:,.0f}" if value >= 100.0 else f"{value:.2g}"
+
+
 def passes(rows: list[Run]) -> str:
     """The passes of a step and of the way back: microseconds of all launches in a step, and times the floor."""
     lines = ["Passes of a step, in microseconds, and how many times the floor that is:", ""]
@@ -104,8 +112,9 @@ def passes(rows: list[Run]) -> str:
             cells = [first["name"], str(first["launches"])]
             for row in rows:
                 found = next((one for one in row[which] if one["name"] == first["name"]), None)
-                times = found["ms"] / found["floor_ms"] if found else 0.0
-                cells.append(f"{1e3 * found['ms']:,.3g} ({times:.2g} x)" if found else "-")
+                cells.append(
+                    f"{short(1e3 * found['ms'])} ({short(found['ms'] / found['floor_ms'])} x)" if found else "-"
+                )
             lines.append(f"| {' | '.join(cells)} |")
     pairs = {one["name"]: one["pairs_per_second"] for one in rows[-1]["passes"] if "pairs_per_second" in one}
     said = ", ".join(f"{name} {1e-6 * rate:.3g}" for name, rate in pairs.items())
