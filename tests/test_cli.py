@@ -687,13 +687,12 @@ def test_a_planted_error_fails_the_check(cortado_command, monkeypatch, json_opti
 
 
 def test_bench_speaks_json_and_words(cortado_command):
-    code, out, err = cortado_command("bench", "--particles", 100, "--steps", 2, "--json")
-    numbers = json.loads(out)
-    assert (code, err) == (0, "") and numbers["particles"] == 125 and numbers["steps"] == 2
-    forward, gradient = numbers["forward_ms_per_step"], numbers["gradient_ms_per_step"]
-    assert forward > 0.0 and numbers["gradient_over_forward"] == pytest.approx(gradient / forward)
-    code, out, _ = cortado_command("bench", "--particles", 100, "--steps", 2)
-    assert code == 0 and "gradient_ms_per_step" in out
+    code, out, err = cortado_command("bench", "--particles", 8, 100, "--steps", 2, "--repeats", 1, "--json")
+    found = json.loads(out)
+    assert (code, err) == (0, "") and [row["particles"] for row in found["sizes"]] == [8, 125]
+    assert all(row["steps"] == 2 and row["gradient"]["ms"] > row["rollout"]["ms"] > 0.0 for row in found["sizes"])
+    code, out, _ = cortado_command("bench", "--particles", 100, "--steps", 2, "--repeats", 1)
+    assert code == 0 and "125 particles" in out and "\npressure force adjoint" in out
 
 
 @pytest.mark.parametrize(
@@ -708,7 +707,11 @@ def test_bench_speaks_json_and_words(cortado_command):
         (["gradients", "check", "absent.toml"], "cannot be read"),
         (["bench", "--particles", "-5"], "--particles is -5"),
         (["bench", "--particles", "8", "--steps", "0"], "steps is 0"),
+        (["bench", "--particles", "8", "0"], "--particles is 0"),
+        (["bench", "--particles"], "--particles"),
+        (["bench", "--particles", "8", "--repeats", "0"], "--repeats is 0"),
         (["bench", "--particles", "8", "--device", "tpu"], "device is 'tpu'"),
+        (["bench", "--particles", "8", "--precision", "float16"], "precision is 'float16'"),
     ],
 )
 def test_other_wrong_arguments_are_refused(cortado_command, folder, arguments, words):

@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 from cortado import CortadoWarning, DivergedError, InputError, Problem, Scene, Simulation, Trajectory, losses
-from cortado.commands.bench import dam_break
+from cortado.bench.scene import dam_break
 from cortado.device.arrays import to_device
 from cortado.device.fields import POSITIONS, VELOCITIES
 from cortado.device.launching import KernelLauncher

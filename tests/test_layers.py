@@ -67,6 +67,8 @@ LAYERS = """
     study.locality study.lyapunov_exponents study.lyapunov study.results study.round_off study.step_size study.task
     study.term_sizes study.pressure_terms study.wrong_adjoints study.wrong_derivation study.registry
     study.experiment_files
+    bench bench.scene bench.timing bench.floor bench.passes bench.memory bench.dam_break bench.environment
+    bench.reference_engine bench.text
     commands commands.bench commands.check commands.figure commands.optimise commands.run commands.study
     cli
     __main__

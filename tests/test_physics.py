@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cortado import DivergedError, Problem, Scene, Simulation, losses
-from cortado.commands.bench import dam_break
+from cortado.bench.scene import dam_break
 from cortado.device import launching
 from cortado.errors import CortadoWarning
 from scenes import plane, scene, splash

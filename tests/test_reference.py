@@ -378,6 +378,6 @@ def test_without_the_extension_module_there_is_one_sentence():
 
 
 def test_bench_times_it():
-    rows = json.loads(bench_reference(100, 2, "float32", as_json=True))
+    (rows,) = json.loads(bench_reference([100], 2, 1, "float32", as_json=True))["sizes"]
     assert rows["particles"] == 125 and rows["threads"] >= 1
     assert rows["speed_up"] == rows["forward_ms_per_step_one_thread"] / rows["forward_ms_per_step"] > 0.0

@@ -175,30 +175,34 @@ def study(
 
 @app.command
 def bench(
-    particles: int = 8000,
+    particles: tuple[int, ...] = (8000,),
     steps: int = 20,
+    repeats: int = 5,
     device: str = "cpu",
     precision: str = "float32",
     engine: Literal["warp", "reference"] = "warp",
     json: bool = False,
 ) -> Work:
-    """Time a dam break, forward and with its derivatives.
+    """Time a dam break: each pass of a step, the step, a rollout and its gradient, beside what the hardware allows.
 
     Args:
-        particles: Number of fluid particles, about.
+        particles: Numbers of fluid particles, about; one measurement for each.
         steps: Number of time steps.
+        repeats: The median of so many repeats counts.
         device: "cpu", or "cuda:0" for the first GPU.
         precision: "float32" or "float64"; of the reference engine also "float80" and "float128".
         engine: The one in Warp, or the reference engine in C++.
-        json: Print JSON for machines instead of a table.
+        json: Print JSON for machines, with more numbers, instead of tables.
     """
-    _require_at_least(1, particles, "--particles")
+    _require_at_least(1, len(particles), "the number of --particles")
+    _require_at_least(1, min(particles), "--particles")
+    _require_at_least(1, repeats, "--repeats")
     from cortado.commands.bench import bench_dam_break, bench_reference
 
     if engine == "reference":
-        return partial(bench_reference, particles, steps, precision, json)
+        return partial(bench_reference, particles, steps, repeats, precision, json)
     else:
-        return partial(bench_dam_break, particles, steps, device, precision, json)
+        return partial(bench_dam_break, particles, steps, repeats, device, precision, json)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

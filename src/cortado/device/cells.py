@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.launching import launch
+from cortado.device.launching import launch, sort_pairs
 from cortado.device.precision import Precision
 
 
@@ -178,6 +178,6 @@ class CellSort:
         launch(
             self._kernels.number_cells, self._particles, self._device, grid=grid, x=positions, keys=keys, order=order
         )
-        wp.utils.radix_sort_pairs(keys, order, self._particles, 0, self._bits)
+        sort_pairs(keys, order, self._particles, self._bits)
         starts, count = grid.starts, self._particles
         launch(self._kernels.find_starts, len(starts), self._device, keys=keys, count=count, starts=starts)

@@ -1,8 +1,9 @@
 """Launches of kernels with arguments by name, and sums over particles in a fixed order."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import wait
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
+from functools import partial
 from typing import Any
 
 import warp as wp
@@ -54,9 +55,42 @@ def bound(kernel: wp.Kernel, groups: Sequence[Named], given: Named) -> list[Any]
     return arguments
 
 
+Watcher = Callable[[str, Any, Sequence[Any], Callable[[], None]], None]
+"""Is given every launch: the name of what is launched, its threads, its arguments, and what launches it, which it must
+call at least once."""
+_watchers: list[Watcher] = []
+
+
+@contextmanager
+def watched(watcher: Watcher) -> Iterator[None]:
+    """Hand every launch of this process to a watcher, which times it or counts it. Captured graphs are not taken apart,
+    and launches within them are seen only while they are captured."""
+    _watchers.append(watcher)
+    try:
+        yield
+    finally:
+        _watchers.remove(watcher)
+
+
+def _perform(name: str, threads: Any, arguments: Sequence[Any], work: Callable[[], None]) -> None:
+    if _watchers:
+        _watchers[-1](name, threads, arguments, work)
+    else:
+        work()
+
+
 def launch(kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, **arguments: Any) -> None:
     """Launch a kernel, off any tape, with arguments by name; ``threads``: their number, or a shape."""
-    wp.launch(kernel, threads, inputs=bound(kernel, groups, arguments), device=device, record_tape=False)
+    inputs = bound(kernel, groups, arguments)
+    work = partial(wp.launch, kernel, threads, inputs=inputs, device=device, record_tape=False)
+    _perform(kernel.key, threads, inputs, work)
+
+
+def sort_pairs(keys: wp.array, values: wp.array, count: int, bits: int) -> None:
+    """Sort the first ``count`` keys by so many of their lowest bits, and values with them; ties keep their order. The
+    arrays have room for twice as many."""
+    work = partial(wp.utils.radix_sort_pairs, keys, values, count, 0, bits)
+    _perform("radix_sort", count, (keys, values), work)
 
 
 class KernelLauncher:
@@ -91,11 +125,12 @@ class KernelLauncher:
         sums = hasattr(inputs[0], "neighbours")
         if sums and threads is not None:
             raise TypeError(f"kernel {kernel.key} sums over neighbours, and has one thread for each particle.")
+        entries = threads or self.particles
         if sums and not self.capturable and kernel in self._compiled:
-            self._launch_parts(kernel, inputs)
+            _perform(kernel.key, entries, inputs, partial(self._launch_parts, kernel, inputs))
             return
-        count = threads or self.particles * lanes_of(kernel)
-        wp.launch(kernel, count, inputs=inputs, device=self.device, record_tape=self._record_tape)
+        options = {"inputs": inputs, "device": self.device, "record_tape": self._record_tape}
+        _perform(kernel.key, entries, inputs, partial(wp.launch, kernel, entries * lanes_of(kernel), **options))
         self._compiled.add(kernel)  # only now: an interrupted launch has compiled nothing
 
     def _launch_parts(self, kernel: wp.Kernel, inputs: Sequence[Any]) -> None:
@@ -169,10 +204,10 @@ class TreeReduction:
 
     def __call__(self, values: wp.array) -> wp.array:
         """The sum as an array (1,), which the next call overwrites."""
-        for partial in self._levels:
-            size = partial.shape[0]
-            launch(self._kernel, size, self._device, count=len(values), stride=size, values=values, partial=partial)
-            values = partial
+        for level in self._levels:
+            size = level.shape[0]
+            launch(self._kernel, size, self._device, count=len(values), stride=size, values=values, partial=level)
+            values = level
         return values
 
 

@@ -1,0 +1,138 @@
+"""The speed of Cortado and of its peers, in one run and in turn: ``python benchmarks/speed.py --sizes 125 8000``.
+
+Prints milliseconds a step and ratios, and appends everything to ``benchmarks/results/DEVICE-DATE.json``, from which
+`benchmarks/figures.py` makes what `docs/performance.md` shows. A peer that is missing is a line.
+"""
+
+import argparse
+import json
+import os
+import re
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from programs import Program, ProgramError, cortado, peers
+
+from cortado.bench.environment import OtherProcesses
+
+QUIET, LOOK = 0.2, 3.0
+"""Cores that others keep busy at most on a quiet machine, and the seconds for which they are watched."""
+RESULTS = Path(__file__).parent / "results"
+Row = dict[str, Any]
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="The speed of Cortado and of its peers.")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[125, 1000, 8000, 97336], help="numbers of particles")
+    parser.add_argument("--device", default="cpu", help='"cpu", or "cuda:0" for the first GPU')
+    parser.add_argument("--precision", default="float32")
+    parser.add_argument("--steps", type=int, default=20)
+    parser.add_argument("--repeats", type=int, default=5, help="the median of so many counts")
+    parser.add_argument("--rounds", type=int, default=1, help="turns of each program; the quietest counts")
+    parser.add_argument("--patience", type=float, default=0.0, help="seconds to wait for a quiet machine each time")
+    parser.add_argument("--timeout", type=float, default=1200.0, help="seconds that a program may take")
+    parser.add_argument("--jax-python", default=sys.executable, help="an interpreter that has jax")
+    parser.add_argument("--splishsplash-python", default=sys.executable, help="one that has pysplishsplash")
+    parser.add_argument("--no-peers", action="store_true", help="Cortado alone")
+    parser.add_argument("--json", type=Path, help="another file to write this run to")
+    return parser.parse_args()
+
+
+def measure_size(programs: list[Program], particles: int, given: argparse.Namespace) -> Row:
+    """Every program's quietest turn at one size, and why it has none."""
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"} if given.device == "cpu" else dict(os.environ)
+    environment["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"  # so that the memory that JAX needs is seen
+    turns: dict[str, list[Row]] = {program.name: [] for program in programs}
+    failed: dict[str, str] = {}
+    for _ in range(given.rounds):
+        for program in programs:
+            if program.name in failed:
+                continue
+            wait_for_quiet(given.patience)
+            try:
+                found = program.run(particles, given.steps, given.repeats, given.timeout, environment)
+            except ProgramError as error:
+                failed[program.name] = str(error)
+                continue
+            turns[program.name].append(flat(found))
+    return {
+        "particles": particles,
+        "measured": {name: quietest(rows) for name, rows in turns.items() if rows},
+        "failed": failed,
+    }
+
+
+def wait_for_quiet(patience: float) -> None:
+    """Wait until other processes leave the cores alone, or until the patience [s] is at an end."""
+    end = time.perf_counter() + patience
+    while time.perf_counter() < end:
+        others = OtherProcesses()
+        time.sleep(LOOK)
+        if (others.busy_cores() or 0.0) < QUIET:
+            return
+
+
+def flat(found: Row) -> Row:
+    """What `cortado bench` says of its only size, with what it says of the machine; what a peer says, as it is."""
+    if "sizes" not in found:
+        return found
+    machine = {name: value for name, value in found.items() if name != "sizes"}
+    return {**found["sizes"][0], **machine}
+
+
+def quietest(rows: list[Row]) -> Row:
+    """The turn during which other processes kept the cores least busy; the first where the system does not say."""
+    return min(rows, key=lambda row: row["cores_busy_elsewhere"] or 0.0)
+
+
+def table(size: Row) -> str:
+    """The times of one size, and how many times as long the peers take as Cortado."""
+    measured, own = size["measured"], size["measured"].get("Cortado")
+    lines = [f"{size['particles']:,} particles: ms a step, forward and with the gradient"]
+    for name, row in measured.items():
+        words = [f"{name:24}"]
+        for what in ("rollout", "gradient"):
+            if what in row:
+                ratio = f" ({row[what]['ms'] / own[what]['ms']:.2f} x)" if own and row is not own else ""
+                words.append(f"{row[what]['ms']:.4g}{ratio}")
+        lines.append("    ".join(words))
+    return "\n".join([*lines, *(f"{name:24}    failed: {why}" for name, why in size["failed"].items())])
+
+
+def results_file(run: Row) -> Path:
+    """Where a run is kept, by the device and the day."""
+    around = run["environment"]
+    device = re.sub(r"[^a-z0-9]+", "-", around["device"].lower()).strip("-")
+    return RESULTS / f"{device}-{around['cores']}-cores-{around['date'][:10]}.json"
+
+
+def main() -> None:
+    given = arguments()
+    found = [] if given.no_peers else peers(given.device, given.jax_python, given.splishsplash_python)
+    present = [program for program in found if program.is_installed]
+    missing = [program.name for program in found if program not in present]
+    for name in missing:
+        print(f"not installed: {name}")
+    programs = [cortado(given.device, given.precision), *present]
+    sizes = []
+    for particles in given.sizes:
+        sizes.append(measure_size(programs, particles, given))
+        print(table(sizes[-1]), flush=True)
+    own = [size["measured"]["Cortado"] for size in sizes if "Cortado" in size["measured"]]
+    if not own:
+        sys.exit("Cortado itself was not measured at any size.")
+    settings = {name: getattr(given, name) for name in ("device", "precision", "steps", "repeats", "rounds")}
+    run = {"environment": own[0]["environment"], "settings": settings, "not_installed": missing, "sizes": sizes}
+    file = results_file(run)
+    history = json.loads(file.read_text())["runs"] if file.exists() else []
+    RESULTS.mkdir(exist_ok=True)
+    file.write_text(json.dumps({"runs": [*history, run]}, indent=1) + "\n")
+    if given.json:
+        given.json.write_text(json.dumps(run, indent=1) + "\n")
+    print(f"The results are in {file}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,35 @@
+"""The scene of benchmarks, of any size; the programs in ``benchmarks/peers`` simulate the same block."""
+
+from cortado.device.neighbours import NeighbourSearch
+from cortado.scene.containers import BoxContainer
+from cortado.scene.fluids import BoxFluid
+from cortado.scene.model import Discretisation, Forces, Phase, Solver
+from cortado.scene.scene import Scene
+from cortado.simulation import Simulation
+from cortado.solvers.particles import ParticleSolver
+
+ITERATIONS = 5
+"""Pressure iterations of every step, whatever the density error."""
+
+
+def dam_break(particles: int) -> Scene:
+    """A cube of about that many particles beside an empty half of a box; 5 iterations a step."""
+    edge = max(round(particles ** (1 / 3)), 2)
+    spacing = 1.0 / edge
+    return Scene(
+        name="dam break",
+        dimension=3,
+        discretisation=Discretisation(spacing=spacing),
+        phase=(Phase(name="water", rest_density=1000.0, viscosity=0.05),),
+        fluid=(BoxFluid(lower=(0.0, 0.0, 0.0), upper=(1.0, 1.0, 1.0), phase="water"),),
+        container=BoxContainer(lower=(0.0, 0.0, 0.0), upper=(2.0, 1.5, 1.0)),
+        forces=Forces(gravity=(0.0, -9.81, 0.0)),
+        solver=Solver(time_step=0.02 * spacing, minimum_iterations=ITERATIONS, maximum_iterations=ITERATIONS),
+    )
+
+
+def search_of(simulation: Simulation) -> NeighbourSearch:
+    """The search for neighbours of a simulation of this scene."""
+    solver = simulation.solver
+    assert isinstance(solver, ParticleSolver)
+    return solver.search

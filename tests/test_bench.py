@@ -1,0 +1,178 @@
+"""`cortado bench` and what it is made of: what it says adds up. How fast Cortado is, it says on the day."""
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp as wp
+
+from cortado import Simulation
+from cortado.bench.dam_break import measure_dam_break, with_floors
+from cortado.bench.environment import OtherProcesses
+from cortado.bench.floor import copy_bandwidth, least_bytes, sums_over_neighbours
+from cortado.bench.memory import ESTIMATED
+from cortado.bench.passes import AGAIN, PassTimer
+from cortado.bench.scene import ITERATIONS, dam_break
+from cortado.bench.text import as_text
+from cortado.bench.timing import LaunchTimer, median_seconds
+from cortado.commands.bench import bench_dam_break
+from cortado.device.launching import KernelLauncher, watched
+
+STEP = [
+    *("sort by cell", "neighbour list", "density", "wall relaxation", "gravity", "viscosity", "pressure"),
+    *("pressure force", "error sums", "the rest"),
+]
+
+
+@pytest.fixture(scope="module")
+def found():
+    """What the command prints for the smallest block."""
+    return json.loads(bench_dam_break([8, 27], 2, 1, "cpu", "float32", as_json=True))
+
+
+def test_sizes_come_in_order_with_what_they_were_measured_on(found):
+    assert [row["particles"] for row in found["sizes"]] == [8, 27]
+    assert found["environment"].keys() >= {"device", "cores", "warp", "date", "cores_busy_elsewhere"}
+    assert found["copy_bandwidth_gb_per_s"] > 0.0 and found["empty_launch_us"] > 0.0
+
+
+def test_every_pass_of_a_step_has_a_time_and_a_floor(found):
+    for row in found["sizes"]:
+        assert sorted(one["name"] for one in row["passes"]) == sorted(STEP)
+        assert row["passes"][-1]["name"] == "the rest"
+        for one in [*row["passes"], *row["adjoint_passes"], row["step"], row["rollout"], row["gradient"]]:
+            assert one["ms"] > 0.0 and one["floor_ms"] > 0.0
+
+
+def test_passes_occur_as_often_as_a_step_launches_them(found):
+    launches = {one["name"]: one["launches"] for one in found["sizes"][1]["passes"]}
+    assert launches["pressure"] == launches["pressure force"] == ITERATIONS
+    assert launches["density"] == launches["viscosity"] == launches["neighbour list"] == 1
+    back = {one["name"]: one["launches"] for one in found["sizes"][1]["adjoint_passes"]}
+    assert back["pressure adjoint"] == back["pressure force adjoint"] == ITERATIONS and back["viscosity adjoint"] == 1
+    assert AGAIN in back
+
+
+def test_floors_are_those_of_the_passes(found):
+    row = found["sizes"][1]
+    step = sum(one["floor_ms"] for one in row["passes"])
+    back = sum(one["floor_ms"] for one in row["adjoint_passes"])
+    assert row["step"]["floor_ms"] == pytest.approx(step) == row["rollout"]["floor_ms"]
+    assert row["gradient"]["floor_ms"] == pytest.approx(step + back)
+    one = row["passes"][0]
+    assert one["floor_ms"] == pytest.approx(1e3 * one["bytes"] / (1e9 * found["copy_bandwidth_gb_per_s"]))
+
+
+def test_only_sums_over_neighbours_have_pairs(found):
+    passes = {one["name"]: one for one in found["sizes"][1]["passes"]}
+    assert all(
+        passes[name]["pairs_per_second"] > 0.0 for name in ("density", "pressure", "viscosity", "neighbour list")
+    )
+    assert not any("pairs_per_second" in passes[name] for name in ("sort by cell", "gravity", "error sums", "the rest"))
+
+
+def test_memory_is_estimated_on_a_cpu(found):
+    memory = found["sizes"][1]["memory"]
+    assert memory["how"] == ESTIMATED
+    assert 0.0 < memory["forward_bytes_per_particle"] < memory["gradient_bytes_per_particle"]
+
+
+def test_tables_have_every_pass(found):
+    text = as_text(found)
+    assert all(text.count(f"\n{name} ") >= 2 for name in [*STEP, "step", "rollout", "gradient"])
+    assert "27 particles" in text and "GB/s" in text
+
+
+def test_bytes_of_a_launch_are_its_entries():
+    x, y = wp.zeros(10, dtype=wp.vec3f, device="cpu"), wp.zeros(20, dtype=wp.int32, device="cpu")
+    assert least_bytes([x, y, 3.0], 10, 10, 0) == 10 * 12 + 10 * 4
+    assert least_bytes([x, x], 10, 10, 0) == 120, "an array counts once"
+    assert least_bytes([x, y], 1, 10, 0) == 12 + 4, "one thread, one entry"
+
+
+def test_bytes_of_a_sum_over_neighbours_have_its_list():
+    solver = Simulation(dam_break(27)).solver
+    neighbourhood = solver.context(solver.new_parameters(1)).neighbourhood
+    x = solver.fields["x"]
+    assert sums_over_neighbours([neighbourhood, x]) and not sums_over_neighbours([x]) and not sums_over_neighbours([])
+    assert least_bytes([neighbourhood, x], 27, 27, 500) == 27 * 12 + 4 * 500 + 8 * 27
+
+
+def test_listed_neighbours_are_those_of_the_first_state():
+    simulation = Simulation(dam_break(64))
+    rollout = simulation.rollout(2)
+    rollout.forward(keep=False)
+    timer = PassTimer(rollout, simulation.solver.search, 1)
+    x = np.concatenate([simulation.positions, simulation.walls])
+    reach = 1.03 * simulation.scene.discretisation.support_radius
+    distances = np.linalg.norm(x[None] - simulation.positions[:, None], axis=2)
+    assert timer.pairs == np.count_nonzero(distances < reach) - simulation.particles
+    assert timer.pairs <= timer.listed < timer.pairs + 4 * simulation.particles
+
+
+def test_a_run_has_the_same_bits_after_its_passes_were_timed():
+    simulation = Simulation(dam_break(64))
+    before = simulation.run(3).positions
+    rollout = simulation.rollout(3)
+    rollout.forward(keep=False)
+    with simulation.turn:
+        timer = PassTimer(rollout, simulation.solver.search, 1)
+        timer.step_passes()
+        timer.adjoint_passes()
+    assert np.array_equal(simulation.run(3).positions, before)
+
+
+def test_a_watcher_sees_every_launch_and_only_within_its_block():
+    simulation = Simulation(dam_break(8))
+    solver, seen = simulation.solver, []
+    rollout = simulation.rollout(1)
+
+    def watch(name, threads, arguments, launch):
+        seen.append(name.rpartition("__")[2])
+        launch()
+
+    with simulation.turn, watched(watch):
+        solver.step(rollout.initial, solver.new_state(), rollout.parameters, rollout.log)
+    assert seen.count("pressure") == ITERATIONS and {"radix_sort", "fill", "record"} <= set(seen)
+    number = len(seen)
+    simulation.run(1)
+    assert len(seen) == number
+
+
+def test_medians_leave_the_first_time_out():
+    calls = []
+    assert median_seconds(lambda: calls.append("work"), 3, before=lambda: calls.append("before")) >= 0.0
+    assert calls == ["before", "work"] * 4
+
+
+def test_a_long_launch_is_not_repeated_often():
+    launcher, calls = KernelLauncher(10**6, wp.get_device("cpu"), record_tape=False), []
+    array = wp.zeros(4_000_000, dtype=wp.float32, device="cpu")
+
+    def work() -> None:
+        calls.append(1)
+        array.fill_(1.0)
+
+    assert LaunchTimer(launcher, 2)(work) > 0.0
+    assert len(calls) < 100
+
+
+@pytest.mark.skipif(not Path("/proc/stat").exists(), reason="the system does not say how busy it is")
+def test_ones_own_time_is_not_that_of_others():
+    others, every = OtherProcesses(), OtherProcesses(lambda: 0.0)
+    end = time.perf_counter() + 0.3
+    while time.perf_counter() < end:
+        pass
+    others_busy, all_busy = others.busy_cores(), every.busy_cores()
+    assert all_busy is not None and others_busy is not None and 0.0 <= others_busy < all_busy
+
+
+def test_the_bandwidth_is_that_of_memory():
+    assert 1e8 < copy_bandwidth(wp.get_device("cpu"), 1) < 1e13
+
+
+def test_float64_moves_more_bytes():
+    single, double = (with_floors(measure_dam_break(8, 1, "cpu", p, 1), 1e9) for p in ("float32", "float64"))
+    assert single["step"]["floor_ms"] < double["step"]["floor_ms"]
