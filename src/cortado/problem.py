@@ -19,7 +19,7 @@ from cortado.losses.checked import as_loss
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import NAMES, UNITS, Arrays, Values
-from cortado.rollout import MEMORY_BUDGET, Observer, Rollout, StepDerivative
+from cortado.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
 from cortado.simulation import Simulation, check_steps, whole_number
 from cortado.words import counted
 
@@ -69,7 +69,7 @@ class Problem:
         self._losses: dict[int, Loss] = {step: as_loss(one) for step, one in by_step.items()}
         self._space = ParameterSpace(simulation, self.steps)
         self._rollout = Rollout(simulation.solver, self.steps, self.memory_budget)
-        self._derivatives: dict[AdjointEstimator, StepDerivative] = {}
+        self._derivatives: dict[AdjointEstimator, BackwardStep] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled and copied as what it is made from."""
@@ -239,7 +239,7 @@ class ForwardPass:
     _values: Arrays
     _bars: Mapping[int, SnapshotAdjoint]
     _space: ParameterSpace
-    _derivatives: dict[AdjointEstimator, StepDerivative]
+    _derivatives: dict[AdjointEstimator, BackwardStep]
     _evaluation: int
 
     @property
@@ -248,7 +248,7 @@ class ForwardPass:
         return self.rollout.turn
 
     @in_turn
-    def derivative(self, estimator: AdjointEstimator) -> StepDerivative:
+    def derivative(self, estimator: AdjointEstimator) -> BackwardStep:
         """The estimator's backward step, made once for each problem."""
         if estimator not in self._derivatives:
             solver = self.rollout.solver
@@ -258,7 +258,7 @@ class ForwardPass:
         return self._derivatives[estimator]
 
     @in_turn
-    def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:
+    def back(self, derivative: BackwardStep, observe: Observer | None = None) -> Arrays:
         """The gradient; ``observe`` is given the number and the adjoint of every state, from the last to the first.
 
         Raises `InputError` after another evaluation of the problem, which overwrites the states of this one.

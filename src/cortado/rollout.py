@@ -29,7 +29,7 @@ MEMORY_BUDGET = 8 * 2**30
 Observer = Callable[[int, State], None]
 
 
-class StepDerivative(Protocol):
+class BackwardStep(Protocol):
     """The way back through one step, made by an `AdjointEstimator` of `cortado.gradients` for one rollout."""
 
     capturable: bool
@@ -151,7 +151,7 @@ class Rollout:
         self._generation = self.solver.generation
         step = partial(self.solver.step, self._buffer, self._buffer, self.parameters, self.log)
         self._step = CapturedGraph(step, self.solver.launch)
-        self._steps_back: dict[tuple[StepDerivative, Counts], CapturedGraph] = {}
+        self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
 
     def _diverged(self, lost: Lost, state: State) -> DivergedError:
         containment = self.solver.containment
@@ -168,7 +168,7 @@ class Rollout:
     # ---- derivatives ---------------------------------------------------------------------------------------------
 
     @in_turn
-    def backward(self, derivative: StepDerivative, bars: Mapping[int, State], observe: Observer | None = None) -> State:
+    def backward(self, derivative: BackwardStep, bars: Mapping[int, State], observe: Observer | None = None) -> State:
         """The adjoint of the first state, for ``bars``, adjoints of states by their number.
 
         ``observe`` is given the adjoint of every state, from the last to the first; the next step overwrites it. Raises
@@ -196,7 +196,7 @@ class Rollout:
                 self._step_back(derivative, self.log.counts(n - 1))
         return self._bar
 
-    def _step_back(self, derivative: StepDerivative, counts: Counts) -> None:
+    def _step_back(self, derivative: BackwardStep, counts: Counts) -> None:
         work = partial(derivative.step, self._buffer, counts, self._bar)
         if not derivative.capturable:
             work()

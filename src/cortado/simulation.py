@@ -133,7 +133,7 @@ class Simulation:
 
         ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity; so does any other parameter
         of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same scene, the run goes on
-        from there, with the same bits as if it had not stopped; a control over time is then that of the steps to come.
+        from there, with the same bits as if it had not stopped; a parameter over time is then that of the steps to come.
         Warns when the pressure did not converge; raises `DivergedError` when a particle is lost.
         """
         return self.collect(self.rollout(steps, controls, state), record_every)
@@ -191,7 +191,7 @@ class Simulation:
         ``state``."""
         rollout = Rollout(self.solver, check_steps(steps))
         space = ParameterSpace(self, rollout.steps)
-        values = space.checked(controls or {}, "control")
+        values = space.checked(controls or {})
         if state is not None:
             space.check_restart(state, values)
         space.begin(rollout, values, state=state)

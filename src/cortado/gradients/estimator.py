@@ -7,7 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 from cortado.device.state import Parameters, State
 from cortado.errors import InputError
 from cortado.parameters.values import Arrays, Values
-from cortado.rollout import Observer, Rollout, StepDerivative
+from cortado.rollout import BackwardStep, Observer, Rollout
 from cortado.solvers.solver import Counts
 from cortado.words import sized
 
@@ -41,10 +41,10 @@ class ForwardPass(Protocol):
     def rollout(self) -> Rollout:
         """The run."""
 
-    def derivative(self, estimator: "AdjointEstimator") -> StepDerivative:
+    def derivative(self, estimator: "AdjointEstimator") -> BackwardStep:
         """The estimator's backward step; it is made once for each problem and estimator."""
 
-    def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:
+    def back(self, derivative: BackwardStep, observe: Observer | None = None) -> Arrays:
         """The gradient; ``observe`` is called with the number and the adjoint of every state, from the last to the
         first."""
 
@@ -93,7 +93,7 @@ class AdjointEstimator(ABC):
     """An estimator that makes one reverse pass through one rollout, step by step."""
 
     @abstractmethod
-    def derivative(self, rollout: Rollout) -> StepDerivative:
+    def derivative(self, rollout: Rollout) -> BackwardStep:
         """The backward step for one rollout."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
@@ -105,7 +105,7 @@ class AdjointEstimator(ABC):
 class Filtered:
     """The backward step of another estimator, followed by a filter of the adjoint."""
 
-    def __init__(self, base: StepDerivative):
+    def __init__(self, base: BackwardStep):
         self._base, self.rollout, self.solver, self.capturable = base, base.rollout, base.solver, base.capturable
 
     def begin(self) -> None:

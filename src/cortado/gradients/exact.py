@@ -7,7 +7,7 @@ import warp as wp
 
 from cortado.device.state import Parameters, State
 from cortado.gradients.estimator import AdjointEstimator
-from cortado.rollout import Rollout, StepDerivative
+from cortado.rollout import BackwardStep, Rollout
 from cortado.solvers.solver import Counts
 
 
@@ -20,7 +20,7 @@ class Exact(AdjointEstimator):
     has about twice the neighbour sums of a forward one.
     """
 
-    def derivative(self, rollout: Rollout) -> StepDerivative:
+    def derivative(self, rollout: Rollout) -> BackwardStep:
         return _AdjointStep(rollout, frozen_geometry=False)
 
 
@@ -41,7 +41,7 @@ class FrozenGeometry(AdjointEstimator):
     Prior art: the default of DiffFR (Li et al. 2023).
     """
 
-    def derivative(self, rollout: Rollout) -> StepDerivative:
+    def derivative(self, rollout: Rollout) -> BackwardStep:
         return _AdjointStep(rollout, frozen_geometry=True)
 
 
@@ -52,7 +52,7 @@ class Tape(AdjointEstimator):
     It is slower than `Exact`, with atomics on a GPU, and is kept to check it.
     """
 
-    def derivative(self, rollout: Rollout) -> StepDerivative:
+    def derivative(self, rollout: Rollout) -> BackwardStep:
         return _TapeStep(rollout)
 
 

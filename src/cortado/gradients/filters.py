@@ -12,7 +12,7 @@ from cortado.gradients.estimator import AdjointEstimator, Differentiable, Estima
 from cortado.gradients.exact import Exact
 from cortado.gradients.strength import sufficient
 from cortado.parameters.values import Arrays, Values
-from cortado.rollout import Observer, Rollout, StepDerivative
+from cortado.rollout import BackwardStep, Observer, Rollout
 
 EXACT = Exact()
 
@@ -113,7 +113,7 @@ class AdjointViscosity(AdjointEstimator):
 class ViscousStep(Filtered):
     """The backward step of `AdjointViscosity`."""
 
-    def __init__(self, base: StepDerivative, rollout: Rollout, estimator: AdjointViscosity):
+    def __init__(self, base: BackwardStep, rollout: Rollout, estimator: AdjointViscosity):
         super().__init__(base)
         self._average, self._limit = Average(base.solver, estimator.fields), Limit(base.solver, estimator.fields)
         self._parameters = rollout.parameters
@@ -147,12 +147,12 @@ class Damped(AdjointEstimator):
         if not (isinstance(self.rate, (int, float, np.number)) and np.isfinite(self.rate) and self.rate >= 0.0):
             raise InputError(f"rate is {shown(self.rate)}, but must be a number of at least 0, in 1/s.")
 
-    def derivative(self, rollout: Rollout) -> StepDerivative:
+    def derivative(self, rollout: Rollout) -> BackwardStep:
         return _DampedStep(self.base.derivative(rollout), rollout, self.rate)
 
 
 class _DampedStep(Filtered):
-    def __init__(self, base: StepDerivative, rollout: Rollout, rate: float):
+    def __init__(self, base: BackwardStep, rollout: Rollout, rate: float):
         super().__init__(base)
         self._drag, self._parameters = Drag(base.solver, rate), rollout.parameters
 

@@ -16,7 +16,7 @@ from cortado.errors import InputError
 from cortado.gradients import Estimate, ForwardPass, GradientEstimator, estimate
 from cortado.parameters.values import Arrays
 from cortado.problem import Problem
-from cortado.rollout import Observer, StepDerivative
+from cortado.rollout import BackwardStep, Observer
 
 SMALLEST = 1e-4
 """Smaller fractions are replaced by this one where their coordinates are computed: that of 0 is minus infinity."""
@@ -142,7 +142,7 @@ class TransformedPass:
         self._pass, self._coordinates, self._u = forward_pass, coordinates, u
         self.loss, self.rollout, self.derivative = forward_pass.loss, forward_pass.rollout, forward_pass.derivative
 
-    def back(self, derivative: StepDerivative, observe: Observer | None = None) -> Arrays:
+    def back(self, derivative: BackwardStep, observe: Observer | None = None) -> Arrays:
         """The gradient with respect to the coordinates."""
         gradient = self._pass.back(derivative, observe)
         for name, coordinates in self._coordinates.items():

@@ -17,7 +17,7 @@ import warp as wp
 from cortado.device.kernels import Kernels
 from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.gradients import Tape
-from cortado.rollout import Rollout, StepDerivative
+from cortado.rollout import BackwardStep, Rollout
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class OneKernelTape(Tape):
     topics: tuple[str, ...]
     """Of `one_kernel_loops`."""
 
-    def derivative(self, rollout: Rollout) -> StepDerivative:
+    def derivative(self, rollout: Rollout) -> BackwardStep:
         step = super().derivative(rollout)
         loops = one_kernel_loops(rollout.solver.discretisation)
         wrong = {topic: Kernels(loops[topic], None, None) for topic in self.topics}

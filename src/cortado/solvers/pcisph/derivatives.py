@@ -59,11 +59,11 @@ class PcisphAdjoint(ParticleAdjoint):
         context.launch(solver.integration.acceleration_adjoint, *known, acceleration_bar=self._acceleration_bar)
         self.accelerate(context, self._acceleration_bar)
         if solver.mixture.phases.count > 1:
-            factors = {"t": solver.contrast, "y": solver.pressure_relaxation, "y_bar": self._y_bar}
-            context.launch(kernels.contrast.factor_adjoint, **factors, t_bar=self._t_bar)
-            context.launch(kernels.contrast.adjoint, *known, t_bar=self._t_bar)
+            factors = {"t": solver.density_ratio, "y": solver.pressure_relaxation, "y_bar": self._y_bar}
+            context.launch(kernels.density_ratio.factor_adjoint, **factors, t_bar=self._t_bar)
+            context.launch(kernels.density_ratio.adjoint, *known, t_bar=self._t_bar)
         if not self._frozen:
-            context.launch(kernels.walls.adjoint, *known, y=solver.wall_relaxation, y_bar=self._y_bar)
+            context.launch(kernels.wall_relaxation.adjoint, *known, y=solver.wall_relaxation, y_bar=self._y_bar)
         self.mix(context, state_bar)
         if self._frozen:
             self._sort_frozen(context, state_bar, free_bar)
@@ -95,7 +95,7 @@ class PcisphTangent(ParticleTangent):
         solver, it, kernels, known = self._solver, self._solver.iterates, self._solver.kernels, self.dot.named
         context = solver.context(parameters)
         self.sort(context, state_dot)
-        self._yields(known, context)
+        self._relax(known, context)
         accelerations = {"acceleration": solver.accelerations[-1], "acceleration_dot": self.accelerate(context)}
         predicted = {"x_star_dot": self._x_star_dot, "v_star_dot": self._v_star_dot}
         context.launch(solver.integration.predict_tangent, *known, **accelerations, v_star=it.v_star[0], **predicted)
@@ -121,12 +121,17 @@ class PcisphTangent(ParticleTangent):
             p_dot_before = p_dot
         self.unsort(context, self._x_star_dot, self._v_star_dot, state_dot)
 
-    def _yields(self, known: tuple[Named, ...], context: StepContext) -> None:
-        """The tangent of what delta is multiplied with."""
+    def _relax(self, known: tuple[Named, ...], context: StepContext) -> None:
+        """The tangent of the pressure relaxation."""
         solver, kernels = self._solver, self._solver.kernels
         several = solver.mixture.phases.count > 1
         y_dot = self._wall_y_dot if several else self._y_dot
-        context.launch(kernels.walls.tangent, *known, y=solver.wall_relaxation, y_dot=y_dot)
+        context.launch(kernels.wall_relaxation.tangent, *known, y=solver.wall_relaxation, y_dot=y_dot)
         if several:
-            factors = {"t": solver.contrast, "y": solver.pressure_relaxation, "wall_y_dot": y_dot, "y_dot": self._y_dot}
-            context.launch(kernels.contrast.tangent, *known, **factors)
+            factors = {
+                "t": solver.density_ratio,
+                "y": solver.pressure_relaxation,
+                "wall_y_dot": y_dot,
+                "y_dot": self._y_dot,
+            }
+            context.launch(kernels.density_ratio.tangent, *known, **factors)

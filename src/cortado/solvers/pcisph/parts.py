@@ -17,8 +17,8 @@ from cortado.solvers.pcisph.wall_relaxation import wall_kernels
 class PcisphKernels:
     """The kernels that only PCISPH needs, each topic with its forward, tangent and adjoint."""
 
-    walls: Kernels
-    contrast: DensityRatioKernels
+    wall_relaxation: Kernels
+    density_ratio: DensityRatioKernels
     pressure: Kernels
     force: Kernels
 

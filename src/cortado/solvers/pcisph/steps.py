@@ -19,7 +19,7 @@ class PcisphSteps(ParticleSolver):
         """``limits`` None leaves the pressure out."""
         super().__init__(system, requires_grad)
         self.limits, self.kernels = limits, PcisphKernels.of(self.discretisation)
-        self.wall_relaxation, self.contrast = self.numbers(), self.numbers()
+        self.wall_relaxation, self.density_ratio = self.numbers(), self.numbers()
         self.pressure_relaxation = self.numbers() if self.mixture.phases.count > 1 else self.wall_relaxation
         """(n,) what delta is multiplied with [-]: beside walls, and with several phases among lighter neighbours."""
         self.iterates = Iterates(self.numbers, self.vectors)
@@ -51,10 +51,13 @@ class PcisphSteps(ParticleSolver):
     def predict(self, state: State, parameters: Parameters) -> StepContext:
         """Everything but the pressure, and the first prediction."""
         it, kernels, context = self.iterates, self.kernels, self.sort(state, parameters)
-        context.launch(kernels.walls.forward, y=self.wall_relaxation)
+        context.launch(kernels.wall_relaxation.forward, y=self.wall_relaxation)
         if self.mixture.phases.count > 1:
             context.launch(
-                kernels.contrast.forward, wall_y=self.wall_relaxation, t=self.contrast, y=self.pressure_relaxation
+                kernels.density_ratio.forward,
+                wall_y=self.wall_relaxation,
+                t=self.density_ratio,
+                y=self.pressure_relaxation,
             )
         first = {"x_star": it.x_star[0], "v_star": it.v_star[0]}
         context.launch(self.integration.predict, acceleration=self.accelerate(context), **first)
