@@ -93,8 +93,8 @@ class Adjoints:
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
-        """For kernels: ``x_bar`` and so on; the sums, (steps,), of parameters over time; and particles' shares, (n,), of those
-        parameters alone that a part names among its ``shares``."""
+        """For kernels: ``x_bar`` and so on; the sums, (steps,), of parameters over time; and particles' shares, (n,),
+        of those parameters alone that a part names among its ``shares``."""
         whole = {
             f"{name}_bar": self.parameters[name] for name in self.parameters.names if BY_NAME[name].axis is Axis.STEP
         }
