@@ -90,7 +90,9 @@ def checked_estimate(found: Any, parameters: Values) -> Estimate:
         what = f"the estimate's gradient with respect to {name}"
         gradient[name] = as_numbers(what, found.gradient[name])
         if gradient[name].shape != np.shape(given):
-            raise InputError(f"{what} has shape {gradient[name].shape}, but must be {np.shape(given)}, as it has.")
+            raise InputError(
+                f"{what} has shape {gradient[name].shape}, but must be {np.shape(given)}, the parameter's."
+            )
     return replace(found, loss=loss, gradient=gradient)
 
 
