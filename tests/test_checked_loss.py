@@ -65,6 +65,12 @@ def test_adjoints_of_every_form_come_through():
     assert found.value_and_adjoint(END)[1].state is bar
 
 
+@pytest.mark.parametrize("name", ["positions", "velocities", "mass_fractions"])
+def test_what_a_loss_is_given_cannot_be_changed(name):
+    with pytest.raises(ValueError, match="read-only"):
+        getattr(END, name)[:] = 1.0
+
+
 def a_pair(positions, velocities=None):
     return positions, np.zeros((N, 2)) if velocities is None else velocities
 

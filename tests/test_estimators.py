@@ -1,6 +1,6 @@
 """Estimators: each does to the adjoint what its formula says, and nothing else."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 
 from cortado import InputError, Problem, Simulation, gradients, losses
+from cortado.gradients import AdjointEstimator, Estimate, Filtered
 from cortado.gradients.adjoint_filters import Average
 from cortado.gradients.strength import LADDER, MOST_GROWTH, growth, sufficient
 from reference import complex_step
@@ -557,6 +558,77 @@ def test_centres_of_mass_and_their_gradients(make, masses):
     assert loss.fingerprint != make([0.3, -0.1], masses).fingerprint
 
 
+# ---- estimators of one's own ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Halved(AdjointEstimator):
+    """The adjoint of velocities halved after every step, in NumPy, or on the device as one that a graph may repeat."""
+
+    in_numpy: bool
+
+    def derivative(self, rollout):
+        return (HalvedInNumpy if self.in_numpy else HalvedOnDevice)(gradients.Exact().derivative(rollout))
+
+
+class HalvedInNumpy(Filtered):
+    def filter(self, bar):
+        bar.velocities.assign(0.5 * bar.velocities.numpy())
+
+
+class HalvedOnDevice(Filtered):
+    only_launches = True
+
+    def filter(self, bar):
+        wp.launch(halve, len(bar.velocities), inputs=[bar.velocities], device=bar.velocities.device)
+
+
+@wp.kernel(enable_backward=False)
+def halve(a: wp.array(dtype=wp.vec3d)):
+    i = wp.tid()
+    a[i] = wp.float64(0.5) * a[i]
+
+
+def test_a_filter_in_numpy_acts_on_every_step():
+    """It is not captured with the first of them, as one that only launches kernels is."""
+    simulation = simulation_of("2-D")
+    problem, point = Problem(simulation, 9, Mixed(simulation)), point_of(simulation)
+    found, wanted = (problem.value_and_gradient(point, Halved(in_numpy))[1] for in_numpy in (True, False))
+    exact = problem.value_and_gradient(point)[1]
+    for name in ("gravity", "initial_velocities"):
+        np.testing.assert_allclose(found[name], wanted[name], rtol=1e-13)
+        assert np.linalg.norm(found[name]) < 0.5 * np.linalg.norm(exact[name])
+
+
+@dataclass
+class Changing(AdjointEstimator):
+    rate: float = 1.0
+
+    def derivative(self, rollout):
+        return gradients.Exact().derivative(rollout)
+
+
+@dataclass(frozen=True)
+class Returning:
+    """What an estimate should not be."""
+
+    found: object
+
+    def estimate(self, problem, parameters, observe=None):
+        return self.found
+
+
+def estimate_of(viscosity):
+    return Returning(Estimate(1.0, {"viscosity": viscosity}))
+
+
+def test_an_estimate_comes_in_float64():
+    simulation = simulation_of("2-D")
+    problem = Problem(simulation, 1, Mixed(simulation))
+    found = problem.estimate({"gravity": [0.0, -9.81]}, Returning(Estimate(np.float32(1.0), {"gravity": [1, 2]})))
+    assert type(found.loss) is float and found.gradient["gravity"].dtype == np.float64
+
+
 # ---- mistakes -------------------------------------------------------------------------------------------------------
 
 MISTAKES = {
@@ -601,6 +673,13 @@ MISTAKES = {
     "target's shape": lambda p: Problem(p.simulation, 1, losses.CentreOfMass([0.0] * 2)).value({}),
     "direction's shape": lambda p: Problem(p.simulation, 1, losses.CentreOfMassAlong([0.0] * 2)).value({}),
     "target a number": lambda p: losses.CentreOfMass(1.0),
+    "settings that may change": lambda p: p.estimate({"viscosity": 0.1}, Changing()),
+    "a tuple": lambda p: p.estimate({"viscosity": 0.1}, Returning((1.0, {}))),
+    "no gradient": lambda p: p.estimate({"viscosity": 0.1}, Returning(Estimate(1.0, {}))),
+    "a gradient of another shape": lambda p: p.estimate(
+        {"viscosity": 0.1}, Returning(Estimate(1.0, {"viscosity": [1.0]}))
+    ),
+    "a gradient in words": lambda p: p.estimate({"viscosity": 0.1}, Returning(Estimate(1.0, {"viscosity": "small"}))),
 }
 
 

@@ -1,10 +1,12 @@
 """What forces promise: they add to adjoints, whatever others have added before."""
 
 import numpy as np
+import pytest
 import warp as wp
 
 from cortado import Simulation
 from cortado.device.arrays import Fields
+from cortado.device.precision import FLOAT64
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint
 from cortado.sph.gravity import Gravity
 from cortado.sph.parts import Adjoints, Shares
@@ -24,6 +26,12 @@ def test_gravity_adds_to_its_adjoint():
     for _ in range(2):
         gravity.adjoint(solver.context(solver.new_parameters(2)), ones, Adjoints(fields, bar, shares))
     np.testing.assert_array_equal(bar["gravity"].numpy(), [[0.5] * 3, [0.5 + 2 * n] * 3])
+
+
+@pytest.mark.parametrize("shares", ["drag", "gravity", "mass_fractions"])
+def test_what_cannot_be_shared_is_said(shares):
+    with pytest.raises(TypeError, match=f"shares has '{shares}', but must be a tuple of some of rest_density, "):
+        Shares([shares], 3, 1, FLOAT64, "cpu")
 
 
 def test_what_parts_added_to_parameters_is_kept_to_the_end():

@@ -5,6 +5,7 @@ import warp as wp
 
 from cortado import Simulation
 from cortado.device.launching import KernelLauncher, bound, launch
+from cortado.device.neighbourhood import neighbourhood_type
 from cortado.device.precision import FLOAT64
 from cortado.sph.integration import integration_kernels
 from scenes import plane
@@ -32,6 +33,14 @@ def test_a_missing_argument_is_named(missing):
         bound(PREDICT, (), given)
 
 
+def test_what_is_known_is_said_where_an_argument_is_missing():
+    groups = dict.fromkeys(("time_step", "x", "v", "xstar"), 0), {"x": 1, "acceleration": 2}
+    with pytest.raises(
+        TypeError, match=r"'x_star' of .* is missing; .*; known are v_star, time_step, x, v, xstar, acc"
+    ):
+        bound(PREDICT, groups, {"v_star": 0})
+
+
 def test_a_misspelt_argument_is_named():
     with pytest.raises(TypeError, match="has no argument 'xstar'; it has time_step, x, v, acceleration, x_star"):
         bound(PREDICT, (), {**dict.fromkeys(NAMES, 0), "xstar": 0})
@@ -54,3 +63,17 @@ def test_a_sum_over_neighbours_has_a_thread_for_each_particle():
     context = solver.context(solver.new_parameters(1))
     with pytest.raises(TypeError, match="sums over neighbours, and has one thread for each particle"):
         context.launch(solver.density.forward, threads=1)
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def count_neighbours(s: neighbourhood_type(FLOAT64), found: wp.array(dtype=wp.int32)):
+    i = wp.tid()
+    found[i] = s.count[i]
+
+
+def test_a_sum_over_neighbours_begins_where_its_range_begins():
+    """Else a range of particles would overwrite another, from some thousands of particles on, without a word."""
+    solver = Simulation(plane(), precision="float64").solver
+    context, found = solver.context(solver.new_parameters(1)), wp.zeros(solver.particles, dtype=wp.int32, device=CPU)
+    with pytest.raises(TypeError, match=r"count_neighbours takes the neighbourhood s, .* i = s\.first \+ wp\.tid\(\)"):
+        context.launch(count_neighbours, found=found)

@@ -19,6 +19,10 @@ def test_the_document_has_the_table_of_the_registry():
     assert markdown() in DOCUMENT.read_text(encoding="utf-8")
 
 
+def test_the_docstring_of_a_problem_names_every_parameter():
+    assert [parameter.name for parameter in PARAMETERS if f"``{parameter.name}``" not in Problem.__doc__] == []
+
+
 def test_every_parameter_of_steps_is_on_the_device():
     found = Simulation(plane_of_three()).solver.new_parameters(7)
     assert found.names == names(Role.RUN)

@@ -40,7 +40,7 @@ def point_of(simulation, seed=0):
 
 
 def twins_steps(simulation, substeps):
-    """The function of parameters, in the order of `point_of`, to the twin's last (x, v, c)."""
+    """The function of parameters, by their names, to the twin's last (x, v, c)."""
     slow, lattice, mixture = twin(simulation), simulation.solver.lattice, simulation.scene.mixture
     phases = len(simulation.scene.phase)
 
@@ -60,12 +60,23 @@ def twins_steps(simulation, substeps):
         walls = lattice.volume * slow.wall_density(x, slow.near(x)[1])
         return slow_mixture.step(x, c, mass, time_step / substeps, substeps, walls)
 
-    def steps(gravity, x, v, rest_density, viscosity, time_step, mobility=0.0, width=1.0, c=None):
-        c = np.ones((len(x), 1)) if c is None else c
+    def steps(
+        gravity,
+        initial_positions,
+        initial_velocities,
+        rest_density,
+        viscosity,
+        time_step,
+        mobility=0.0,
+        interface_width=1.0,
+        mass_fractions=None,
+    ):
+        x, v = initial_positions, initial_velocities
+        c = np.ones((len(x), 1)) if mass_fractions is None else mass_fractions
         mass = reference.blend(c, rest_density, viscosity)[0]
         for _ in range(STEPS):
             if phases > 1:
-                c = mix(x, c, mass, time_step, mobility, width)
+                c = mix(x, c, mass, time_step, mobility, interface_width)
             rho_0, mu = reference.blend(c, rest_density, viscosity)
             x, v = slow.step(x, v, gravity, lattice.volume * mass, rho_0, mu, time_step, ITERATIONS)
         return np.concatenate([x, v, c], axis=1)
@@ -93,7 +104,7 @@ def test_steps_equal_those_of_the_twin(make, kernel, viscosity, slip, precision)
     rollout = simulation.rollout(STEPS, point)
     last = rollout.forward().numpy(d)
     found = np.concatenate([last[name] for name in ADJOINT_FIELDS], axis=1)
-    wanted = twins_steps(simulation, rollout.solver.mixture.substeps)(*point.values())
+    wanted = twins_steps(simulation, rollout.solver.mixture.substeps)(**point)
     tolerance = 1e-13 if precision == "float64" else 2e-5
     assert np.abs(wanted[:, :d] - point["initial_positions"]).max() > 1e-3
     if "mass_fractions" in point:
@@ -114,7 +125,9 @@ def test_tangents_and_adjoints_equal_complex_steps_of_the_twin(make, kernel, vis
     states = {}
     rollout.tangent(*controls.direction(rollout, values, along), lambda step, dot: states.update({step: dot.numpy(d)}))
     slow = twins_steps(simulation, rollout.solver.mixture.substeps)
-    exact = reference.complex_step(slow, list(values.values()), list(along.values()))
+    exact = reference.complex_step(
+        lambda *given: slow(**dict(zip(values, given, strict=True))), list(values.values()), list(along.values())
+    )
     wanted = np.split(exact, [d, 2 * d], axis=1)
     for name, one in zip(ADJOINT_FIELDS, wanted, strict=True):
         found = states[STEPS][name]

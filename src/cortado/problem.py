@@ -249,8 +249,13 @@ class ForwardPass:
 
     @in_turn
     def derivative(self, estimator: AdjointEstimator) -> BackwardStep:
-        """The estimator's backward step, made once for each problem."""
-        if estimator not in self._derivatives:
+        """The estimator's backward step, made once for each problem. Raises `InputError` for an estimator whose
+        settings may change, as its backward step would keep the first ones."""
+        try:
+            is_new = estimator not in self._derivatives
+        except TypeError as error:
+            raise InputError(f"estimator has an {error}, but must be a dataclass(frozen=True) of numbers.") from None
+        if is_new:
             solver = self.rollout.solver
             parts = solver.gradient_memory(self.rollout.log)
             require(parts, "take a larger spacing or fewer pressure iterations", solver.device)

@@ -133,7 +133,7 @@ class Simulation:
 
         ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity; so does any other parameter
         of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same scene, the run goes on
-        from there, with the same bits as if it had not stopped; a parameter over time is then that of the steps to come.
+        from there, with the same bits as if it had not stopped; a parameter over time is then one of the steps to come.
         Warns when the pressure did not converge; raises `DivergedError` when a particle is lost.
         """
         return self.collect(self.rollout(steps, controls, state), record_every)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import wait
 from contextlib import contextmanager, nullcontext
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import warp as wp
@@ -51,7 +51,10 @@ def bound(kernel: wp.Kernel, groups: Sequence[Named], given: Named) -> list[Any]
                 arguments.append(source[name])
                 break
         else:
-            raise TypeError(f"argument {name!r} of kernel {kernel.key} is missing; it has {', '.join(names)}.")
+            known = ", ".join(dict.fromkeys(known for source in sources for known in source))
+            raise TypeError(
+                f"argument {name!r} of kernel {kernel.key} is missing; it has {', '.join(names)}; known are {known}."
+            )
     return arguments
 
 
@@ -77,6 +80,12 @@ def _perform(name: str, threads: Any, arguments: Sequence[Any], work: Callable[[
         _watchers[-1](name, threads, arguments, work)
     else:
         work()
+
+
+@cache
+def starts_at_first(kernel: wp.Kernel) -> bool:
+    """Whether a kernel whose first argument is the neighbourhood reads of it where its range of particles begins."""
+    return f"{kernel.adj.args[0].label}.first" in kernel.adj.source
 
 
 def launch(kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, **arguments: Any) -> None:
@@ -126,6 +135,11 @@ class KernelLauncher:
         if sums and threads is not None:
             raise TypeError(f"kernel {kernel.key} sums over neighbours, and has one thread for each particle.")
         entries = threads or self.particles
+        if sums and not starts_at_first(kernel):
+            raise TypeError(
+                f"kernel {kernel.key} takes the neighbourhood s, but does not look where its range of particles "
+                "begins, and every range would write to the first: let it begin with i = s.first + wp.tid()."
+            )
         if sums and not self.capturable and kernel in self._compiled:
             _perform(kernel.key, entries, inputs, partial(self._launch_parts, kernel, inputs))
             return

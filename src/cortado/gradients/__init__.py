@@ -12,8 +12,10 @@ from cortado.gradients.estimator import (
     AdjointEstimator,
     Differentiable,
     Estimate,
+    Filtered,
     ForwardPass,
     GradientEstimator,
+    checked_estimate,
     checked_estimator,
     tuned,
 )
@@ -31,6 +33,7 @@ __all__ = [
     "EnsembleMean",
     "Estimate",
     "Exact",
+    "Filtered",
     "ForwardPass",
     "FrozenGeometry",
     "GradientEstimator",
@@ -53,6 +56,7 @@ def estimate(
 ) -> Estimate:
     """The loss of a problem and its gradient by an estimator, `Exact` if none is given.
 
-    Raises `InputError` where what is given is no estimator.
+    Raises `InputError` where what is given is no estimator, or does not return the gradient of every parameter.
     """
-    return checked_estimator(Exact() if estimator is None else estimator).estimate(problem, parameters, observe)
+    chosen = checked_estimator(Exact() if estimator is None else estimator)
+    return checked_estimate(chosen.estimate(problem, parameters, observe), parameters)

@@ -1,9 +1,12 @@
 """The protocols of gradient estimators, which are given to `Problem.value_and_gradient`, and what these return."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
+import numpy as np
+
+from cortado.arrays import as_numbers, as_one_number
 from cortado.device.state import Parameters, State
 from cortado.errors import InputError
 from cortado.parameters.values import Arrays, Values
@@ -75,6 +78,24 @@ def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
     return estimator
 
 
+def checked_estimate(found: Any, parameters: Values) -> Estimate:
+    """What an estimator has returned, in float64; raises `InputError` unless it has a gradient of the shape of every
+    parameter that was given."""
+    if not isinstance(found, Estimate):
+        raise InputError(f"the estimator returned a {type(found).__name__}, but must return a gradients.Estimate.")
+    loss, gradient = as_one_number("the estimate's loss", found.loss), {}
+    for name, given in parameters.items():
+        if name not in found.gradient:
+            raise InputError(f"the estimate has no gradient with respect to {name}, but must have one.")
+        what = f"the estimate's gradient with respect to {name}"
+        gradient[name] = as_numbers(what, found.gradient[name])
+        if gradient[name].shape != np.shape(given):
+            raise InputError(
+                f"{what} has shape {gradient[name].shape}, but must be {np.shape(given)}, the parameter's."
+            )
+    return replace(found, loss=loss, gradient=gradient)
+
+
 @runtime_checkable
 class Tunable(Protocol):
     """An estimator with a setting that it chooses by itself, such as an automatic strength."""
@@ -105,8 +126,13 @@ class AdjointEstimator(ABC):
 class Filtered:
     """The backward step of another estimator, followed by a filter of the adjoint."""
 
+    only_launches: ClassVar[bool] = False
+    """Whether `filter` does nothing but launch kernels, always the same ones. Only then may a backward step be captured
+    as a graph, which repeats launches, and not what Python or NumPy do between them."""
+
     def __init__(self, base: BackwardStep):
-        self._base, self.rollout, self.solver, self.capturable = base, base.rollout, base.solver, base.capturable
+        self._base, self.rollout, self.solver = base, base.rollout, base.solver
+        self.capturable = base.capturable and self.only_launches
 
     def begin(self) -> None:
         self._base.begin()

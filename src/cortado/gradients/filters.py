@@ -113,6 +113,8 @@ class AdjointViscosity(AdjointEstimator):
 class ViscousStep(Filtered):
     """The backward step of `AdjointViscosity`."""
 
+    only_launches = True
+
     def __init__(self, base: BackwardStep, rollout: Rollout, estimator: AdjointViscosity):
         super().__init__(base)
         self._average, self._limit = Average(base.solver, estimator.fields), Limit(base.solver, estimator.fields)
@@ -152,6 +154,8 @@ class Damped(AdjointEstimator):
 
 
 class _DampedStep(Filtered):
+    only_launches = True
+
     def __init__(self, base: BackwardStep, rollout: Rollout, rate: float):
         super().__init__(base)
         self._drag, self._parameters = Drag(base.solver, rate), rollout.parameters

@@ -44,7 +44,7 @@ class CheckedLoss:
             count = f" of {len(bar)}" if isinstance(bar, (tuple, list)) else ""
             raise InputError(
                 f"the loss's adjoint is a {type(bar).__name__}{count}, but must be a tuple of two or three arrays, the "
-                f"derivatives with respect to {', '.join(FORMS[:2])} and {FORMS[2]}, or a State, or an SnapshotAdjoint."
+                f"derivatives with respect to {', '.join(FORMS[:2])} and {FORMS[2]}, or a State, or a SnapshotAdjoint."
             )
         wanted = (end.positions.shape, end.velocities.shape, end.mass_fractions.shape)
         return tuple(_checked_array(*entry) for entry in zip(FORMS, bar, wanted, strict=False))

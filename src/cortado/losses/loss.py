@@ -34,18 +34,25 @@ class Snapshot:
 
     @cached_property
     def positions(self) -> np.ndarray:
-        """(n, d) [m], float64"""
-        return self.state.positions.numpy()[:, : self.dimension].astype(np.float64)
+        """(n, d) [m], float64, read-only"""
+        return _read_only(self.state.positions.numpy()[:, : self.dimension])
 
     @cached_property
     def velocities(self) -> np.ndarray:
-        """(n, d) [m / s], float64"""
-        return self.state.velocities.numpy()[:, : self.dimension].astype(np.float64)
+        """(n, d) [m / s], float64, read-only"""
+        return _read_only(self.state.velocities.numpy()[:, : self.dimension])
 
     @cached_property
     def mass_fractions(self) -> np.ndarray:
-        """(n, phases) [-], float64"""
-        return self.state.mass_fractions.numpy().astype(np.float64)
+        """(n, phases) [-], float64, read-only"""
+        return _read_only(self.state.mass_fractions.numpy())
+
+
+def _read_only(values: np.ndarray) -> np.ndarray:
+    """A copy in float64 that a loss cannot change by mistake for what is computed from it next."""
+    found = values.astype(np.float64)
+    found.flags.writeable = False
+    return found
 
 
 @dataclass(frozen=True, repr=False)

@@ -17,7 +17,7 @@ from cortado.device.precision import Precision
 from cortado.device.state import Parameters
 from cortado.discretise.discrete_scene import Lattice
 from cortado.discretise.walls.layers import WallLayers
-from cortado.parameters.registry import BY_NAME, Axis
+from cortado.parameters.registry import BY_NAME, PARAMETERS, Axis, Role
 from cortado.scene.scene import Scene
 
 
@@ -65,11 +65,14 @@ class Shares(Arrays):
     up: (n,) numbers, of a parameter of phases (n,) of one for each phase."""
 
     def __init__(self, names: Iterable[str], particles: int, phases: int, precision: Precision, device: Any):
-        """Of the parameters of these names, all 0."""
-        kinds = {
-            name: (particles, precision.fractions(phases) if BY_NAME[name].axis is Axis.PHASE else precision.real)
-            for name in dict.fromkeys(names)
-        }
+        """Of the parameters of these names, all 0. Raises `TypeError` for what cannot be shared."""
+        dtypes = {Axis.SCALAR: precision.real, Axis.PHASE: precision.fractions(phases)}
+        known = {p.name: dtypes[p.axis] for p in PARAMETERS if p.role is Role.RUN and p.axis in dtypes}
+        kinds = {}
+        for name in names:
+            if name not in known:
+                raise TypeError(f"shares has {name!r}, but must be a tuple of some of {', '.join(known)}.")
+            kinds[name] = (particles, known[name])
         super().__init__(zeros(kinds, device))
         self._sums = {name: sum_of(dtype, size, device) for name, (size, dtype) in kinds.items()}
 
@@ -90,8 +93,8 @@ class Adjoints:
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
-        """For kernels: ``x_bar`` and so on; ``viscosity_bar`` is (n,), of particles' shares, where a part names the
-        viscosity among its ``shares``, and the sum (phases,) elsewhere."""
+        """For kernels: ``x_bar`` and so on; the sums, (steps,), of parameters over time; and particles' shares, (n,),
+        of those parameters alone that a part names among its ``shares``."""
         whole = {
             f"{name}_bar": self.parameters[name] for name in self.parameters.names if BY_NAME[name].axis is Axis.STEP
         }
@@ -116,7 +119,8 @@ class Force(Protocol):
 
     shares: tuple[str, ...]
     """Parameters, numbers or those of phases, to whose adjoints every particle adds a share: an adjoint kernel sees
-    these adjoints with an entry for each particle, (n,), and those of all other parameters as sums, such as (1,)."""
+    these adjoints with an entry for each particle, (n,), those of parameters over time as sums, (steps,), and no
+    others."""
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         """``after`` = ``before`` + this force's acceleration, both (n,) vectors."""
