@@ -22,7 +22,8 @@ from cortado.sph.density import density_kernels
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
 from cortado.sph.pair_forces import laminar, pairwise
-from cortado.sph.surface_stress import normal_kernels, surface_tension_kernels
+from cortado.sph.surface_normals import normal_kernels
+from cortado.sph.surface_stress import surface_tension_kernels
 from cortado.sph.viscosity import viscosity_kernels
 
 

@@ -32,8 +32,8 @@ LAYERS = """
     parameters.checks
     discretise.sampling discretise.discrete_scene
     sph sph.density sph.free_energy sph.integration sph.materials sph.emitter_kernels sph.pair_forces
-    sph.pairwise_laplacian sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter sph.gravity sph.mixture
-    sph.surface_tension sph.viscosity
+    sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
+    sph.gravity sph.mixture sph.surface_tension sph.viscosity
     solvers solvers.containment_kernels solvers.containment solvers.solver solvers.convergence solvers.loop
     solvers.particles solvers.particle_derivatives solvers.build solvers.pcisph
     solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure solvers.pcisph.pressure

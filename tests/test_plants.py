@@ -34,11 +34,8 @@ SHARED = {
     "render.interpolation": {"interpolation_functions.trilinear_weight"},
     "solvers.pcisph.density_ratio_relaxation": {"density_ratio_kernels.excess_derivative"},
     "sph.free_energy": {"_double_well.hessian_product", "_miscible.hessian_product", "_degenerate.gradient"},
-    "sph.surface_stress": {
-        "tension_functions.arrow_change",
-        "tension_functions.pull_derivative",
-        "normal_kernels.change",
-    },
+    "sph.surface_normals": {"normal_kernels.arrow_change", "normal_kernels.change"},
+    "sph.surface_stress": {"tension_functions.pull_derivative"},
     "sph.viscosity": {"viscosity_kernels.pair_viscosity_derivative"},
 }
 """Derivatives that forward mode uses too, and those of pictures, so that only differences can tell."""

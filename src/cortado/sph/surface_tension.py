@@ -20,7 +20,8 @@ from cortado.errors import CortadoWarning
 from cortado.lattice.calibration import lattice_offsets
 from cortado.scene.scene import Scene
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.surface_stress import normal_kernels, surface_tension_kernels
+from cortado.sph.surface_normals import normal_kernels
+from cortado.sph.surface_stress import surface_tension_kernels
 
 RELAXED = {2: 1.1, 3: 1.25}
 """By dimension: the tension of a surface that has flown over that of a cut lattice, measured in drops: see
