@@ -1,7 +1,7 @@
 """Redraw and rewrite what `docs/performance.md` shows: ``python benchmarks/figures.py benchmarks/results/*.json``.
 
-Of each kind of device, CPU and GPU, the last file given is shown, and of each size the last run in it: tables between
-the comments that mark their place in the document, and a log-log figure.
+Of each kind of device, CPU and GPU, the last file given is shown, and of each size the run in it that other
+processes disturbed least: tables between the comments that mark their place in the document, and a log-log figure.
 """
 
 import json
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.ticker import NullFormatter
+from speed import busiest
 
 from cortado.figures.canvas import DASHED, PALETTE, drawing
 
@@ -20,9 +21,13 @@ MISSING = "*No results file of this kind is there yet.*"
 Run = dict[str, Any]
 
 
-def latest(runs: list[Run]) -> Run:
-    """The last run, with the sizes that earlier runs on the same device have beyond its own."""
-    sizes = {size["particles"]: size for run in runs for size in run["sizes"]}
+def shown(runs: list[Run]) -> Run:
+    """The last run with all sizes of its file, each from the run whose programs were disturbed least."""
+    sizes: dict[int, Run] = {}
+    for size in (size for run in runs for size in run["sizes"]):
+        known = sizes.get(size["particles"])
+        if known is None or busiest(size["measured"]) <= busiest(known["measured"]):
+            sizes[size["particles"]] = size
     return {**runs[-1], "sizes": [sizes[particles] for particles in sorted(sizes)]}
 
 
@@ -62,9 +67,10 @@ def tables(run: Run) -> str:
     names = [name for name in run["sizes"][0]["measured"] if name != "Cortado"]
     lines = [
         f"{around['device']}, {around['cores']} cores; {around['date'][:10]}, Cortado {around['cortado']}, "
-        f"Warp {around['warp']}, {settings['precision']}, medians of {settings['repeats']} times {settings['steps']} "
-        f"steps, of several turns the quietest. Copy bandwidth "
-        f"{rows[-1]['copy_bandwidth_gb_per_s']:.3g} GB/s; an empty launch takes {rows[-1]['empty_launch_us']:.2g} us.",
+        f"Warp {around['warp']}, {settings['precision']}, medians of {span(rows, 'repeats')} times "
+        f"{span(rows, 'steps')} steps; of several rounds and runs the one that other processes disturbed least. Copy "
+        f"bandwidth {span(rows, 'copy_bandwidth_gb_per_s')} GB/s; an empty launch takes "
+        f"{span(rows, 'empty_launch_us')} us.",
         "",
         "Milliseconds a step, forward / with the gradient. *Others*: cores that other processes kept busy while each",
         "of the programs ran, in the order of the columns.",
@@ -85,6 +91,12 @@ def tables(run: Run) -> str:
         lines += [f"\n{name}, {size['particles']:,} particles: {why}." for name, why in size["failed"].items()]
     lines += ["", *(f"Not installed: {name}." for name in run["not_installed"])]
     return "\n".join([*lines, passes(rows), "", memory(rows)])
+
+
+def span(rows: list[Run], name: str) -> str:
+    """A number of all rows, or the least and the greatest."""
+    least, most = (f"{pick(row[name] for row in rows):.2g}" for pick in (min, max))
+    return least if least == most else f"{least} to {most}"
 
 
 def both(row: Run | None, own: Run | None = None) -> str:
@@ -143,7 +155,7 @@ def rewritten(page: str, name: str, text: str) -> str:
 
 
 def main() -> None:
-    runs = [latest(json.loads(Path(file).read_text())["runs"]) for file in sys.argv[1:]]
+    runs = [shown(json.loads(Path(file).read_text())["runs"]) for file in sys.argv[1:]]
     last = {kind(run): run for run in runs}
     page = PAGE.read_text(encoding="utf-8")
     for name in ("cpu", "gpu"):

@@ -6,6 +6,7 @@ Prints milliseconds a step and ratios, and appends everything to ``benchmarks/re
 
 import argparse
 import json
+import math
 import os
 import re
 import sys
@@ -30,7 +31,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--precision", default="float32")
     parser.add_argument("--steps", type=int, default=20)
     parser.add_argument("--repeats", type=int, default=5, help="the median of so many counts")
-    parser.add_argument("--rounds", type=int, default=1, help="turns of each program; the quietest counts")
+    parser.add_argument("--rounds", type=int, default=1, help="turns of each program; the quietest round counts")
     parser.add_argument("--patience", type=float, default=0.0, help="seconds to wait for a quiet machine each time")
     parser.add_argument("--timeout", type=float, default=1200.0, help="seconds that a program may take")
     parser.add_argument("--jax-python", default=sys.executable, help="an interpreter that has jax")
@@ -41,12 +42,13 @@ def arguments() -> argparse.Namespace:
 
 
 def measure_size(programs: list[Program], particles: int, given: argparse.Namespace) -> Row:
-    """Every program's quietest turn at one size, and why it has none."""
+    """What every program measures at one size in the quietest round, and why one has measured nothing."""
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"} if given.device == "cpu" else dict(os.environ)
     environment["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"  # so that the memory that JAX needs is seen
-    turns: dict[str, list[Row]] = {program.name: [] for program in programs}
+    rounds: list[dict[str, Row]] = []
     failed: dict[str, str] = {}
     for _ in range(given.rounds):
+        rounds.append({})
         for program in programs:
             if program.name in failed:
                 continue
@@ -55,13 +57,14 @@ def measure_size(programs: list[Program], particles: int, given: argparse.Namesp
                 found = program.run(particles, given.steps, given.repeats, given.timeout, environment)
             except ProgramError as error:
                 failed[program.name] = str(error)
-                continue
-            turns[program.name].append(flat(found))
-    return {
-        "particles": particles,
-        "measured": {name: quietest(rows) for name, rows in turns.items() if rows},
-        "failed": failed,
-    }
+            else:
+                rounds[-1][program.name] = flat(found)
+    return {"particles": particles, "measured": min(rounds, key=busiest), "failed": failed}
+
+
+def busiest(measured: dict[str, Row]) -> float:
+    """The most cores that other processes kept busy while one of the programs ran."""
+    return max((row["cores_busy_elsewhere"] or 0.0 for row in measured.values()), default=math.inf)
 
 
 def wait_for_quiet(patience: float) -> None:
@@ -80,11 +83,6 @@ def flat(found: Row) -> Row:
         return found
     machine = {name: value for name, value in found.items() if name != "sizes"}
     return {**found["sizes"][0], **machine}
-
-
-def quietest(rows: list[Row]) -> Row:
-    """The turn during which other processes kept the cores least busy; the first where the system does not say."""
-    return min(rows, key=lambda row: row["cores_busy_elsewhere"] or 0.0)
 
 
 def table(size: Row) -> str:
