@@ -80,6 +80,7 @@ SLOW_TESTS = {
         "test_gradient_equals_tangent_and_differences",
         "test_the_whole_chain_from_gravity_to_the_picture",
     },
+    "test_lanes": {"test_kernels_for_lanes_compile_for_a_gpu_that_is_not_there"},
     "test_layers": {
         "test_the_discretisation_is_without_warp",
     },

@@ -38,8 +38,8 @@ class OneKernelTape(Tape):
 
 @cache
 def one_kernel_loops(discretisation: Discretisation) -> dict[str, wp.Kernel]:
-    """Forward kernels by topic: "density" and "force" are linear after their sums, and so right; "walls" and "pressure"
-    are not."""
+    """Forward kernels by topic: "density" and "force" are linear after their sums, and so right; "wall_relaxation" and
+    "pressure" are not."""
     real, vector, pair_of = (
         discretisation.precision.real,
         discretisation.precision.vector,
@@ -138,4 +138,4 @@ def one_kernel_loops(discretisation: Discretisation) -> dict[str, wp.Kernel]:
         v_star[i] = velocity
         x_star[i] = x[i] + dt * velocity
 
-    return {"density": density, "walls": wall_relaxation, "pressure": pressure, "force": pressure_force}
+    return {"density": density, "wall_relaxation": wall_relaxation, "pressure": pressure, "force": pressure_force}

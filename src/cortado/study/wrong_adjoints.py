@@ -31,7 +31,7 @@ WAYS: dict[str, gradients.GradientEstimator] = {
     RIGHT: gradients.Tape(),
     LINEAR: OneKernelTape(("density", "force")),
     CLAMP: OneKernelTape(("pressure",)),
-    WALLS: OneKernelTape(("walls",)),
+    WALLS: OneKernelTape(("wall_relaxation",)),
 }
 STYLES: dict[str, dict[str, Any]] = {
     RIGHT: {"color": PALETTE[0], "linewidth": 5.0, "alpha": 0.4, "markersize": 9},
