@@ -140,7 +140,7 @@ class ParameterSpace:
     def gradient(self, values: Arrays, state: State, parameters: Parameters) -> Arrays:
         """Adjoints of the first state and of the parameters, for the names and in the shapes of ``values``."""
         dimension = self._simulation.dimension
-        found: Arrays = {name: parameters[name].numpy() for name in RUN if name in values}
+        found: Arrays = {name: parameters[name].numpy().copy() for name in RUN if name in values}
         for field in state.fields:
             if field.first in values:
                 bar = state[field.name].numpy()
