@@ -6,7 +6,7 @@ What they compute is compared with one thread for each particle in `tests/test_g
 import pytest
 import warp as wp
 
-from cortado.device.lanes import LANES, lanes_for, lanes_of
+from cortado.device.lanes import BY_SIZE, lanes_for, lanes_of
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.neighbours import fill_kernel
 from cortado.device.precision import FLOAT32, FLOAT64
@@ -35,7 +35,7 @@ class Device:
 
 
 def test_few_particles_get_many_lanes_and_a_cpu_has_one():
-    sizes = [1, *(most for most, _ in LANES), *(most + 1 for most, _ in LANES), 10**7]
+    sizes = [1, *(most for most, _ in BY_SIZE), *(most + 1 for most, _ in BY_SIZE), 10**7]
     found = [lanes_for(size, Device(is_cpu=False)) for size in sorted(sizes)]
     assert found == sorted(found, reverse=True) and found[-1] == 1
     assert all(32 % lanes == 0 for lanes in found)

@@ -14,11 +14,10 @@ import warp as wp
 
 from cortado.device.precision import Precision
 
-LANES = ((2_000, 16), (16_000, 8), (48_000, 4))
+BY_SIZE = ((2_000, 16), (16_000, 8), (48_000, 4))
 """Up to so many particles a GPU gets so many lanes for each; beyond them one. Measured on an H200."""
-
-
 _OF_MODULES: dict[str, int] = {}
+"""What LANES is in the kernels of a Warp module, by its name."""
 
 
 def set_lanes(module: Any, lanes: int) -> None:
@@ -36,7 +35,7 @@ def lanes_for(particles: int, device: Any) -> int:
     """How many lanes a particle gets, for so many particles of one scene."""
     if device.is_cpu:
         return 1
-    return next((lanes for most, lanes in LANES if particles <= most), 1)
+    return next((lanes for most, lanes in BY_SIZE if particles <= most), 1)
 
 
 @dataclass(frozen=True)
