@@ -22,11 +22,12 @@ Run = dict[str, Any]
 
 
 def shown(runs: list[Run]) -> Run:
-    """The last run with all sizes of its file, each from the run whose programs were disturbed least."""
+    """The last run with all sizes of its file, each from the run whose programs were disturbed least, to a tenth of a
+    core; of several such runs from the last."""
     sizes: dict[int, Run] = {}
     for size in (size for run in runs for size in run["sizes"]):
         known = sizes.get(size["particles"])
-        if known is None or busiest(size["measured"]) <= busiest(known["measured"]):
+        if known is None or round(busiest(size["measured"]), 1) <= round(busiest(known["measured"]), 1):
             sizes[size["particles"]] = size
     return {**runs[-1], "sizes": [sizes[particles] for particles in sorted(sizes)]}
 
