@@ -21,13 +21,17 @@ MISSING = "*No results file of this kind is there yet.*"
 Run = dict[str, Any]
 
 
+QUIET = 0.1
+"""Cores that other processes may keep busy without disturbing."""
+
+
 def shown(runs: list[Run]) -> Run:
-    """The last run with all sizes of its file, each from the run whose programs were disturbed least, to a tenth of a
-    core; of several such runs from the last."""
+    """The last run with all sizes of its file, each from the run whose programs were disturbed least; of several that
+    were disturbed by no more than `QUIET` from the last."""
     sizes: dict[int, Run] = {}
     for size in (size for run in runs for size in run["sizes"]):
         known = sizes.get(size["particles"])
-        if known is None or round(busiest(size["measured"]), 1) <= round(busiest(known["measured"]), 1):
+        if known is None or busiest(size["measured"]) <= max(busiest(known["measured"]), QUIET):
             sizes[size["particles"]] = size
     return {**runs[-1], "sizes": [sizes[particles] for particles in sorted(sizes)]}
 
