@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from cortado import __version__
+from cortado.device.cores import usable_cores
 
 
 def environment() -> dict[str, Any]:
     """The machine, the versions that matter, and the date."""
     return {
         "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": usable_cores(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "cortado": __version__,
