@@ -476,7 +476,7 @@ class Blend(Operation):
         }
 
     def in_scene_order(self, c):
-        return launch(self.kernels.unsort, order=self.order, c=c, c_scene=np.zeros_like(c))["c_scene"]
+        return launch(self.kernels.order.unsort, order=self.order, a=c, a_scene=np.zeros_like(c))["a_scene"]
 
     def forward(self, values):
         found = launch(self.kernels.blend.forward, **{**values, "rho_0": np.zeros(N), "mu": np.zeros(N)})
@@ -719,10 +719,10 @@ def test_sort_and_unsort_are_inverses():
     np.testing.assert_array_equal(back["v_scene"], v)
     back = launch(Kernels.integration.collect_masses, order=order, m_bar=found["m"], m_scene_bar=m)
     np.testing.assert_array_equal(back["m_scene_bar"], 2.0 * m)
-    found = launch(Kernels.mixture.sort, order=order, c_scene=c, c=np.zeros((N, 3)))
-    np.testing.assert_array_equal(found["c"], c[order])
-    back = launch(Kernels.mixture.unsort, order=order, c=found["c"], c_scene=np.zeros((N, 3)))
-    np.testing.assert_array_equal(back["c_scene"], c)
+    found = launch(Kernels.mixture.order.sort, order=order, a_scene=c, a=np.zeros((N, 3)))
+    np.testing.assert_array_equal(found["a"], c[order])
+    back = launch(Kernels.mixture.order.unsort, order=order, a=found["a"], a_scene=np.zeros((N, 3)))
+    np.testing.assert_array_equal(back["a_scene"], c)
 
 
 @pytest.mark.parametrize("phases", [1, 2, 3])

@@ -17,10 +17,10 @@ from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.pcisph.pressure import pressure_kernels
 from cortado.solvers.pcisph.pressure_force import pressure_force_kernels
 from cortado.solvers.pcisph.wall_relaxation import wall_kernels
-from cortado.sph.carried import order_kernels
 from cortado.sph.density import density_kernels
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
+from cortado.sph.integration import integration_kernels
 from cortado.sph.pair_forces import laminar, pairwise
 from cortado.sph.surface_normals import normal_kernels
 from cortado.sph.surface_stress import surface_tension_kernels
@@ -78,6 +78,6 @@ def compiles(module, folder):
 def test_kernels_for_lanes_compile_for_a_gpu_that_is_not_there(smoothing, precision, lanes, tmp_path):
     kernels = kernels_of(Discretisation(smoothing, precision, lanes))
     assert {lanes_of(kernel) for kernel in kernels} == {lanes}
-    assert lanes_of(order_kernels(precision.vector).sort) == 1
+    assert lanes_of(integration_kernels(precision).sort) == 1
     for module in {kernel.module.name: kernel.module for kernel in kernels}.values():
         compiles(module, tmp_path)

@@ -31,7 +31,7 @@ LAYERS = """
     scene.checks scene.scene
     parameters.checks
     discretise.sampling discretise.discrete_scene
-    sph sph.density sph.free_energy sph.integration sph.materials sph.emitter_kernels sph.pair_forces
+    sph sph.density sph.free_energy sph.integration sph.order sph.materials sph.emitter_kernels sph.pair_forces
     sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
     sph.gravity sph.mixture sph.surface_tension sph.viscosity
     solvers solvers.containment_kernels solvers.containment solvers.solver solvers.convergence solvers.loop

@@ -27,6 +27,7 @@ PASSES = {
     "wall": "wall relaxation",
     "integration": "the rest",
     "mixture": "the rest",
+    "order": "the rest",
     "lost": "the rest",
     "sum": "the rest",
 }

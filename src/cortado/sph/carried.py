@@ -4,52 +4,14 @@ A state has them in the scene's order of particles, a step works on sorted ones.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from functools import cache
-from typing import Any
 
 import warp as wp
 
 from cortado.device.fields import StateField
 from cortado.device.reduction import type_name
 from cortado.device.state import Layout, State
+from cortado.sph.order import OrderKernels, order_kernels
 from cortado.sph.parts import StepContext
-
-
-@dataclass(frozen=True)
-class OrderKernels:
-    """Kernels between the scene's order and the sorted one."""
-
-    sort: Any
-    unsort: Any
-
-
-@cache
-def order_kernels(dtype: Any) -> OrderKernels:
-    """The kernels for entries of a Warp type."""
-    module = wp.get_module(f"cortado_order_{type_name(dtype)}")
-
-    @wp.kernel(module=module)
-    def sort(
-        order: wp.array(dtype=wp.int32),
-        a_scene: wp.array(dtype=dtype),
-        # out
-        a: wp.array(dtype=dtype),
-    ):
-        i = wp.tid()
-        a[i] = a_scene[order[i]]
-
-    @wp.kernel(module=module)
-    def unsort(
-        order: wp.array(dtype=wp.int32),
-        a: wp.array(dtype=dtype),
-        # out
-        a_scene: wp.array(dtype=dtype),
-    ):
-        i = wp.tid()
-        a_scene[order[i]] = a[i]
-
-    return OrderKernels(sort, unsort)
 
 
 class Carried:
@@ -66,11 +28,15 @@ class Carried:
         """Take them from a state."""
         for name in self._arrays.names:
             a = self._arrays[name]
-            step.launch(order_kernels(a.dtype).sort, a_scene=state[name], a=a)
+            step.launch(_kernels(a).sort, a_scene=state[name], a=a)
 
     def unsort(self, step: StepContext, values: Mapping[str, wp.array], state: State) -> None:
         """Write sorted values, one for each field, to a state."""
         if values.keys() != set(self._arrays.names):
             raise TypeError(f"the step carries {', '.join(self._arrays.names)}, but was given {', '.join(values)}.")
         for name, a in values.items():
-            step.launch(order_kernels(a.dtype).unsort, a=a, a_scene=state[name])
+            step.launch(_kernels(a).unsort, a=a, a_scene=state[name])
+
+
+def _kernels(a: wp.array) -> OrderKernels:
+    return order_kernels(a.dtype, wp.get_module(f"cortado_order_{type_name(a.dtype)}"))

@@ -15,6 +15,7 @@ import warp as wp
 
 from cortado.device.kernels import Kernels
 from cortado.device.precision import Precision
+from cortado.sph.order import OrderKernels, order_kernels
 
 
 def mixture_module(precision: Precision, phases: int, differentiable: bool) -> Any:
@@ -29,8 +30,7 @@ def mixture_module(precision: Precision, phases: int, differentiable: bool) -> A
 class MixtureKernels:
     """The kernels that carry fractions into a step and out of it, and make materials of them."""
 
-    sort: Any
-    unsort: Any
+    order: OrderKernels
     blend: Kernels
 
 
@@ -44,26 +44,6 @@ def mixture_kernels(precision: Precision, phases: int) -> MixtureKernels:
     def logarithm(viscosity: real) -> real:
         """tiny stands in for a phase without viscosity, of which any amount makes a mixture thin."""
         return wp.log(viscosity + tiny)
-
-    @wp.kernel(module=mixture_module(precision, phases, True))
-    def sort_fractions(
-        order: wp.array(dtype=wp.int32),
-        c_scene: wp.array(dtype=fractions),
-        # out
-        c: wp.array(dtype=fractions),
-    ):
-        i = wp.tid()
-        c[i] = c_scene[order[i]]
-
-    @wp.kernel(module=mixture_module(precision, phases, True))
-    def unsort_fractions(
-        order: wp.array(dtype=wp.int32),
-        c: wp.array(dtype=fractions),
-        # out
-        c_scene: wp.array(dtype=fractions),
-    ):
-        i = wp.tid()
-        c_scene[order[i]] = c[i]
 
     @wp.kernel(module=mixture_module(precision, phases, True))
     def blend(
@@ -138,4 +118,5 @@ def mixture_kernels(precision: Precision, phases: int) -> MixtureKernels:
         viscosity_bar[i] = viscosity_bar_i
         c_bar[i] = c_bar_i
 
-    return MixtureKernels(sort_fractions, unsort_fractions, Kernels(blend, blend_tangent, blend_adjoint))
+    order = order_kernels(fractions, mixture_module(precision, phases, True))
+    return MixtureKernels(order, Kernels(blend, blend_tangent, blend_adjoint))

@@ -70,7 +70,7 @@ class Mixture:
 
     def diffuse(self, step: StepContext, mass_fractions: wp.array) -> None:
         """From ``mass_fractions`` in the scene's order, and write rest densities and viscosities."""
-        step.launch(self.kernels.sort, c_scene=mass_fractions, c=self.c[0])
+        step.launch(self.kernels.order.sort, a_scene=mass_fractions, a=self.c[0])
         for k in range(self.substeps):
             assert self.diffusion is not None
             now = {"c": self.c[k], "chi": self.chi[k], "w": self.w[k]}
@@ -81,7 +81,7 @@ class Mixture:
     def result(self, step: StepContext, mass_fractions: wp.array) -> None:
         """Write the fractions after the last substep, in the scene's order."""
         if self.phases.count > 1:
-            step.launch(self.kernels.unsort, c=self.c[self.substeps], c_scene=mass_fractions)
+            step.launch(self.kernels.order.unsort, a=self.c[self.substeps], a_scene=mass_fractions)
 
 
 class MixtureAdjoint:
@@ -102,7 +102,7 @@ class MixtureAdjoint:
             step.launch(diffusion.scale_adjoint, substeps=substeps, c_bar=c_bar, y=y)
             step.launch(diffusion.flux.adjoint, *known, strength=strength, c=c, chi=chi, w=w, y=y, c_bar=c_bar, z=z)
             step.launch(diffusion.potential.adjoint, *known, c=c, z=z, c_bar=c_bar)
-        step.launch(kernels.unsort, c=c_bar, c_scene=fractions_bar)
+        step.launch(kernels.order.unsort, a=c_bar, a_scene=fractions_bar)
 
 
 class MixtureTangent:
@@ -118,7 +118,7 @@ class MixtureTangent:
         """From the tangent of the old fractions, in scene order, to those of the materials; `result` writes the new."""
         mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, dot.named
         substeps, now = mixture.substeps, {"chi_dot": self._chi_dot, "w_dot": self._w_dot}
-        step.launch(kernels.sort, c_scene=fractions_dot, c=self._c_dot[0])
+        step.launch(kernels.order.sort, a_scene=fractions_dot, a=self._c_dot[0])
         for k in range(substeps):
             assert diffusion is not None
             c_dot, c_new_dot = self._c_dot[k % 2], self._c_dot[(k + 1) % 2]
@@ -138,4 +138,4 @@ class MixtureTangent:
         """Write the tangent of the new fractions, in the scene's order."""
         if self._mixture.phases.count > 1:
             last = self._c_dot[self._mixture.substeps % 2]
-            step.launch(self._mixture.kernels.unsort, c=last, c_scene=new_fractions_dot)
+            step.launch(self._mixture.kernels.order.unsort, a=last, a_scene=new_fractions_dot)
