@@ -41,12 +41,13 @@ LAYERS = """
     solvers.pcisph.wall_relaxation solvers.pcisph.parts solvers.pcisph.steps solvers.pcisph.derivatives
     solvers.pcisph.solver solvers.pcisph.build
     reference.digits reference.engine reference.histories reference.losses reference.simulation reference
+    executors.executor executors.calls executors.distributed executors.worker_process executors.local executors
     rollout
     parameters.scene_parameters parameters.space
     losses.image_losses losses.loss losses.centre_of_mass losses.image losses.matching losses.positions
     losses.recorded losses.batch losses losses.checked
-    gradients.estimator gradients.ensemble_members gradients.exact gradients.filter_kernels
-    gradients.adjoint_filters gradients.strength gradients.filters gradients.ensemble gradients
+    gradients.estimator gradients.points gradients.ensemble_members gradients.exact
+    gradients.filter_kernels gradients.adjoint_filters gradients.strength gradients.filters gradients.ensemble gradients
     render.cameras render.colour_field render.interpolation render.phase_colours render.fields render.rays
     render.absorption render.views render.marching render.renderer render.scene_renderer render
     io.pictures
@@ -57,7 +58,7 @@ LAYERS = """
     figures.curves figures
     certificate.alignment certificate.perturbations certificate.twin certificate.loss_history certificate.horizon
     certificate.consistency certificate.text certificate.certificate certificate certificate.figure
-    optimisation optimisation.differentiable optimisation.replay_log optimisation.optimisers
+    optimisation optimisation.evaluate optimisation.differentiable optimisation.replay_log optimisation.optimisers
     optimisation.named_optimisers optimisation.result optimisation.optimise optimisation.transforms
     io.run_folder io.report
     inverse inverse.tables inverse.task inverse.setup inverse.figures
