@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from importlib import import_module
 from inspect import signature
-from math import prod
+from math import isqrt, prod
 from os import PathLike
 from typing import Any
 
@@ -14,7 +14,7 @@ import warp as wp
 
 from cortado.device.fields import first_values
 from cortado.device.kernel_cache import start_warp
-from cortado.device.memory import frame_parts, require, simulation_parts
+from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import Precision, precision_named
 from cortado.device.state import State
 from cortado.device.threads import WARP, Turn, in_turn
@@ -39,6 +39,8 @@ from cortado.words import counted
 
 MOST_SUBSTEPS = 10_000
 """Explicit steps of diffusion in a time step; beyond it the mobility is taken for a mistake."""
+WORTH = {"cpu": 16_000, "cuda": 1_000_000}
+"""Particles of all scenes in one launch, beyond which more of them are no faster."""
 GREATEST_NUMBER = 10**18
 """Of steps: within a 64-bit number."""
 
@@ -249,6 +251,21 @@ class Simulation:
         if len(states) != (self.batch or 1):
             raise InputError(f"state has {len(states)} states, but must have {self.batch or 1}, one for each scene.")
         return states
+
+    def batch_of(self, size: int) -> "Simulation":
+        """The same scene so many times in one launch."""
+        energy = self.free_energy if len(self.scene.phase) > 1 else None
+        return Simulation(self.scene, self.device.alias, self.precision.name, energy, size)
+
+    def room(self, steps: int, checkpoints: float) -> int:
+        """How many runs of so many steps are worth one launch, and fit half of the memory that is free, with at most so
+        many bytes of ``checkpoints`` in all."""
+        neighbours, real = first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
+        own = sum(simulation_parts(self.particles, 0, neighbours, real).values())
+        states = real * self.numbers_in_frame(3) * 2 * isqrt(steps)
+        fitting = within(np.inf, self.device) // own
+        kept = checkpoints // states if checkpoints else fitting
+        return int(max(min(WORTH["cpu" if self.device.is_cpu else "cuda"] // self.particles, fitting, kept), 1))
 
     def renderer(self, **settings: Any) -> Renderer:
         """What takes pictures of the simulation, ``renderer.render(trajectory[k])``, and differentiates them: as the
