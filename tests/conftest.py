@@ -130,6 +130,11 @@ SLOW_TESTS = {
     "test_smoothing": {
         "test_the_pressure_iteration_converges_on_the_lattice",
     },
+    "test_sweep": {
+        "test_a_task_is_optimised_with_every_combination",
+        "test_a_worker_that_is_killed_half_way_changes_nothing",
+        "test_what_is_finished_is_not_repeated",
+    },
     "test_threads": {
         "test_forks_after_use_and_while_others_compute",
     },
