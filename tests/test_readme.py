@@ -61,7 +61,7 @@ def test_a_command_is_one(command, monkeypatch):
 
 
 def test_there_are_commands():
-    assert {command.split()[0] for command in COMMANDS} == {"run", "optimise", "gradients", "bench"}
+    assert {command.split()[0] for command in COMMANDS} == {"run", "optimise", "sweep", "gradients", "bench"}
 
 
 def test_its_files_are_there():
