@@ -47,7 +47,12 @@ class Ensemble:
         checked_executor(self.executor)
 
     def around(self, problem: Differentiable, parameters: Values) -> "Sampler":
-        """The ensemble around these parameters of a problem."""
+        """The ensemble around these parameters of a problem. Raises `InputError` for a batch."""
+        if problem.simulation.batch is not None:
+            raise InputError(
+                f"{type(self).__name__} is given a problem of a batch, but must be given one of a single scene, whose "
+                "samples it runs in batches of its own."
+            )
         values = {name: as_numbers(f"parameter {name}", value) for name, value in parameters.items()}
         spreads = np.concatenate([np.full(value.size, self._spread(name)) for name, value in values.items()])
         start = problem.simulation.positions

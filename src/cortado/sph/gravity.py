@@ -1,13 +1,12 @@
 """Gravity: the same acceleration everywhere, one for each step."""
 
 from functools import cache
-from typing import Any
 
 import warp as wp
 
 from cortado.device.kernels import Kernels
-from cortado.device.launching import sum_of
 from cortado.device.precision import Precision
+from cortado.device.state import Layout
 from cortado.sph.integration import integration_module
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 
@@ -19,35 +18,39 @@ def gravity_kernels(precision: Precision) -> Kernels:
 
     @wp.kernel(module=integration_module(precision, True))
     def accelerate(
-        gravity: wp.array(dtype=vector),
+        particles: int,
+        gravity: wp.array2d(dtype=vector),
         step: wp.array(dtype=wp.int32),
         acceleration_in: wp.array(dtype=vector),
         # out
         acceleration: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        acceleration[i] = acceleration_in[i] + gravity[step[0]]
+        member = i // particles
+        acceleration[i] = acceleration_in[i] + gravity[member, step[member]]
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def adjoint(
         total: wp.array(dtype=vector),
         step: wp.array(dtype=wp.int32),
         # in and out
-        gravity_bar: wp.array(dtype=vector),
+        gravity_bar: wp.array2d(dtype=vector),
     ):
-        gravity_bar[step[0]] = gravity_bar[step[0]] + total[0]
+        member = wp.tid()
+        n = step[member]
+        gravity_bar[member, n] = gravity_bar[member, n] + total[member]
 
     return Kernels(accelerate, accelerate, adjoint)
 
 
 class Gravity:
-    """The force of gravity on a number of particles."""
+    """The force of gravity on the particles of one solver."""
 
     shares: tuple[str, ...] = ()
 
-    def __init__(self, precision: Precision, particles: int, device: Any):
-        self._kernels = gravity_kernels(precision)
-        self._sum = sum_of(precision.vector, particles, device)
+    def __init__(self, layout: Layout):
+        self._kernels, self._members = gravity_kernels(layout.precision), layout.members
+        self._sum = layout.sum_of(layout.precision.vector)
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         step.launch(self._kernels.forward, acceleration_in=before, acceleration=after)
@@ -58,9 +61,9 @@ class Gravity:
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
         total = self._sum(acceleration_bar)
-        step.launch(self._kernels.adjoint, *bar.named, total=total, threads=1)
+        step.launch(self._kernels.adjoint, *bar.named, total=total, threads=self._members)
 
 
 def force(setting: Setting) -> Gravity:
     """Gravity in every scene."""
-    return Gravity(setting.discretisation.precision, setting.particles, setting.device)
+    return Gravity(setting.layout)

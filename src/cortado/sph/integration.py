@@ -79,6 +79,7 @@ def integration_kernels(precision: Precision) -> IntegrationKernels:
 
     @wp.kernel(module=integration_module(precision, True))
     def predict(
+        particles: int,
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
@@ -88,12 +89,14 @@ def integration_kernels(precision: Precision) -> IntegrationKernels:
         v_star: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        velocity = v[i] + time_step[0] * acceleration[i]
+        member = i // particles
+        velocity = v[i] + time_step[member] * acceleration[i]
         v_star[i] = velocity
-        x_star[i] = x[i] + time_step[0] * velocity
+        x_star[i] = x[i] + time_step[member] * velocity
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def predict_tangent(
+        particles: int,
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
         x_dot: wp.array(dtype=vector),
@@ -106,13 +109,15 @@ def integration_kernels(precision: Precision) -> IntegrationKernels:
         v_star_dot: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        dt = time_step[0]
-        velocity_dot = v_dot[i] + dt * acceleration_dot[i] + time_step_dot[0] * acceleration[i]
+        member = i // particles
+        dt = time_step[member]
+        velocity_dot = v_dot[i] + dt * acceleration_dot[i] + time_step_dot[member] * acceleration[i]
         v_star_dot[i] = velocity_dot
-        x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[0] * v_star[i]
+        x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[member] * v_star[i]
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def begin_adjoint(
+        particles: int,
         order: wp.array(dtype=wp.int32),
         time_step: wp.array(dtype=real),
         m: wp.array(dtype=real),
@@ -135,7 +140,8 @@ def integration_kernels(precision: Precision) -> IntegrationKernels:
     ):
         """From the adjoint of the new state, in scene order, to that of the last prediction; others begin at 0."""
         i = wp.tid()
-        dt = time_step[0]
+        member = i // particles
+        dt = time_step[member]
         x_star_bar = x_scene_bar[order[i]]
         speed_bar = v_scene_bar[order[i]] + dt * x_star_bar
         x_bar[i] = x_star_bar
@@ -151,6 +157,7 @@ def integration_kernels(precision: Precision) -> IntegrationKernels:
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def acceleration_adjoint(
+        particles: int,
         time_step: wp.array(dtype=real),
         v_bar: wp.array(dtype=vector),
         # out
@@ -158,7 +165,8 @@ def integration_kernels(precision: Precision) -> IntegrationKernels:
     ):
         """Every prediction of the step used v + dt a, so that one adjoint is dt times the other."""
         i = wp.tid()
-        acceleration_bar[i] = time_step[0] * v_bar[i]
+        member = i // particles
+        acceleration_bar[i] = time_step[member] * v_bar[i]
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def collect_masses(
