@@ -204,6 +204,12 @@ def test_another_task_is_not_gone_on_with(sweep, folder):
     assert not (folder / "all" / "optimise.learning_rate=0.25").exists()
 
 
+def test_a_worker_that_does_not_see_the_folder_says_so(folder):
+    member = cortado.commands.sweep.Member(folder / "task.toml", None, folder / "elsewhere", "cpu", "float32")
+    with pytest.raises(InputError, match=r"^A worker does not see \S+elsewhere, but the task and the folder"):
+        member(combinations(["problem.steps=4"])[0])
+
+
 @pytest.mark.parametrize(
     "arguments, words",
     [
