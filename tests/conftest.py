@@ -131,6 +131,7 @@ SLOW_TESTS = {
         "test_the_pressure_iteration_converges_on_the_lattice",
     },
     "test_sweep": {
+        "test_a_search_with_an_ensemble_has_the_same_bits_on_workers",
         "test_a_task_is_optimised_with_every_combination",
         "test_a_worker_that_is_killed_half_way_changes_nothing",
         "test_what_is_finished_is_not_repeated",

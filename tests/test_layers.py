@@ -71,8 +71,8 @@ LAYERS = """
     bench bench.scene bench.timing bench.floor bench.passes bench.memory bench.dam_break bench.environment
     bench.reference_engine bench.text
     sweep sweep.combinations sweep.table
-    commands commands.bench commands.check commands.figure commands.optimise commands.run commands.study
-    commands.sweep
+    commands commands.executor commands.bench commands.check commands.figure commands.optimise commands.run
+    commands.study commands.sweep
     cli
     __main__
 """

@@ -257,3 +257,17 @@ def test_a_worker_that_is_killed_half_way_changes_nothing(alone, sweep, folder):
     assert (folder / "many" / "sweep.csv").read_bytes() == (alone / "sweep.csv").read_bytes()
     logs = [sorted(out.glob("*/checkpoint/replay.log")) for out in (alone, folder / "many")]
     assert len(logs[0]) == 4 and [path.read_bytes() for path in logs[0]] == [path.read_bytes() for path in logs[1]]
+
+
+def test_a_search_with_an_ensemble_has_the_same_bits_on_workers(folder, capfd):
+    options = ("--set", "optimise.iterations=2", "--set", "optimise.gradient.samples=4")
+    options += ("--set", "optimise.gradient.spread.gravity=0.1")
+    main(["optimise", "task.toml", *options, "--out", "alone"])
+    main(["optimise", "task.toml", *options, "--out", "many", "--workers", "2"])
+    logs = [(folder / out / "checkpoint" / "replay.log").read_bytes() for out in ("alone", "many")]
+    assert logs[0] == logs[1] and len(logs[0]) > 100
+    with pytest.raises(SystemExit) as end:
+        main(["optimise", "task.toml", "--out", "more", "--workers", "2"])
+    assert end.value.code == 2 and not Path("more").exists()
+    wanted = "--workers is given, but must be left out, as optimise.gradient.samples is 1.\n"
+    assert without_compiling(capfd.readouterr().err) == wanted

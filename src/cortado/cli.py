@@ -78,6 +78,8 @@ def optimise(
     precision: str = "float32",
     resume: bool = False,
     overwrite: bool = False,
+    scheduler: str | None = None,
+    workers: int | None = None,
 ) -> Work:
     """Optimise what a task file names, and check the result as the file asks.
 
@@ -89,12 +91,16 @@ def optimise(
         precision: "float32" or "float64".
         resume: Go on with the run in the folder, bit for bit.
         overwrite: Replace an earlier run in the same folder.
+        scheduler: Address of a scheduler of Dask's, whose workers compute the samples of an ensemble.
+        workers: Number of worker processes on this machine that do; on a GPU each has one of its own.
     """
     if resume and overwrite:
         raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
+    from cortado.commands.executor import Where
     from cortado.commands.optimise import optimise_task
 
-    return partial(optimise_task, task, out, _words(overrides), device, precision, resume, overwrite, _command())
+    where, words = Where(scheduler, workers), _words(overrides)
+    return partial(optimise_task, task, out, words, device, precision, resume, overwrite, _command(), where)
 
 
 @app.command
@@ -121,9 +127,10 @@ def sweep(
         scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
         workers: Number of worker processes on this machine; on a GPU each has one of its own.
     """
+    from cortado.commands.executor import Where
     from cortado.commands.sweep import run_sweep
 
-    return partial(run_sweep, file, _words(sets), steps, out, device, precision, scheduler, workers)
+    return partial(run_sweep, file, _words(sets), steps, out, device, precision, Where(scheduler, workers))
 
 
 @gradients.command

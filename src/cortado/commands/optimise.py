@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cortado.errors import ComputationError, DivergedError
+from cortado.commands.executor import HERE, Where
+from cortado.errors import ComputationError, DivergedError, InputError
+from cortado.executors import Executor
 from cortado.gradients import GradientEstimator, tuned
 from cortado.inverse.figures import task_figures
 from cortado.inverse.setup import Setup, setup
@@ -52,15 +54,20 @@ def optimise_task(
     resume: bool,
     overwrite: bool,
     command: list[str],
+    where: Where = HERE,
 ) -> str:
-    """Optimise, write the run folder, and return a sentence that says where the results are."""
-    made = setup(load_task(task_file, overrides), device, precision)
+    """Optimise, write the run folder, and return a sentence that says where the results are. The samples of an ensemble
+    are computed ``where`` is asked for."""
+    task = load_task(task_file, overrides)
+    if where.option and task.optimise.gradient.samples == 1:
+        raise InputError(f"{where.option} is given, but must be left out, as optimise.gradient.samples is 1.")
+    made = setup(task, device, precision)
     if resume:
         RunFolder.open(out)
-    with locked(out):
+    with where.executor(device) as executor, locked(out):
         folder = _run_folder(made, out, resume, overwrite, command)
         with keeping(lambda: f"{_kept(folder)}; --resume goes on with them" if _kept(folder) else ""):
-            return _solved(made, folder, resume)
+            return _solved(made, folder, resume, executor)
 
 
 def _run_folder(made: Setup, out: Path, resume: bool, overwrite: bool, command: list[str]) -> RunFolder:
@@ -87,10 +94,10 @@ def _kept(folder: RunFolder) -> str:
     return f"the evaluations so far are in {folder.checkpoint}" if folder.read_metrics() else ""
 
 
-def _solved(made: Setup, folder: RunFolder, resume: bool) -> str:
+def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> str:
     """Search, judge, and write what came out; returns the sentence about it."""
     try:
-        result, estimator = _search(made, folder, resume)
+        result, estimator = _search(made, folder, resume, executor)
     except DivergedError as error:
         evaluations = len(folder.read_metrics())
         write_report(folder, made.task.scene.name, [("ended early", error), ("evaluations", evaluations)], [])
@@ -150,7 +157,7 @@ def _distance(estimate: ArrayLike, true: ArrayLike) -> float:
     return float(np.linalg.norm(estimate - true) / (np.linalg.norm(true) or 1.0))
 
 
-def _search(made: Setup, folder: RunFolder, resume: bool) -> tuple[Result, GradientEstimator]:
+def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> tuple[Result, GradientEstimator]:
     """What came out, and the estimator of the last search as it was tuned."""
     settings = made.task.optimise
     known = len(folder.read_metrics()) if resume else 0
@@ -166,7 +173,7 @@ def _search(made: Setup, folder: RunFolder, resume: bool) -> tuple[Result, Gradi
             advance(loss=record.loss)
 
         for k, search in enumerate(made.searches):
-            estimator = tuned(settings.gradient.estimator(), search, start)
+            estimator = tuned(settings.gradient.estimator(executor), search, start)
             result = optimise(
                 search,
                 start,

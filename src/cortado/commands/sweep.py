@@ -1,16 +1,14 @@
 """``cortado sweep``: a scene or a task with every combination of some values, on any number of processes."""
 
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from cortado.commands.executor import HERE, Where
 from cortado.commands.optimise import optimise_task, search_settings
 from cortado.commands.run import run_scene, run_settings
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
-from cortado.executors import Distributed, Executor, InProcess, local_workers
 from cortado.inverse.task import load_task
 from cortado.io.folder_lock import LOCK, locked
 from cortado.io.interruption import keeping
@@ -111,13 +109,10 @@ def run_sweep(
     out: Path,
     device: str,
     precision: str,
-    scheduler: str | None,
-    workers: int | None,
+    where: Where,
 ) -> str:
     """Compute what is not there yet; returns a sentence that says where the table is. Raises `ComputationError` where
     some combinations failed."""
-    if scheduler is not None and workers is not None:
-        raise InputError("--scheduler and --workers are both given, but only one of them can be meant.")
     chosen, member = combinations(options), _member(file, steps, out, device, precision)
     done = _there(member, chosen)
     left = [number for number in range(len(chosen)) if number not in done]
@@ -132,7 +127,7 @@ def run_sweep(
         advance(failed=sum(map(failed, done.values())))
 
     with (
-        _executor(scheduler, workers, device) if left else nullcontext(InProcess()) as executor,
+        (where if left else HERE).executor(device) as executor,
         locked(out),
         keeping(kept),
         track(len(left), "sweep") as advance,
@@ -141,10 +136,10 @@ def run_sweep(
         executor.map(member, [chosen[number] for number in left], note)
     failures = sum(map(failed, done.values()))
     all_of_them = f"Of {counted(len(chosen), 'combination')}{f', {there} of them there already,' if there else ''}"
-    where = f"the table is {out.absolute() / NAME}, beside a folder for each."
+    table = f"the table is {out.absolute() / NAME}, beside a folder for each."
     if failures:
-        raise ComputationError(f"{all_of_them} {failures} failed; {where}")
-    return f"{all_of_them} none failed; {where}"
+        raise ComputationError(f"{all_of_them} {failures} failed; {table}")
+    return f"{all_of_them} none failed; {table}"
 
 
 def _there(member: Member, chosen: list[Combination]) -> dict[int, dict[str, Any]]:
@@ -168,16 +163,3 @@ def _member(file: Path, steps: int | None, out: Path, device: str, precision: st
         device,
         precision,
     )
-
-
-@contextmanager
-def _executor(scheduler: str | None, workers: int | None, device: str) -> Iterator[Executor]:
-    """Where combinations are computed: in this process unless workers are asked for."""
-    if scheduler is not None:
-        with Distributed(scheduler) as there:
-            yield there
-    elif workers is not None:
-        with local_workers(workers, device.partition(":")[0]) as here:
-            yield here
-    else:
-        yield InProcess()
