@@ -67,6 +67,7 @@ SLOW_TESTS = {
         "test_velocity_only_grows_at_most_linearly",
         "test_without_strength_an_estimator_is_exact_bit_for_bit",
     },
+    "test_executors": {"test_each_process_has_one_gpu_also_when_it_is_started_again"},
     "test_extinction_schedule": {
         "test_thin_fluid_first_gathers_what_thick_fluid_leaves_behind",
     },
