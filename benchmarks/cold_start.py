@@ -13,10 +13,9 @@ import statistics
 import sys
 import tempfile
 import time
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
-
-from programs import ProgramError, last_json
 
 HERE = Path(__file__).resolve()
 STAGES = ("import", "scene made", "first step", "first gradient")
@@ -34,7 +33,9 @@ def scene(name: str) -> dict[str, Any]:
     return {
         "dimension": size,
         "discretisation": {"spacing": 0.05},
-        "phase": [{"name": phase, "rest_density": 1000.0 - 100.0 * k, "viscosity": 0.05} for k, phase in enumerate(names)],
+        "phase": [
+            {"name": phase, "rest_density": 1000.0 - 100.0 * k, "viscosity": 0.05} for k, phase in enumerate(names)
+        ],
         "fluid": [
             {
                 "shape": "box",
@@ -83,6 +84,18 @@ def start(name: str, device: str, precision: str) -> dict[str, Any]:
     return {"stages": stages, "device": simulation.device.name}
 
 
+class Sources:
+    """Finds Cortado in a folder, before whatever an installation has put in the way."""
+
+    def __init__(self, folder: str):
+        self._folder = folder
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
+        if name.partition(".")[0] != "cortado":
+            return None
+        return PathFinder.find_spec(name, [self._folder] if path is None else path, target)
+
+
 def note_modules(modules: list[tuple[str, float]]) -> None:
     """Note the name of every module of kernels that Warp loads from now on, and the seconds that it took: by the clock
     of the thread that loads it, those that it waits for others included."""
@@ -98,17 +111,20 @@ def note_modules(modules: list[tuple[str, float]]) -> None:
             if len(self.execs) > before:
                 modules.append((self.name, time.perf_counter() - begun))
 
-    Module.load = noted  # type: ignore[method-assign]
+    Module.load = noted
 
 
 def measured(name: str, words: list[str], folder: str, sources: str | None) -> dict[str, Any]:
-    """What `start` finds in a process of its own, with kernels in a folder."""
+    """What `start` finds in a process of its own, with kernels in a folder; ends this one where that one fails."""
+    from programs import ProgramError, last_json  # not in the process that is measured: it imports Cortado
+
     environment = {**os.environ, "WARP_CACHE_PATH": folder}
-    if sources is not None:
-        environment["PYTHONPATH"] = os.pathsep.join(filter(None, (sources, os.environ.get("PYTHONPATH"))))
-    found: dict[str, Any] = last_json(
-        [sys.executable, str(HERE), "--one", "--scenes", name, *words], 600.0, environment
-    )
+    where = ["--sources", sources] if sources is not None else []
+    command = [sys.executable, str(HERE), "--one", "--scenes", name, *where, *words]
+    try:
+        found: dict[str, Any] = last_json(command, 600.0, environment)
+    except ProgramError as error:
+        sys.exit(f"{name}: {error}")
     return found
 
 
@@ -134,8 +150,11 @@ def main() -> None:
     parser.add_argument("--modules", action="store_true", help="also list the modules that are loaded")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--one", action="store_true", help="one start of one scene, here and as JSON")
+    parser.add_argument("--sources", help="where that one is to find Cortado")
     given = parser.parse_args()
     if given.one:
+        if given.sources is not None:
+            sys.meta_path.insert(0, Sources(given.sources))
         print(json.dumps(start(given.scenes[0], given.device, given.precision)))
         return
     versions: dict[str, str | None] = {**dict(entry.split("=", 1) for entry in given.beside), "this": None}
@@ -146,10 +165,7 @@ def main() -> None:
             for version, sources in versions.items():
                 with tempfile.TemporaryDirectory() as folder:
                     for state in ("cold", "warm")[: 2 if given.warm else 1]:
-                        try:
-                            run = measured(name, words, folder, sources)
-                        except ProgramError as error:
-                            sys.exit(f"{name}, {version}, {state}: {error}")
+                        run = measured(name, words, folder, sources)
                         found.setdefault(f"{name}, {version}, {state}", []).append(run)
     if given.json:
         print(json.dumps(found, indent=2))

@@ -65,12 +65,14 @@ class ParticleSolver:
     def __init__(self, system: ParticleSystem, requires_grad: bool = False):
         discretisation, search, phases, nozzle = system.discretisation, system.search, system.phases, system.nozzle
         precision, particles, device = discretisation.precision, search.particles, search.device
+        if requires_grad and not discretisation.taped:
+            raise TypeError("a tape needs the kernels of system.of_one_lane(): make the solver of that system.")
         self.system, self.discretisation, self.lattice, self.search = system, discretisation, system.lattice, search
         self.particles, self.device, self.forces = particles, device, tuple(system.forces)
         self.launch = KernelLauncher(particles, device, record_tape=requires_grad)
         self.turn = Turn(device)
         """Whose arrays these are now."""
-        self.density, self.integration = density_kernels(discretisation), integration_kernels(precision)
+        self.density, self.integration = density_kernels(discretisation), integration_kernels(precision, requires_grad)
         self.layout = Layout(particles, phases.count, precision, device)
         self.mixture = Mixture(phases, precision, particles, device, requires_grad)
         self.emitter = Emitter(nozzle, self.layout, requires_grad) if nozzle else None

@@ -32,7 +32,7 @@ class EmitterKernels(Kernels):
 
 
 @cache
-def emitter_kernels(precision: Precision) -> EmitterKernels:
+def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
     """The kernels for a precision. ``outlet`` (1,) is q_(n-1) [m], ``emitted`` (1,) l at the end of the step [m]."""
     real, vector = precision.real, precision.vector
 
@@ -48,7 +48,7 @@ def emitter_kernels(precision: Precision) -> EmitterKernels:
             return real(0.0)
         return real(wp.float64(upstream[i - first]) - emitted[0])
 
-    @wp.kernel(module=integration_module(precision, True))
+    @wp.kernel(module=integration_module(precision, True, taped))
     def begin(
         area: real,
         flow_rate: wp.array(dtype=real),
@@ -62,7 +62,7 @@ def emitter_kernels(precision: Precision) -> EmitterKernels:
         outlet[0] = outlet_in[0]
         emitted[0] = emitted_in[0] + advance(flow_rate[0], area, time_step[0])
 
-    @wp.kernel(module=integration_module(precision, True))
+    @wp.kernel(module=integration_module(precision, True, taped))
     def prescribe(
         first: int,
         upstream: wp.array(dtype=real),

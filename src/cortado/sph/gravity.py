@@ -7,17 +7,18 @@ import warp as wp
 
 from cortado.device.kernels import Kernels
 from cortado.device.launching import sum_of
+from cortado.device.neighbourhood import Discretisation
 from cortado.device.precision import Precision
 from cortado.sph.integration import integration_module
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 
 
 @cache
-def gravity_kernels(precision: Precision) -> Kernels:
+def gravity_kernels(precision: Precision, taped: bool) -> Kernels:
     """The kernels; the tangent is the acceleration itself, of another table."""
     vector = precision.vector
 
-    @wp.kernel(module=integration_module(precision, True))
+    @wp.kernel(module=integration_module(precision, True, taped))
     def accelerate(
         gravity: wp.array(dtype=vector),
         step: wp.array(dtype=wp.int32),
@@ -45,9 +46,9 @@ class Gravity:
 
     shares: tuple[str, ...] = ()
 
-    def __init__(self, precision: Precision, particles: int, device: Any):
-        self._kernels = gravity_kernels(precision)
-        self._sum = sum_of(precision.vector, particles, device)
+    def __init__(self, discretisation: Discretisation, particles: int, device: Any):
+        self._kernels = gravity_kernels(discretisation.precision, discretisation.taped)
+        self._sum = sum_of(discretisation.precision.vector, particles, device)
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         step.launch(self._kernels.forward, acceleration_in=before, acceleration=after)
@@ -63,4 +64,4 @@ class Gravity:
 
 def force(setting: Setting) -> Gravity:
     """Gravity in every scene."""
-    return Gravity(setting.discretisation.precision, setting.particles, setting.device)
+    return Gravity(setting.discretisation, setting.particles, setting.device)
