@@ -24,3 +24,8 @@ def kind_of(forward: bool, taped: bool) -> str:
     if not forward:
         return "derivative"
     return "taped" if taped else "forward"
+
+
+def is_derivative(module: Any) -> bool:
+    """Whether a Warp module has the kernels of derivatives."""
+    return "_derivative_" in module.name or "_tangent_" in module.name

@@ -1,12 +1,12 @@
 """Gravity: the same acceleration everywhere, one for each step."""
 
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import warp as wp
 
 from cortado.device.kernels import Kernels
-from cortado.device.launching import sum_of
+from cortado.device.launching import TreeReduction, sum_of
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.precision import Precision
 from cortado.sph.integration import integration_module
@@ -48,7 +48,12 @@ class Gravity:
 
     def __init__(self, discretisation: Discretisation, particles: int, device: Any):
         self._kernels = gravity_kernels(discretisation.precision, discretisation.taped)
-        self._sum = sum_of(discretisation.precision.vector, particles, device)
+        self._discretisation, self._particles, self._device = discretisation, particles, device
+
+    @cached_property
+    def _sum(self) -> TreeReduction:
+        """Of the adjoint alone, so that its kernel is not compiled for a run forward."""
+        return sum_of(self._discretisation.precision.vector, self._particles, self._device)
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         step.launch(self._kernels.forward, acceleration_in=before, acceleration=after)
