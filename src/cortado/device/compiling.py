@@ -5,14 +5,15 @@ the headers that every module includes, with all that is in them, for each threa
 and leaves out what no kernel of Cortado's uses. They take 1.0 s of a core of 2.5 GHz then, and not 1.7 s.
 """
 
+import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import wait
+from concurrent.futures import Future, wait
 from contextlib import contextmanager, suppress
 from functools import wraps
 from pathlib import Path
-from threading import Lock
+from threading import Event, Lock
 from types import SimpleNamespace
 from typing import Any
 from weakref import WeakValueDictionary
@@ -50,6 +51,13 @@ def compile_ahead_adjoint(owner: Any, device: Any) -> None:
         _compile([kernel for kernel in kernels_of(owner) if "_tangent_" not in kernel.module.name], device)
 
 
+def begin_headers(kernel: wp.Kernel, device: Any) -> None:
+    """Precompile Warp's headers in another thread, with a small kernel that is needed in any case, where the cache has
+    no kernels of Cortado's yet; returns once nothing but the compiler goes on there."""
+    if device.is_cpu and not any(Path(wp.config.kernel_cache_dir).glob(f"{OURS}*")):
+        _HEADERS.begin(kernel.module, device)
+
+
 def kernels_of(owner: Any) -> list[wp.Kernel]:
     """The kernels that an object of Cortado's holds, itself or by what it is made of."""
     found: dict[int, Any] = {}
@@ -78,6 +86,7 @@ def _is_ours(kind: type) -> bool:
 def _compile(kernels: Sequence[wp.Kernel], device: Any) -> None:
     """Compile and load the modules of kernels that are not in the cache, if there are several; one alone can as well be
     compiled when it is launched."""
+    _HEADERS.wait()
     sizes: dict[Any, int] = {}
     for kernel in kernels:
         sizes[kernel.module] = sizes.get(kernel.module, 0) + len(kernel.adj.source) * (1 + 9 * _sums(kernel))
@@ -133,6 +142,21 @@ class _Headers:
         """Whether several threads compile now."""
         self._lock, self._made = Lock(), set[str]()
         self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._compiler = Event()
+        self._begun: Future[None] | None = None
+
+    def begin(self, module: Any, device: Any) -> None:
+        """Compile a module in another thread."""
+        if self._begun is None:
+            _Said.anything = True  # or else a line would come of a second that nobody waits for
+            self._begun = helpers().submit(wp.force_load, device, [module], max_workers=0)
+            self._begun.add_done_callback(lambda _: self._compiler.set())
+            self._compiler.wait()
+
+    def wait(self) -> None:
+        """Until what was begun has ended. If it failed, so will the launch that needs it, which says why."""
+        if self._begun is not None:
+            wait([self._begun])
 
     def build_cpu(self, build: Callable[..., Any], arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:
         """Compile a file for a CPU. The first to come precompiles the headers, while others wait."""
@@ -142,6 +166,7 @@ class _Headers:
             own = {"pch_dir": self._path(), "extra_flags": f"{options.get('extra_flags', '')} {UNUSED}"}
             key = repr(sorted((name, value) for name, value in options.items() if name != "pch_dir"))
             if key not in self._made:
+                self._compiler.set()
                 result = build(*arguments, **{**options, **own})
                 self._made.add(key)
                 return result
@@ -161,6 +186,8 @@ class _Headers:
 
 
 _HEADERS = _Headers()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_HEADERS.wait)  # a child would wait for ever for what no thread of its own ends
 
 
 # ---- what is said ----------------------------------------------------------------------------------------------------
