@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve()
+PAGE = HERE.parent.parent / "docs" / "performance.md"
 STAGES = ("import", "scene made", "first step", "first gradient")
 
 
@@ -132,11 +133,38 @@ def median(runs: list[dict[str, Any]], stage: str, clock: str) -> float:
     return statistics.median(run["stages"][stage][clock] for run in runs)
 
 
-def row(label: str, runs: list[dict[str, Any]]) -> str:
-    clocks = "".join(f"{median(runs, stage, 'seconds'):12.2f}" for stage in STAGES)
-    used = median(runs, "first step", "processor_seconds"), median(runs, "first gradient", "processor_seconds")
-    count = sum(len(runs[0]["stages"][stage]["modules"]) for stage in STAGES[:3])
-    return f"{label:<32}{clocks}{used[0]:12.2f}{used[1]:12.2f}{count:10}"
+def table(found: dict[str, list[dict[str, Any]]]) -> str:
+    """Medians, as a table of Markdown: the clock at the end of each stage, and processor time at the end of two."""
+    lines = [
+        "| seconds since the import began | " + " | ".join(STAGES) + " | processor, step | processor, gradient | |"
+    ]
+    lines += ["|---|" + "---|" * (len(STAGES) + 3)]
+    for label, runs in found.items():
+        clocks = [median(runs, stage, "seconds") for stage in STAGES]
+        used = [median(runs, stage, "processor_seconds") for stage in STAGES[2:]]
+        count = sum(len(runs[0]["stages"][stage]["modules"]) for stage in STAGES[:3])
+        cells = " | ".join(f"{seconds:.1f}" for seconds in (*clocks, *used))
+        lines.append(f"| {label} | {cells} | {count} modules |")
+    return "\n".join(lines)
+
+
+def write_page(file: str) -> None:
+    """Write the table of a file that ``--json`` made into the document, at the place of its kind of device."""
+    given = json.loads(Path(file).read_text(encoding="utf-8"))
+    around, device = given["environment"], next(iter(given["starts"].values()))[0]["device"]
+    kind = "cpu" if given["device"] == "cpu" else "gpu"
+    begin, end = (
+        f"<!-- cold start, {kind}: written by benchmarks/cold_start.py -->",
+        f"<!-- end of cold start, {kind} -->",
+    )
+    name = around["processor"] if kind == "cpu" else device
+    said = (
+        f"{name}, {around['cores']} cores; {around['date'][:10]}, {given['precision']}, medians of {given['rounds']}:"
+    )
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(begin)
+    after = rest.partition(end)[2]
+    PAGE.write_text(f"{before}{begin}\n{said}\n\n{table(given['starts'])}\n{end}{after}", encoding="utf-8")
+    print(f"{PAGE} is rewritten")
 
 
 def main() -> None:
@@ -149,9 +177,13 @@ def main() -> None:
     parser.add_argument("--warm", action="store_true", help="also start with the kernels that a start has left")
     parser.add_argument("--modules", action="store_true", help="also list the modules that are loaded")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--page", metavar="FILE", help="write what --json printed into docs/performance.md")
     parser.add_argument("--one", action="store_true", help="one start of one scene, here and as JSON")
     parser.add_argument("--sources", help="where that one is to find Cortado")
     given = parser.parse_args()
+    if given.page is not None:
+        write_page(given.page)
+        return
     if given.one:
         if given.sources is not None:
             sys.meta_path.insert(0, Sources(given.sources))
@@ -167,15 +199,17 @@ def main() -> None:
                     for state in ("cold", "warm")[: 2 if given.warm else 1]:
                         run = measured(name, words, folder, sources)
                         found.setdefault(f"{name}, {version}, {state}", []).append(run)
+    from cortado.bench.environment import environment
+
+    around = environment()
+    settings = {"device": given.device, "precision": given.precision, "rounds": given.rounds}
     if given.json:
-        print(json.dumps(found, indent=2))
+        print(json.dumps({"environment": around, **settings, "starts": found}, indent=2))
         return
-    print(f"seconds since the import began, medians of {given.rounds}; {given.device}, {given.precision}")
-    ends = "".join(f"{stage:>12}"[:12] if len(stage) < 12 else f"{'gradient':>12}" for stage in STAGES)
-    print(f"{'':<32}{ends}{'CPU s, step':>12}{'gradient':>12}{'modules':>10}")
-    for label, runs in found.items():
-        print(row(label, runs))
-        for stage in STAGES if given.modules else ():
+    print(table(found))
+    for label, runs in found.items() if given.modules else ():
+        print(label)
+        for stage in STAGES:
             for module, seconds in runs[0]["stages"][stage]["modules"].items():
                 print(f"    {stage}: {module} {seconds:.2f}")
 
