@@ -83,7 +83,7 @@ class Remembering(Pcisph):
         precision = self.discretisation.precision
         rounds = LoopLimits(minimum_iterations=1, maximum_iterations=9, tolerance=0.008, greatest_tolerance=inf)
         self.memory_kernels = memory_kernels(precision)
-        self.memory_loop = Loop(rounds, precision, self.launch, "memory_iterations", "memory_errors")
+        self.memory_loop = Loop(rounds, self.layout, self.launch, "memory_iterations", "memory_errors")
         self.loops = (*self.loops, self.memory_loop)
         self.memories, self.v = [self.vectors()], self.vectors()
 

@@ -68,6 +68,7 @@ class Step:
         at_rest, x_star, v_star = (wp.zeros_like(fields["x"]) for _ in range(3))
         self.solver.launch(
             self.solver.kernels.force.forward,
+            {"k": 0, "rounds": self.solver.pressure_loop.rounds, "x_before": x_star, "v_before": v_star},
             {"x": fields["x"], "m": fields["m"], "v": at_rest, "acceleration": at_rest},
             s=neighbourhood,
             time_step=time_step,

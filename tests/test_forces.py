@@ -7,6 +7,7 @@ import warp as wp
 from cortado import Simulation
 from cortado.device.arrays import Fields
 from cortado.device.precision import FLOAT64
+from cortado.device.state import Layout
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint
 from cortado.sph.gravity import Gravity
 from cortado.sph.parts import Adjoints, Shares
@@ -17,21 +18,21 @@ def test_gravity_adds_to_its_adjoint():
     simulation = Simulation(splash(), precision="float64")
     solver, n = simulation.solver, simulation.particles
     bar = solver.new_parameters(2)
-    bar["gravity"].assign(np.full((2, 3), 0.5))
+    bar["gravity"].assign(np.full((1, 2, 3), 0.5))
     fields = Fields.zeros(n, simulation.precision, simulation.device)
-    shares = Shares(["time_step"], n, 1, simulation.precision, simulation.device)
+    shares = Shares(["time_step"], solver.layout)
     ones = wp.array(np.ones((n, 3)), dtype=wp.vec3d, device=simulation.device)
     solver.step_number.fill_(1)
-    gravity = Gravity(simulation.solver.discretisation, n, simulation.device)
+    gravity = Gravity(solver.layout, taped=False)
     for _ in range(2):
         gravity.adjoint(solver.context(solver.new_parameters(2)), ones, Adjoints(fields, bar, shares))
-    np.testing.assert_array_equal(bar["gravity"].numpy(), [[0.5] * 3, [0.5 + 2 * n] * 3])
+    np.testing.assert_array_equal(bar["gravity"].numpy(), [[[0.5] * 3, [0.5 + 2 * n] * 3]])
 
 
 @pytest.mark.parametrize("shares", ["drag", "gravity", "mass_fractions"])
 def test_what_cannot_be_shared_is_said(shares):
     with pytest.raises(TypeError, match=f"shares has '{shares}', but must be a tuple of some of rest_density, "):
-        Shares([shares], 3, 1, FLOAT64, "cpu")
+        Shares([shares], Layout(3, 1, FLOAT64, "cpu"))
 
 
 def test_what_parts_added_to_parameters_is_kept_to_the_end():

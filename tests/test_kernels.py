@@ -19,6 +19,7 @@ from cortado.device.launching import TreeReduction, add, sum_and_maximum, sum_of
 from cortado.device.neighbourhood import Discretisation, neighbourhood_type
 from cortado.device.neighbours import NeighbourSearch
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
+from cortado.device.state import Layout
 from cortado.lattice.smoothing import CUBIC_SPLINE
 from cortado.parameters.reference_density import (
     reference_density,
@@ -78,15 +79,27 @@ def array(values: np.ndarray, dtype: Any = wp.vec3d) -> Any:
     return wp.array(values, dtype=dtype, device=CPU)
 
 
+SINGLE: Values = {
+    "rounds": np.array([1]),
+    "x_before": np.zeros((N, 3)),
+    "v_before": np.zeros((N, 3)),
+}
+"""Of a single scene in the first iteration."""
+
+
 def launch(kernel: Any, threads: int = N, **given: Any) -> Values:
-    """Run a kernel on arguments by name and return every array argument after it."""
-    arguments = [
-        array(given[a.label], a.type.dtype) if isinstance(given[a.label], np.ndarray) else given[a.label]
-        for a in kernel.adj.args
-    ]
+    """Run a kernel on arguments by name and return every array argument after it. An array with an axis for the scenes
+    of a batch has none here."""
+    given = {"particles": N, "k": 0, **SINGLE, **given}
+    arguments = []
+    for a in kernel.adj.args:
+        value = given[a.label]
+        if isinstance(value, np.ndarray):
+            value = array(value[None] if a.type.ndim == 2 else value, a.type.dtype)
+        arguments.append(value)
     wp.launch(kernel, threads, inputs=arguments, device=CPU)
     return {
-        a.label: value.numpy()
+        a.label: value.numpy()[0] if a.type.ndim == 2 else value.numpy()
         for a, value in zip(kernel.adj.args, arguments, strict=True)
         if isinstance(value, wp.array)
     }
@@ -119,8 +132,10 @@ def cloud(name: str) -> Cloud:
     x[:, dimension:] = walls[:, dimension:] = 0.0
     period = np.array([side, 0.0, 0.0]) * (name == "periodic")
     grid = Grid.around(np.full(3, -0.4)[:dimension], np.full(3, side)[:dimension], period, 1.03 * SUPPORT, 512)
-    search = NeighbourSearch(DISCRETISATION, grid, walls, random.uniform(0.5, 1.5, WALLS), N, 100, CPU)
+    weights, layout = random.uniform(0.5, 1.5, WALLS), Layout(N, 1, FLOAT64, CPU)
+    search = NeighbourSearch(DISCRETISATION, grid, walls, weights, layout, 100)
     s = neighbourhood_type(FLOAT64)()
+    s.particles = N
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count
     s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
@@ -132,7 +147,7 @@ def cloud(name: str) -> Cloud:
     s.frequency = wp.vec3d(1.0 / side if period.any() else 0.0, 0.0, 0.0)
     search.sort(array(x))
     x = x[search.order.numpy()[:N]]
-    search.fill(s, array(x))
+    search.fill(s, array(x), array(np.array([-1]), wp.int32))
     count, fluid_count = search.count.numpy(), search.fluid_count.numpy()
     assert search.needed < 100
     assert fluid_count.mean() > 8 and (count - fluid_count).mean() > 1

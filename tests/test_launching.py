@@ -12,7 +12,7 @@ from scenes import plane
 
 CPU = wp.get_device("cpu")
 PREDICT = integration_kernels(FLOAT64, False).predict
-NAMES = ("time_step", "x", "v", "acceleration", "x_star", "v_star")
+NAMES = ("particles", "time_step", "x", "v", "acceleration", "x_star", "v_star")
 
 
 def test_arguments_come_in_the_order_of_the_kernel():
@@ -22,34 +22,36 @@ def test_arguments_come_in_the_order_of_the_kernel():
 
 def test_what_is_given_comes_before_groups_and_groups_in_their_order():
     first, second = {"x": 1, "v": 2, "other": 0}, {"x": 10, "v": 20, "time_step": 30, "x_star": 40, "v_star": 50}
-    found = bound(PREDICT, (first, second), {"v": 3, "acceleration": 4})
-    assert found == [30, 1, 3, 4, 40, 50]
+    found = bound(PREDICT, (first, second), {"v": 3, "acceleration": 4, "particles": 60})
+    assert found == [60, 30, 1, 3, 4, 40, 50]
 
 
 @pytest.mark.parametrize("missing", NAMES)
 def test_a_missing_argument_is_named(missing):
     given = {name: 0 for name in NAMES if name != missing}
-    with pytest.raises(TypeError, match=f"argument '{missing}' of kernel .*predict.* is missing; it has time_step, x"):
+    with pytest.raises(
+        TypeError, match=f"argument '{missing}' of kernel .*predict.* is missing; it has particles, time"
+    ):
         bound(PREDICT, (), given)
 
 
 def test_what_is_known_is_said_where_an_argument_is_missing():
-    groups = dict.fromkeys(("time_step", "x", "v", "xstar"), 0), {"x": 1, "acceleration": 2}
+    groups = dict.fromkeys(("particles", "time_step", "x", "v", "xstar"), 0), {"x": 1, "acceleration": 2}
     with pytest.raises(
-        TypeError, match=r"'x_star' of .* is missing; .*; known are v_star, time_step, x, v, xstar, acc"
+        TypeError, match=r"'x_star' of .* is missing; .*; known are v_star, particles, time_step, x, v, xstar, acc"
     ):
         bound(PREDICT, groups, {"v_star": 0})
 
 
 def test_a_misspelt_argument_is_named():
-    with pytest.raises(TypeError, match="has no argument 'xstar'; it has time_step, x, v, acceleration, x_star"):
+    with pytest.raises(TypeError, match="has no argument 'xstar'; it has particles, time_step, x, v, acc"):
         bound(PREDICT, (), {**dict.fromkeys(NAMES, 0), "xstar": 0})
 
 
 @pytest.mark.parametrize("by", ["launch", "launcher"])
 def test_launches_compute_what_kernels_say(by):
-    arrays = {name: wp.full(3, wp.vec3d(2.0, 3.0, 4.0), dtype=wp.vec3d, device=CPU) for name in NAMES[1:]}
-    arrays["time_step"] = wp.full(1, 0.5, dtype=wp.float64, device=CPU)
+    arrays = {name: wp.full(3, wp.vec3d(2.0, 3.0, 4.0), dtype=wp.vec3d, device=CPU) for name in NAMES[2:]}
+    arrays["particles"], arrays["time_step"] = 3, wp.full(1, 0.5, dtype=wp.float64, device=CPU)
     if by == "launch":
         launch(PREDICT, 3, CPU, arrays)
     else:
@@ -74,6 +76,9 @@ def count_neighbours(s: neighbourhood_type(FLOAT64), found: wp.array(dtype=wp.in
 def test_a_sum_over_neighbours_begins_where_its_range_begins():
     """Else a range of particles would overwrite another, from some thousands of particles on, without a word."""
     solver = Simulation(plane(), precision="float64").solver
-    context, found = solver.context(solver.new_parameters(1)), wp.zeros(solver.particles, dtype=wp.int32, device=CPU)
+    context, found = (
+        solver.context(solver.new_parameters(1)),
+        wp.zeros(solver.layout.particles, dtype=wp.int32, device=CPU),
+    )
     with pytest.raises(TypeError, match=r"count_neighbours takes the neighbourhood s, .* i = s\.first \+ wp\.tid\(\)"):
         context.launch(count_neighbours, found=found)

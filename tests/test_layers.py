@@ -27,7 +27,7 @@ LAYERS = """
     scene.containers scene.model scene.stability
     device device.cores device.kernels device.memory device.precision device.lanes device.reduction device.silence
     device.threads device.compiling device.kernel_cache device.smoothing device.neighbourhood device.arrays
-    device.fields device.state device.launching device.cells device.neighbours
+    device.fields device.launching device.state device.cells device.neighbours
     scene.checks scene.scene
     parameters.checks
     discretise.sampling discretise.discrete_scene
@@ -41,23 +41,24 @@ LAYERS = """
     solvers.pcisph.wall_relaxation solvers.pcisph.parts solvers.pcisph.steps solvers.pcisph.derivatives
     solvers.pcisph.solver solvers.pcisph.build
     reference.digits reference.engine reference.histories reference.losses reference.simulation reference
+    executors.executor executors.calls executors.distributed executors.worker_process executors.local executors
     rollout
-    parameters.space
+    parameters.scene_parameters parameters.space
     losses.image_losses losses.loss losses.centre_of_mass losses.image losses.matching losses.positions
-    losses.recorded losses losses.checked
-    gradients.estimator gradients.ensemble_members gradients.exact gradients.filter_kernels
-    gradients.adjoint_filters gradients.strength gradients.filters gradients.ensemble gradients
+    losses.recorded losses.batch losses losses.checked
+    gradients.estimator gradients.points gradients.ensemble_members gradients.exact
+    gradients.filter_kernels gradients.adjoint_filters gradients.strength gradients.filters gradients.ensemble gradients
     render.cameras render.colour_field render.interpolation render.phase_colours render.fields render.rays
     render.absorption render.views render.marching render.renderer render.scene_renderer render
     io.pictures
     figures.canvas figures.particle_sets figures.side_by_side
-    io.trajectory
+    io.trajectory io.trajectory_batch
     simulation
     problem
     figures.curves figures
     certificate.alignment certificate.perturbations certificate.twin certificate.loss_history certificate.horizon
     certificate.consistency certificate.text certificate.certificate certificate certificate.figure
-    optimisation optimisation.differentiable optimisation.replay_log optimisation.optimisers
+    optimisation optimisation.evaluate optimisation.differentiable optimisation.replay_log optimisation.optimisers
     optimisation.named_optimisers optimisation.result optimisation.optimise optimisation.transforms
     io.run_folder io.report
     inverse inverse.tables inverse.task inverse.setup inverse.figures

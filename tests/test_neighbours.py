@@ -13,6 +13,7 @@ from cortado.device.cells import Grid
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type
 from cortado.device.neighbours import NeighbourSearch
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
+from cortado.device.state import Layout
 from cortado.lattice.calibration import SKIN
 from cortado.lattice.smoothing import CUBIC_SPLINE
 
@@ -31,6 +32,7 @@ def padded(vectors: np.ndarray) -> np.ndarray:
 def around(search: NeighbourSearch, period: np.ndarray, precision: Precision) -> Any:
     """What `NeighbourSearch.fill` reads of the neighbourhood, as `ParticleSolver.resize` sets it."""
     s = neighbourhood_type(precision)()
+    s.particles = search.particles
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count
     s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
@@ -78,14 +80,15 @@ def lists(
     grid = Grid.around(lower, upper, period, REACH, most)
     discretisation = Discretisation(CUBIC_SPLINE, precision)
     names = np.arange(len(walls), dtype=np.float64)  # as weights, so that sorted walls tell who they were
-    search = NeighbourSearch(discretisation, grid, padded(walls), names, n, capacity, CPU)
+    search = NeighbourSearch(discretisation, grid, padded(walls), names, Layout(n, 1, precision, CPU), capacity)
     memory = wp.full((n, capacity + 8), GUARD, dtype=wp.int32, device=CPU)
     search.neighbours = memory[:, :capacity].transpose((1, 0))
     neighbourhood = around(search, period, precision)
     given_positions = padded(positions).astype(precision.numpy)
     search.sort(wp.array(given_positions, dtype=precision.vector, device=CPU))
     order = search.order.numpy()[:n]
-    search.fill(neighbourhood, wp.array(given_positions[order], dtype=precision.vector, device=CPU))
+    nothing_lost = wp.full(1, -1, dtype=wp.int32, device=CPU)
+    search.fill(neighbourhood, wp.array(given_positions[order], dtype=precision.vector, device=CPU), nothing_lost)
     rows, fluid_count, count = memory.numpy(), search.fluid_count.numpy(), search.count.numpy()
     own = fluid_count - search.filling.numpy()
     wall_names = search.wall_weights.numpy().astype(int)
@@ -271,7 +274,7 @@ def test_lists_that_are_too_short_say_how_long_they_must_be(capacity, precision)
 def test_room_can_be_made():
     discretisation = Discretisation(CUBIC_SPLINE, FLOAT64)
     grid = Grid.around(np.zeros(3), np.ones(3), np.zeros(3), REACH, 1000)
-    search = NeighbourSearch(discretisation, grid, np.zeros((0, 3)), np.zeros(0), 10, 4, CPU)
+    search = NeighbourSearch(discretisation, grid, np.zeros((0, 3)), np.zeros(0), Layout(10, 1, FLOAT64, CPU), 4)
     search.allocate(9)
     assert search.capacity == 12  # the next multiple of UNROLL
     assert search.neighbours.shape == (12, 10)

@@ -26,8 +26,8 @@ def test_the_docstring_of_a_problem_names_every_parameter():
 def test_every_parameter_of_steps_is_on_the_device():
     found = Simulation(plane_of_three()).solver.new_parameters(7)
     assert found.names == names(Role.RUN)
-    sizes = {"gravity": 7, "nozzle_path": 7, "rest_density": 3, "viscosity": 3}
-    assert {name: len(found[name]) for name in found.names} == {name: sizes.get(name, 1) for name in found.names}
+    shapes = {"gravity": (1, 7), "nozzle_path": (1, 7), "rest_density": (1, 3), "viscosity": (1, 3)}
+    assert {name: found[name].shape for name in found.names} == {name: shapes.get(name, (1,)) for name in found.names}
 
 
 @pytest.mark.parametrize("made", [scene, plane_of_three])

@@ -7,7 +7,7 @@ import pytest
 
 import cortado
 
-MODULES = ("gradients", "image_losses", "losses", "optimisers", "pictures", "render")
+MODULES = ("executors", "gradients", "image_losses", "losses", "optimisers", "pictures", "render")
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -9,6 +9,7 @@ TYPE_CHECKING = False  # that of typing, which takes as long to import as all el
 if TYPE_CHECKING:
     from typing import Any
 
+    from cortado import executors as executors
     from cortado import gradients as gradients
     from cortado import losses as losses
     from cortado import render as render
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from cortado.io.trajectory import Trajectory as Trajectory
     from cortado.losses import image_losses as image_losses
     from cortado.optimisation import optimisers as optimisers
+    from cortado.optimisation.evaluate import evaluate as evaluate
     from cortado.optimisation.optimise import optimise as optimise
     from cortado.optimisation.optimise import optimize as optimize
     from cortado.problem import Problem as Problem
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
+    "executors": "executors",
     "gradients": "gradients",
     "image_losses": "losses.image_losses",
     "losses": "losses",
@@ -52,6 +55,7 @@ _HOMES = {
     "Simulation": "simulation",
     "Trajectory": "io.trajectory",
     "certify": "certificate",
+    "evaluate": "optimisation.evaluate",
     "load_scene": "scene.scene",
     "optimise": "optimisation.optimise",
     "optimize": "optimisation.optimise",

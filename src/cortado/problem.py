@@ -11,16 +11,16 @@ import numpy as np
 from cortado.device.memory import require
 from cortado.device.state import State
 from cortado.device.threads import Turn, in_turn
-from cortado.errors import CortadoWarning, InputError
+from cortado.errors import CortadoWarning, DivergedError, InputError
 from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator, estimate
-from cortado.io.trajectory import Trajectory, noted
-from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, fingerprint
+from cortado.io.trajectory import noted
+from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch, batch, fingerprint
 from cortado.losses.checked import as_loss
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import NAMES, UNITS, Arrays, Values
 from cortado.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
-from cortado.simulation import Simulation, check_steps, whole_number
+from cortado.simulation import Simulation, check_steps, lost_sentence, whole_number
 from cortado.words import counted
 
 __all__ = ["NAMES", "UNITS", "Problem"]
@@ -85,27 +85,28 @@ class Problem:
         return self.simulation.turn
 
     @in_turn
-    def value(self, parameters: Values) -> float:
-        """The loss, forward only."""
+    def value(self, parameters: Values) -> Any:
+        """The loss, forward only: a float, of a batch (batch,), NaN for a scene that was ``lost``."""
         return self._total(self._ends(self._space.checked(parameters), self._losses, keep=False))
 
-    def end(self, parameters: Values) -> Snapshot:
-        """The last state of the rollout under these parameters."""
+    def end(self, parameters: Values) -> Any:
+        """The last state of the rollout under these parameters: a `Snapshot`, of a batch a `SnapshotBatch`."""
         return self.states(parameters, [self.steps])[self.steps]
 
     @in_turn
-    def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, Snapshot]:
+    def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, Any]:
         """States of the rollout under these parameters, by the number of steps before them."""
         return self._ends(self._space.checked(parameters), steps, keep=False)
 
     @in_turn
-    def run(self, parameters: Values, record_every: int = 1) -> Trajectory:
+    def run(self, parameters: Values, record_every: int = 1) -> Any:
         """The whole trajectory under these parameters; see `Simulation.run`."""
         self._space.begin(self._rollout, self._space.checked(parameters))
         return self.simulation.collect(self._rollout, record_every)
 
-    def value_and_gradient(self, parameters: Values, gradient: GradientEstimator | None = None) -> tuple[float, Arrays]:
-        """The loss and its derivatives: for each parameter given, an array of its shape (float64)."""
+    def value_and_gradient(self, parameters: Values, gradient: GradientEstimator | None = None) -> tuple[Any, Arrays]:
+        """The loss and its derivatives: for each parameter given, an array of its shape (float64), of a batch with a
+        first axis for the scenes."""
         found = self.estimate(parameters, gradient)
         return found.loss, found.gradient
 
@@ -119,7 +120,8 @@ class Problem:
         go back through a run; `gradients.AdjointNorms` is such an observer.
         """
         found = estimate(self, parameters, gradient, observe)
-        broken = [name for name, value in found.gradient.items() if not np.isfinite(value).all()]
+        kept = self._going if self.simulation.batch else slice(None)
+        broken = [name for name, value in found.gradient.items() if not np.isfinite(np.atleast_1d(value)[kept]).all()]
         if broken:
             warnings.warn(
                 f"the gradient with respect to {', '.join(broken)} is not finite, as it grew beyond what "
@@ -139,8 +141,9 @@ class Problem:
         return ForwardPass(loss, self._rollout, values, bars, self._space, self._derivatives, evaluation)
 
     @in_turn
-    def tangent(self, parameters: Values, directions: Values) -> float:
-        """The derivative of the loss along ``directions`` (any of the parameters), by forward mode."""
+    def tangent(self, parameters: Values, directions: Values) -> Any:
+        """The derivative of the loss along ``directions`` (any of the parameters), by forward mode: a float, of a batch
+        (batch,)."""
         dots: dict[int, Arrays] = {}
 
         def observe(step: int, dot: State) -> None:
@@ -148,27 +151,38 @@ class Problem:
                 dots[step] = dot.numpy(3)
 
         ends = self.tangents(parameters, directions, observe, self._losses)
-        _, bars = self._judged(ends)
+        loss, bars = self._judged(ends)
+        leading = np.shape(loss)
+
+        def product(bar: np.ndarray, dot: np.ndarray) -> np.ndarray:
+            return (bar.astype(np.float64) * dot).reshape(*leading, -1).sum(axis=-1)
+
         terms = []
         if "colours" in directions:
             colours_dot = np.asarray(directions["colours"], dtype=np.float64)
-            terms = [np.sum(bar.colours * colours_dot) for bar in bars.values()]
+            terms = [product(bar.colours, colours_dot) for bar in bars.values()]
         for step in sorted(dots):
             bar = bars[step].state.numpy(3)
-            terms += [(bar[name].astype(np.float64) * d).sum() for name, d in dots[step].items()]
-        return float(sum(terms))
+            terms += [product(bar[name], d) for name, d in dots[step].items()]
+        return sum(terms) + 0.0 * loss if leading else float(sum(terms))
 
     @in_turn
     def tangents(
         self, parameters: Values, directions: Values, observe: Observer, steps: Iterable[int] = ()
-    ) -> dict[int, Snapshot]:
+    ) -> dict[int, Any]:
         """Forward mode: run, and give ``observe`` the number of every state and its tangent along ``directions`` (any
-        of the parameters), which the next step overwrites. Returns the states after ``steps`` steps, by these."""
+        of the parameters), which the next step overwrites. Returns the states after ``steps`` steps, by these, as
+        `states` does."""
         values = self._space.checked(parameters)
         along = self._space.checked(directions, "direction")
         ends = self._ends(values, steps, keep=False, varied=along)
         self._rollout.tangent(*self._space.direction(self._rollout, values, along), observe)
         return ends
+
+    @property
+    def lost(self) -> Mapping[int, DivergedError]:
+        """Of a batch: the scenes that lost a particle in the last evaluation, by their number, and what happened."""
+        return self._rollout.lost
 
     @property
     def fingerprint(self) -> str:
@@ -194,30 +208,44 @@ class Problem:
         """(steps,) by name, of the last evaluation: ``converged``, and what else the solver notes of each step."""
         return self._rollout.diagnostics
 
-    def _ends(
-        self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()
-    ) -> dict[int, Snapshot]:
+    def _ends(self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()) -> dict[int, Any]:
         """States by the number of steps before them; ``keep`` checkpoints for a way back."""
-        wanted, colours = set(steps), self._space.colours(values)
-        ends: dict[int, Snapshot] = {}
+        wanted, dimension = set(steps), self.simulation.dimension
+        ends: dict[int, Any] = {}
+        colours = [self._space.colours(own) for own in self._space.members(values)]
 
         def observe(step: int, state: State) -> None:
-            if step in wanted:
-                ends[step] = Snapshot(state.copy(), self.simulation.dimension, colours)
+            if step in wanted and state.batch is None:
+                ends[step] = Snapshot(state.copy(), dimension, colours[0])
+            elif step in wanted:
+                ends[step] = SnapshotBatch(state.copy(), dimension, np.array(colours))
 
         self._space.begin(self._rollout, values, varied)
         observe(0, self._rollout.initial)
         self._rollout.forward(observe, keep)
+        if self.lost:
+            warnings.warn(lost_sentence(self.lost, len(colours)), CortadoWarning, stacklevel=5)
         return ends
 
-    def _total(self, ends: dict[int, Snapshot]) -> float:
-        return sum(loss.value(ends[step]) for step, loss in self._losses.items())
+    @property
+    def _going(self) -> list[int]:
+        """The scenes of a batch that have not lost a particle."""
+        return [b for b in range(self.simulation.batch or 1) if b not in self.lost]
 
-    def _judged(self, ends: dict[int, Snapshot]) -> tuple[float, dict[int, SnapshotAdjoint]]:
+    def _total(self, ends: dict[int, Any]) -> Any:
+        if self.simulation.batch is None:
+            return sum(loss.value(ends[step]) for step, loss in self._losses.items())
+        return sum(batch.values(loss, ends[step], self._going) for step, loss in self._losses.items())
+
+    def _judged(self, ends: dict[int, Any]) -> tuple[Any, dict[int, SnapshotAdjoint]]:
         """The loss of a run, and its adjoints of states by the number of steps before them."""
-        found = {step: loss.value_and_adjoint(ends[step]) for step, loss in self._losses.items()}
-        bars = {step: self._on_device(bar, ends[step]) for step, (_, bar) in found.items()}
-        return sum(value for value, _ in found.values()), bars
+        if self.simulation.batch is None:
+            one = {step: loss.value_and_adjoint(ends[step]) for step, loss in self._losses.items()}
+            bars = {step: self._on_device(bar, ends[step]) for step, (_, bar) in one.items()}
+            return sum(value for value, _ in one.values()), bars
+        going = self._going
+        each = {step: batch.values_and_adjoints(loss, ends[step], going) for step, loss in self._losses.items()}
+        return sum(values for values, _ in each.values()), {step: bar for step, (_, bar) in each.items()}
 
     def _on_device(self, bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
         if isinstance(bar, SnapshotAdjoint):
@@ -234,7 +262,8 @@ class Problem:
 class ForwardPass:
     """A forward run of a problem with its loss, and the ways back through it."""
 
-    loss: float
+    loss: Any
+    """Of a batch (batch,)."""
     rollout: Rollout
     _values: Arrays
     _bars: Mapping[int, SnapshotAdjoint]
@@ -278,4 +307,7 @@ class ForwardPass:
         gradient = self._space.gradient(values, first, derivative.parameters())
         if "colours" in values:
             gradient["colours"] = np.sum([bar.colours for bar in bars.values()], axis=0)
+        for b in self.rollout.lost:
+            for bar in gradient.values():
+                bar[b] = np.nan
         return {name: gradient[name] for name in values}

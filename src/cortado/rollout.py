@@ -71,10 +71,13 @@ class Rollout:
         self.parameters = solver.new_parameters(steps)
         self.substeps = 0
         """Explicit steps of diffusion within each step."""
-        self.time_step = 0.0
-        """[s], as it was given: the device rounds it."""
-        self.clock = Clock()
-        """Of the first state."""
+        self.time_steps = np.zeros(solver.layout.members)
+        """(members,) [s], as they were given: the device rounds them."""
+        self.clocks = [Clock()] * solver.layout.members
+        """Of the first state of each scene of a batch."""
+        self.lost: dict[int, DivergedError] = {}
+        """The scenes of a batch that lost a particle in the last forward run, by number. What stands in their states
+        after the step before means nothing."""
         self.log = solver.new_log(steps)
         """What the solver noted of the steps of the last forward run."""
         state_bytes = sum(self.initial[f.name].capacity for f in self.initial.fields if not f.is_constant)
@@ -90,7 +93,7 @@ class Rollout:
 
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
-        """(steps,) by name, of the steps of the last forward run: see `StepLog`."""
+        """(steps,) by name, in a batch (steps, batch), of the steps of the last forward run: see `StepLog`."""
         return self.log.diagnostics
 
     @property
@@ -103,8 +106,10 @@ class Rollout:
     @in_turn
     def forward(self, observe: Observer | None = None, keep: bool = True) -> State:
         """Run all steps and return the last state. ``observe`` is given every state; ``keep`` checkpoints for a way
-        back. Raises `DivergedError` after the good states were observed."""
+        back. Raises `DivergedError` after the good states were observed; a batch goes on without the scenes that have
+        ``lost`` a particle."""
         self._states, self._kept, self._run = {0: self.initial}, -1, -1
+        self.lost = {}
         state, step = self.initial, 0
         self.solver.set_substeps(self.substeps)
         self._forget_stale_graphs()
@@ -117,18 +122,20 @@ class Rollout:
                 chunk = self._advance(state, step, last)
                 if self.solver.make_room():
                     self._forget_stale_graphs()
-                    self.solver.reset()
+                    self.solver.reset(step)
                     continue
                 lost = self.solver.containment.lost()
-                good = chunk if lost is None else chunk[: lost.step - step]
-                for number, new_state in enumerate(good, step + 1):
+                for b in lost.keys() - self.lost.keys():
+                    self.lost[b] = self._diverged(b, lost[b], chunk[lost[b].step - step])
+                stops = bool(lost) and self.solver.layout.batch is None
+                for number, new_state in enumerate(chunk[: lost[0].step - step] if stops else chunk, step + 1):
                     if observe is not None:
                         observe(number, new_state)
                     if keep and number % self._interval == 0:
                         self._states[number] = new_state
-                if lost is not None:
-                    bad, step = chunk[lost.step - step], lost.step + 1
-                    raise self._diverged(lost, bad)
+                if stops:
+                    step = lost[0].step + 1
+                    raise self.lost[0]
                 state, step = chunk[-1], last
         finally:
             self.log.read(step)
@@ -156,14 +163,15 @@ class Rollout:
         self._step = CapturedGraph(step, self.solver.launch)
         self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
 
-    def _diverged(self, lost: Lost, state: State) -> DivergedError:
-        containment = self.solver.containment
-        position = state.positions.numpy()[lost.particle][: containment.walled.dimension]
+    def _diverged(self, member: int, lost: Lost, state: State) -> DivergedError:
+        containment, particle = self.solver.containment, member * self.solver.layout.particles + lost.particle
+        position = state.positions.numpy()[particle][: containment.walled.dimension]
+        time_step = self.time_steps[member]
         imprecise = ", or float64 for fluid that flies that far" if containment.is_imprecise(position) else ""
         return DivergedError(
             step=lost.step + 1,
             particle=lost.particle,
-            advice=f"try a smaller time step than {self.time_step:g} s, or more pressure iterations{imprecise}",
+            advice=f"try a smaller time step than {time_step:g} s, or more pressure iterations{imprecise}",
             where=containment.where(position),
             others=lost.others,
         )
@@ -198,7 +206,7 @@ class Rollout:
             if n > 0:
                 self._buffer.assign(self._restore(n - 1))
                 self.solver.step_number.fill_(n - 1)
-                self._step_back(derivative, self.log.counts(n - 1))
+                self._step_back(derivative, self.log.seek(n - 1))
         return self._bar
 
     def _step_back(self, derivative: BackwardStep, counts: Counts) -> None:
@@ -224,7 +232,7 @@ class Rollout:
         state.assign(self.initial)
         observe(0, dot)
         for n in range(self.steps):
-            counts = self.log.counts(n)
+            counts = self.log.seek(n)
             solver.step_number.fill_(n)
             solver.replay(state, self.parameters, counts)
             derivative.step(counts, dot, self.parameters)
@@ -244,7 +252,7 @@ class Rollout:
         if n not in self._states:
             start = n - n % self._interval
             for m in range(start, n):
-                counts = self.log.counts(m)
+                counts = self.log.seek(m)
                 self.solver.step_number.fill_(m)
                 self.solver.replay(self._states[m], self.parameters, counts)
                 self._states[m + 1] = self.initial.following()

@@ -1,9 +1,10 @@
 """A scene on a device in a precision: the thing that runs."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from importlib import import_module
+from inspect import signature
 from math import prod
 from os import PathLike
 from typing import Any
@@ -20,12 +21,13 @@ from cortado.device.reduction import sum_and_maximum_kernel
 from cortado.device.state import State
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.discretise.discrete_scene import DiscreteScene, discretise
-from cortado.errors import CortadoWarning, InputError, shown
+from cortado.errors import CortadoWarning, DivergedError, InputError, shown
 from cortado.io.trajectory import Trajectory
+from cortado.io.trajectory_batch import TrajectoryBatch
 from cortado.lattice.calibration import diffusion_limit
 from cortado.parameters.checks import check_sizes
 from cortado.parameters.space import ParameterSpace
-from cortado.parameters.values import scene_values
+from cortado.parameters.values import Arrays, scene_values
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
 from cortado.restart import RestartState
@@ -56,10 +58,12 @@ class Simulation:
         device: str = "cpu",
         precision: str = "float32",
         free_energy: FreeEnergy | None = None,
+        batch: int | None = None,
     ):
         """``scene``: one, or the path of its file; ``device`` as Warp names it ("cpu", "cuda:0"), ``precision``
-        "float32" or "float64"; ``free_energy`` replaces the one that the scene names."""
-        scene = as_scene(scene)
+        "float32" or "float64"; ``free_energy`` replaces the one that the scene names. ``batch``: run so many of it in
+        one launch, each with parameters of its own; see `docs/batches.md`."""
+        scene, self.batch = as_scene(scene), None if batch is None else whole_number("batch", batch, 1)
         start_warp()
         if free_energy is not None and not isinstance(free_energy, FreeEnergy):
             wanted = "a FreeEnergy, of cortado.sph.free_energy"
@@ -72,9 +76,10 @@ class Simulation:
         begin_headers(sum_and_maximum_kernel(self.precision), self.device)
         discrete = discretise(scene)
         room = first_capacity(scene.discretisation.support, scene.dimension)
-        counts = len(discrete.fluid.positions), len(discrete.walls.positions)
+        counts = (self.batch or 1) * len(discrete.fluid.positions), len(discrete.walls.positions)
         parts = simulation_parts(*counts, room, self.precision.bytes)
-        require(parts, "take a larger spacing or a smaller container", self.device)
+        smaller = "" if self.batch is None else "a smaller batch, "
+        require(parts, f"take {smaller}a larger spacing or a smaller container", self.device)
         _check_distance(scene, discrete, self.precision)
         self.positions = discrete.fluid.positions
         """(n, d) first positions [m]."""
@@ -91,23 +96,34 @@ class Simulation:
         """Constants of the lattice of particles at rest."""
         self.free_particles = discrete.fluid.emitted.start
         """How many particles, the first ones, do not wait in a nozzle."""
-        build = import_module(SOLVERS[scene.solver.kind]).build
-        self.solver: Solver = build(scene, discrete, self.free_energy, self.precision, self.device)
+        self.solver: Solver = self._built(discrete)
         self.state = self.solver.new_state()
         """The first state on the device."""
-        self.state.set(first_values(self.state.fields, self.parameters()))
+        first = first_values(self.state.fields, self.parameters())
+        self.state.set(first if self.batch is None else {name: [a] * self.batch for name, a in first.items()})
         for array in (self.positions, self.velocities, self.mass_fractions):
             array.setflags(write=False)
         check_sizes(self.parameters(), self.precision)
 
+    def _built(self, discrete: DiscreteScene) -> Solver:
+        kind = self.scene.solver.kind
+        build = import_module(SOLVERS[kind]).build
+        own = (self.scene, discrete, self.free_energy, self.precision, self.device)
+        if self.batch is None:
+            return build(*own)
+        if "batch" not in signature(build).parameters:
+            raise InputError(f'batch is {self.batch}, but must be left out, as solver.kind "{kind}" has no batches.')
+        return build(*own, batch=self.batch)
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled and copied as what it is made from."""
         energy = self.free_energy if len(self.scene.phase) > 1 else None
-        return _made_again, (self.scene, self.device.alias, self.precision.name, energy, self._points)
+        return _made_again, (self.scene, self.device.alias, self.precision.name, energy, self.batch, self._points)
 
     def __repr__(self) -> str:
         sizes = f"{counted(self.particles, 'particle')}, {counted(len(self.scene.phase), 'phase')}"
-        return f"Simulation({sizes}, {self.device.alias}, {self.precision.name})"
+        batch = "" if self.batch is None else f"batch of {self.batch}, "
+        return f"Simulation({batch}{sizes}, {self.device.alias}, {self.precision.name})"
 
     @property
     def dimension(self) -> int:
@@ -130,22 +146,24 @@ class Simulation:
         steps: int,
         controls: Mapping[str, Any] | None = None,
         record_every: int = 1,
-        state: RestartState | None = None,
-    ) -> Trajectory:
-        """Run from the scene's first state and return the frames, the first and the last state included.
+        state: RestartState | Sequence[RestartState] | None = None,
+    ) -> Any:
+        """Run from the scene's first state and return a `Trajectory` of the frames, the first and the last state
+        included; of a batch a `TrajectoryBatch`.
 
         ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity; so does any other parameter
         of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same scene, the run goes on
         from there, with the same bits as if it had not stopped; a parameter over time is then one of the steps to come.
-        Warns when the pressure did not converge; raises `DivergedError` when a particle is lost.
+        A batch goes on from one state for each scene. Warns when the pressure did not converge; raises `DivergedError`
+        when a particle is lost, where a batch warns, and goes on without the scene.
         """
         return self.collect(self.rollout(steps, controls, state), record_every)
 
     @in_turn
-    def collect(self, rollout: Rollout, record_every: int = 1) -> Trajectory:
+    def collect(self, rollout: Rollout, record_every: int = 1) -> Any:
         """Run a rollout forward and return its frames; warnings and errors as of `run`."""
         record_every = whole_number("record_every", record_every, 1)
-        numbers = 2 * self.numbers_in_frame(self.dimension)
+        numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
         parts = frame_parts(2 + rollout.steps // record_every, numbers, self.precision.bytes)
         require(parts, "take a larger record_every or fewer steps")
         steps, frames = [0], [self.frame(rollout.initial)]
@@ -159,18 +177,39 @@ class Simulation:
         converged = rollout.diagnostics["converged"]
         if not converged.all():
             warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=5)
+        if rollout.lost:
+            warnings.warn(lost_sentence(rollout.lost, rollout.solver.layout.members), CortadoWarning, stacklevel=5)
         fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
-        return Trajectory(
-            times=rollout.clock.times(np.array(steps), rollout.time_step),
-            steps=rollout.clock.steps + np.array(steps),
-            positions=fields.pop("positions"),
-            velocities=fields.pop("velocities"),
-            diagnostics=rollout.diagnostics,
-            mass_fractions=fields.pop("mass_fractions", None),
-            others=fields,
-            constants=self.constants(rollout),
-            substeps=rollout.substeps,
-        )
+        return self._trajectory(rollout, np.array(steps), fields)
+
+    def _trajectory(self, rollout: Rollout, steps: np.ndarray, fields: Arrays) -> Trajectory | TrajectoryBatch:
+        """Of fields (frames, ...) after so many steps (frames,), in a batch (frames, batch, ...)."""
+        noted, constants = rollout.diagnostics, self.constants(rollout)
+
+        def one(number: int, kept: slice, at: tuple[Any, ...]) -> Trajectory:
+            own = {name: array[kept][at] for name, array in fields.items()}
+            clock = rollout.clocks[number]
+            return Trajectory(
+                times=clock.times(steps[kept], float(rollout.time_steps[number])),
+                steps=clock.steps + steps[kept],
+                positions=own.pop("positions"),
+                velocities=own.pop("velocities"),
+                diagnostics={name: column[at] for name, column in noted.items()},
+                mass_fractions=own.pop("mass_fractions", None),
+                others=own,
+                constants={name: array[at[1:]] for name, array in constants.items()},
+                substeps=rollout.substeps,
+            )
+
+        if self.batch is None:
+            return one(0, slice(None), (slice(None),))
+        found = []
+        for b in range(self.batch):
+            good = np.count_nonzero(steps < rollout.lost[b].step) if b in rollout.lost else len(steps)
+            found.append(one(b, slice(good), (slice(None), b)))
+            for array in fields.values():
+                array[good:, b] = np.nan
+        return TrajectoryBatch(tuple(found), fields, rollout.lost)
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
         """What a trajectory records of a state: the fields that steps change."""
@@ -183,22 +222,36 @@ class Simulation:
 
     def constants(self, rollout: Rollout) -> dict[str, np.ndarray]:
         """The fields of a rollout's states that no step changes."""
-        fields = rollout.initial.fields
-        return {field.name: rollout.initial[field.name].numpy().copy() for field in fields if field.is_constant}
+        names = [field.name for field in rollout.initial.fields if field.is_constant]
+        values = rollout.initial.numpy(self.dimension)
+        return {name: values[name] for name in names}
 
     @in_turn
     def rollout(
-        self, steps: int, controls: Mapping[str, Any] | None = None, state: RestartState | None = None
+        self,
+        steps: int,
+        controls: Mapping[str, Any] | None = None,
+        state: RestartState | Sequence[RestartState] | None = None,
     ) -> Rollout:
         """A rollout that is ready to go forward from the scene's first state; see `run` for ``controls`` and
         ``state``."""
         rollout = Rollout(self.solver, check_steps(steps))
         space = ParameterSpace(self, rollout.steps)
         values = space.checked(controls or {})
-        if state is not None:
-            space.check_restart(state, values)
-        space.begin(rollout, values, state=state)
+        states = self._states(state)
+        for one in states:
+            space.check_restart(one, values)
+        space.begin(rollout, values, states=states)
         return rollout
+
+    def _states(self, state: RestartState | Sequence[RestartState] | None) -> list[RestartState]:
+        """The states to go on from, one for each scene; none for the scene's own."""
+        if state is None:
+            return []
+        states = list(state) if isinstance(state, Sequence) else [state]
+        if len(states) != (self.batch or 1):
+            raise InputError(f"state has {len(states)} states, but must have {self.batch or 1}, one for each scene.")
+        return states
 
     def renderer(self, **settings: Any) -> Renderer:
         """What takes pictures of the simulation, ``renderer.render(trajectory[k])``, and differentiates them: as the
@@ -252,9 +305,11 @@ def _check_distance(scene: Scene, discrete: DiscreteScene, precision: Precision)
         )
 
 
-def _made_again(scene: Scene, device: str, precision: str, free_energy: FreeEnergy | None, points: str) -> Simulation:
+def _made_again(
+    scene: Scene, device: str, precision: str, free_energy: FreeEnergy | None, batch: int | None, points: str
+) -> Simulation:
     """A simulation from what it was made from, first positions of the same checksum included."""
-    simulation = Simulation(scene, device, precision, free_energy)
+    simulation = Simulation(scene, device, precision, free_energy, batch)
     if simulation._points != points:
         raise InputError(
             "The first positions of a simulation are others than when it was pickled, but must be the same: the file "
@@ -281,9 +336,15 @@ def whole_number(what: str, value: Any, least: int) -> int:
 def not_converged_sentence(converged: np.ndarray) -> str:
     """What to say of steps that ended above the tolerance."""
     return (
-        f"the pressure did not converge in {np.count_nonzero(~converged)} of {len(converged)} steps: "
+        f"the pressure did not converge in {np.count_nonzero(~converged)} of {converged.size} steps: "
         "try a smaller time step, more iterations or a larger tolerance."
     )
+
+
+def lost_sentence(lost: Mapping[int, DivergedError], batch: int) -> str:
+    """What to say of the scenes of a batch that lost a particle."""
+    first = min(lost, key=lambda b: lost[b].step)
+    return f"{len(lost)} of {counted(batch, 'scene')} of the batch were lost. First scene {first}: {lost[first]}"
 
 
 def _device(name: str) -> Any:

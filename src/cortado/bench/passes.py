@@ -69,7 +69,7 @@ class PassTimer:
         self._time = LaunchTimer(self._solver.launch, repeats)
         self._launches: dict[Key, _Launch] = {}
         self._solver.reset()
-        self._solver.replay(rollout.initial, rollout.parameters, rollout.log.counts(0))
+        self._solver.replay(rollout.initial, rollout.parameters, rollout.log.seek(0))
         self.listed = int(search.count.numpy().sum())
         """Entries of all lists of neighbours of the first state."""
         self.pairs = self.listed - int(search.filling.numpy().sum())
@@ -78,7 +78,7 @@ class PassTimer:
     def step_passes(self) -> list[Pass]:
         """The passes of the first step of the rollout."""
         rollout, solver = self._rollout, self._solver
-        counts, new_state = rollout.log.counts(0), rollout.initial.following()
+        counts, new_state = rollout.log.seek(0), rollout.initial.following()
 
         def replay() -> None:
             solver.replay(rollout.initial, rollout.parameters, counts)
@@ -94,7 +94,7 @@ class PassTimer:
     def adjoint_passes(self) -> list[Pass]:
         """The passes of the way back through that step; the step itself, which is taken again, is one of them."""
         rollout, solver = self._rollout, self._solver
-        forward, counts = set(self._launches), rollout.log.counts(0)
+        forward, counts = set(self._launches), rollout.log.seek(0)
         derivative, bar = Exact().derivative(rollout), solver.new_state()
         bar.positions.fill_(1.0)
         solver.reserve(counts)
@@ -112,7 +112,7 @@ class PassTimer:
             launch()
             if key not in self._launches:
                 pairs = self.pairs if sums_over_neighbours(arguments) else 0
-                size = least_bytes(arguments, threads, self._solver.particles, self.listed)
+                size = least_bytes(arguments, threads, self._solver.layout.all_particles, self.listed)
                 self._launches[key] = _Launch(self._time(launch), size, pairs)
 
         with watched(watch):

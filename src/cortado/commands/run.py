@@ -65,7 +65,7 @@ def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record
 def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:
     steps = rollout.steps
     recorded = np.array([*range(0, steps, record_every), steps])
-    times, first = rollout.clock.times(recorded, rollout.time_step), simulation.frame(rollout.initial)
+    times, first = rollout.clocks[0].times(recorded, rollout.time_steps[0]), simulation.frame(rollout.initial)
     constants = simulation.constants(rollout)
     with (
         frame_writer(folder.trajectory, times, first, constants, steps, rollout.diagnostics) as writer,

@@ -60,8 +60,8 @@ class Arrays:
             array.zero_()
 
 
-def zeros(kinds: Mapping[str, tuple[int, Any]], device: Any, requires_grad: bool = False) -> dict[str, wp.array]:
-    """Arrays of zeros by name, each of a size and a Warp type."""
+def zeros(kinds: Mapping[str, tuple[Any, Any]], device: Any, requires_grad: bool = False) -> dict[str, wp.array]:
+    """Arrays of zeros by name, each of a size or a shape and a Warp type."""
     options = {"device": device, "requires_grad": requires_grad}
     return {name: wp.zeros(size, dtype=dtype, **options) for name, (size, dtype) in kinds.items()}
 

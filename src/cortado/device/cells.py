@@ -1,4 +1,4 @@
-"""Particles sorted by cell.
+"""Particles sorted by cell, the scenes of a batch one behind the other.
 
 The grid of cells wraps around in every direction, so that no position lies outside of it: along a periodic axis
 the cells divide the period, elsewhere cells that share a number are told apart by the distance test.
@@ -61,7 +61,7 @@ def cell_grid_type(precision: Precision) -> Any:
         """1 / edge length of a cell [1 / m]."""
         shape: wp.vec3i
         starts: wp.array(dtype=wp.int32)
-        """(cells + 1,): first sorted particle of each cell."""
+        """(members cells + 1,): first sorted particle of each cell; each scene of a batch has cells of its own."""
 
     CellGrid.__name__ = CellGrid.__qualname__ = f"CellGrid_{precision.name}"
     return wp.struct(CellGrid)
@@ -131,6 +131,7 @@ def _cell_kernels(precision: Precision) -> _CellKernels:
     @wp.kernel(module=module, enable_backward=False)
     def number_cells(
         grid: grid_type,
+        particles: int,
         x: wp.array(dtype=vector),
         # out
         keys: wp.array(dtype=wp.int32),
@@ -138,7 +139,8 @@ def _cell_kernels(precision: Precision) -> _CellKernels:
     ):
         i = wp.tid()
         c = cell_of(x[i], grid)
-        keys[i] = (c[2] * grid.shape[1] + c[1]) * grid.shape[0] + c[0]
+        layer = i // particles * grid.shape[2] + c[2]
+        keys[i] = (layer * grid.shape[1] + c[1]) * grid.shape[0] + c[0]
         order[i] = i
 
     @wp.kernel(module=module, enable_backward=False)
@@ -154,30 +156,30 @@ def _cell_kernels(precision: Precision) -> _CellKernels:
 
 
 class CellSort:
-    """Sorts a fixed number of particles by cell, on one device and without a host read."""
+    """Sorts a fixed number of particles by scene and by cell, on one device and without a host read."""
 
-    def __init__(self, grid: Grid, particles: int, precision: Precision, device: Any):
-        self._particles, self._device = particles, device
+    def __init__(self, grid: Grid, particles: int, precision: Precision, device: Any, members: int = 1):
+        """``particles`` of each of ``members`` scenes."""
+        self._particles, self._all, self._device = particles, members * particles, device
         self._kernels = _cell_kernels(precision)
-        self._bits = max(int(grid.cells - 1).bit_length(), 1)
-        self._keys = wp.empty(2 * particles, dtype=wp.int32, device=device)
-        self.order = wp.empty(2 * particles, dtype=wp.int32, device=device)
+        self._bits = max(int(members * grid.cells - 1).bit_length(), 1)
+        self._keys = wp.empty(2 * self._all, dtype=wp.int32, device=device)
+        self.order = wp.empty(2 * self._all, dtype=wp.int32, device=device)
         """(2 n,): sorted -> given, in the first half."""
         self.grid = cell_grid_type(precision)()
         """What kernels see."""
         self.grid.origin = precision.vector(*grid.origin)
         self.grid.frequency = precision.vector(*(1.0 / grid.cell))
         self.grid.shape = wp.vec3i(*grid.shape)
-        self.grid.starts = wp.zeros(grid.cells + 1, dtype=wp.int32, device=device)
+        self.grid.starts = wp.zeros(members * grid.cells + 1, dtype=wp.int32, device=device)
 
     def __call__(self, positions: wp.array) -> None:
-        """Find the order of cells of positions (n,) [m]; ties keep the given order."""
-        if self._particles == 0:
+        """Find the order of cells of positions (members n,) [m]; ties keep the given order."""
+        count, device = self._all, self._device
+        if count == 0:
             return
-        keys, order, grid = self._keys, self.order, self.grid
-        launch(
-            self._kernels.number_cells, self._particles, self._device, grid=grid, x=positions, keys=keys, order=order
-        )
-        sort_pairs(keys, order, self._particles, self._bits)
-        starts, count = grid.starts, self._particles
-        launch(self._kernels.find_starts, len(starts), self._device, keys=keys, count=count, starts=starts)
+        numbered = {"grid": self.grid, "keys": self._keys, "order": self.order}
+        launch(self._kernels.number_cells, count, device, numbered, particles=self._particles, x=positions)
+        sort_pairs(self._keys, self.order, count, self._bits)
+        starts = self.grid.starts
+        launch(self._kernels.find_starts, len(starts), device, keys=self._keys, count=count, starts=starts)

@@ -206,33 +206,34 @@ class CapturedGraph:
 
 
 class TreeReduction:
-    """Adds one value of each particle on the device, in the same order every time."""
+    """Adds one value of each particle on the device, scene by scene, in the same order every time."""
 
-    def __init__(self, kernel: Any, dtype: Any, particles: int, device: Any):
-        self._kernel, self._device = kernel, device
-        self._levels: list[wp.array] = []
+    def __init__(self, kernel: Any, dtype: Any, particles: int, device: Any, members: int = 1):
+        """``particles`` of each of ``members`` scenes."""
+        self._kernel, self._device, self._particles = kernel, device, particles
+        self._levels: list[tuple[int, wp.array]] = []
         size = particles
         while size > 1 or not self._levels:
             size = -(-size // BRANCHES)
-            self._levels.append(wp.zeros(size, dtype=dtype, device=device))
+            self._levels.append((size, wp.zeros(members * size, dtype=dtype, device=device)))
 
     def __call__(self, values: wp.array) -> wp.array:
-        """The sum as an array (1,), which the next call overwrites."""
-        for level in self._levels:
-            size = level.shape[0]
-            launch(self._kernel, size, self._device, count=len(values), stride=size, values=values, partial=level)
-            values = level
+        """The sums as an array (members,), which the next call overwrites."""
+        count = self._particles
+        for size, level in self._levels:
+            launch(self._kernel, len(level), self._device, count=count, stride=size, values=values, partial=level)
+            count, values = size, level
         return values
 
 
-def sum_of(dtype: Any, particles: int, device: Any) -> TreeReduction:
-    """Sums of (n,) numbers, vectors or matrices of a Warp type."""
-    return TreeReduction(sum_kernel(dtype), dtype, particles, device)
+def sum_of(dtype: Any, particles: int, device: Any, members: int = 1) -> TreeReduction:
+    """Sums of (members n,) numbers, vectors or matrices of a Warp type."""
+    return TreeReduction(sum_kernel(dtype), dtype, particles, device, members)
 
 
-def sum_and_maximum(particles: int, precision: Precision, device: Any) -> TreeReduction:
-    """Sums of first and maxima of second components of pairs (n,)."""
-    return TreeReduction(sum_and_maximum_kernel(precision), precision.pair, particles, device)
+def sum_and_maximum(particles: int, precision: Precision, device: Any, members: int = 1) -> TreeReduction:
+    """Sums of first and maxima of second components of pairs (members n,)."""
+    return TreeReduction(sum_and_maximum_kernel(precision), precision.pair, particles, device, members)
 
 
 def add(values: wp.array, total: wp.array) -> None:

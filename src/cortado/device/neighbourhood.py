@@ -54,6 +54,8 @@ def neighbourhood_type(precision: Precision) -> Any:
         """Particle of a launch's first thread: a launch may be cut into ranges of particles."""
         part: wp.int32
         """Number of the range."""
+        particles: wp.int32
+        """Of one scene: particle i belongs to scene i // particles of a batch."""
         neighbours: wp.array2d(dtype=wp.int32)
         """First the fluid neighbours of a particle, filled up with itself, then its wall neighbours."""
         fluid_count: wp.array(dtype=wp.int32)

@@ -18,6 +18,7 @@ from cortado.device.cells import CellSort, Grid, cell_functions, cell_grid_type
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import MOST_PARTS, KernelLauncher
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
+from cortado.device.state import Layout
 
 
 @cache
@@ -89,6 +90,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
         s: neighbourhood,
         grid: grid_type,
         wall_grid: grid_type,
+        bad_step: wp.array(dtype=wp.int32),
         x: wp.array(dtype=vector),
         # out
         fluid_count: wp.array(dtype=wp.int32),
@@ -96,8 +98,16 @@ def fill_kernel(discretisation: Discretisation) -> Any:
         count: wp.array(dtype=wp.int32),
         needed: wp.array(dtype=wp.int32),
     ):
-        """``needed``, for each range, becomes the longest list, also where that is more than there is room for."""
+        """``needed``, for each range, becomes the longest list, also where that is more than there is room for. Scenes
+        that have lost a particle, in ``bad_step``, get empty lists."""
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
+        if bad_step[member] >= 0:
+            if lane() == 0:
+                filling[i] = 0
+                fluid_count[i] = 0
+                count[i] = 0
+            return
         x_i = x[i]
         c = cell_of(x_i, grid)
         n_y = grid.shape[1]
@@ -106,7 +116,8 @@ def fill_kernel(discretisation: Discretisation) -> Any:
         found = int(0)
         for o_z in range(below(n_z), above(n_z)):
             for o_y in range(below(n_y), above(n_y)):
-                row = (wrap(c[2] + o_z, n_z) * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]
+                layer = member * n_z + wrap(c[2] + o_z, n_z)
+                row = (layer * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]
                 found = scan_row(i, i, row, c[0], found, x_i, x, grid, s)
         filled = (found + wp.static(UNROLL - 1)) // wp.static(UNROLL) * wp.static(UNROLL)
         for k in range(found + lane(), wp.min(filled, capacity), LANES):
@@ -142,15 +153,14 @@ class NeighbourSearch:
         grid: Grid,
         walls: np.ndarray,
         wall_weights: np.ndarray,
-        particles: int,
+        layout: Layout,
         capacity: int,
-        device: Any,
     ):
-        """``walls`` (b, 3) [m], ``wall_weights`` (b,) [-]."""
-        precision = discretisation.precision
+        """``walls`` (b, 3) [m], ``wall_weights`` (b,) [-], the same ones for all scenes of a batch."""
+        precision, device, particles = discretisation.precision, layout.device, layout.all_particles
         self.particles, self.device = particles, device
         self._fill = fill_kernel(discretisation)
-        self._sort = CellSort(grid, particles, precision, device)
+        self._sort = CellSort(grid, layout.particles, precision, device, layout.members)
         self.order = self._sort.order
         self.fluid_count = wp.zeros(particles, dtype=wp.int32, device=device)
         self.filling = wp.zeros(particles, dtype=wp.int32, device=device)
@@ -173,7 +183,8 @@ class NeighbourSearch:
             self.neighbours = wp.empty(shape[::-1], dtype=wp.int32, device=self.device)
 
     def sort(self, positions: wp.array) -> None:
-        """Find the order of cells (``order``: sorted -> given) of positions (n,) [m]; ties keep the given order."""
+        """Find the order of cells (``order``: sorted -> given) of positions (members n,) [m]; ties keep the given
+        order."""
         if self._unsorted_walls is not None:  # once, and not before kernels are compiled side by side
             self._sort_walls(*self._unsorted_walls)
             self._unsorted_walls = None
@@ -185,13 +196,15 @@ class NeighbourSearch:
         self.wall_positions.assign(walls[sorted_to_given])
         self.wall_weights.assign(wall_weights[sorted_to_given])
 
-    def fill(self, neighbourhood: Any, positions: wp.array) -> None:
-        """List the neighbours of sorted positions (n,) [m]; `needed` tells whether the lists were long enough."""
+    def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:
+        """List the neighbours of sorted positions (members n,) [m], but none where the ``bad_step`` (members,) of a
+        scene is not -1; `needed` tells whether the lists were long enough."""
         self._launch(
             self._fill,
             s=neighbourhood,
             grid=self._sort.grid,
             wall_grid=self._wall_sort.grid,
+            bad_step=bad_step,
             x=positions,
             fluid_count=self.fluid_count,
             filling=self.filling,

@@ -1,4 +1,7 @@
-"""Sums over particles in a fixed order: a tree of partial sums, so that the same bits come back every time."""
+"""Sums over particles in a fixed order: a tree of partial sums, so that the same bits come back every time.
+
+Each scene of a batch has ``count`` values, one scene behind the other, which ``stride`` threads add up.
+"""
 
 from functools import cache
 from typing import Any
@@ -16,17 +19,18 @@ def type_name(dtype: Any) -> str:
 
 @cache
 def sum_kernel(dtype: Any) -> Any:
-    """Sums of numbers, vectors or matrices of one type: partial[t] from values t, t + T, t + 2 T, ..."""
+    """Sums of numbers, vectors or matrices of one type: of each scene partial[t] from values t, t + T, t + 2 T, ..."""
     module = wp.get_module(f"cortado_sum_{type_name(dtype)}")
     module.options["enable_backward"] = False
 
     @wp.kernel(module=module, enable_backward=False)
     def add(count: int, stride: int, values: wp.array(dtype=dtype), partial: wp.array(dtype=dtype)):
-        t = wp.tid()
-        total = values[t]
+        t = wp.tid() % stride
+        first = wp.tid() // stride * count
+        total = values[first + t]
         for k in range(t + stride, count, stride):
-            total += values[k]
-        partial[t] = total
+            total += values[first + k]
+        partial[wp.tid()] = total
 
     return add
 
@@ -40,13 +44,14 @@ def sum_and_maximum_kernel(precision: Precision) -> Any:
 
     @wp.kernel(module=module, enable_backward=False)
     def sum_and_maximum(count: int, stride: int, values: wp.array(dtype=pair), partial: wp.array(dtype=pair)):
-        t = wp.tid()
-        total = values[t][0]
-        largest = values[t][1]
+        t = wp.tid() % stride
+        first = wp.tid() // stride * count
+        total = values[first + t][0]
+        largest = values[first + t][1]
         for k in range(t + stride, count, stride):
-            total += values[k][0]
-            largest = wp.max(largest, values[k][1])
-        partial[t] = pair(total, largest)
+            total += values[first + k][0]
+            largest = wp.max(largest, values[first + k][1])
+        partial[wp.tid()] = pair(total, largest)
 
     return sum_and_maximum
 

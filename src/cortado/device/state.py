@@ -9,6 +9,7 @@ import warp as wp
 
 from cortado.device.arrays import Arrays, padded, zeros
 from cortado.device.fields import Entry, StateField
+from cortado.device.launching import TreeReduction, sum_of
 from cortado.device.precision import Precision
 from cortado.parameters.registry import BY_NAME, Axis, Role, names
 from cortado.parameters.values import OVER_TIME
@@ -19,12 +20,14 @@ class State(Arrays):
     of its derivatives.
 
     Every state has ``positions`` (n,) vectors [m], ``velocities`` (n,) vectors [m / s] and ``mass_fractions`` (n,) of
-    as many numbers as there are phases [-], in the scene's order of particles.
+    as many numbers as there are phases [-], in the scene's order of particles; in a batch of scenes one scene stands
+    behind the other.
     """
 
-    def __init__(self, fields: tuple[StateField, ...], arrays: Mapping[str, wp.array]):
+    def __init__(self, fields: tuple[StateField, ...], arrays: Mapping[str, wp.array], batch: int | None = None):
+        """``batch`` as that of `Layout`."""
         super().__init__(arrays)
-        self.fields = fields
+        self.fields, self.batch = fields, batch
 
     @property
     def positions(self) -> wp.array:
@@ -43,12 +46,13 @@ class State(Arrays):
 
     def like(self) -> Self:
         """One of the same fields and sizes, all 0."""
-        return type(self)(self.fields, {name: wp.zeros_like(self[name], requires_grad=False) for name in self.names})
+        zero = {name: wp.zeros_like(self[name], requires_grad=False) for name in self.names}
+        return type(self)(self.fields, zero, self.batch)
 
     def following(self) -> Self:
         """A later state of the same run that is still to be written: what no step changes is the same array."""
         new = {f.name: self[f.name] if f.is_constant else wp.empty_like(self[f.name]) for f in self.fields}
-        return type(self)(self.fields, new)
+        return type(self)(self.fields, new, self.batch)
 
     def copy(self) -> Self:
         """The same in arrays of its own."""
@@ -56,33 +60,46 @@ class State(Arrays):
         new.assign(self)
         return new
 
+    def member(self, number: int) -> Self:
+        """One scene of a batch, as a view of these arrays."""
+        assert self.batch is not None
+        sizes = {name: len(self[name]) // self.batch for name in self.names}
+        views = {name: self[name][number * size : (number + 1) * size] for name, size in sizes.items()}
+        return type(self)(self.fields, views)
+
     def set(self, values: Mapping[str, Any]) -> None:
-        """Write fields by name: vectors (n, d), numbers (n,), fractions (n, phases)."""
+        """Write fields by name: vectors (n, d), numbers (n,), fractions (n, phases), in a batch (batch, n, ...)."""
         for field in self.fields:
             if field.name in values:
                 given = np.asarray(values[field.name])
-                self[field.name].assign(padded(given) if field.entry is Entry.VECTOR else given)
+                flat = given if self.batch is None else given.reshape(-1, *given.shape[2:])
+                self[field.name].assign(padded(flat) if field.entry is Entry.VECTOR else flat)
 
     def numpy(self, dimension: int, constants: bool = True) -> dict[str, np.ndarray]:
-        """Every field as a new array: vectors (n, dimension), numbers (n,), fractions (n, phases); ``constants``: also
-        what no step changes."""
+        """Every field as a new array: vectors (n, dimension), numbers (n,), fractions (n, phases), in a batch
+        (batch, n, ...); ``constants``: also what no step changes."""
         arrays = {f: self[f.name].numpy() for f in self.fields if constants or not f.is_constant}
-        return {f.name: (a[:, :dimension] if f.entry is Entry.VECTOR else a).copy() for f, a in arrays.items()}
+        found = {f.name: (a[:, :dimension] if f.entry is Entry.VECTOR else a).copy() for f, a in arrays.items()}
+        if self.batch is None:
+            return found
+        return {name: a.reshape(self.batch, -1, *a.shape[1:]) for name, a in found.items()}
 
 
 class Parameters(Arrays):
     """What steps depend on besides the state, by the names of the registry. Also the type of its derivatives.
 
-    A parameter over time is (steps,) vectors, one of phases (phases,) numbers, any other (1,) number.
+    A parameter over time is (members, steps) vectors, one of phases (members, phases) numbers, any other (members,)
+    numbers, with one member for each scene of a batch.
     """
 
     def set(self, values: Mapping[str, Any]) -> None:
-        """Write some by name: a vector (d,) for every step, or vectors (steps, d); numbers or arrays of them."""
+        """Write some by name, the same for all members or with an axis of them: a vector (d,) for every step, or
+        vectors (steps, d); numbers or arrays of them."""
         for name, value in values.items():
             array, given = self[name], np.asarray(value, dtype=np.float64)
             if name in OVER_TIME:
-                table = np.zeros((len(array), 3))
-                table[:, : given.shape[-1]] = given
+                table = np.zeros((*array.shape, 3))
+                table[..., : given.shape[-1]] = given
                 array.assign(table)
             else:
                 array.assign(np.broadcast_to(given, array.shape))
@@ -90,13 +107,30 @@ class Parameters(Arrays):
 
 @dataclass(frozen=True)
 class Layout:
-    """How large the arrays of one solver are, and where they are. Several scenes in one launch, or solids, would be an
-    axis more here; kernels have one thread for each particle, whichever scene it belongs to."""
+    """How large the arrays of one solver are, and where they are: those of one scene, or of several in one launch, one
+    behind the other. A kernel has one thread for each particle of all of them."""
 
     particles: int
+    """Of one scene."""
     phases: int
     precision: Precision
     device: Any
+    batch: int | None = None
+    """How many scenes; None for a single one, whose arrays have no axis for it."""
+
+    @property
+    def members(self) -> int:
+        """How many scenes there are."""
+        return self.batch or 1
+
+    @property
+    def all_particles(self) -> int:
+        """Of all scenes."""
+        return self.members * self.particles
+
+    def sum_of(self, dtype: Any) -> TreeReduction:
+        """Sums over the particles of each scene of numbers, vectors or matrices of a Warp type."""
+        return sum_of(dtype, self.particles, self.device, self.members)
 
     def state(self, fields: tuple[StateField, ...], requires_grad: bool = False) -> State:
         """A state of these fields, all 0."""
@@ -107,13 +141,13 @@ class Layout:
             Entry.FRACTIONS: precision.fractions(self.phases),
             Entry.DOUBLE: wp.float64,
         }
-        sizes = {Axis.PARTICLE: self.particles, Axis.SCALAR: 1}
+        sizes = {Axis.PARTICLE: self.all_particles, Axis.SCALAR: self.members}
         kinds = {field.name: (sizes[field.axis], dtypes[field.entry]) for field in fields}
-        return State(fields, zeros(kinds, self.device, requires_grad))
+        return State(fields, zeros(kinds, self.device, requires_grad), self.batch)
 
     def parameters(self, steps: int, requires_grad: bool = False) -> Parameters:
         """Parameters of a run of so many steps, all 0."""
-        real, vector = self.precision.real, self.precision.vector
-        of_axis = {Axis.STEP: (max(steps, 1), vector), Axis.PHASE: (self.phases, real)}
-        kinds = {name: of_axis.get(BY_NAME[name].axis, (1, real)) for name in names(Role.RUN)}
+        real, vector, members = self.precision.real, self.precision.vector, self.members
+        of_axis = {Axis.STEP: ((members, max(steps, 1)), vector), Axis.PHASE: ((members, self.phases), real)}
+        kinds = {name: of_axis.get(BY_NAME[name].axis, (members, real)) for name in names(Role.RUN)}
         return Parameters(zeros(kinds, self.device, requires_grad))

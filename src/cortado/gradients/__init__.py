@@ -59,4 +59,4 @@ def estimate(
     Raises `InputError` where what is given is no estimator, or does not return the gradient of every parameter.
     """
     chosen = checked_estimator(Exact() if estimator is None else estimator)
-    return checked_estimate(chosen.estimate(problem, parameters, observe), parameters)
+    return checked_estimate(chosen.estimate(problem, parameters, observe), parameters, problem.simulation.batch)

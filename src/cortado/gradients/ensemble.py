@@ -1,9 +1,8 @@
 """The gradient of a loss averaged over an ensemble, by finite differences or as the mean of other estimators'
 gradients."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from cortado.errors import InputError, shown
 from cortado.gradients.ensemble_members import Ensemble
 from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator, checked_estimator, tuned
 from cortado.gradients.filters import AdjointViscosity
+from cortado.gradients.points import Point
 from cortado.parameters.values import Arrays, Values
 from cortado.rollout import Observer
 
@@ -38,18 +38,27 @@ class RandomizedSmoothing(Ensemble):
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         ensemble = self.around(problem, parameters)
-        loss, numbers = problem.value(ensemble.values), len(ensemble.spreads)
+        numbers = len(ensemble.spreads)
         if numbers > MOST_NUMBERS:
             raise InputError(
                 f"the parameters are {numbers} numbers, but must be at most {MOST_NUMBERS}, as the simulation "
                 "is run twice for each: take fewer, such as one gravity for all steps, or another estimator."
             )
-        found, r = np.zeros((self.samples, numbers)), np.sqrt(numbers)
-        for sample in found:
-            for q in ensemble.rotation():
-                displacement = ensemble.displacement()
-                ahead, behind = (ensemble.at(side * q, displacement, problem.value) for side in (r, -r))
-                sample += (ahead - behind) / (2.0 * r) * q
+        directions, r = [], np.sqrt(numbers)
+
+        def points() -> Iterator[Point]:
+            yield Point(ensemble.values)
+            for _ in range(self.samples):
+                for q in ensemble.rotation():
+                    displacement = ensemble.displacement()
+                    directions.append(q)
+                    yield ensemble.sample(r * q, displacement)
+                    yield ensemble.sample(-r * q, displacement)
+
+        loss, *losses = (one.loss for one in self.evaluated(problem, points(), observe))
+        found = np.zeros((self.samples, numbers))
+        for k, q in enumerate(directions):
+            found[k // numbers] += (losses[2 * k] - losses[2 * k + 1]) / (2.0 * r) * q
         gradient, error = (ensemble.named(one / ensemble.spreads) for one in _mean_and_error(found))
         return Estimate(loss, gradient, standard_error=error)
 
@@ -81,15 +90,20 @@ class EnsembleMean(Ensemble):
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         """``observe`` is called with the adjoints of one sample after the other."""
         ensemble = self.around(problem, parameters)
-        loss, estimator = problem.value(ensemble.values), tuned(self.estimator, problem, ensemble.values)
-        made = partial(estimator.estimate, problem, observe=observe)
-        pairs = []
-        for _ in range(self.samples // 2):
-            u, displacement = ensemble.offset(), ensemble.displacement()
-            pairs.append([ensemble.at(side * u, side * displacement, made) for side in (1.0, -1.0)])
-        means = [np.mean([_numbers(one.gradient, ensemble.values) for one in pair], axis=0) for pair in pairs]
+        estimator = tuned(self.estimator, problem, ensemble.values)
+
+        def points() -> Iterator[Point]:
+            yield Point(ensemble.values)
+            for _ in range(self.samples // 2):
+                u, displacement = ensemble.offset(), ensemble.displacement()
+                yield ensemble.sample(u, displacement, estimator)
+                yield ensemble.sample(-u, -displacement, estimator)
+
+        at_them, *samples = self.evaluated(problem, points(), observe)
+        numbers = [_numbers(one.gradient, ensemble.values) for one in samples]
+        means = [np.mean(pair, axis=0) for pair in zip(numbers[::2], numbers[1::2], strict=True)]
         gradient, error = (ensemble.named(one) for one in _mean_and_error(np.array(means)))
-        return Estimate(loss, gradient, pairs[-1][-1].strength, error)
+        return Estimate(at_them.loss, gradient, samples[-1].strength, error)
 
     def tuned(self, problem: Differentiable, parameters: Values) -> "EnsembleMean":
         """The same with its estimator tuned at these parameters."""

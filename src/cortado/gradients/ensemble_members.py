@@ -1,18 +1,18 @@
 """Ensembles: parameters and first states around given ones, over which a loss or its gradient is averaged."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TypeVar
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from cortado.arrays import as_numbers
 from cortado.errors import InputError, shown
-from cortado.gradients.estimator import Differentiable
+from cortado.executors.executor import Executor, InProcess, checked_executor
+from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator
+from cortado.gradients.points import Evaluation, Point, Sample
 from cortado.parameters.values import Arrays, Values
+from cortado.rollout import Observer
 from cortado.scene.fields import as_number
-
-Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,8 @@ class Ensemble:
     position_noise: float = 0.01
     """Standard deviation of the perturbations of first positions [spacings]; 0 for none."""
     seed: int = 0
+    executor: Executor = field(default=InProcess(), compare=False, repr=False, kw_only=True)
+    """Where the members of the ensemble are computed, which changes no bit of the result."""
 
     def __post_init__(self) -> None:
         if not _is_whole(self.samples) or self.samples < 2:
@@ -42,14 +44,26 @@ class Ensemble:
             )
         if not _is_whole(self.seed) or self.seed < 0:
             raise InputError(f"seed is {shown(self.seed)}, but must be a whole number of at least 0.")
+        checked_executor(self.executor)
 
     def around(self, problem: Differentiable, parameters: Values) -> "Sampler":
-        """The ensemble around these parameters of a problem."""
+        """The ensemble around these parameters of a problem. Raises `InputError` for a batch."""
+        if problem.simulation.batch is not None:
+            raise InputError(
+                f"{type(self).__name__} is given a problem of a batch, but must be given one of a single scene, whose "
+                "samples it runs in batches of its own."
+            )
         values = {name: as_numbers(f"parameter {name}", value) for name, value in parameters.items()}
         spreads = np.concatenate([np.full(value.size, self._spread(name)) for name, value in values.items()])
         start = problem.simulation.positions
         position_noise = self.position_noise * problem.simulation.scene.discretisation.spacing
         return Sampler(values, spreads, start, position_noise, np.random.default_rng(self.seed))
+
+    def evaluated(self, problem: Differentiable, points: Iterable[Point], observe: Observer | None) -> list[Estimate]:
+        """Estimates at points, in their order. Where ``observe`` is given they are computed in this process, which has
+        the states that it is called with."""
+        executor = self.executor if observe is None else InProcess()
+        return executor.map(Evaluation(problem, observe), points)
 
     def _spread(self, name: str) -> float:
         if isinstance(self.spread, Mapping) and name not in self.spread:
@@ -89,17 +103,12 @@ class Sampler:
         """(n, d) a random displacement of the first positions [m]"""
         return self.position_noise * self.random.standard_normal(self.start.shape)
 
-    def at(self, u: np.ndarray, displacement: np.ndarray, made: Callable[[Arrays], Made]) -> Made:
-        """The result of ``made`` for the parameters moved by ``u`` (numbers,), in spreads, and displaced first
-        positions."""
+    def sample(self, u: np.ndarray, displacement: np.ndarray, estimator: GradientEstimator | None = None) -> Sample:
+        """The parameters moved by ``u`` (numbers,), in spreads, and displaced first positions."""
         values = _moved(self.values, self.spreads * u)
         if self.position_noise:
             values["initial_positions"] = values.get("initial_positions", self.start) + displacement
-        try:
-            return made(values)
-        except InputError as error:
-            advice = "Take a smaller spread, or a logarithm (cortado.optimisation.transforms)."
-            raise InputError(f"A sample of the ensemble does not fit: {error} {advice}") from error
+        return Sample(values, estimator)
 
     def named(self, numbers: np.ndarray) -> Arrays:
         """One vector of numbers (numbers,) as arrays by the parameters' names."""

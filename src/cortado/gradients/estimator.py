@@ -19,9 +19,10 @@ from cortado.words import sized
 class Estimate:
     """A loss and its gradient, with what the estimator knows about its accuracy."""
 
-    loss: float
+    loss: Any
+    """A float, of a batch (batch,)."""
     gradient: Arrays
-    """For each parameter given, an array of its shape (float64)."""
+    """For each parameter given, an array of its shape (float64), of a batch with a first axis for the scenes."""
     strength: float | None = None
     """The strength of `AdjointViscosity`; where two were extrapolated, the smaller one."""
     standard_error: Arrays | None = None
@@ -30,7 +31,8 @@ class Estimate:
     def __repr__(self) -> str:
         strength = "" if self.strength is None else f", strength {self.strength:.4g}"
         error = "" if self.standard_error is None else ", with its standard error"
-        return f"Estimate(loss {self.loss:.6g}, gradient of {sized(self.gradient)}{strength}{error})"
+        loss = f"losses {self.loss.shape}" if np.ndim(self.loss) else f"loss {self.loss:.6g}"
+        return f"Estimate({loss}, gradient of {sized(self.gradient)}{strength}{error})"
 
 
 class ForwardPass(Protocol):
@@ -78,21 +80,21 @@ def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
     return estimator
 
 
-def checked_estimate(found: Any, parameters: Values) -> Estimate:
+def checked_estimate(found: Any, parameters: Values, batch: int | None = None) -> Estimate:
     """What an estimator has returned, in float64; raises `InputError` unless it has a gradient of the shape of every
-    parameter that was given."""
+    parameter that was given, of a batch with a first axis for the scenes."""
     if not isinstance(found, Estimate):
         raise InputError(f"the estimator returned a {type(found).__name__}, but must return a gradients.Estimate.")
-    loss, gradient = as_one_number("the estimate's loss", found.loss), {}
+    loss = as_one_number("the estimate's loss", found.loss) if batch is None else as_numbers("losses", found.loss)
+    gradient = {}
     for name, given in parameters.items():
         if name not in found.gradient:
             raise InputError(f"the estimate has no gradient with respect to {name}, but must have one.")
         what = f"the estimate's gradient with respect to {name}"
         gradient[name] = as_numbers(what, found.gradient[name])
-        if gradient[name].shape != np.shape(given):
-            raise InputError(
-                f"{what} has shape {gradient[name].shape}, but must be {np.shape(given)}, the parameter's."
-            )
+        wanted = np.shape(given) if batch is None else (batch, *gradient[name].shape[1:])
+        if gradient[name].shape != wanted:
+            raise InputError(f"{what} has shape {gradient[name].shape}, but must be {wanted}, the parameter's.")
     return replace(found, loss=loss, gradient=gradient)
 
 

@@ -94,7 +94,7 @@ class _TapeStep:
 
     def step(self, state: State, counts: Counts, bar: State) -> None:
         self._before.assign(state)
-        wp.copy(self.solver.step_number, self._given.step_number)
+        self.solver.follow(self._given)
         tape = wp.Tape()
         try:
             self._back(tape, counts, bar)

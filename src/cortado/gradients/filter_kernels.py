@@ -102,12 +102,13 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
     @wp.kernel(module=module, enable_backward=False)
     def drag(
         rate: real,
+        particles: int,
         time_step: wp.array(dtype=real),
         # in and out
         a: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        a[i] = wp.exp(-rate * time_step[0]) * a[i]
+        a[i] = wp.exp(-rate * time_step[i // particles]) * a[i]
 
     @wp.kernel(module=module, enable_backward=False)
     def squares(
@@ -132,9 +133,9 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
         # in and out
         a: wp.array(dtype=vector),
     ):
-        """``squares`` of every particle and their ``sums``, of field 0 or 1, which is ``a``."""
+        """``squares`` of every particle and their ``sums`` over each scene, of field 0 or 1, which is ``a``."""
         i = wp.tid()
-        most = times[0] * times[0] * sums[0][field] / wp.float64(particles)
+        most = times[0] * times[0] * sums[i // particles][field] / wp.float64(particles)
         own = squares[i][field]
         if own > most:
             a[i] = real(wp.sqrt(most / own)) * a[i]

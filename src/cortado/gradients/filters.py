@@ -100,6 +100,10 @@ class AdjointViscosity(AdjointEstimator):
 
     def _sufficient(self, forward_pass: ForwardPass) -> float:
         rollout = forward_pass.rollout
+        if rollout.solver.layout.batch is not None:
+            raise InputError(
+                'strength is "auto", but must be a number for a batch: take that of tuned() for one scene.'
+            )
         norms = AdjointNorms(rollout.solver, rollout.steps)
 
         def history(strength: float) -> np.ndarray:

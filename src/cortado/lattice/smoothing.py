@@ -12,6 +12,7 @@ Cubic spline: Monaghan (1992). Wendland C2 and C4: Dehnen and Aly (2012). The sa
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import pi
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +30,10 @@ class SmoothingKernel:
     """w(q)."""
     gradient_factor: Callable[[np.ndarray], np.ndarray]
     """f(q) = w'(q) / q."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled by its name."""
+        return smoothing_kernel, (self.name,)
 
     def normalisation(self, dimension: int, support: float) -> float:
         """sigma [1 / m^d] for a support radius [m]."""

@@ -1,5 +1,6 @@
 """What a rollout is judged by: objects with a value and an adjoint at the end of the trajectory, or on the way."""
 
+from cortado.losses.batch import SnapshotBatch
 from cortado.losses.centre_of_mass import CentreOfMass, CentreOfMassAlong
 from cortado.losses.image import Image
 from cortado.losses.loss import Frames, Loss, Snapshot, SnapshotAdjoint, fingerprint
@@ -16,6 +17,7 @@ __all__ = [
     "Recorded",
     "Snapshot",
     "SnapshotAdjoint",
+    "SnapshotBatch",
     "fingerprint",
 ]
 

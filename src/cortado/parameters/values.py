@@ -71,8 +71,8 @@ def _check_range(name: str, array: np.ndarray, allowed: Range, what: str) -> Non
     if is_too_small(array, allowed):
         raise InputError(f"{what} {name} is {shown(float(array.min()))}, but must be {allowed.value}.")
     if allowed is Range.FRACTIONS:
-        miss = np.abs(array.sum(axis=1) - 1.0)
-        if miss.max() > SUM_TOLERANCE:
-            worst = int(miss.argmax())
-            total = array[worst].sum()
-            raise InputError(f"{what} {name} of particle {worst} add up to {total:g}, but must to 1.")
+        totals = array.sum(axis=-1)
+        worst = np.unravel_index(np.abs(totals - 1.0).argmax(), totals.shape)
+        if abs(totals[worst] - 1.0) > SUM_TOLERANCE:
+            place = f"particle {worst[-1]}" + (f" of scene {worst[0]}" if totals.ndim > 1 else "")
+            raise InputError(f"{what} {name} of {place} add up to {totals[worst]:g}, but must to 1.")

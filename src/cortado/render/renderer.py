@@ -10,7 +10,7 @@ import warp as wp
 from cortado.arrays import as_numbers
 from cortado.device.arrays import padded
 from cortado.device.kernel_cache import start_warp
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, precision_named
 from cortado.device.threads import WARP
 from cortado.errors import InputError, shown
 from cortado.lattice.smoothing import SmoothingKernel
@@ -119,7 +119,9 @@ class Renderer:
         return f"Renderer({view}, {columns} x {rows} pixels, {counted(self._particles, 'particle')})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        raise InputError("A Renderer cannot be pickled or copied; make another one where it is needed.")
+        """Pickled and copied as what it is made from."""
+        settings = {**self._settings, "device": self._device.alias}
+        return _made_again, (self.view, settings, self._precision.name)
 
     @property
     def fingerprint(self) -> str:
@@ -206,6 +208,10 @@ class Renderer:
             found = f"{values.dtype.__name__} of shape {values.shape} on {values.device}"
             raise InputError(f"{name} is {found}, but must be {dtype.__name__} of shape {shape} on {device}.")
         return values
+
+
+def _made_again(view: View, settings: dict[str, Any], precision: str) -> Renderer:
+    return Renderer(view, **settings, precision=precision_named(precision))
 
 
 def _of_shape(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -12,6 +12,7 @@ from cortado.device.lanes import lanes_for
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.neighbours import NeighbourSearch
 from cortado.device.precision import Precision
+from cortado.device.state import Layout
 from cortado.discretise.discrete_scene import DiscreteScene
 from cortado.lattice.calibration import SKIN
 from cortado.parameters.registry import PARAMETERS
@@ -33,19 +34,26 @@ def first_capacity(support: float, dimension: int) -> int:
 
 
 def particle_system(
-    scene: Scene, discrete: DiscreteScene, free_energy: FreeEnergy, precision: Precision, device: Any
+    scene: Scene,
+    discrete: DiscreteScene,
+    free_energy: FreeEnergy,
+    precision: Precision,
+    device: Any,
+    batch: int | None = None,
 ) -> ParticleSystem:
-    """A scene that is cut into particles, on a device."""
-    shared = Discretisation(discrete.kernel, precision, lanes_for(len(discrete.fluid.positions), device))
-    search = _search(scene, discrete, shared, device)
+    """A scene that is cut into particles, on a device; ``batch`` of it in one launch."""
+    layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, batch)
+    shared = Discretisation(discrete.kernel, precision, lanes_for(layout.particles, device))
+    search = _search(scene, discrete, shared, layout)
 
     def system(discretisation: Discretisation) -> ParticleSystem:
         return ParticleSystem(
             scene.solver.kind,
             discretisation,
+            layout,
             discrete.lattice,
             search,
-            _forces(scene, discrete, discretisation, device),
+            _forces(scene, discrete, discretisation, layout),
             [*discrete.periods, *[0.0] * (3 - scene.dimension)],
             _phases(scene, discretisation, free_energy),
             _nozzle(scene, discrete),
@@ -56,25 +64,24 @@ def particle_system(
     return system(shared)
 
 
-def _search(scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, device: Any) -> NeighbourSearch:
+def _search(scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, layout: Layout) -> NeighbourSearch:
     """The search for neighbours within the support, and a little beyond."""
-    support, particles = discrete.lattice.support, len(discrete.fluid.positions)
+    support = discrete.lattice.support
     grid = Grid.around(
         discrete.near.lower,
         discrete.near.upper,
         discrete.periods,
         reach=(1.0 + SKIN) * support,
-        most=max(4 * particles, 512),
+        most=max(4 * layout.particles, 512),
     )
     room = first_capacity(support / scene.discretisation.spacing, scene.dimension)
     walls = discrete.walls
-    return NeighbourSearch(discretisation, grid, padded(walls.positions), walls.weights, particles, room, device)
+    return NeighbourSearch(discretisation, grid, padded(walls.positions), walls.weights, layout, room)
 
 
-def _forces(scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, device: Any) -> list[Force]:
+def _forces(scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, layout: Layout) -> list[Force]:
     """Those of the parameters that the scene has, in the order of the registry."""
-    particles, layers = len(discrete.fluid.positions), discrete.wall_layers
-    setting = Setting(scene, discretisation, discrete.lattice, layers, particles, device)
+    setting = Setting(scene, discretisation, discrete.lattice, discrete.wall_layers, layout)
     modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene)]
     found = [import_module(name).force(setting) for name in modules]
     return [force for force in found if force is not None]

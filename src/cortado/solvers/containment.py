@@ -9,7 +9,7 @@ import warp as wp
 from cortado.device.arrays import padded
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import Precision
-from cortado.device.state import State
+from cortado.device.state import Layout, State
 from cortado.lattice.region import TOLERANCE, Region
 from cortado.solvers.containment_kernels import NO_PARTICLE, bounds_type, lost_kernel
 
@@ -43,7 +43,7 @@ class Walled:
 
 @dataclass(frozen=True)
 class Lost:
-    """The first particles that were lost, all in one step."""
+    """The first particles that one scene has lost, all in one step."""
 
     step: int
     """From 0."""
@@ -56,22 +56,25 @@ class Lost:
 class Containment:
     """What one solver asks at the end of each step."""
 
-    def __init__(self, walled: Walled, precision: Precision, launch: KernelLauncher, first_waiting: int):
+    def __init__(self, walled: Walled, layout: Layout, launch: KernelLauncher, first_waiting: int):
         """``first_waiting``: the first particle, in the scene's order, that may wait in a nozzle."""
-        self.walled, self._precision, self._launch = walled, precision, launch
-        self._first_waiting = first_waiting
-        self._kernel, self._bounds = lost_kernel(precision), self._made_bounds()
-        self.bad_step = wp.full(1, -1, dtype=wp.int32, device=launch.device)
-        """The first step in which a particle was lost; -1 while none was."""
-        self.bad_particle = wp.full(1, NO_PARTICLE, dtype=wp.int32, device=launch.device)
-        """The first particle that was lost in it; `NO_PARTICLE` while none was."""
-        self._count = wp.zeros(1, dtype=wp.int32, device=launch.device)
+        self.walled, self._precision, self._launch = walled, layout.precision, launch
+        self._kernel = lost_kernel(layout.precision)
+        own = {"bounds": self._made_bounds(), "particles": layout.particles, "first_waiting": first_waiting}
+        self._constants: dict[str, Any] = own
+        members, device = layout.members, layout.device
+        self.bad_step = wp.full(members, -1, dtype=wp.int32, device=device)
+        """(members,) the first step in which a scene lost a particle; -1 while it has lost none."""
+        self.bad_particle = wp.full(members, NO_PARTICLE, dtype=wp.int32, device=device)
+        """(members,) the first particle that was lost in it; `NO_PARTICLE` while none was."""
+        self._count = wp.zeros(members, dtype=wp.int32, device=device)
 
-    def reset(self) -> None:
-        """Forget an earlier run."""
-        self.bad_step.fill_(-1)
-        self.bad_particle.fill_(NO_PARTICLE)
-        self._count.zero_()
+    def reset(self, step: int = 0) -> None:
+        """Forget what was lost from a step on; from the first on, an earlier run."""
+        steps = self.bad_step.numpy()
+        kept = (steps >= 0) & (steps < step)
+        for array, well in ((self.bad_step, -1), (self.bad_particle, NO_PARTICLE), (self._count, 0)):
+            array.assign(np.where(kept, array.numpy(), well))
 
     def look(
         self, order: wp.array, x_before: wp.array, rho_0: wp.array, x_free: wp.array, v_free: wp.array, state: State
@@ -80,8 +83,7 @@ class Containment:
         after it without what a nozzle leads, and the state with it."""
         self._launch(
             self._kernel,
-            bounds=self._bounds,
-            first_waiting=self._first_waiting,
+            self._constants,
             order=order,
             x_before=x_before,
             rho_0=rho_0,
@@ -93,12 +95,14 @@ class Containment:
             count=self._count,
         )
 
-    def lost(self) -> Lost | None:
-        """Which particles were lost since `reset`; reads from the device."""
-        step = int(self.bad_step.numpy()[0])
-        if step < 0:
-            return None
-        return Lost(step, int(self.bad_particle.numpy()[0]), int(self._count.numpy()[0]) - 1)
+    def lost(self) -> dict[int, Lost]:
+        """Which particles were lost since `reset`, by the number of their scene; reads from the device."""
+        steps = self.bad_step.numpy()
+        members = np.flatnonzero(steps >= 0).tolist()
+        if not members:
+            return {}
+        particles, counts = self.bad_particle.numpy(), self._count.numpy()
+        return {b: Lost(int(steps[b]), int(particles[b]), int(counts[b]) - 1) for b in members}
 
     def is_imprecise(self, position: np.ndarray) -> bool:
         """Whether a position (d,) [m] is further from the origin than the precision resolves."""

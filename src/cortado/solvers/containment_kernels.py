@@ -64,6 +64,7 @@ def lost_kernel(precision: Precision) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     def find_lost(
         bounds: bounds_struct,
+        particles: int,
         first_waiting: int,
         order: wp.array(dtype=wp.int32),
         x_before: wp.array(dtype=vector),
@@ -76,8 +77,8 @@ def lost_kernel(precision: Precision) -> Any:
         bad: wp.array(dtype=wp.int32),
         count: wp.array(dtype=wp.int32),
     ):
-        """``bad``: the first particle, in scene order, that is lost; ``count``: how many are. After a bad step nothing
-        is looked for.
+        """``bad``: the first particle of a scene, in its order, that is lost; ``count``: how many are. After a bad step
+        nothing is looked for.
 
         Lost is what is not finite, too far away, of a mixture without a volume, or what went through a wall: it was
         inside before the step and is outside after it. Over the rim of an open cup fluid may go, and what a nozzle
@@ -85,15 +86,16 @@ def lost_kernel(precision: Precision) -> Any:
         from ``first_waiting`` on, in scene order. ``x`` is the new state in that order; the others are sorted, and
         ``x_free`` and ``v_free`` are the new state without the nozzle.
         """
-        if bad_step[0] >= 0:
-            return
         i = wp.tid()
-        p = order[i]
+        member = i // particles
+        if bad_step[member] >= 0:
+            return
+        p = order[i] - member * particles
         x_i = x_free[i]
         let_go = bool(True)
         if p >= first_waiting:
-            let_go = x[p] == x_i
-            x_i = x[p]
+            let_go = x[order[i]] == x_i
+            x_i = x[order[i]]
         before = x_before[i]
         good = between(x_i, bounds.nearest, bounds.furthest) and wp.isfinite(v_free[i]) and rho_0[i] > real(0.0)
         escaped = (
@@ -104,7 +106,7 @@ def lost_kernel(precision: Precision) -> Any:
             and below_rim(x_i, bounds)
         )
         if escaped or not good:
-            wp.atomic_min(bad, 0, p)
-            wp.atomic_add(count, 0, 1)
+            wp.atomic_min(bad, member, p)
+            wp.atomic_add(count, member, 1)
 
     return find_lost

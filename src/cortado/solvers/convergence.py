@@ -9,10 +9,13 @@ import warp as wp
 from cortado.device.precision import Precision
 from cortado.solvers.containment_kernels import NO_PARTICLE
 
+UNKNOWN = 2**31 - 1
+"""What stands for the number of rounds of a loop before it is known."""
+
 
 @dataclass(frozen=True)
 class ConvergenceKernels:
-    """The kernels of one thread that count iterations and steps."""
+    """The kernels of one thread a scene that count iterations and steps."""
 
     decide: Any
     """Whether to go on iterating."""
@@ -39,20 +42,28 @@ def convergence_kernels(precision: Precision) -> ConvergenceKernels:
         sums: wp.array(dtype=pair),
         # in and out
         iteration: wp.array(dtype=wp.int32),
-        # out
+        rounds: wp.array(dtype=wp.int32),
         active: wp.array(dtype=wp.int32),
     ):
-        """``done`` iterations are added to the count; ``active`` stays 1 while the error is above a tolerance."""
-        count = iteration[0] + done
-        average = sums[0][0] / real(particles)
-        iteration[0] = count
-        active[0] = wp.where(count < most and (average > tolerance or sums[0][1] > greatest_tolerance), 1, 0)
+        """``done`` iterations are added to the count of each scene that has not come to an end; ``rounds`` becomes
+        known where the error is below the tolerances, and ``active`` counts the scenes where it is not."""
+        b = wp.tid()
+        if rounds[b] != wp.static(UNKNOWN):
+            return
+        count = iteration[b] + done
+        average = sums[b][0] / real(particles)
+        iteration[b] = count
+        if count >= most or not (average > tolerance or sums[b][1] > greatest_tolerance):
+            rounds[b] = count
+            wp.atomic_sub(active, 0, 1)
 
     @wp.func
-    def end_step(bad: wp.array(dtype=wp.int32), bad_step: wp.array(dtype=wp.int32), step: wp.array(dtype=wp.int32)):
-        if bad[0] != wp.static(NO_PARTICLE) and bad_step[0] < 0:
-            bad_step[0] = step[0]
-        step[0] = step[0] + 1
+    def end_step(
+        b: int, bad: wp.array(dtype=wp.int32), bad_step: wp.array(dtype=wp.int32), step: wp.array(dtype=wp.int32)
+    ):
+        if bad[b] != wp.static(NO_PARTICLE) and bad_step[b] < 0:
+            bad_step[b] = step[b]
+        step[b] = step[b] + 1
 
     @wp.kernel(module=module, enable_backward=False)
     def record(
@@ -65,16 +76,23 @@ def convergence_kernels(precision: Precision) -> ConvergenceKernels:
         iteration: wp.array(dtype=wp.int32),
         bad_step: wp.array(dtype=wp.int32),
         # out
-        iterations: wp.array(dtype=wp.int32),
-        errors: wp.array(dtype=pair),
+        rounds: wp.array(dtype=wp.int32),
+        active: wp.array(dtype=wp.int32),
+        iterations: wp.array2d(dtype=wp.int32),
+        errors: wp.array2d(dtype=pair),
     ):
-        """Record the loop's iterations and its (average, greatest) error, and after the last loop count the step."""
-        n = step[0]
-        iterations[n] = iteration[0]
-        errors[n] = pair(sums[0][0] / real(particles), sums[0][1])
-        iteration[0] = 0
+        """Record the loop's iterations and its (average, greatest) error, and after the last loop count the step. The
+        next loop begins with all scenes."""
+        b = wp.tid()
+        n = step[b]
+        iterations[n, b] = iteration[b]
+        errors[n, b] = pair(sums[b][0] / real(particles), sums[b][1])
+        iteration[b] = 0
+        rounds[b] = wp.static(UNKNOWN)
+        if b == 0:
+            active[0] = bad.shape[0]
         if is_last != 0:
-            end_step(bad, bad_step, step)
+            end_step(b, bad, bad_step, step)
 
     @wp.kernel(module=module, enable_backward=False)
     def count_step(
@@ -83,6 +101,6 @@ def convergence_kernels(precision: Precision) -> ConvergenceKernels:
         bad_step: wp.array(dtype=wp.int32),
         step: wp.array(dtype=wp.int32),
     ):
-        end_step(bad, bad_step, step)
+        end_step(wp.tid(), bad, bad_step, step)
 
     return ConvergenceKernels(decide, record, count_step)

@@ -8,9 +8,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.launching import KernelLauncher, sum_and_maximum
-from cortado.device.precision import Precision
+from cortado.device.state import Layout
 from cortado.solvers.containment import Containment
-from cortado.solvers.convergence import convergence_kernels
+from cortado.solvers.convergence import UNKNOWN, convergence_kernels
 from cortado.solvers.solver import Counts
 
 
@@ -30,53 +30,50 @@ class LoopRecord:
     """What is noted of one loop in every step of a run, on the device until it is read."""
 
     def __init__(self, steps: int, loop: "Loop"):
-        self.iterations = wp.zeros(max(steps, 1), dtype=wp.int32, device=loop.errors.device)
-        """(steps,) on the device."""
-        self.errors = wp.zeros(max(steps, 1), dtype=loop.errors.dtype, device=loop.errors.device)
-        """(steps,) average and greatest error, on the device."""
-        self._loop = loop
-        self.diagnostics = self._named(np.zeros(0, dtype=int), np.zeros((0, 2)))
-        """(steps,) by name, of the steps that were read."""
+        shape, layout = (max(steps, 1), loop.layout.members), loop.layout
+        self.iterations = wp.zeros(shape, dtype=wp.int32, device=layout.device)
+        """(steps, members) on the device."""
+        self.errors = wp.zeros(shape, dtype=layout.precision.pair, device=layout.device)
+        """(steps, members) average and greatest error, on the device."""
+        self.loop = loop
+        self.read(0)
 
     def read(self, steps: int) -> None:
         """Read so many steps from the device."""
-        iterations, errors = self.iterations.numpy()[:steps], self.errors.numpy()[:steps]
-        self.diagnostics = self._named(iterations.astype(int), errors.astype(np.float64))
-
-    def _named(self, iterations: NDArray, errors: NDArray) -> dict[str, NDArray]:
-        loop, (average, greatest) = self._loop, errors.T
-        return {
-            loop.iterations_name: iterations,
-            loop.errors_name: average,
-            f"greatest_{loop.errors_name}": greatest,
+        loop, kept = self.loop, (slice(None), 0 if self.loop.layout.batch is None else slice(None))
+        iterations, errors = self.iterations.numpy()[:steps].astype(int), self.errors.numpy()[:steps]
+        self.counts = iterations.max(axis=1)
+        """(steps,) how often the loop went round, in the scene of a batch that took most."""
+        self.diagnostics: dict[str, NDArray] = {
+            loop.iterations_name: iterations[kept],
+            loop.errors_name: errors[..., 0][kept].astype(np.float64),
+            f"greatest_{loop.errors_name}": errors[..., 1][kept].astype(np.float64),
         }
-
-    @property
-    def counts(self) -> NDArray:
-        """(steps,) how often the loop went round."""
-        return self.diagnostics[self._loop.iterations_name]
+        """(steps,) by name, in a batch (steps, batch), of the steps that were read."""
 
     @property
     def converged(self) -> NDArray:
-        """(steps,) whether the errors came below the tolerances; always, with a fixed number of iterations."""
-        limits, name = self._loop.limits, self._loop.errors_name
+        """(steps,) or (steps, batch) whether the errors came below the tolerances; always, with a fixed number of
+        iterations."""
+        limits, name = self.loop.limits, self.loop.errors_name
         average, greatest = self.diagnostics[name], self.diagnostics[f"greatest_{name}"]
         if limits is None or limits.minimum_iterations == limits.maximum_iterations:
-            return np.ones(len(average), dtype=bool)
+            return np.ones(average.shape, dtype=bool)
         return (average <= limits.tolerance) & (greatest <= limits.greatest_tolerance)
 
 
 class IterationLog:
     """The records of a step's loops: a `StepLog`. A solver without loops has only to say that it converged."""
 
-    def __init__(self, steps: int, loops: Sequence["Loop"]):
+    def __init__(self, steps: int, loops: Sequence["Loop"], layout: Layout):
         self.records = tuple(LoopRecord(steps, loop) for loop in loops)
-        self._steps = 0
+        self._steps, self._layout = 0, layout
 
     @property
     def diagnostics(self) -> dict[str, NDArray]:
         found: dict[str, NDArray] = {}
-        converged = np.ones(self._steps, dtype=bool)
+        scenes = () if self._layout.batch is None else (self._layout.batch,)
+        converged = np.ones((self._steps, *scenes), dtype=bool)
         for record in self.records:
             found |= record.diagnostics
             converged &= record.converged
@@ -87,8 +84,8 @@ class IterationLog:
         for record in self.records:
             record.read(steps)
 
-    def counts(self, step: int) -> Counts:
-        return tuple(int(record.counts[step]) for record in self.records)
+    def seek(self, step: int) -> Counts:
+        return tuple(record.loop.seek(record, step) for record in self.records)
 
 
 class Loop:
@@ -97,28 +94,41 @@ class Loop:
     def __init__(
         self,
         limits: LoopLimits | None,
-        precision: Precision,
+        layout: Layout,
         launch: KernelLauncher,
         iterations_name: str = "iterations",
         errors_name: str = "density_errors",
     ):
         """``limits`` None: it never goes round. The names are those of the diagnostics of a run."""
-        particles, device = launch.particles, launch.device
-        self.limits, self.iterations_name, self.errors_name = limits, iterations_name, errors_name
-        self.errors = wp.zeros(particles, dtype=precision.pair, device=device)
+        precision, device = layout.precision, layout.device
+        self.limits, self.iterations_name, self.errors_name, self.layout = limits, iterations_name, errors_name, layout
+        self.errors = wp.zeros(layout.all_particles, dtype=precision.pair, device=device)
         """(n,) the error of a particle, twice (for a sum and a maximum): every iteration writes it."""
+        self.rounds = wp.full(layout.members, UNKNOWN, dtype=wp.int32, device=device)
+        """(members,) how often the loop goes round in each scene of a batch, `UNKNOWN` until that is known: iteration k
+        must leave a scene as it is where k is not below."""
         self._launch, self._kernels = launch, convergence_kernels(precision)
-        self._sum = sum_and_maximum(particles, precision, device)
-        self._sums = wp.zeros(1, dtype=precision.pair, device=device)
-        self._iteration, self._active = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        self._sum = sum_and_maximum(layout.particles, precision, device, layout.members)
+        self._sums = wp.zeros(layout.members, dtype=precision.pair, device=device)
+        self._iteration = wp.zeros(layout.members, dtype=wp.int32, device=device)
+        self._active = wp.full(1, layout.members, dtype=wp.int32, device=device)
 
     def reset(self) -> None:
         """Forget the count of a step that was interrupted."""
         self._iteration.zero_()
+        self.rounds.fill_(UNKNOWN)
+        self._active.fill_(self.layout.members)
+
+    def seek(self, record: LoopRecord, step: int) -> int:
+        """Make ready to go round as often as in a recorded step, and return how often that is. Only in a batch do
+        scenes differ in that."""
+        if self.layout.members > 1:
+            wp.copy(self.rounds, record.iterations[step])
+        return int(record.counts[step])
 
     def run(self, iterate: Callable[[int], None]) -> None:
         """Go round until the errors are small enough. ``iterate`` is given the number of the iteration, from 0; beyond
-        the least number of them it is captured once, and always given that number."""
+        the least number of them it is captured once, and always given the greatest number."""
         limits = self.limits
         if limits is None:
             return
@@ -128,7 +138,7 @@ class Loop:
         if limits.maximum_iterations > limits.minimum_iterations:
 
             def once_more() -> None:
-                iterate(limits.minimum_iterations)
+                iterate(limits.maximum_iterations)
                 self._decide(limits, 1)
 
             wp.capture_while(self._active, once_more)
@@ -137,16 +147,18 @@ class Loop:
         """Record what the loop did in this step; the last loop of a step counts it."""
         self._launch(
             self._kernels.record,
-            particles=self._launch.particles,
+            particles=self.layout.particles,
             is_last=int(is_last),
             sums=self._sums,
             bad=containment.bad_particle,
             step=step_number,
             iteration=self._iteration,
             bad_step=containment.bad_step,
+            rounds=self.rounds,
+            active=self._active,
             iterations=record.iterations,
             errors=record.errors,
-            threads=1,
+            threads=self.layout.members,
         )
 
     def _decide(self, limits: LoopLimits, done: int) -> None:
@@ -155,11 +167,12 @@ class Loop:
             self._kernels.decide,
             done=done,
             most=limits.maximum_iterations,
-            particles=self._launch.particles,
+            particles=self.layout.particles,
             tolerance=limits.tolerance,
             greatest_tolerance=limits.greatest_tolerance,
             sums=self._sums,
             iteration=self._iteration,
+            rounds=self.rounds,
             active=self._active,
-            threads=1,
+            threads=self.layout.members,
         )

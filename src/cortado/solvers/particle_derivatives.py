@@ -16,7 +16,7 @@ class ParticleTangent:
 
     def __init__(self, solver: ParticleSolver, parameters_dot: Parameters):
         self._solver = solver
-        fields = Fields.zeros(solver.particles, solver.discretisation.precision, solver.device)
+        fields = Fields.zeros(solver.layout.all_particles, solver.discretisation.precision, solver.device)
         self.dot = Tangents(fields, parameters_dot)
         """Of the sorted particles, once `sort` has been called, and of the parameters."""
         self.carried_dot = Carried(solver.carried_fields, solver.layout)
@@ -63,14 +63,13 @@ class ParticleAdjoint:
     atomics are needed."""
 
     def __init__(self, solver: ParticleSolver, steps: int):
-        precision, particles, device = solver.discretisation.precision, solver.particles, solver.device
-        mixture = solver.mixture
+        layout, mixture = solver.layout, solver.mixture
         names = ["time_step", *mixture.shares, *(name for force in solver.forces for name in force.shares)]
         self._solver = solver
         self.bar = Adjoints(
-            Fields.zeros(particles, precision, device),
+            Fields.zeros(layout.all_particles, layout.precision, layout.device),
             solver.new_parameters(steps),
-            Shares(names, particles, mixture.phases.count, precision, device),
+            Shares(names, layout),
         )
         """Adjoints; those of the parameters are complete after `collect`."""
         self.carried_bar = Carried(solver.carried_fields, solver.layout)

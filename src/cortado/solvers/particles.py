@@ -40,6 +40,7 @@ class ParticleSystem:
     kind: str
     """What scenes call the solver."""
     discretisation: Discretisation
+    layout: Layout
     lattice: Lattice
     search: NeighbourSearch
     forces: Sequence[Force]
@@ -63,20 +64,19 @@ class ParticleSolver:
     """What the solver itself carries from step to step, of particles."""
 
     def __init__(self, system: ParticleSystem, requires_grad: bool = False):
-        discretisation, search, phases, nozzle = system.discretisation, system.search, system.phases, system.nozzle
-        precision, particles, device = discretisation.precision, search.particles, search.device
+        discretisation, search, layout, nozzle = system.discretisation, system.search, system.layout, system.nozzle
+        precision, particles, device = layout.precision, layout.all_particles, layout.device
         if requires_grad and not discretisation.taped:
             raise TypeError("a tape needs the kernels of system.of_one_lane(): make the solver of that system.")
         self.system, self.discretisation, self.lattice, self.search = system, discretisation, system.lattice, search
-        self.particles, self.device, self.forces = particles, device, tuple(system.forces)
+        self.layout, self.device, self.forces = layout, device, tuple(system.forces)
         self.launch = KernelLauncher(particles, device, record_tape=requires_grad)
         self.turn = Turn(device)
         """Whose arrays these are now."""
         self.density, self.integration = density_kernels(discretisation), integration_kernels(precision, requires_grad)
-        self.layout = Layout(particles, phases.count, precision, device)
-        self.mixture = Mixture(phases, precision, particles, device, requires_grad)
-        self.emitter = Emitter(nozzle, self.layout, requires_grad) if nozzle else None
-        self.carried = Carried(self.carried_fields, self.layout, requires_grad)
+        self.mixture = Mixture(system.phases, layout, requires_grad)
+        self.emitter = Emitter(nozzle, layout, requires_grad) if nozzle else None
+        self.carried = Carried(self.carried_fields, layout, requires_grad)
         """Sorted, as they were at the start of the step."""
         of_parts = (*self.mixture.fields, *(self.emitter.fields if self.emitter else ()))
         self.state_fields = (POSITIONS, VELOCITIES, *of_parts, *self.carried_fields)
@@ -87,8 +87,9 @@ class ParticleSolver:
         """``accelerations[t]``: of the first t forces; the first is 0 and never written."""
         self.loops: tuple[Loop, ...] = ()
         """Those of a step, in the order in which they run."""
-        self.step_number = wp.zeros(1, dtype=wp.int32, device=device)
-        self.containment = Containment(system.walled, precision, self.launch, nozzle.first if nozzle else particles)
+        self.step_number = wp.zeros(layout.members, dtype=wp.int32, device=device)
+        first_waiting = nozzle.first if nozzle else layout.particles
+        self.containment = Containment(system.walled, layout, self.launch, first_waiting)
         self._neighbourhood: Any = None
         self._context: StepContext | None = None
         self.generation = 0
@@ -104,7 +105,7 @@ class ParticleSolver:
         return self._array(self.discretisation.precision.real)
 
     def _array(self, dtype: Any) -> wp.array:
-        return wp.zeros(self.particles, dtype=dtype, device=self.device, requires_grad=self._requires_grad)
+        return wp.zeros(self.layout.all_particles, dtype=dtype, device=self.device, requires_grad=self._requires_grad)
 
     def resize(self, capacity: int) -> None:
         """Make room for neighbour lists of that length."""
@@ -120,7 +121,7 @@ class ParticleSolver:
         return self.layout.parameters(steps, requires_grad)
 
     def new_log(self, steps: int) -> IterationLog:
-        return IterationLog(steps, self.loops)
+        return IterationLog(steps, self.loops, self.layout)
 
     def set_substeps(self, substeps: int) -> None:
         if substeps != self.mixture.substeps:
@@ -139,18 +140,24 @@ class ParticleSolver:
         self.resize(other.search.capacity)
         self.set_substeps(other.mixture.substeps)
 
-    def reset(self) -> None:
+    def follow(self, other: Self) -> None:
+        wp.copy(self.step_number, other.step_number)
+        for own, given in zip(self.loops, other.loops, strict=True):
+            wp.copy(own.rounds, given.rounds)
+
+    def reset(self, step: int = 0) -> None:
         for loop in self.loops:
             loop.reset()
-        self.step_number.zero_()
-        self.containment.reset()
+        self.step_number.fill_(step)
+        self.containment.reset(step)
 
     # ---- what a step is made of ----------------------------------------------------------------------------------
 
     def context(self, parameters: Parameters) -> StepContext:
         if self._context is None or self._context.parameters is not parameters:
-            order, step = self.search.order, self.step_number
-            self._context = StepContext(self.launch, self._neighbourhood, order, step, self.fields, parameters)
+            order, step, particles = self.search.order, self.step_number, self.layout.particles
+            own = (self.launch, particles, self._neighbourhood, order, step, self.fields)
+            self._context = StepContext(*own, parameters)
         return self._context
 
     def sort(self, state: State, parameters: Parameters) -> StepContext:
@@ -162,7 +169,7 @@ class ParticleSolver:
         scene = {"x_scene": state.positions, "v_scene": state.velocities, "m_scene": state["reference_density"]}
         context.launch(self.integration.sort, **scene)
         self.carried.sort(context, state)
-        self.search.fill(self._neighbourhood, self.fields["x"])
+        self.search.fill(self._neighbourhood, self.fields["x"], self.containment.bad_step)
         context.launch(self.density.forward)
         self.mixture.diffuse(context, state.mass_fractions)
         return context
@@ -196,7 +203,7 @@ class ParticleSolver:
                 bad=containment.bad_particle,
                 bad_step=containment.bad_step,
                 step=self.step_number,
-                threads=1,
+                threads=self.layout.members,
             )
 
     # ---- derivatives ---------------------------------------------------------------------------------------------
@@ -215,13 +222,14 @@ class ParticleSolver:
 
     def gradient_memory(self, log: IterationLog) -> dict[str, float]:
         iterations = sum(int(record.counts.max(initial=0)) for record in log.records)
-        return gradient_parts(self.particles, iterations, self.discretisation.precision.bytes)
+        return gradient_parts(self.layout.all_particles, iterations, self.discretisation.precision.bytes)
 
 
 def _neighbourhood(system: ParticleSystem) -> Any:
     """What particles see, with the present arrays of the search."""
     search, lattice, periods, precision = system.search, system.lattice, system.periods, system.discretisation.precision
     s = neighbourhood_type(precision)()
+    s.particles = system.layout.particles
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count
     s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import KernelLauncher
 from cortado.device.neighbourhood import Discretisation
-from cortado.device.state import Parameters, State
+from cortado.device.state import Layout, Parameters, State
 from cortado.device.threads import Turn
 from cortado.solvers.containment import Containment
 from cortado.sph.parts import StepContext
@@ -26,16 +26,17 @@ class StepLog(Protocol):
 
     @property
     def diagnostics(self) -> Mapping[str, NDArray]:
-        """(steps,) by name, of the steps that were read. Every solver has ``converged``; PCISPH also ``iterations``,
-        ``density_errors``, the average of the compressions (rho* - rho_0)+ / rho_0, and ``greatest_density_errors``.
-        Reports draw ``density_errors``, and whole numbers as the iterations of loops.
+        """(steps,) by name, in a batch (steps, batch), of the steps that were read. Every solver has ``converged``;
+        PCISPH also ``iterations``, ``density_errors``, the average of the compressions (rho* - rho_0)+ / rho_0, and
+        ``greatest_density_errors``. Reports draw ``density_errors``, and whole numbers as the iterations of loops.
         """
 
     def read(self, steps: int) -> None:
         """Read so many steps from the device."""
 
-    def counts(self, step: int) -> Counts:
-        """Of a step that was read, from 0."""
+    def seek(self, step: int) -> Counts:
+        """Make the loops of the solver ready to take a step again that was read, from 0. Of a batch the counts are
+        those of the scene that went round most often."""
 
 
 class StepTangent(Protocol):
@@ -59,19 +60,19 @@ class StepAdjoint(Protocol):
 
 
 class Solver(Protocol):
-    """The solver of one set of particles on one device, which rollouts share. Of its methods `make_room` alone
-    waits for the device and reads from it. `tangent`, `adjoint` and `differentiable` raise `InputError`, one sentence,
-    where a solver has no such derivative.
+    """The solver of a scene, or of a batch of scenes, on one device, which rollouts share. Of its methods `make_room`
+    and `reset` alone wait for the device and read from it. `tangent`, `adjoint` and `differentiable` raise
+    `InputError`, one sentence, where a solver has no such derivative.
     """
 
     discretisation: Discretisation
-    particles: int
+    layout: Layout
     device: Any
     launch: KernelLauncher
     turn: Turn
     containment: Containment
     step_number: wp.array
-    """(1,) of the step to take, which `step` counts."""
+    """(members,) of the step to take, which `step` counts; the same for all scenes of a batch."""
     generation: int
     """How often arrays, or the work of a step, were replaced; what was captured before is stale."""
 
@@ -87,8 +88,8 @@ class Solver(Protocol):
     def set_substeps(self, substeps: int) -> None:
         """Take so many explicit substeps of diffusion in each step from now on."""
 
-    def reset(self) -> None:
-        """Forget the counts and flags of an earlier run, also of one that was interrupted."""
+    def reset(self, step: int = 0) -> None:
+        """Be ready to take a step, and forget the counts and flags of those from it on, also of an interrupted run."""
 
     def make_room(self) -> bool:
         """Whether the lists of neighbours were too short; they are longer now, and what used them must be repeated."""
@@ -119,6 +120,9 @@ class Solver(Protocol):
 
     def match(self, other: Self) -> None:
         """Have the room and the substeps of another that is the same but for its arrays."""
+
+    def follow(self, other: Self) -> None:
+        """Be ready to replay the step that another, that is the same but for its arrays, is ready to replay."""
 
     def gradient_memory(self, log: Any) -> Mapping[str, float]:
         """[bytes] by what they are for, that going back through the steps of a log takes."""

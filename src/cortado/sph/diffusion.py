@@ -98,12 +98,13 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
     ):
         """``w``: m M of a particle."""
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
         total = spread(i, x, n, m, c, s)
         if lane() > 0:
             return
-        stiffness = interface_width[0] * interface_width[0] * s.volume / m[i]
+        stiffness = interface_width[member] * interface_width[member] * s.volume / m[i]
         chi[i] = strength * project(energy_gradient(c[i])) - stiffness * total
-        w[i] = m[i] * mobility[0] * mobile(c[i])
+        w[i] = m[i] * mobility[member] * mobile(c[i])
 
     @wp.kernel(module=diffusion.module(True))
     def flux(
@@ -120,10 +121,11 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         c_new: wp.array(dtype=fractions),
     ):
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
         total = spread(i, x, n, w, chi, s)
         if lane() > 0:
             return
-        c_new[i] = c[i] + (time_step[0] / real(substeps) * s.volume / m[i]) * total
+        c_new[i] = c[i] + (time_step[member] / real(substeps) * s.volume / m[i]) * total
 
     @wp.kernel(module=diffusion.tangent_module(), enable_backward=False)
     def potential_tangent(
@@ -146,19 +148,20 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         w_dot: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
         total = spread(i, x, n, m, c, s)
         total_dot = spread_tangent(i, x, x_dot, n, n_dot, m, m_dot, c, c_dot, s)
         if lane() > 0:
             return
-        width = interface_width[0]
+        width = interface_width[member]
         scale = s.volume / m[i]
         stiffness = width * width * scale
-        stiffness_dot = real(2.0) * width * interface_width_dot[0] * scale - stiffness * m_dot[i] / m[i]
+        stiffness_dot = real(2.0) * width * interface_width_dot[member] * scale - stiffness * m_dot[i] / m[i]
         chi_dot[i] = (
             strength * project(energy_hessian_product(c[i], c_dot[i])) - stiffness * total_dot - stiffness_dot * total
         )
-        m_0 = mobility[0]
-        w_dot[i] = (m_dot[i] * m_0 + m[i] * mobility_dot[0]) * mobile(c[i]) + m[i] * m_0 * wp.dot(
+        m_0 = mobility[member]
+        w_dot[i] = (m_dot[i] * m_0 + m[i] * mobility_dot[member]) * mobile(c[i]) + m[i] * m_0 * wp.dot(
             mobile_gradient(c[i]), c_dot[i]
         )
 
@@ -183,12 +186,13 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         c_new_dot: wp.array(dtype=fractions),
     ):
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
         total = spread(i, x, n, w, chi, s)
         total_dot = spread_tangent(i, x, x_dot, n, n_dot, w, w_dot, chi, chi_dot, s)
         if lane() > 0:
             return
-        scale = time_step[0] / real(substeps) * s.volume / m[i]
-        change = time_step_dot[0] / time_step[0] - m_dot[i] / m[i]
+        scale = time_step[member] / real(substeps) * s.volume / m[i]
+        change = time_step_dot[member] / time_step[member] - m_dot[i] / m[i]
         c_new_dot[i] = c_dot[i] + scale * (total_dot + change * total)
 
     @wp.kernel(module=diffusion.module(False), enable_backward=False)
@@ -203,7 +207,8 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
     ):
         """``y``: the adjoint of the flux's raw sum."""
         i = s.first + wp.tid()
-        y[i] = (time_step[0] / real(substeps) * s.volume / m[i]) * c_bar[i]
+        member = i // s.particles
+        y[i] = (time_step[member] / real(substeps) * s.volume / m[i]) * c_bar[i]
 
     @wp.kernel(module=diffusion.module(False), enable_backward=False)
     def flux_adjoint(
@@ -231,11 +236,12 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
     ):
         """``z``: the adjoint of the potential's raw sum."""
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
         x_sum, n_sum, w_bar, chi_bar, own = spread_adjoint(i, x, n, w, chi, y, s)
         if lane() > 0:
             return
         m_i = m[i]
-        m_0 = mobility[0]
+        m_0 = mobility[member]
         mobile_i = mobile(c[i])
         x_bar[i] = x_bar[i] + x_sum
         n_bar[i] = n_bar[i] + n_sum
@@ -244,9 +250,9 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         c_bar[i] = (
             c_bar[i] + (w_bar * m_i * m_0) * mobile_gradient(c[i]) + strength * energy_hessian_product(c[i], straight)
         )
-        time_step_bar[i] = time_step_bar[i] + own / time_step[0]
+        time_step_bar[i] = time_step_bar[i] + own / time_step[member]
         mobility_bar[i] = mobility_bar[i] + w_bar * m_i * mobile_i
-        z[i] = (-interface_width[0] * interface_width[0] * s.volume / m_i) * chi_bar
+        z[i] = (-interface_width[member] * interface_width[member] * s.volume / m_i) * chi_bar
 
     @wp.kernel(module=diffusion.module(False), enable_backward=False)
     def potential_adjoint(
@@ -265,6 +271,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         interface_width_bar: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
         x_sum, n_sum, m_sum, c_sum, own = spread_adjoint(i, x, n, m, c, z, s)
         if lane() > 0:
             return
@@ -272,7 +279,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         n_bar[i] = n_bar[i] + n_sum
         m_bar[i] = m_bar[i] + m_sum - own / m[i]
         c_bar[i] = c_bar[i] + c_sum
-        interface_width_bar[i] = interface_width_bar[i] + real(2.0) * own / interface_width[0]
+        interface_width_bar[i] = interface_width_bar[i] + real(2.0) * own / interface_width[member]
 
     return DiffusionKernels(
         Kernels(potential, potential_tangent, potential_adjoint),

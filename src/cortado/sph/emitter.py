@@ -7,7 +7,6 @@ import warp as wp
 
 from cortado.device.arrays import to_device
 from cortado.device.fields import POSITIONS, VELOCITIES, Entry, StateField
-from cortado.device.launching import sum_of
 from cortado.device.state import Layout, Parameters, State
 from cortado.parameters.registry import Axis
 from cortado.sph.emitter_kernels import emitter_kernels
@@ -42,7 +41,7 @@ class Emitter:
     """What it carries from step to step."""
 
     def __init__(self, nozzle: Nozzle, layout: Layout, requires_grad: bool = False):
-        self.nozzle = nozzle
+        self.nozzle, self.layout = nozzle, layout
         self.free = layout.state((POSITIONS, VELOCITIES), requires_grad)
         """Room for the end of a step if no particle were prescribed."""
         precision, device = layout.precision, layout.device
@@ -61,7 +60,7 @@ class Emitter:
     def begin(self, step: StepContext, state: State) -> None:
         """Keep what the end of a step needs of the state before it."""
         before = {"outlet_in": state["outlet"], "emitted_in": state["emitted"]}
-        step.launch(self.kernels.begin, self.constants, **before, threads=1)
+        step.launch(self.kernels.begin, self.constants, **before, threads=self.layout.members)
 
     def prescribe(self, step: StepContext, state: State) -> None:
         """Write the state at the end of a step; ``free`` holds positions and velocities without the nozzle."""
@@ -73,7 +72,7 @@ class Emitter:
         """From the tangent of the state before to that of the state after, of prescribed particles and the nozzle."""
         rates, outlet, emitted = dot.named("_dot"), state_dot["outlet"], state_dot["emitted"]
         before = {"outlet_in_dot": outlet, "emitted_in_dot": emitted}
-        step.launch(self.kernels.begin_tangent, self.constants, self._dot, rates, **before, threads=1)
+        step.launch(self.kernels.begin_tangent, self.constants, self._dot, rates, **before, threads=self.layout.members)
         new = {"outlet_out_dot": outlet, "emitted_out_dot": emitted}
         moved = {"x_dot": state_dot.positions, "v_dot": state_dot.velocities}
         step.launch(self.kernels.tangent, self.constants, self._dot, rates, **moved, **new)
@@ -87,8 +86,8 @@ class EmitterAdjoint:
         self.free = emitter.free.like()
         """Adjoint of the end of a step if no particle were prescribed."""
         self._prescribed = emitter.free.like()
-        x = self._prescribed.positions
-        self._sums = [sum_of(x.dtype, len(x), x.device) for _ in range(2)]
+        layout = emitter.layout
+        self._sums = [layout.sum_of(layout.precision.vector) for _ in range(2)]
 
     def step(self, step: StepContext, state_bar: State, bar: Parameters) -> None:
         """Write what reaches ``free``, and add what reaches prescribed particles to ``bar`` and to the adjoint of the
@@ -107,4 +106,5 @@ class EmitterAdjoint:
         x_total, v_total = (add_up(x) for add_up, x in zip(self._sums, prescribed.arrays(), strict=True))
         own = {"outlet_bar": state_bar["outlet"], "emitted_bar": state_bar["emitted"]}
         totals = {"x_total": x_total, "v_total": v_total}
-        step.launch(emitter.kernels.collect, emitter.constants, bar.named("_bar"), **own, **totals, threads=1)
+        collected = {**own, **totals, "threads": emitter.layout.members}
+        step.launch(emitter.kernels.collect, emitter.constants, bar.named("_bar"), **collected)

@@ -22,7 +22,7 @@ from cortado.sph.integration import integration_module
 
 @dataclass(frozen=True)
 class EmitterKernels(Kernels):
-    """The kernels of the end of a step, in the scene's order of particles; the others have one thread."""
+    """The kernels of the end of a step, in the scene's order of particles; the others have one thread a scene."""
 
     begin: Any
     """Keeps q_(n-1) of the state before a step, and l at its end, as a step may write over the state that it reads."""
@@ -33,7 +33,8 @@ class EmitterKernels(Kernels):
 
 @cache
 def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
-    """The kernels for a precision. ``outlet`` (1,) is q_(n-1) [m], ``emitted`` (1,) l at the end of the step [m]."""
+    """The kernels for a precision. Of each scene b, ``outlet`` (members,) is q_(n-1) [m], ``emitted`` (members,) l at
+    the end of the step [m]; ``first`` and ``upstream`` count the particles p of one scene."""
     real, vector = precision.real, precision.vector
 
     @wp.func
@@ -42,11 +43,11 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         return wp.float64(flow_rate) / wp.float64(area) * wp.float64(time_step)
 
     @wp.func
-    def remaining(i: int, first: int, upstream: wp.array(dtype=real), emitted: wp.array(dtype=wp.float64)) -> real:
+    def remaining(p: int, first: int, upstream: wp.array(dtype=real), emitted: wp.float64) -> real:
         """s of a particle; 0 for one that is no part of the emitter."""
-        if i < first:
+        if p < first:
             return real(0.0)
-        return real(wp.float64(upstream[i - first]) - emitted[0])
+        return real(wp.float64(upstream[p - first]) - emitted)
 
     @wp.kernel(module=integration_module(precision, True, taped))
     def begin(
@@ -59,17 +60,19 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         outlet: wp.array(dtype=vector),
         emitted: wp.array(dtype=wp.float64),
     ):
-        outlet[0] = outlet_in[0]
-        emitted[0] = emitted_in[0] + advance(flow_rate[0], area, time_step[0])
+        b = wp.tid()
+        outlet[b] = outlet_in[b]
+        emitted[b] = emitted_in[b] + advance(flow_rate[b], area, time_step[b])
 
     @wp.kernel(module=integration_module(precision, True, taped))
     def prescribe(
+        particles: int,
         first: int,
         upstream: wp.array(dtype=real),
         offsets: wp.array(dtype=vector),
         direction: vector,
         area: real,
-        nozzle_path: wp.array(dtype=vector),
+        nozzle_path: wp.array2d(dtype=vector),
         flow_rate: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
         step: wp.array(dtype=wp.int32),
@@ -84,17 +87,19 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         emitted_out: wp.array(dtype=wp.float64),
     ):
         i = wp.tid()
-        s = remaining(i, first, upstream, emitted)
-        q = nozzle_path[step[0]]
+        b = i // particles
+        p = i - b * particles
+        s = remaining(p, first, upstream, emitted[b])
+        q = nozzle_path[b, step[b]]
         if s > real(0.0):
-            x[i] = q + offsets[i - first] - s * direction
-            v[i] = (q - outlet[0]) / time_step[0] + (flow_rate[0] / area) * direction
+            x[i] = q + offsets[p - first] - s * direction
+            v[i] = (q - outlet[b]) / time_step[b] + (flow_rate[b] / area) * direction
         else:
             x[i] = x_free[i]
             v[i] = v_free[i]
-        if i == 0:
-            outlet_out[0] = q
-            emitted_out[0] = emitted[0]
+        if p == 0:
+            outlet_out[b] = q
+            emitted_out[b] = emitted[b]
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def begin_tangent(
@@ -109,19 +114,21 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         outlet_dot: wp.array(dtype=vector),
         emitted_dot: wp.array(dtype=wp.float64),
     ):
-        outlet_dot[0] = outlet_in_dot[0]
-        faster = advance(flow_rate_dot[0], area, time_step[0])
-        longer = advance(flow_rate[0], area, time_step_dot[0])
-        emitted_dot[0] = emitted_in_dot[0] + faster + longer
+        b = wp.tid()
+        outlet_dot[b] = outlet_in_dot[b]
+        faster = advance(flow_rate_dot[b], area, time_step[b])
+        longer = advance(flow_rate[b], area, time_step_dot[b])
+        emitted_dot[b] = emitted_in_dot[b] + faster + longer
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def prescribe_tangent(
+        particles: int,
         first: int,
         upstream: wp.array(dtype=real),
         direction: vector,
         area: real,
-        nozzle_path: wp.array(dtype=vector),
-        nozzle_path_dot: wp.array(dtype=vector),
+        nozzle_path: wp.array2d(dtype=vector),
+        nozzle_path_dot: wp.array2d(dtype=vector),
         flow_rate_dot: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
@@ -138,18 +145,22 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         emitted_out_dot: wp.array(dtype=wp.float64),
     ):
         i = wp.tid()
-        n = step[0]
-        if remaining(i, first, upstream, emitted) > real(0.0):
-            dt = time_step[0]
-            turn_dot = nozzle_path_dot[n] - outlet_dot[0] - (nozzle_path[n] - outlet[0]) * (time_step_dot[0] / dt)
-            x_dot[i] = nozzle_path_dot[n] + real(emitted_dot[0]) * direction
-            v_dot[i] = turn_dot / dt + (flow_rate_dot[0] / area) * direction
-        if i == 0:
-            outlet_out_dot[0] = nozzle_path_dot[n]
-            emitted_out_dot[0] = emitted_dot[0]
+        b = i // particles
+        p = i - b * particles
+        q = nozzle_path[b, step[b]]
+        q_dot = nozzle_path_dot[b, step[b]]
+        if remaining(p, first, upstream, emitted[b]) > real(0.0):
+            dt = time_step[b]
+            turn_dot = q_dot - outlet_dot[b] - (q - outlet[b]) * (time_step_dot[b] / dt)
+            x_dot[i] = q_dot + real(emitted_dot[b]) * direction
+            v_dot[i] = turn_dot / dt + (flow_rate_dot[b] / area) * direction
+        if p == 0:
+            outlet_out_dot[b] = q_dot
+            emitted_out_dot[b] = emitted_dot[b]
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def prescribe_adjoint(
+        particles: int,
         first: int,
         upstream: wp.array(dtype=real),
         emitted: wp.array(dtype=wp.float64),
@@ -163,7 +174,8 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
     ):
         """What reaches free particles, and what reaches prescribed ones."""
         i = wp.tid()
-        prescribed = remaining(i, first, upstream, emitted) > real(0.0)
+        b = i // particles
+        prescribed = remaining(i - b * particles, first, upstream, emitted[b]) > real(0.0)
         x_free_bar[i] = wp.where(prescribed, vector(), x_bar[i])
         v_free_bar[i] = wp.where(prescribed, vector(), v_bar[i])
         x_prescribed_bar[i] = wp.where(prescribed, x_bar[i], vector())
@@ -173,7 +185,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
     def collect(
         direction: vector,
         area: real,
-        nozzle_path: wp.array(dtype=vector),
+        nozzle_path: wp.array2d(dtype=vector),
         flow_rate: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
         step: wp.array(dtype=wp.int32),
@@ -183,20 +195,21 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         # in and out
         outlet_bar: wp.array(dtype=vector),
         emitted_bar: wp.array(dtype=wp.float64),
-        nozzle_path_bar: wp.array(dtype=vector),
+        nozzle_path_bar: wp.array2d(dtype=vector),
         flow_rate_bar: wp.array(dtype=real),
         time_step_bar: wp.array(dtype=real),
     ):
-        n = step[0]
-        dt = time_step[0]
-        x_bar = x_total[0]
-        v_bar = v_total[0]
-        nozzle_path_bar[n] = nozzle_path_bar[n] + outlet_bar[0] + x_bar + v_bar / dt
-        outlet_bar[0] = -v_bar / dt
-        emitted_bar[0] = emitted_bar[0] + wp.float64(wp.dot(direction, x_bar))
-        along = real(emitted_bar[0]) / area
-        flow_rate_bar[0] = flow_rate_bar[0] + along * dt + wp.dot(direction, v_bar) / area
-        turn = wp.dot(v_bar, nozzle_path[n] - outlet[0]) / (dt * dt)
-        time_step_bar[0] = time_step_bar[0] + along * flow_rate[0] - turn
+        b = wp.tid()
+        n = step[b]
+        dt = time_step[b]
+        x_bar = x_total[b]
+        v_bar = v_total[b]
+        nozzle_path_bar[b, n] = nozzle_path_bar[b, n] + outlet_bar[b] + x_bar + v_bar / dt
+        outlet_bar[b] = -v_bar / dt
+        emitted_bar[b] = emitted_bar[b] + wp.float64(wp.dot(direction, x_bar))
+        along = real(emitted_bar[b]) / area
+        flow_rate_bar[b] = flow_rate_bar[b] + along * dt + wp.dot(direction, v_bar) / area
+        turn = wp.dot(v_bar, nozzle_path[b, n] - outlet[b]) / (dt * dt)
+        time_step_bar[b] = time_step_bar[b] + along * flow_rate[b] - turn
 
     return EmitterKernels(prescribe, prescribe_tangent, prescribe_adjoint, begin, begin_tangent, collect)

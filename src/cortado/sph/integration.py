@@ -80,6 +80,7 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
 
     @wp.kernel(module=integration_module(precision, True, taped))
     def predict(
+        particles: int,
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
@@ -89,12 +90,14 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
         v_star: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        velocity = v[i] + time_step[0] * acceleration[i]
+        member = i // particles
+        velocity = v[i] + time_step[member] * acceleration[i]
         v_star[i] = velocity
-        x_star[i] = x[i] + time_step[0] * velocity
+        x_star[i] = x[i] + time_step[member] * velocity
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def predict_tangent(
+        particles: int,
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
         x_dot: wp.array(dtype=vector),
@@ -107,13 +110,15 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
         v_star_dot: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        dt = time_step[0]
-        velocity_dot = v_dot[i] + dt * acceleration_dot[i] + time_step_dot[0] * acceleration[i]
+        member = i // particles
+        dt = time_step[member]
+        velocity_dot = v_dot[i] + dt * acceleration_dot[i] + time_step_dot[member] * acceleration[i]
         v_star_dot[i] = velocity_dot
-        x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[0] * v_star[i]
+        x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[member] * v_star[i]
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def begin_adjoint(
+        particles: int,
         order: wp.array(dtype=wp.int32),
         time_step: wp.array(dtype=real),
         m: wp.array(dtype=real),
@@ -136,7 +141,8 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
     ):
         """From the adjoint of the new state, in scene order, to that of the last prediction; others begin at 0."""
         i = wp.tid()
-        dt = time_step[0]
+        member = i // particles
+        dt = time_step[member]
         x_star_bar = x_scene_bar[order[i]]
         speed_bar = v_scene_bar[order[i]] + dt * x_star_bar
         x_bar[i] = x_star_bar
@@ -152,6 +158,7 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def acceleration_adjoint(
+        particles: int,
         time_step: wp.array(dtype=real),
         v_bar: wp.array(dtype=vector),
         # out
@@ -159,7 +166,8 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
     ):
         """Every prediction of the step used v + dt a, so that one adjoint is dt times the other."""
         i = wp.tid()
-        acceleration_bar[i] = time_step[0] * v_bar[i]
+        member = i // particles
+        acceleration_bar[i] = time_step[member] * v_bar[i]
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def collect_masses(

@@ -36,8 +36,8 @@ class MixtureKernels:
 
 @cache
 def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKernels:
-    """The kernels for a number of phases; their materials are arrays (phases,). A tape can differentiate ``taped``
-    ones."""
+    """The kernels for a number of phases; their materials are arrays (members, phases). A tape can differentiate
+    ``taped`` ones."""
     real, fractions = precision.real, precision.fractions(phases)
     tiny = wp.constant(real(precision.tiny))
 
@@ -48,30 +48,33 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKe
 
     @wp.kernel(module=mixture_module(precision, phases, True, taped))
     def blend(
+        particles: int,
         c: wp.array(dtype=fractions),
-        rest_density: wp.array(dtype=real),
-        viscosity: wp.array(dtype=real),
+        rest_density: wp.array2d(dtype=real),
+        viscosity: wp.array2d(dtype=real),
         # out
         rho_0: wp.array(dtype=real),
         mu: wp.array(dtype=real),
     ):
         i = wp.tid()
+        member = i // particles
         specific_volume = real(0.0)
         power = real(0.0)
         for k in range(wp.static(phases)):
-            specific_volume += c[i][k] / rest_density[k]
-            power += c[i][k] * logarithm(viscosity[k])
+            specific_volume += c[i][k] / rest_density[member, k]
+            power += c[i][k] * logarithm(viscosity[member, k])
         rho_0[i] = real(1.0) / specific_volume
         mu[i] = wp.exp(power)
 
     @wp.kernel(module=mixture_module(precision, phases, False), enable_backward=False)
     def blend_tangent(
+        particles: int,
         c: wp.array(dtype=fractions),
         c_dot: wp.array(dtype=fractions),
-        rest_density: wp.array(dtype=real),
-        rest_density_dot: wp.array(dtype=real),
-        viscosity: wp.array(dtype=real),
-        viscosity_dot: wp.array(dtype=real),
+        rest_density: wp.array2d(dtype=real),
+        rest_density_dot: wp.array2d(dtype=real),
+        viscosity: wp.array2d(dtype=real),
+        viscosity_dot: wp.array2d(dtype=real),
         rho_0: wp.array(dtype=real),
         mu: wp.array(dtype=real),
         # out
@@ -79,20 +82,24 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKe
         mu_dot: wp.array(dtype=real),
     ):
         i = wp.tid()
+        member = i // particles
         change = real(0.0)
         power_dot = real(0.0)
         for k in range(wp.static(phases)):
-            change += (c_dot[i][k] - c[i][k] * rest_density_dot[k] / rest_density[k]) / rest_density[k]
-            power_dot += c_dot[i][k] * logarithm(viscosity[k]) + c[i][k] * viscosity_dot[k] / (viscosity[k] + tiny)
+            rho_k = rest_density[member, k]
+            mu_k = viscosity[member, k]
+            change += (c_dot[i][k] - c[i][k] * rest_density_dot[member, k] / rho_k) / rho_k
+            power_dot += c_dot[i][k] * logarithm(mu_k) + c[i][k] * viscosity_dot[member, k] / (mu_k + tiny)
         rho_0_dot[i] = -rho_0[i] * rho_0[i] * change
         mu_dot[i] = mu[i] * power_dot
 
     @wp.kernel(module=mixture_module(precision, phases, False), enable_backward=False)
     def blend_adjoint(
+        particles: int,
         order: wp.array(dtype=wp.int32),
         c: wp.array(dtype=fractions),
-        rest_density: wp.array(dtype=real),
-        viscosity: wp.array(dtype=real),
+        rest_density: wp.array2d(dtype=real),
+        viscosity: wp.array2d(dtype=real),
         rho_0: wp.array(dtype=real),
         mu: wp.array(dtype=real),
         rho_0_bar: wp.array(dtype=real),
@@ -106,15 +113,16 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKe
     ):
         """``c_scene_bar``: the adjoint of the new state's fractions. Those of the phases add up by particle."""
         i = wp.tid()
+        member = i // particles
         c_bar_i = c_scene_bar[order[i]]
         rest_density_bar_i = rest_density_bar[i]
         viscosity_bar_i = viscosity_bar[i]
         power_bar = mu_bar[i] * mu[i]
         for k in range(wp.static(phases)):
-            by_volume = rho_0_bar[i] * rho_0[i] * rho_0[i] / rest_density[k]
-            c_bar_i[k] = c_bar_i[k] - by_volume + power_bar * logarithm(viscosity[k])
-            rest_density_bar_i[k] = rest_density_bar_i[k] + by_volume * c[i][k] / rest_density[k]
-            viscosity_bar_i[k] = viscosity_bar_i[k] + power_bar * c[i][k] / (viscosity[k] + tiny)
+            by_volume = rho_0_bar[i] * rho_0[i] * rho_0[i] / rest_density[member, k]
+            c_bar_i[k] = c_bar_i[k] - by_volume + power_bar * logarithm(viscosity[member, k])
+            rest_density_bar_i[k] = rest_density_bar_i[k] + by_volume * c[i][k] / rest_density[member, k]
+            viscosity_bar_i[k] = viscosity_bar_i[k] + power_bar * c[i][k] / (viscosity[member, k] + tiny)
         rest_density_bar[i] = rest_density_bar_i
         viscosity_bar[i] = viscosity_bar_i
         c_bar[i] = c_bar_i

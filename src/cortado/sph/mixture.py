@@ -4,12 +4,11 @@ It comes first in a step, on the particles at rest at x(t); what it makes of a p
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import warp as wp
 
 from cortado.device.fields import Entry, StateField
-from cortado.device.precision import Precision
+from cortado.device.state import Layout
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.materials import mixture_kernels
 from cortado.sph.parts import Adjoints, StepContext, Tangents
@@ -33,18 +32,18 @@ class Phases:
 class Mixture:
     """The composition of the particles of one solver; its arrays are reused by every step."""
 
-    def __init__(self, phases: Phases, precision: Precision, particles: int, device: Any, requires_grad: bool = False):
+    def __init__(self, phases: Phases, layout: Layout, requires_grad: bool = False):
         self.phases = phases
         self.fields = (replace(MASS_FRACTIONS, is_constant=phases.count == 1), REFERENCE_DENSITY)
         """What it carries from step to step: one phase stays what it is."""
-        self.kernels = mixture_kernels(precision, phases.count, requires_grad)
+        self.kernels = mixture_kernels(layout.precision, phases.count, requires_grad)
         self.diffusion = diffusion_kernels(phases.diffusion) if phases.diffusion else None
         self.shares = ("rest_density", "viscosity", *(("mobility", "interface_width") if phases.diffusion else ()))
         """Parameters, numbers or those of phases, in whose adjoints every particle has a share."""
         self.substeps = 0
         """Explicit steps of diffusion within a time step."""
-        self._precision, self._particles = precision, particles
-        self._options = {"device": device, "requires_grad": requires_grad}
+        self._layout = layout
+        self._options = {"device": layout.device, "requires_grad": requires_grad}
         self.c: list[wp.array] = [self.fractions()]
         """Sorted fractions (n,) before each substep, and after the last."""
         self.chi: list[wp.array] = []
@@ -54,11 +53,12 @@ class Mixture:
 
     def fractions(self) -> wp.array:
         """(n,) of one number for each phase, all 0."""
-        return wp.zeros(self._particles, dtype=self._precision.fractions(self.phases.count), **self._options)
+        dtype = self._layout.precision.fractions(self.phases.count)
+        return wp.zeros(self._layout.all_particles, dtype=dtype, **self._options)
 
     def numbers(self) -> wp.array:
         """(n,) numbers, all 0."""
-        return wp.zeros(self._particles, dtype=self._precision.real, **self._options)
+        return wp.zeros(self._layout.all_particles, dtype=self._layout.precision.real, **self._options)
 
     def reserve(self, substeps: int) -> None:
         """Take so many substeps from now on, and make room for them."""

@@ -11,10 +11,9 @@ from typing import Any, Protocol
 import warp as wp
 
 from cortado.device.arrays import Arrays, Fields, zeros
-from cortado.device.launching import KernelLauncher, Named, add, sum_of
+from cortado.device.launching import KernelLauncher, Named, add
 from cortado.device.neighbourhood import Discretisation
-from cortado.device.precision import Precision
-from cortado.device.state import Parameters
+from cortado.device.state import Layout, Parameters
 from cortado.discretise.discrete_scene import Lattice
 from cortado.discretise.walls.layers import WallLayers
 from cortado.parameters.registry import BY_NAME, PARAMETERS, Axis, Role
@@ -24,9 +23,11 @@ from cortado.scene.scene import Scene
 @dataclass(frozen=True)
 class StepContext:
     """A step as its parts see it. Kernels find in it, by name, the fields of the particles, the parameters, ``s`` (what
-    lies around each particle), ``order`` (sorted -> scene) and ``step`` (1,), the number of the step."""
+    lies around each particle), ``order`` (sorted -> scene), ``step`` (members,), the number of the step, and
+    ``particles``, how many a scene has: particle i belongs to scene i // particles of a batch."""
 
     launcher: KernelLauncher
+    particles: int
     neighbourhood: Any
     order: wp.array
     step: wp.array
@@ -35,7 +36,7 @@ class StepContext:
 
     @cached_property
     def _known(self) -> tuple[Named, ...]:
-        own = {"s": self.neighbourhood, "order": self.order, "step": self.step}
+        own = {"s": self.neighbourhood, "particles": self.particles, "order": self.order, "step": self.step}
         return own, self.fields.named(), self.parameters.named()
 
     def launch(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
@@ -64,22 +65,22 @@ class Shares(Arrays):
     """The adjoints of parameters in which every particle has a share, kept particle by particle until they are added
     up: (n,) numbers, of a parameter of phases (n,) of one for each phase."""
 
-    def __init__(self, names: Iterable[str], particles: int, phases: int, precision: Precision, device: Any):
+    def __init__(self, names: Iterable[str], layout: Layout):
         """Of the parameters of these names, all 0. Raises `TypeError` for what cannot be shared."""
-        dtypes = {Axis.SCALAR: precision.real, Axis.PHASE: precision.fractions(phases)}
+        dtypes = {Axis.SCALAR: layout.precision.real, Axis.PHASE: layout.precision.fractions(layout.phases)}
         known = {p.name: dtypes[p.axis] for p in PARAMETERS if p.role is Role.RUN and p.axis in dtypes}
         kinds = {}
         for name in names:
             if name not in known:
                 raise TypeError(f"shares has {name!r}, but must be a tuple of some of {', '.join(known)}.")
-            kinds[name] = (particles, known[name])
-        super().__init__(zeros(kinds, device))
-        self._sums = {name: sum_of(dtype, size, device) for name, (size, dtype) in kinds.items()}
+            kinds[name] = (layout.all_particles, known[name])
+        super().__init__(zeros(kinds, layout.device))
+        self._sums = {name: layout.sum_of(dtype) for name, (_, dtype) in kinds.items()}
 
     def collect(self, bar: Parameters) -> None:
         """Add them up into ``bar``, and begin anew."""
         for name, total in self._sums.items():
-            add(total(self[name]).view(bar[name].dtype).flatten(), bar[name])
+            add(total(self[name]).view(bar[name].dtype).flatten(), bar[name].flatten())
         self.clear()
 
 
@@ -93,7 +94,7 @@ class Adjoints:
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
-        """For kernels: ``x_bar`` and so on; the sums, (steps,), of parameters over time; and particles' shares, (n,),
+        """For kernels: ``x_bar`` and so on; the sums, (members, steps), of parameters over time; and particles' shares,
         of those parameters alone that a part names among its ``shares``."""
         whole = {
             f"{name}_bar": self.parameters[name] for name in self.parameters.names if BY_NAME[name].axis is Axis.STEP
@@ -110,8 +111,7 @@ class Setting:
     discretisation: Discretisation
     lattice: Lattice
     walls: WallLayers
-    particles: int
-    device: Any
+    layout: Layout
 
 
 class Force(Protocol):
@@ -119,8 +119,8 @@ class Force(Protocol):
 
     shares: tuple[str, ...]
     """Parameters, numbers or those of phases, to whose adjoints every particle adds a share: an adjoint kernel sees
-    these adjoints with an entry for each particle, (n,), those of parameters over time as sums, (steps,), and no
-    others."""
+    these adjoints with an entry for each particle, (n,), those of parameters over time as sums, (members, steps), and
+    no others."""
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         """``after`` = ``before`` + this force's acceleration, both (n,) vectors."""

@@ -143,10 +143,11 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         acceleration: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
         total = pulls(i, x, normals, s)
         if lane() > 0:
             return
-        acceleration[i] = acceleration_in[i] - (scale * surface_tension[0] / m[i]) * total
+        acceleration[i] = acceleration_in[i] - (scale * surface_tension[member] / m[i]) * total
 
     @wp.kernel(module=discretisation.tangent_module("surface_tension"), enable_backward=False)
     def accelerate_tangent(
@@ -165,8 +166,9 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         acceleration_dot: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        sigma = surface_tension[0]
-        rate = surface_tension_dot[0] - sigma * m_dot[i] / m[i]
+        member = i // s.particles
+        sigma = surface_tension[member]
+        rate = surface_tension_dot[member] - sigma * m_dot[i] / m[i]
         total = rate * pulls(i, x, normals, s) + sigma * pulls_change(i, x, x_dot, normals, normals_dot, s)
         if lane() > 0:
             return
@@ -190,6 +192,7 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
     ):
         """w is the adjoint of a force."""
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
         x_i = x[i]
         n_i = normals[i]
         w_i = acceleration_bar[i] / m[i]
@@ -216,7 +219,7 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         n_sum = add_up_vectors(n_sum)
         if lane() > 0:
             return
-        sigma = surface_tension[0]
+        sigma = surface_tension[member]
         work = scale * wp.dot(total, w_i)
         x_bar[i] = x_bar[i] - (scale * sigma) * x_sum
         m_bar[i] = m_bar[i] + sigma * work / m[i]

@@ -10,12 +10,12 @@ nearly. They are the gradient of no energy either: a fluid that has hardly any v
 
 import warnings
 from math import pi, sqrt
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from cortado.device.neighbourhood import Discretisation
+from cortado.device.state import Layout
 from cortado.errors import CortadoWarning
 from cortado.lattice.calibration import lattice_offsets
 from cortado.scene.scene import Scene
@@ -37,13 +37,13 @@ class SurfaceTension:
 
     shares: tuple[str, ...] = ("surface_tension",)
 
-    def __init__(self, discretisation: Discretisation, inverse: float, scale: float, particles: int, device: Any):
+    def __init__(self, discretisation: Discretisation, inverse: float, scale: float, layout: Layout):
         """``inverse`` and ``scale`` as `tension_constants` gives them."""
         self._normal, self._kernels = normal_kernels(discretisation), surface_tension_kernels(discretisation)
         self._inverse, self._scale = inverse, scale
-        vector = discretisation.precision.vector
-        self._n = wp.zeros(particles, dtype=vector, device=device, requires_grad=True)
-        self._change = wp.zeros(particles, dtype=vector, device=device)
+        vectors = {"shape": layout.all_particles, "dtype": layout.precision.vector, "device": layout.device}
+        self._n = wp.zeros(**vectors, requires_grad=True)
+        self._change = wp.zeros(**vectors)
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         step.launch(self._normal.forward, inverse=self._inverse, normals=self._n)
@@ -86,9 +86,9 @@ def force(setting: Setting) -> SurfaceTension:
     """Surface tension in a scene that has it; warns where it is likely to tear the fluid apart."""
     scene, lattice = setting.scene, setting.lattice
     _check_support(scene)
-    _check_viscosity(scene, setting.particles)
+    _check_viscosity(scene, setting.layout.particles)
     constants = tension_constants(scene.discretisation.spacing, lattice.support, lattice.volume, scene.dimension)
-    return SurfaceTension(setting.discretisation, *constants, setting.particles, setting.device)
+    return SurfaceTension(setting.discretisation, *constants, setting.layout)
 
 
 def _check_support(scene: Scene) -> None:

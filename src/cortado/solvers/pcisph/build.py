@@ -13,9 +13,16 @@ from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FreeEnergy
 
 
-def build(scene: Scene, discrete: DiscreteScene, free_energy: FreeEnergy, precision: Precision, device: Any) -> Solver:
-    """The solver of a scene that is cut into particles, on a device."""
-    return Pcisph(particle_system(scene, discrete, free_energy, precision, device), pressure_limits(scene))
+def build(
+    scene: Scene,
+    discrete: DiscreteScene,
+    free_energy: FreeEnergy,
+    precision: Precision,
+    device: Any,
+    batch: int | None = None,
+) -> Solver:
+    """The solver of a scene that is cut into particles, on a device; ``batch`` of it in one launch."""
+    return Pcisph(particle_system(scene, discrete, free_energy, precision, device, batch), pressure_limits(scene))
 
 
 def pressure_limits(scene: Scene) -> LoopLimits | None:

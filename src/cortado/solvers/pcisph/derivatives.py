@@ -42,8 +42,10 @@ class PcisphAdjoint(ParticleAdjoint):
             **pressure_bar,
         )
         for k in reversed(range(iterations)):
+            going = {"k": k, "rounds": solver.pressure_loop.rounds}
             context.launch(
                 self._force,
+                going,
                 *known,
                 stiffness=solver.lattice.stiffness,
                 y=solver.pressure_relaxation,
@@ -55,7 +57,7 @@ class PcisphAdjoint(ParticleAdjoint):
                 **pressure_bar,
             )
             predicted = {"x_star": it.x_star[k], "v_star": it.v_star[k]}
-            context.launch(kernels.pressure.adjoint, *known, r=self._r, push_bar=push_bar, **predicted)
+            context.launch(kernels.pressure.adjoint, going, *known, r=self._r, push_bar=push_bar, **predicted)
         context.launch(solver.integration.acceleration_adjoint, *known, acceleration_bar=self._acceleration_bar)
         self.accelerate(context, self._acceleration_bar)
         if kernels.density_ratio:
@@ -102,8 +104,10 @@ class PcisphTangent(ParticleTangent):
         p_dot_before = self._zero_pressure
         for k in range(iterations):
             p_dot, c_dot = self._p_dot[k % 2], self._c_dot
+            going = {"k": k, "rounds": solver.pressure_loop.rounds}
             context.launch(
                 kernels.pressure.tangent,
+                going,
                 *known,
                 stiffness=solver.lattice.stiffness,
                 y=solver.pressure_relaxation,
@@ -117,7 +121,7 @@ class PcisphTangent(ParticleTangent):
                 c_dot=c_dot,
             )
             forces = {"c": it.c[k], "c_dot": c_dot, "v_star": it.v_star[k + 1]}
-            context.launch(kernels.force.tangent, *known, **accelerations, **forces, **predicted)
+            context.launch(kernels.force.tangent, going, *known, **accelerations, **forces, **predicted)
             p_dot_before = p_dot
         self.unsort(context, self._x_star_dot, self._v_star_dot, state_dot)
 

@@ -26,6 +26,8 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
     @wp.kernel(module=discretisation.module(False, "frozen_pressure"), enable_backward=False)
     def adjoint(
         s: neighbourhood,
+        k: int,
+        rounds: wp.array(dtype=wp.int32),
         stiffness: real,
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),
@@ -48,6 +50,9 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
     ):
         """From ``push_bar``, the adjoint of the pressure acceleration over m, to those of p and (r) of n*."""
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
+        if k >= rounds[member]:
+            return
         x_i = x[i]
         c_i = c[i]
         push_bar_i = push_bar[i]
@@ -73,7 +78,7 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
             return
         m_i = m[i]
         p_i = p_out[i]
-        delta = y[i] * stiffness / (time_step[0] * time_step[0])
+        delta = y[i] * stiffness / (time_step[member] * time_step[member])
         p_bar_i = real(0.0)
         if p_i > real(0.0):
             p_bar_i = p_bar[i] - s.volume * divergence / (n[i] * n[i])
@@ -84,6 +89,6 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
         y_bar[i] = y_bar[i] + excess_bar * excess / y[i]
         p_bar[i] = p_bar_i
         r[i] = m_i * excess_bar
-        time_step_bar[i] = time_step_bar[i] - real(2.0) * excess_bar * excess / time_step[0]
+        time_step_bar[i] = time_step_bar[i] - real(2.0) * excess_bar * excess / time_step[member]
 
     return adjoint

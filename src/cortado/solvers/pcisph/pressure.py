@@ -41,6 +41,8 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     @wp.kernel(module=discretisation.module(True))
     def pressure(
         s: neighbourhood,
+        k: int,
+        rounds: wp.array(dtype=wp.int32),
         stiffness: real,
         time_step: wp.array(dtype=real),
         n: wp.array(dtype=real),
@@ -56,11 +58,14 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     ):
         """``error``: the compression (rho* - rho_0)+ / rho_0 of a particle, twice (for a sum and a maximum)."""
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
+        if k >= rounds[member]:
+            return
         total = weights(i, x_star, s)
         if lane() > 0:
             return
         excess = m[i] * s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - rho_0[i]
-        delta = y[i] * stiffness / (time_step[0] * time_step[0])
+        delta = y[i] * stiffness / (time_step[member] * time_step[member])
         p_i = p_in[i] + delta * excess
         if p_i < real(0.0):  # not wp.max, which would turn NaN into 0 and hide it
             p_i = real(0.0)
@@ -72,6 +77,8 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
     def pressure_tangent(
         s: neighbourhood,
+        k: int,
+        rounds: wp.array(dtype=wp.int32),
         stiffness: real,
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
@@ -93,16 +100,19 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         c_dot: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
+        if k >= rounds[member]:
+            return
         total = weights_tangent(i, x_star, x_star_dot, s)
         if lane() > 0:
             return
         p_i = p_out[i]
         p_dot_i = real(0.0)
         if p_i > real(0.0):
-            delta = y[i] * stiffness / (time_step[0] * time_step[0])
+            delta = y[i] * stiffness / (time_step[member] * time_step[member])
             excess = (p_i - p_in[i]) / delta
             excess_dot = m[i] * s.volume * total + (excess + rho_0[i]) * m_dot[i] / m[i] - rho_0_dot[i]
-            delta_dot = delta * (y_dot[i] / y[i] - real(2.0) * time_step_dot[0] / time_step[0])
+            delta_dot = delta * (y_dot[i] / y[i] - real(2.0) * time_step_dot[member] / time_step[member])
             p_dot_i = p_in_dot[i] + delta * excess_dot + delta_dot * excess
         n_i = n[i]
         p_out_dot[i] = p_dot_i
@@ -111,6 +121,8 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def pressure_adjoint(
         s: neighbourhood,
+        k: int,
+        rounds: wp.array(dtype=wp.int32),
         time_step: wp.array(dtype=real),
         m: wp.array(dtype=real),
         v: wp.array(dtype=vector),
@@ -126,10 +138,13 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     ):
         """From the adjoint r of n* to that of x*, and on to what x* was predicted from."""
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
+        if k >= rounds[member]:
+            return
         x_star_bar = s.volume * weights_adjoint(i, x_star, r, s)
         if lane() > 0:
             return
-        dt = time_step[0]
+        dt = time_step[member]
         speed_bar = dt * x_star_bar
         x_bar[i] = x_bar[i] + x_star_bar
         v_bar[i] = v_bar[i] + speed_bar

@@ -66,21 +66,31 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     @wp.kernel(module=discretisation.module(True))
     def pressure_force(
         s: neighbourhood,
+        k: int,
+        rounds: wp.array(dtype=wp.int32),
         time_step: wp.array(dtype=real),
         m: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         acceleration: wp.array(dtype=vector),
         c: wp.array(dtype=real),
+        x_before: wp.array(dtype=vector),
+        v_before: wp.array(dtype=vector),
         # out
         x_star: wp.array(dtype=vector),
         v_star: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
+        if k >= rounds[member]:
+            if lane() == 0:
+                x_star[i] = x_before[i]
+                v_star[i] = v_before[i]
+            return
         total = force_sum(i, x, c, s)
         if lane() > 0:
             return
-        dt = time_step[0]
+        dt = time_step[member]
         push = (-s.volume / m[i]) * total
         velocity = v[i] + dt * (acceleration[i] + push)
         v_star[i] = velocity
@@ -89,6 +99,8 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
     def pressure_force_tangent(
         s: neighbourhood,
+        k: int,
+        rounds: wp.array(dtype=wp.int32),
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
         m: wp.array(dtype=real),
@@ -107,20 +119,25 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         v_star_dot: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
+        if k >= rounds[member]:
+            return
         total_dot = force_sum_tangent(i, x, x_dot, c, c_dot, s)
         if lane() > 0:
             return
-        dt = time_step[0]
+        dt = time_step[member]
         accelerated = (v_star[i] - v[i]) / dt
         push = accelerated - acceleration[i]
         push_dot = (-s.volume / m[i]) * total_dot - (m_dot[i] / m[i]) * push
-        velocity_dot = v_dot[i] + dt * (acceleration_dot[i] + push_dot) + time_step_dot[0] * accelerated
+        velocity_dot = v_dot[i] + dt * (acceleration_dot[i] + push_dot) + time_step_dot[member] * accelerated
         v_star_dot[i] = velocity_dot
-        x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[0] * v_star[i]
+        x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[member] * v_star[i]
 
     @wp.kernel(module=discretisation.module(False), enable_backward=False)
     def pressure_force_adjoint(
         s: neighbourhood,
+        k: int,
+        rounds: wp.array(dtype=wp.int32),
         stiffness: real,
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),
@@ -146,6 +163,9 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         """From ``push_bar``, the adjoint of the pressure acceleration over m, to those of c, p and (r) of n*: every
         sum a gather."""
         i = s.first + wp.tid() // LANES
+        member = i // s.particles
+        if k >= rounds[member]:
+            return
         x_i = x[i]
         c_i = c[i]
         push_bar_i = push_bar[i]
@@ -179,7 +199,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         n_i = n[i]
         m_i = m[i]
         p_i = p_out[i]
-        delta = y[i] * stiffness / (time_step[0] * time_step[0])
+        delta = y[i] * stiffness / (time_step[member] * time_step[member])
         c_bar = -s.volume * divergence
         p_bar_i = real(0.0)
         if p_i > real(0.0):
@@ -193,6 +213,6 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         y_bar[i] = y_bar[i] + excess_bar * excess / y[i]
         p_bar[i] = p_bar_i
         r[i] = m_i * excess_bar
-        time_step_bar[i] = time_step_bar[i] - real(2.0) * excess_bar * excess / time_step[0]
+        time_step_bar[i] = time_step_bar[i] - real(2.0) * excess_bar * excess / time_step[member]
 
     return Kernels(pressure_force, pressure_force_tangent, pressure_force_adjoint)

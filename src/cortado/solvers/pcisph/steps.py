@@ -23,7 +23,7 @@ class PcisphSteps(ParticleSolver):
         self.pressure_relaxation = self.numbers() if self.mixture.phases.count > 1 else self.wall_relaxation
         """(n,) what delta is multiplied with [-]: beside walls, and with several phases among lighter neighbours."""
         self.iterates = Iterates(self.numbers, self.vectors)
-        self.pressure_loop = Loop(limits, self.discretisation.precision, self.launch)
+        self.pressure_loop = Loop(limits, self.layout, self.launch)
         self.loops = (self.pressure_loop,)
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: IterationLog) -> None:
@@ -66,8 +66,10 @@ class PcisphSteps(ParticleSolver):
     def iterate(self, k: int, slot: int, context: StepContext) -> None:
         """Iteration k, from the predicted state of the slot before to that of ``slot`` (0: the only one)."""
         it, kernels, before = self.iterates, self.kernels, max(slot - 1, 0)
+        going = {"k": k, "rounds": self.pressure_loop.rounds}
         context.launch(
             kernels.pressure.forward,
+            going,
             stiffness=self.lattice.stiffness,
             y=self.pressure_relaxation,
             x_star=it.x_star[before],
@@ -76,5 +78,7 @@ class PcisphSteps(ParticleSolver):
             c=it.c[before],
             error=self.pressure_loop.errors,
         )
+        predicted = {"x_before": it.x_star[before], "v_before": it.v_star[before]}
         new = {"x_star": it.x_star[slot], "v_star": it.v_star[slot]}
-        context.launch(kernels.force.forward, acceleration=self.accelerations[-1], c=it.c[before], **new)
+        now = {"acceleration": self.accelerations[-1], "c": it.c[before]}
+        context.launch(kernels.force.forward, going, **now, **predicted, **new)

@@ -1,0 +1,147 @@
+"""A call of a function as it travels to a worker process, and its answer as it comes back.
+
+A worker keeps the last functions that it was sent, so that a problem is made once in each process and not for each of
+its evaluations.
+"""
+
+import pickle
+import threading
+import traceback
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from hashlib import sha256
+from importlib import metadata
+from typing import Any
+
+from cortado import __version__
+from cortado.errors import CortadoError, InputError
+
+KEPT = 2
+"""Functions that a worker process keeps, the last ones used. Each may hold a problem with all its memory."""
+
+_functions: OrderedDict[str, Callable[[Any], Any]] = OrderedDict()
+_one_at_a_time = threading.RLock()
+
+
+@dataclass(frozen=True)
+class Payload:
+    """A function in transit."""
+
+    digest: str
+    """A checksum of the content."""
+    versions: str
+    """Of what decides about the bits of a result, where the function was pickled."""
+    content: bytes | None
+    """Pickled; None where a worker should have it."""
+
+    @classmethod
+    def of(cls, function: Callable[[Any], Any]) -> "Payload":
+        """Raises `InputError` for a function that cannot be pickled."""
+        content = pickled(function, "The function")
+        return cls(sha256(content).hexdigest(), versions(), content)
+
+    @property
+    def mention(self) -> "Payload":
+        """The same without its content."""
+        return replace(self, content=None)
+
+
+@dataclass(frozen=True)
+class Lacking:
+    """The answer of a worker that does not have a function which was only mentioned."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a call came to in a worker process."""
+
+    result: Any = None
+    error: BaseException | None = None
+    traceback: str = ""
+    """Of an error that is none of Cortado's own."""
+    warnings: tuple[tuple[str, type[Warning]], ...] = ()
+    """(text, category) of each warning."""
+
+
+def pickled(value: Any, what: str) -> bytes:
+    """A value pickled, with classes and functions of the main module themselves; raises `InputError`."""
+    import cloudpickle
+
+    try:
+        return cloudpickle.dumps(value)
+    except Exception as error:  # pickling may raise anything
+        raise InputError(f"{what} cannot be sent to another process: {in_words(error)}.") from error
+
+
+@cache
+def versions() -> str:
+    """Of what decides about the bits of a result, in words."""
+    return f"Cortado {__version__}, Warp {metadata.version('warp-lang')} and NumPy {metadata.version('numpy')}"
+
+
+def call(payload: Payload, item: bytes) -> Answer | Lacking:
+    """Call the function for an item, in a worker process. One call at a time: threads of a worker wait.
+
+    What the function raises is part of the answer, so that it is raised again where the function came from.
+    """
+    with _one_at_a_time, warnings.catch_warnings(record=True) as caught:
+        if payload.content is None and payload.digest not in _functions:
+            return Lacking()
+        warnings.simplefilter("always")
+        try:
+            answer = Answer(_function(payload)(_unpickled(item)))
+        except Exception as error:
+            answer = Answer(error=_sendable(error), traceback="" if _is_ours(error) else traceback.format_exc())
+    said = tuple((str(warning.message), warning.category) for warning in caught)
+    return Answer(answer.result, answer.error, answer.traceback, said)
+
+
+def _function(payload: Payload) -> Callable[[Any], Any]:
+    """The function of a payload, made unless it is there."""
+    if payload.versions != versions():
+        raise InputError(
+            f"A worker has {versions()}, but must have {payload.versions}, as the process that asks, for the same bits."
+        )
+    if payload.digest not in _functions:
+        assert payload.content is not None
+        while len(_functions) >= KEPT:
+            _functions.popitem(last=False)
+        _functions[payload.digest] = _unpickled(payload.content)
+    _functions.move_to_end(payload.digest)
+    return _functions[payload.digest]
+
+
+def _unpickled(content: bytes) -> Any:
+    try:
+        return pickle.loads(content)
+    except CortadoError:
+        raise
+    except Exception as error:  # unpickling may raise anything
+        raise InputError(
+            f"A worker cannot make what it was sent: {in_words(error)}; classes and functions that are sent must be in "
+            "a module that every worker can import."
+        ) from error
+
+
+def _is_ours(error: BaseException) -> bool:
+    return isinstance(error, CortadoError)
+
+
+def _sendable(error: Exception) -> BaseException:
+    """The error, or one with the same words if it cannot be pickled."""
+    try:
+        again = pickle.loads(pickle.dumps(error))
+        if type(again) is type(error) and str(again) == str(error):
+            return error
+    except Exception:  # pickling may raise anything
+        pass
+    return RuntimeError(in_words(error))
+
+
+def in_words(error: BaseException) -> str:
+    """An error in words, on one line, without the full stop."""
+    text = " ".join(str(error).split()).rstrip(".")
+    return text if isinstance(error, CortadoError) else f"{type(error).__name__}: {text}"

@@ -1,0 +1,118 @@
+"""Losses of the scenes of a batch, one by one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import overload
+
+import numpy as np
+import warp as wp
+
+from cortado.device.state import State
+from cortado.losses.loss import ADJOINT_FIELDS, Loss, Snapshot, SnapshotAdjoint
+from cortado.words import counted
+
+
+@dataclass(frozen=True, eq=False)
+class SnapshotBatch(Sequence[Snapshot]):
+    """A state of a rollout of a batch: ``end[b]`` is the `Snapshot` of scene b."""
+
+    state: State
+    """Warp arrays (batch n,), in the scenes' order; `State.numbers` shows them as (batch, n, ...)."""
+    dimension: int
+    colours: np.ndarray
+    """(batch, phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
+
+    def __repr__(self) -> str:
+        scenes = counted(len(self), "scene")
+        return f"SnapshotBatch({scenes} of {counted(len(self.state.positions) // len(self), 'particle')})"
+
+    def __len__(self) -> int:
+        """Number of scenes."""
+        return len(self.colours)
+
+    @overload
+    def __getitem__(self, b: int) -> Snapshot: ...
+
+    @overload
+    def __getitem__(self, b: slice) -> Sequence[Snapshot]: ...
+
+    def __getitem__(self, b: int | slice) -> Snapshot | Sequence[Snapshot]:
+        if isinstance(b, slice):
+            return [self[k] for k in range(len(self))[b]]
+        number = range(len(self))[b]
+        return _Member(self.state.member(number), self.dimension, self.colours[number], self, number)
+
+    @property
+    def positions(self) -> np.ndarray:
+        """(batch, n, d) [m], float64, read-only"""
+        return self._host["positions"]
+
+    @property
+    def velocities(self) -> np.ndarray:
+        """(batch, n, d) [m / s], float64, read-only"""
+        return self._host["velocities"]
+
+    @property
+    def mass_fractions(self) -> np.ndarray:
+        """(batch, n, phases) [-], float64, read-only"""
+        return self._host["mass_fractions"]
+
+    @cached_property
+    def _host(self) -> dict[str, np.ndarray]:
+        """Read from the device at once, for all scenes."""
+        found = {name: array.astype(np.float64) for name, array in self.state.numpy(self.dimension).items()}
+        for array in found.values():
+            array.flags.writeable = False
+        return found
+
+
+@dataclass(frozen=True, repr=False)
+class _Member(Snapshot):
+    """One scene of a batch, whose arrays come to the host with those of the others."""
+
+    batch: SnapshotBatch
+    number: int
+
+    @cached_property
+    def positions(self) -> np.ndarray:
+        return self.batch.positions[self.number]
+
+    @cached_property
+    def velocities(self) -> np.ndarray:
+        return self.batch.velocities[self.number]
+
+    @cached_property
+    def mass_fractions(self) -> np.ndarray:
+        return self.batch.mass_fractions[self.number]
+
+
+def values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray:
+    """(batch,) the losses of some scenes; NaN for others."""
+    found = np.full(len(end), np.nan)
+    for b in members:
+        found[b] = loss.value(end[b])
+    return found
+
+
+def values_and_adjoints(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> tuple[np.ndarray, SnapshotAdjoint]:
+    """The same, with the adjoints of the states of these scenes; 0 for others."""
+    found, adjoint = np.full(len(end), np.nan), SnapshotAdjoint(end.state.like(), np.zeros_like(end.colours))
+    arrays: dict[str, np.ndarray] = {}
+    for b in members:
+        found[b], bar = loss.value_and_adjoint(end[b])
+        if isinstance(bar, SnapshotAdjoint):
+            adjoint.colours[b] = bar.colours
+            bar = bar.state
+        if isinstance(bar, State):
+            _copy(bar, adjoint.state.member(b))
+            continue
+        for name, array in zip(ADJOINT_FIELDS, bar, strict=False):
+            arrays.setdefault(name, np.zeros((len(end), *array.shape)))[b] = array
+    adjoint.state.set(arrays)
+    return found, adjoint
+
+
+def _copy(bar: State, member: State) -> None:
+    for source, target in zip(bar.arrays(), member.arrays(), strict=True):
+        wp.copy(target, source)

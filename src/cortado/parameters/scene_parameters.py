@@ -1,0 +1,138 @@
+"""The way from the parameters of one scene, by name, to what a run of it depends on, and back: as NumPy arrays.
+
+n counts fluid particles in the order in which the scene lists them, d is the scene's dimension.
+"""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.device.fields import first_values
+from cortado.device.precision import Precision
+from cortado.device.state import State
+from cortado.errors import InputError
+from cortado.parameters.reference_density import (
+    reference_density,
+    reference_density_adjoint,
+    reference_density_tangent,
+)
+from cortado.parameters.registry import BY_NAME, Axis, Role, Source, names
+from cortado.parameters.tilt import Tilt
+from cortado.parameters.values import OVER_TIME, Arrays, scene_values
+
+RUN = names(Role.RUN)
+DENSITY = "reference_density"
+"""The field of a state that the first mass fractions and the rest densities decide."""
+COMPOSITION = ("mass_fractions", "rest_density")
+
+
+class Simulated(Source, Protocol):
+    """A simulation as its parameters see it."""
+
+    state: State
+    """The first, on the device."""
+    batch: int | None
+    """How many scenes there are in one launch; None for a single one."""
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+
+    @property
+    def precision(self) -> Precision:
+        """Of the device's arrays."""
+
+    @property
+    def free_particles(self) -> int:
+        """How many particles, the first ones, do not wait in an emitter."""
+
+    def substeps(self, time_step: NDArray, mobility: NDArray, interface_width: NDArray, rest_density: NDArray) -> int:
+        """Explicit steps of diffusion within a time step that are stable with these parameters."""
+
+
+class SceneParameters:
+    """The parameters of one scene over a number of steps."""
+
+    def __init__(self, simulation: Simulated, steps: int):
+        self._simulation, self._steps = simulation, steps
+        absent = {name: np.zeros(self.shapes(name)[0]) for name in RUN}
+        self.values: Arrays = absent | scene_values(simulation)
+        """As the scene has them."""
+
+    def shapes(self, name: str) -> list[tuple[int, ...]]:
+        """The shapes that a parameter may have; () is a number."""
+        simulation = self._simulation
+        return BY_NAME[name].shapes(self._steps, len(simulation.scene.phase), simulation.positions.shape)
+
+    def upright(self, values: Arrays) -> Arrays:
+        """The values, with gravity in the place of a tilt."""
+        return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values
+
+    def run(self, values: Arrays) -> Arrays:
+        """What steps depend on, by the upright ``values``, and the scene's for what is not among them: parameters over
+        time as (steps, d), those of phases as (phases,), others as numbers ()."""
+        found = {name: values.get(name, self.values[name]) for name in RUN}
+        for name, value in found.items():
+            if name in OVER_TIME:
+                found[name] = np.broadcast_to(value, (max(self._steps, 1), value.shape[-1]))
+            elif BY_NAME[name].axis is Axis.PHASE:
+                found[name] = np.atleast_1d(value)
+        return found
+
+    def first(self, values: Arrays) -> Arrays:
+        """The fields of the first state that differ from the scene's under these values. Raises `InputError` for mass
+        fractions without a volume: a little below 0, as diffusion may leave them."""
+        fractions, density = self._composition(values)
+        with np.errstate(divide="ignore"):
+            found = reference_density(fractions, density)
+        bad = np.flatnonzero(~(np.isfinite(found) & (found > 0.0)))
+        if bad.size:
+            raise InputError(
+                f"mass_fractions of particle {bad[0]} are {fractions[bad[0]].tolist()}, but must be such that its "
+                "volume, the sum of the fractions over the rest densities of the phases, is greater than 0."
+            )
+        return {**first_values(self._simulation.state.fields, values), DENSITY: found}
+
+    def direction(self, values: Arrays, along: Arrays) -> tuple[Arrays, Arrays]:
+        """A direction by name as tangents of the fields of the first state and of what steps depend on."""
+        if "tilt" in along:
+            if "gravity" in values:
+                raise InputError("direction tilt is given, but must be left out, as gravity is given in its place.")
+            angles = values.get("tilt", np.zeros(self._simulation.dimension - 1))
+            along = {**along, "gravity": self._tilt.tangent(angles, along["tilt"])}
+        along = {name: along.get(name, np.zeros_like(value)) for name, value in self.values.items()}
+        fractions_dot, density_dot = along["mass_fractions"], np.atleast_1d(along["rest_density"])
+        density = reference_density_tangent(*self._composition(values), fractions_dot, density_dot)
+        first = {**first_values(self._simulation.state.fields, along), DENSITY: density}
+        return first, self.run(along)
+
+    def gradient(self, values: Arrays, first: Arrays, run: Arrays) -> Arrays:
+        """From the adjoints of the fields of the first state and of what steps depend on to those of ``values``, in
+        their shapes."""
+        found = {name: run[name].copy() for name in RUN if name in values}
+        for field in self._simulation.state.fields:
+            if field.first in values:
+                if field.first in found:
+                    found[field.first][0] += first[field.name][0]
+                else:
+                    found[field.first] = first[field.name]
+        if "tilt" in values:
+            found["tilt"] = self._tilt.adjoint(values["tilt"], run["gravity"])
+        for name in OVER_TIME:
+            if name in values and values[name].ndim == 1:
+                found[name] = found[name].sum(axis=0)
+        if not values.keys().isdisjoint(COMPOSITION):
+            bars = reference_density_adjoint(*self._composition(values), first[DENSITY])
+            for name, own_bar in zip(COMPOSITION, bars, strict=True):
+                if name in found:
+                    found[name] = found[name] + own_bar
+        return {name: found[name].reshape(values[name].shape) for name in values if name in found}
+
+    @property
+    def _tilt(self) -> Tilt:
+        return Tilt(self._simulation.scene.forces.gravity)
+
+    def _composition(self, values: Arrays) -> tuple[np.ndarray, np.ndarray]:
+        fractions, density = (values.get(name, self.values[name]) for name in COMPOSITION)
+        return fractions, np.atleast_1d(density)

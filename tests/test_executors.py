@@ -1,0 +1,375 @@
+"""Where something is computed changes no bit of it, also where a worker is killed half-way."""
+
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado import ComputationError, CortadoWarning, DivergedError, InputError, Problem, SceneError, Simulation
+from cortado.device.cores import usable_cores
+from cortado.executors import Distributed, InProcess, calls, local, local_workers
+from cortado.executors import distributed as of_dask
+from cortado.gradients import EnsembleMean, Exact, RandomizedSmoothing
+from dask_processes import PATIENCE, scheduler
+from scenes import plane
+from work_for_workers import FarFromHome, SlowValue, gpu_and_process, process, square
+
+POINTS = [{"gravity": np.array([0.1 * k, -9.81])} for k in range(10)]
+
+
+@pytest.fixture(scope="module")
+def problem():
+    simulation = Simulation(plane(), precision="float64")
+    return Problem(simulation, 4, FarFromHome(simulation.positions))
+
+
+@pytest.fixture(scope="module")
+def processes(tmp_path_factory):
+    """A scheduler and two workers, all processes of their own; the last test that has them kills them."""
+    with scheduler(tmp_path_factory.mktemp("scheduler"), workers=2) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def workers(processes):
+    with Distributed(processes.address) as executor:
+        at_work = set()
+        while len(at_work) < 2:
+            at_work |= set(executor.map(process, range(4)))
+        yield executor
+
+
+def bits(estimate):
+    errors = estimate.standard_error or {}
+    return b"".join(np.asarray(value).tobytes() for one in (estimate.gradient, errors) for value in one.values()), (
+        estimate.loss,
+        estimate.strength,
+    )
+
+
+MAIN = """
+class Loss:
+    def value(self, end):
+        return float(end.positions.sum())
+    def adjoint(self, end):
+        return 0 * end.positions + 1, 0 * end.positions
+"""
+
+
+# ---- in this process ---------------------------------------------------------------------------------------------
+
+
+def test_in_process_one_after_the_other():
+    told = []
+    assert InProcess().map(square, iter(range(4)), lambda *pair: told.append(pair)) == [0, 1, 4, 9]
+    assert told == [(0, 0), (1, 1), (2, 4), (3, 9)]
+
+
+def test_in_process_the_first_error_ends_it():
+    seen = []
+
+    def fails(number):
+        seen.append(number)
+        raise DivergedError(3, number, "take care")
+
+    with pytest.raises(DivergedError) as caught:
+        InProcess().map(fails, range(3))
+    assert (caught.value.particle, seen) == (0, [0])
+
+
+def test_items_are_taken_as_they_are_needed():
+    taken = []
+
+    def items():
+        for number in range(3):
+            taken.append(number)
+            yield number
+
+    assert InProcess().map(lambda number: len(taken), items()) == [1, 2, 3]
+
+
+# ---- errors and functions in transit -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        DivergedError(5, 7, "try less", "went through a wall", 2),
+        SceneError("a.toml", "solver.time_step", -1.0, "greater than 0"),
+        InputError("This is wrong."),
+        ComputationError("This failed."),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_errors_arrive_as_themselves(error):
+    def fail(_):
+        raise error
+
+    answer = pickle.loads(pickle.dumps(calls.call(calls.Payload.of(fail), calls.pickled(0, "The item"))))
+    assert type(answer.error) is type(error) and str(answer.error) == str(error)
+    assert vars(answer.error) == vars(error) and answer.traceback == ""
+
+
+def test_an_error_that_cannot_travel_is_told_in_words():
+    class Odd(Exception):
+        def __init__(self, one, two):
+            super().__init__(f"{one} and {two}")
+
+    def fail(_):
+        raise Odd(1, 2)
+
+    answer = calls.call(calls.Payload.of(fail), calls.pickled(0, "The item"))
+    assert (
+        type(answer.error) is RuntimeError and str(answer.error) == "Odd: 1 and 2" and "raise Odd" in answer.traceback
+    )
+
+
+def test_what_cannot_be_sent_is_a_sentence():
+    with pytest.raises(InputError, match=r"^The function cannot be sent to another process: TypeError: .*\.$"):
+        calls.Payload.of(threading.Lock().acquire)
+
+
+def test_a_worker_with_other_versions_is_refused(monkeypatch):
+    payload = calls.Payload.of(square)
+    monkeypatch.setattr(calls, "versions", lambda: "Cortado 0.0.1, Warp 1.0 and NumPy 2.0")
+    answer = calls.call(payload, calls.pickled(3, "The item"))
+    assert isinstance(answer.error, InputError) and "must have Cortado" in str(answer.error)
+
+
+def test_a_worker_that_lacks_the_function_says_so(monkeypatch):
+    monkeypatch.setattr(calls, "_functions", calls.OrderedDict())
+    payload, item = calls.Payload.of(square), calls.pickled(3, "The item")
+    assert isinstance(calls.call(payload.mention, item), calls.Lacking)
+    assert calls.call(payload, item).result == calls.call(payload.mention, item).result == 9
+
+
+def test_an_executor_is_asked_for_by_its_type():
+    with ThreadPoolExecutor(1) as pool, pytest.raises(InputError, match="executor is of the type ThreadPoolExecutor"):
+        EnsembleMean(executor=pool)
+    with pytest.raises(InputError, match="executor is the class InProcess"):
+        RandomizedSmoothing(executor=InProcess)
+
+
+def test_an_executor_is_no_part_of_what_an_estimator_is():
+    class Other(InProcess):
+        pass
+
+    one, other = EnsembleMean(), EnsembleMean(executor=Other())
+    assert one == other and hash(one) == hash(other) and repr(one) == repr(other)
+
+
+# ---- two worker processes ----------------------------------------------------------------------------------------
+
+
+def test_estimators_have_the_bits_that_they_have_alone(problem, workers):
+    for made in (RandomizedSmoothing(samples=2), EnsembleMean(estimator=Exact())):
+        wanted = problem.estimate(POINTS[1], made)
+        found = problem.estimate(POINTS[1], replace(made, executor=workers))
+        assert bits(found) == bits(wanted)
+
+
+def test_many_points_have_the_bits_that_they_have_alone(problem, workers):
+    told = []
+    found = cortado.evaluate(problem, POINTS, executor=workers, on_result=lambda *pair: told.append(pair))
+    assert [one.loss for one in found] == [problem.value(point) for point in POINTS]
+    assert sorted(number for number, _ in told) == list(range(10)) and dict(told)[7] is found[7]
+    for gradient in (Exact(),):
+        found = cortado.evaluate(problem, POINTS, gradient, workers)
+        assert [bits(one) for one in found] == [bits(problem.estimate(point, gradient)) for point in POINTS]
+
+
+def test_items_are_shared_out_and_a_function_is_made_once_a_process(workers):
+    class Kept:
+        def __call__(self, _):
+            time.sleep(0.05)
+            return os.getpid(), id(self)
+
+    kept = Kept()
+    found = {*workers.map(kept, range(12)), *workers.map(kept, range(12))}
+    assert len({pid for pid, _ in found}) == 2 == len(found)
+
+
+def test_a_loss_of_the_main_module_travels(problem, workers):
+    """As in a script, whose classes no other process can import."""
+    namespace = {"__name__": "__main__"}
+    exec(MAIN, namespace)
+    own = Problem(problem.simulation, 2, namespace["Loss"]())
+    assert workers.map(own.value, POINTS[:3]) == [own.value(point) for point in POINTS[:3]]
+
+
+def test_the_error_of_the_first_item_that_has_one_is_raised(workers):
+    def fail(number):
+        if number == 2:
+            time.sleep(0.3)
+            raise DivergedError(5, 7, "take a smaller time step")
+        if number > 2:
+            raise ValueError("later")
+
+    with pytest.raises(DivergedError, match=r"^The simulation diverged in step 5: particle 7 was lost; take a"):
+        workers.map(fail, range(8))
+    assert workers.map(square, range(3)) == [0, 1, 4]
+
+    def wrong(_):
+        raise ValueError("not of Cortado")
+
+    with pytest.raises(ValueError, match="not of Cortado") as caught:
+        workers.map(wrong, range(2))
+    assert "in wrong" in caught.value.__notes__[0]
+
+
+@pytest.mark.filterwarnings("ignore:time_step is")
+def test_what_diverges_may_have_a_loss(problem, workers):
+    far = {"initial_velocities": np.full_like(problem.simulation.positions, 1e5)}
+    with pytest.raises(DivergedError):
+        cortado.evaluate(problem, [POINTS[0], far], executor=workers)
+    one, other = cortado.evaluate(problem, [POINTS[0], far], Exact(), workers, loss_if_diverged=np.inf)
+    assert one.loss == problem.value(POINTS[0]) and other.loss == np.inf
+    assert np.isnan(other.gradient["initial_velocities"]).all()
+
+
+def test_warnings_of_workers_are_heard(workers):
+    def warn(number):
+        warnings.warn(f"mind number {number}", CortadoWarning, stacklevel=1)
+
+    with pytest.warns(CortadoWarning) as caught:
+        workers.map(warn, range(3))
+    assert sorted(str(one.message) for one in caught) == [f"mind number {k}" for k in range(3)]
+
+
+def test_an_executor_within_an_executor_is_refused(problem, workers):
+    nested = EnsembleMean(executor=workers)
+    with pytest.raises(InputError, match="An executor cannot be used within what an executor computes"):
+        cortado.evaluate(problem, POINTS[:2], nested, workers)
+
+
+def test_observers_hear_of_every_sample(problem, workers):
+    heard = []
+    alone = EnsembleMean(estimator=Exact(), executor=workers)
+    found = problem.estimate(POINTS[0], alone, lambda step, bar: heard.append(step))
+    assert heard == [4, 3, 2, 1, 0] * 4 and bits(found) == bits(problem.estimate(POINTS[0], alone))
+
+
+# ---- what is lost ------------------------------------------------------------------------------------------------
+
+
+def test_a_worker_that_is_killed_half_way_changes_nothing(problem, processes, workers):
+    """Afterwards the scheduler is lost too."""
+    arrived = []
+
+    def kill(number, result):
+        arrived.append(number)
+        if len(arrived) == len(POINTS) // 2:
+            processes.workers[0].kill()
+
+    with pytest.warns(CortadoWarning, match="was lost; what it was computing is computed again"):
+        found = workers.map(SlowValue(problem), POINTS, kill)
+    assert [loss for loss, _ in found] == [problem.value(point) for point in POINTS]
+    assert sorted(arrived) == list(range(len(POINTS)))
+    assert {pid for _, pid in found} == {worker.pid for worker in processes.workers}
+
+    with pytest.raises(ComputationError, match=r"^The scheduler tcp://127\.0\.0\.1:\d+ was lost, and"):
+        workers.map(SlowValue(problem), POINTS, lambda *_: processes.process.kill())
+
+
+def test_a_scheduler_without_workers_is_left_in_the_end():
+    import distributed
+
+    options = {"host": "127.0.0.1", "port": 0, "dashboard_address": ":0", "dashboard": False}
+    here = {"cls": distributed.Scheduler, "options": options}
+    with (
+        distributed.SpecCluster({}, here, silence_logs=False) as cluster,
+        Distributed(cluster.scheduler_address, patience=0.5) as executor,
+        pytest.raises(ComputationError, match=r"has had no worker for \d+ s; start some, such as by `dask worker"),
+    ):
+        executor.map(square, range(3))
+
+
+@pytest.mark.parametrize(
+    "address, words",
+    [
+        ("tcp://127.0.0.1:1", "nothing there answers as one within 0.2 s"),
+        ("here", "missing port"),
+        (3, "scheduler is 3"),
+    ],
+)
+def test_a_scheduler_that_is_not_there_is_a_sentence(monkeypatch, address, words):
+    monkeypatch.setattr(of_dask, "REACHED", 0.2)
+    with pytest.raises(InputError, match=words):
+        Distributed(address)
+
+
+def test_without_distributed_there_is_one_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    wanted = (
+        r"^Several processes need Dask's distributed, which is not installed: pip install 'cortado-sph\[distributed\]'"
+    )
+    with pytest.raises(InputError, match=wanted):
+        Distributed("tcp://127.0.0.1:8786")
+    with pytest.raises(InputError, match=wanted), local_workers(2):
+        pass
+
+
+# ---- local workers -----------------------------------------------------------------------------------------------
+
+
+def test_each_process_has_one_gpu_also_when_it_is_started_again(monkeypatch):
+    monkeypatch.setattr("cortado.executors.local.visible_gpus", lambda: ["3", "GPU-5f1c"])
+
+    def at_work(executor):
+        """Processes by their GPUs."""
+        found, end = {}, time.monotonic() + PATIENCE
+        while len(found) < 2 and time.monotonic() < end:
+            found.update(executor.map(gpu_and_process, range(8)))
+        return found
+
+    with local_workers(device="cuda") as executor:
+        first = at_work(executor)
+        os.kill(first["3"], signal.SIGKILL)
+        second = at_work(executor)
+    assert first.keys() == second.keys() == {"3", "GPU-5f1c"}
+    assert first["3"] != second["3"] and first["GPU-5f1c"] == second["GPU-5f1c"]
+
+
+def test_cores_are_shared_out(monkeypatch):
+    monkeypatch.setattr("cortado.executors.local.usable_cores", lambda: 8)
+    environments = local._environments
+    assert environments(None, "cpu") == [{"CORTADO_CORES": "1"}] * 8
+    assert environments(3, "cpu") == [{"CORTADO_CORES": "2"}] * 3
+    assert environments(9, "cpu") == [{"CORTADO_CORES": "1"}] * 9
+
+
+@pytest.mark.parametrize(
+    "number, device, words",
+    [
+        (0, "cpu", "number is 0"),
+        (1.5, "cpu", "number is 1.5"),
+        (None, "cuda:1", "device is 'cuda:1'"),
+        (None, "cuda", "1 worker processes need a GPU each, but there are 0"),
+        (3, "cuda", "3 worker processes need a GPU each, but there are 0"),
+    ],
+)
+def test_wrong_local_workers_are_a_sentence(monkeypatch, number, device, words):
+    monkeypatch.setattr("cortado.executors.local.visible_gpus", list)
+    with pytest.raises(InputError, match=words), local_workers(number, device):
+        pass
+
+
+def test_the_cores_of_a_process_can_be_limited(monkeypatch):
+    monkeypatch.delenv("CORTADO_CORES", raising=False)
+    everything = usable_cores()
+    monkeypatch.setenv("CORTADO_CORES", "1")
+    assert usable_cores() == 1
+    monkeypatch.setenv("CORTADO_CORES", "100000")
+    assert usable_cores() == everything
+    monkeypatch.setenv("CORTADO_CORES", "many")
+    with pytest.raises(InputError, match="CORTADO_CORES is 'many'"):
+        usable_cores()
