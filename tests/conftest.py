@@ -72,6 +72,7 @@ SLOW_TESTS = {
         "test_velocity_only_grows_at_most_linearly",
         "test_without_strength_an_estimator_is_exact_bit_for_bit",
     },
+    "test_executors": {"test_each_process_has_one_gpu_also_when_it_is_started_again"},
     "test_extinction_schedule": {
         "test_thin_fluid_first_gathers_what_thick_fluid_leaves_behind",
     },
@@ -134,6 +135,12 @@ SLOW_TESTS = {
     },
     "test_smoothing": {
         "test_the_pressure_iteration_converges_on_the_lattice",
+    },
+    "test_sweep": {
+        "test_a_search_with_an_ensemble_has_the_same_bits_on_workers",
+        "test_a_task_is_optimised_with_every_combination",
+        "test_a_worker_that_is_killed_half_way_changes_nothing",
+        "test_what_is_finished_is_not_repeated",
     },
     "test_threads": {
         "test_forks_after_use_and_while_others_compute",

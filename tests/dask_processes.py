@@ -37,7 +37,8 @@ class Scheduler:
 
     def _start(self, program, *arguments):
         command = [sys.executable, "-m", f"distributed.cli.{program}", *map(str, arguments)]
-        environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent), "CORTADO_CORES": "1"}
+        path = os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = {**os.environ, "PYTHONPATH": path, "CORTADO_CORES": "1"}
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         self._processes.append(subprocess.Popen(command, env=environment, **quiet))
         return self._processes[-1]

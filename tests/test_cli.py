@@ -28,8 +28,8 @@ from cortado.io.pictures import heart, rosetta, write_picture
 from cortado.io.run_folder import FIGURES, RunFolder
 from full_disk import largest_file
 
-RUN_FILES = {"scene.json", "environment.json", "metrics.jsonl", "trajectory.vtkhdf", "figures", "report.html"}
-OPTIMISE_FILES = {"scene.json", "environment.json", "metrics.jsonl", "checkpoint", "figures", "report.html"}
+ALWAYS = {"scene.json", "environment.json", "metrics.jsonl", "figures", "report.html", "result.json"}
+RUN_FILES, OPTIMISE_FILES = {*ALWAYS, "trajectory.vtkhdf"}, {*ALWAYS, "checkpoint"}
 
 
 @pytest.fixture(autouse=True)
@@ -234,7 +234,7 @@ def test_wrong_arguments_of_run_are_refused(cortado_command, folder, arguments, 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "a command is missing, one of gradients, run, optimise, bench; see cortado --help."),
+        ([], "a command is missing, one of gradients, run, optimise, sweep, bench; see cortado --help."),
         (["walk"], "walk is unknown, but must be one of gradients, run, "),
         (["run"], "SCENE.toml is missing; see cortado run --help."),
         (["gradients"], "a command is missing, one of check, figure, study; see cortado gradients --help."),
@@ -254,7 +254,9 @@ def test_wrong_usage_is_refused(cortado_command, folder, arguments, words):
     assert_nothing_made(folder)
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["optimise"], ["gradients"], ["gradients", "check"], ["bench"]])
+@pytest.mark.parametrize(
+    "command", [[], ["run"], ["optimise"], ["gradients"], ["gradients", "check"], ["bench"], ["sweep"]]
+)
 def test_every_command_has_help(cortado_command, command):
     code, out, err = cortado_command(*command, "--help")
     assert (code, err) == (0, "") and out.startswith(" ".join(["usage: cortado", *command]))

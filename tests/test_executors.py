@@ -321,6 +321,7 @@ def test_without_distributed_there_is_one_sentence(monkeypatch):
 # ---- local workers -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:The worker .* was lost")
 def test_each_process_has_one_gpu_also_when_it_is_started_again(monkeypatch):
     monkeypatch.setattr("cortado.executors.local.visible_gpus", lambda: ["3", "GPU-5f1c"])
 

@@ -76,3 +76,14 @@ def test_other_errors_are_no_complaint_of_the_cache():
     from cortado.device.kernel_cache import complaint
 
     assert complaint(ValueError("steps")) is None and complaint(OSError(28, "No space left on device")) is None
+
+
+def test_what_another_process_is_compiling_is_not_damaged(tmp_path):
+    from cortado.device.kernel_cache import _trouble
+
+    for name in ("wp_cortado_a_846ebbe_p512_t139785425587072", "wp_cortado_a_846ebbe"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.o").write_bytes(b"\x7fELF, and no more yet")
+    assert _trouble(str(tmp_path)) == "wp_cortado_a_846ebbe in it is damaged and should be deleted"
+    (tmp_path / "wp_cortado_a_846ebbe" / "a.o").unlink()
+    assert _trouble(str(tmp_path)) is None

@@ -70,7 +70,9 @@ LAYERS = """
     study.experiment_files
     bench bench.scene bench.timing bench.floor bench.passes bench.memory bench.dam_break bench.environment
     bench.reference_engine bench.text
-    commands commands.bench commands.check commands.figure commands.optimise commands.run commands.study
+    sweep sweep.combinations sweep.table
+    commands commands.executor commands.bench commands.check commands.figure commands.optimise commands.run
+    commands.study commands.sweep
     cli
     __main__
 """

@@ -12,6 +12,7 @@ import cortado.commands.check
 import cortado.commands.figure
 import cortado.commands.optimise
 import cortado.commands.run
+import cortado.commands.sweep
 from cortado.cli import main
 from cortado.inverse.task import load_task
 from cortado.scene.scene import load_scene
@@ -19,7 +20,7 @@ from cortado.study.experiment_files import load_experiment
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-LOADERS = {"optimise": load_task, "figure": load_experiment}
+LOADERS = {"optimise": load_task, "sweep": load_task, "figure": load_experiment}
 COMMANDS = re.findall(r"^    cortado (.*)$", README, re.MULTILINE)
 
 
@@ -48,6 +49,7 @@ def test_a_command_is_one(command, monkeypatch):
         (cortado.commands.check, "check_scene"),
         (cortado.commands.figure, "measure_figure"),
         (cortado.commands.bench, "bench_dam_break"),
+        (cortado.commands.sweep, "run_sweep"),
     ):
         monkeypatch.setattr(module, function, lambda *arguments: "done")
     words = shlex.split(command)
@@ -59,7 +61,7 @@ def test_a_command_is_one(command, monkeypatch):
 
 
 def test_there_are_commands():
-    assert {command.split()[0] for command in COMMANDS} == {"run", "optimise", "gradients", "bench"}
+    assert {command.split()[0] for command in COMMANDS} == {"run", "optimise", "sweep", "gradients", "bench"}
 
 
 def test_its_files_are_there():

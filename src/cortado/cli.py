@@ -1,4 +1,4 @@
-"""The command line: ``cortado run | optimise | gradients | bench``.
+"""The command line: ``cortado run | optimise | sweep | gradients | bench``.
 
 Exit codes: 0 done, 1 the computation failed (or a check did), 2 the input is wrong, 130 interrupted. A mistake of the
 user's, or of the machine, is one sentence on stderr, never a traceback.
@@ -78,6 +78,8 @@ def optimise(
     precision: str = "float32",
     resume: bool = False,
     overwrite: bool = False,
+    scheduler: str | None = None,
+    workers: int | None = None,
 ) -> Work:
     """Optimise what a task file names, and check the result as the file asks.
 
@@ -89,12 +91,46 @@ def optimise(
         precision: "float32" or "float64".
         resume: Go on with the run in the folder, bit for bit.
         overwrite: Replace an earlier run in the same folder.
+        scheduler: Address of a scheduler of Dask's, whose workers compute the samples of an ensemble.
+        workers: Number of worker processes on this machine that do; on a GPU each has one of its own.
     """
     if resume and overwrite:
         raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
+    from cortado.commands.executor import Where
     from cortado.commands.optimise import optimise_task
 
-    return partial(optimise_task, task, out, _words(overrides), device, precision, resume, overwrite, _command())
+    where, words = Where(scheduler, workers), _words(overrides)
+    return partial(optimise_task, task, out, words, device, precision, resume, overwrite, _command(), where)
+
+
+@app.command
+def sweep(
+    file: Annotated[Positional[Path], arg(metavar="FILE.toml")],
+    sets: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE,VALUE")] = (),
+    steps: int | None = None,
+    out: Path = Path("runs/sweep"),
+    device: str = "cpu",
+    precision: str = "float32",
+    scheduler: str | None = None,
+    workers: int | None = None,
+) -> Work:
+    """Run a scene, or optimise a task, with every combination of some values, each in a folder of its own; folders that
+    are finished already are not repeated.
+
+    Args:
+        file: The scene file, or the task file.
+        sets: What changes, such as solver.time_step=0.001,0.002; may be given again, for every combination.
+        steps: Number of time steps of a scene, 200 if left out; a task says its own.
+        out: Folder of the sweep, with a folder for each combination and a table of them all.
+        device: "cpu", or "cuda:0" for the first GPU, of each worker.
+        precision: "float32" or "float64".
+        scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
+        workers: Number of worker processes on this machine; on a GPU each has one of its own.
+    """
+    from cortado.commands.executor import Where
+    from cortado.commands.sweep import run_sweep
+
+    return partial(run_sweep, file, _words(sets), steps, out, device, precision, Where(scheduler, workers))
 
 
 @gradients.command

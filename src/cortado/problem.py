@@ -1,7 +1,7 @@
 """Parameters in, loss out; loss and gradient; and the derivative along a direction."""
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any
@@ -18,12 +18,15 @@ from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatc
 from cortado.losses.checked import as_loss
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
 from cortado.parameters.space import ParameterSpace
-from cortado.parameters.values import NAMES, UNITS, Arrays, Values
+from cortado.parameters.values import NAMES, OVER_TIME, UNITS, Arrays, Values
 from cortado.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
-from cortado.simulation import Simulation, check_steps, lost_sentence, whole_number
+from cortado.simulation import Simulation, check_steps, whole_number
 from cortado.words import counted
 
 __all__ = ["NAMES", "UNITS", "Problem"]
+
+KEPT = 2
+"""Batches of a problem, of different sizes, that are kept for the next evaluation."""
 
 
 class Problem:
@@ -70,6 +73,7 @@ class Problem:
         self._space = ParameterSpace(simulation, self.steps)
         self._rollout = Rollout(simulation.solver, self.steps, self.memory_budget)
         self._derivatives: dict[AdjointEstimator, BackwardStep] = {}
+        self._batches: dict[int, Problem] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled and copied as what it is made from."""
@@ -184,6 +188,34 @@ class Problem:
         """Of a batch: the scenes that lost a particle in the last evaluation, by their number, and what happened."""
         return self._rollout.lost
 
+    def room(self, estimator: AdjointEstimator | None = None) -> int:
+        """See `Batchable.room`."""
+        if self.simulation.batch is not None or (estimator is not None and not estimator.batches):
+            return 1
+        return self.simulation.room(self.steps, self.memory_budget if estimator else 0.0)
+
+    @in_turn
+    def together(
+        self, points: Sequence[Values], estimator: AdjointEstimator | None = None
+    ) -> list[Estimate | DivergedError]:
+        """See `Batchable.together`."""
+        problem = self._batch_of(len(points))
+        over_time = {name for name in points[0] if name in OVER_TIME and np.ndim(points[0][name]) == 1}
+        rows = [{name: [value] if name in over_time else value for name, value in point.items()} for point in points]
+        values = {name: np.stack([np.asarray(row[name], dtype=np.float64) for row in rows]) for name in points[0]}
+        found = Estimate(problem.value(values), {}) if estimator is None else estimator.estimate(problem, values)
+        shapes = {name: np.shape(value) for name, value in points[0].items()}
+        lost = problem.lost
+        return [lost[b] if b in lost else found.member(b, shapes) for b in range(len(points))]
+
+    def _batch_of(self, size: int) -> "Problem":
+        """The same problem of so many scenes in one launch; the last few sizes are kept."""
+        if size not in self._batches:
+            while len(self._batches) >= KEPT:
+                self._batches.pop(next(iter(self._batches)))
+            self._batches[size] = Problem(self.simulation.batch_of(size), self.steps, self.loss, self.memory_budget)
+        return self._batches[size]
+
     @property
     def fingerprint(self) -> str:
         """Which problem this is, part by part, in words and checksums: steps, precision, scene, first positions (which
@@ -223,8 +255,6 @@ class Problem:
         self._space.begin(self._rollout, values, varied)
         observe(0, self._rollout.initial)
         self._rollout.forward(observe, keep)
-        if self.lost:
-            warnings.warn(lost_sentence(self.lost, len(colours)), CortadoWarning, stacklevel=5)
         return ends
 
     @property
@@ -279,7 +309,13 @@ class ForwardPass:
     @in_turn
     def derivative(self, estimator: AdjointEstimator) -> BackwardStep:
         """The estimator's backward step, made once for each problem. Raises `InputError` for an estimator whose
-        settings may change, as its backward step would keep the first ones."""
+        settings may change, as its backward step would keep the first ones, and for one that may mix up the scenes of a
+        batch."""
+        if self.rollout.solver.layout.batch is not None and not estimator.batches:
+            raise InputError(
+                f"{type(estimator).__name__} is given a batch, but has no `batches = True`, which says that it treats "
+                "each scene by itself."
+            )
         try:
             is_new = estimator not in self._derivatives
         except TypeError as error:

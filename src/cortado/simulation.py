@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from importlib import import_module
 from inspect import signature
-from math import prod
+from math import isqrt, prod
 from os import PathLike
 from typing import Any
 
@@ -15,7 +15,7 @@ import warp as wp
 from cortado.device.compiling import begin_headers
 from cortado.device.fields import first_values
 from cortado.device.kernel_cache import start_warp
-from cortado.device.memory import frame_parts, require, simulation_parts
+from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import Precision, precision_named
 from cortado.device.reduction import sum_and_maximum_kernel
 from cortado.device.state import State
@@ -41,6 +41,8 @@ from cortado.words import counted
 
 MOST_SUBSTEPS = 10_000
 """Explicit steps of diffusion in a time step; beyond it the mobility is taken for a mistake."""
+WORTH = {"cpu": 16_000, "cuda": 1_000_000}
+"""Particles of all scenes in one launch, beyond which more of them are no faster."""
 GREATEST_NUMBER = 10**18
 """Of steps: within a 64-bit number."""
 
@@ -147,9 +149,9 @@ class Simulation:
         controls: Mapping[str, Any] | None = None,
         record_every: int = 1,
         state: RestartState | Sequence[RestartState] | None = None,
-    ) -> Any:
-        """Run from the scene's first state and return a `Trajectory` of the frames, the first and the last state
-        included; of a batch a `TrajectoryBatch`.
+    ) -> Trajectory:
+        """Run from the scene's first state and return the frames, the first and the last state included; of a batch a
+        `TrajectoryBatch`.
 
         ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity; so does any other parameter
         of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same scene, the run goes on
@@ -160,7 +162,7 @@ class Simulation:
         return self.collect(self.rollout(steps, controls, state), record_every)
 
     @in_turn
-    def collect(self, rollout: Rollout, record_every: int = 1) -> Any:
+    def collect(self, rollout: Rollout, record_every: int = 1) -> Trajectory:
         """Run a rollout forward and return its frames; warnings and errors as of `run`."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
@@ -180,7 +182,7 @@ class Simulation:
         if rollout.lost:
             warnings.warn(lost_sentence(rollout.lost, rollout.solver.layout.members), CortadoWarning, stacklevel=5)
         fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
-        return self._trajectory(rollout, np.array(steps), fields)
+        return self._trajectory(rollout, np.array(steps), fields)  # type: ignore[return-value]  # of a batch
 
     def _trajectory(self, rollout: Rollout, steps: np.ndarray, fields: Arrays) -> Trajectory | TrajectoryBatch:
         """Of fields (frames, ...) after so many steps (frames,), in a batch (frames, batch, ...)."""
@@ -252,6 +254,21 @@ class Simulation:
         if len(states) != (self.batch or 1):
             raise InputError(f"state has {len(states)} states, but must have {self.batch or 1}, one for each scene.")
         return states
+
+    def batch_of(self, size: int) -> "Simulation":
+        """The same scene so many times in one launch."""
+        energy = self.free_energy if len(self.scene.phase) > 1 else None
+        return Simulation(self.scene, self.device.alias, self.precision.name, energy, size)
+
+    def room(self, steps: int, checkpoints: float) -> int:
+        """How many runs of so many steps are worth one launch, and fit half of the memory that is free, with at most so
+        many bytes of ``checkpoints`` in all."""
+        neighbours, real = first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
+        own = sum(simulation_parts(self.particles, 0, neighbours, real).values())
+        states = real * self.numbers_in_frame(3) * 2 * isqrt(steps)
+        fitting = within(np.inf, self.device) // own
+        kept = checkpoints // states if checkpoints else fitting
+        return int(max(min(WORTH["cpu" if self.device.is_cpu else "cuda"] // self.particles, fitting, kept), 1))
 
     def renderer(self, **settings: Any) -> Renderer:
         """What takes pictures of the simulation, ``renderer.render(trajectory[k])``, and differentiates them: as the

@@ -1,6 +1,7 @@
 """``cortado optimise``: solve the inverse problem of a task, resume the search, and judge the result."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cortado.errors import ComputationError, DivergedError
+from cortado.commands.executor import HERE, Where
+from cortado.errors import ComputationError, DivergedError, InputError
+from cortado.executors import Executor
 from cortado.gradients import GradientEstimator, tuned
 from cortado.inverse.figures import task_figures
 from cortado.inverse.setup import Setup, setup
@@ -22,6 +25,8 @@ from cortado.losses.image_losses import psnr
 from cortado.optimisation.optimise import Record, Result, optimise
 
 Rows = list[tuple[str, object]]
+MOST_NUMBERS = 1000
+"""Of a parameter whose estimate is in result.json; larger ones are in the checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -49,29 +54,39 @@ def optimise_task(
     resume: bool,
     overwrite: bool,
     command: list[str],
+    where: Where = HERE,
 ) -> str:
-    """Optimise, write the run folder, and return a sentence that says where the results are."""
-    made = setup(load_task(task_file, overrides), device, precision)
+    """Optimise, write the run folder, and return a sentence that says where the results are. The samples of an ensemble
+    are computed ``where`` is asked for."""
+    task = load_task(task_file, overrides)
+    if where.option and task.optimise.gradient.samples == 1:
+        raise InputError(f"{where.option} is given, but must be left out, as optimise.gradient.samples is 1.")
+    made = setup(task, device, precision)
     if resume:
         RunFolder.open(out)
-    with locked(out):
+    with where.executor(device) as executor, locked(out):
         folder = _run_folder(made, out, resume, overwrite, command)
         with keeping(lambda: f"{_kept(folder)}; --resume goes on with them" if _kept(folder) else ""):
-            return _solved(made, folder, resume)
+            return _solved(made, folder, resume, executor)
 
 
 def _run_folder(made: Setup, out: Path, resume: bool, overwrite: bool, command: list[str]) -> RunFolder:
     """A new one, or the one that is there; a search goes on with other iterations and another check if so wished."""
     task, simulation = made.task, made.problem.simulation
-    settings = {
-        "precision": simulation.precision.name,
-        "problem": task.problem.model_dump(),
-        "optimise": task.optimise.model_dump(exclude={"iterations", "check"}),
-    }
+    settings = search_settings(task, simulation.precision.name)
     noted: dict[str, Any] = {"kind": "optimise", "settings": settings, "device": str(simulation.device)}
     if resume:
         return RunFolder.resume(out, task.scene.to_json(), command, **noted)
     return RunFolder.create(out, task.scene.to_json(), command, overwrite=overwrite, **noted)
+
+
+def search_settings(task: Task, precision: str) -> dict[str, Any]:
+    """What must be the same, beside the scene, where a search goes on."""
+    return {
+        "precision": precision,
+        "problem": task.problem.model_dump(),
+        "optimise": task.optimise.model_dump(exclude={"iterations", "check"}),
+    }
 
 
 def _kept(folder: RunFolder) -> str:
@@ -79,16 +94,18 @@ def _kept(folder: RunFolder) -> str:
     return f"the evaluations so far are in {folder.checkpoint}" if folder.read_metrics() else ""
 
 
-def _solved(made: Setup, folder: RunFolder, resume: bool) -> str:
+def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> str:
     """Search, judge, and write what came out; returns the sentence about it."""
     try:
-        result, estimator = _search(made, folder, resume)
+        result, estimator = _search(made, folder, resume, executor)
     except DivergedError as error:
         evaluations = len(folder.read_metrics())
         write_report(folder, made.task.scene.name, [("ended early", error), ("evaluations", evaluations)], [])
         advice = f"{error.advice}, a smaller learning rate, or bounds on the parameters"
         advice = "; ".join(filter(None, [advice, _kept(folder)]))
-        raise error.with_advice(advice) from error
+        told = error.with_advice(advice)
+        folder.write_result(evaluations=evaluations, failures=[str(told)])
+        raise told from error
     estimate = made.search.parameters(result.parameters)
     noise = None
     if made.renderer is not None:
@@ -98,6 +115,7 @@ def _solved(made: Setup, folder: RunFolder, resume: bool) -> str:
     verdict = judge(made.task, result, estimate, noise, first)
     figures = task_figures(made, result, folder.figures)
     write_report(folder, made.task.scene.name, _rows(made, estimate, result, verdict, estimator), figures)
+    folder.write_result(**_for_machines(result, estimate, verdict))
     if verdict.failures:
         raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
     return f"{_summary(made, result, verdict)} The results are in {folder.path}; open report.html."
@@ -139,7 +157,7 @@ def _distance(estimate: ArrayLike, true: ArrayLike) -> float:
     return float(np.linalg.norm(estimate - true) / (np.linalg.norm(true) or 1.0))
 
 
-def _search(made: Setup, folder: RunFolder, resume: bool) -> tuple[Result, GradientEstimator]:
+def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> tuple[Result, GradientEstimator]:
     """What came out, and the estimator of the last search as it was tuned."""
     settings = made.task.optimise
     known = len(folder.read_metrics()) if resume else 0
@@ -155,7 +173,7 @@ def _search(made: Setup, folder: RunFolder, resume: bool) -> tuple[Result, Gradi
             advance(loss=record.loss)
 
         for k, search in enumerate(made.searches):
-            estimator = tuned(settings.gradient.estimator(), search, start)
+            estimator = tuned(settings.gradient.estimator(executor), search, start)
             result = optimise(
                 search,
                 start,
@@ -169,6 +187,22 @@ def _search(made: Setup, folder: RunFolder, resume: bool) -> tuple[Result, Gradi
             )
             start = result.last_parameters
     return replace(result, history=tuple(history), evaluations=len(history)), estimator
+
+
+def _for_machines(result: Result, estimate: Mapping[str, np.ndarray], verdict: Verdict) -> dict[str, Any]:
+    """What came out, by names."""
+    found: dict[str, Any] = {
+        "evaluations": len(result.history),
+        "first_loss": verdict.first,
+        "loss": result.loss,
+        "loss_reduction": verdict.reduction,
+        "parameter_error": verdict.errors,
+        "parameters": {name: value for name, value in estimate.items() if np.size(value) <= MOST_NUMBERS},
+        "converged": result.converged,
+        "message": result.message,
+        "failures": verdict.failures,
+    }
+    return found if verdict.psnr is None else {**found, "psnr": verdict.psnr}
 
 
 def _summary(made: Setup, result: Result, verdict: Verdict) -> str:

@@ -2,6 +2,7 @@
 
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -42,13 +43,19 @@ def run_scene(
     numbers = simulation.numbers_in_frame(components=3)  # as in the file
     frames = frame_parts(2 + steps // record_every, numbers, simulation.precision.bytes)
     require(frames, "take a larger --record-every or fewer steps")
+    noted: dict[str, Any] = {"device": str(simulation.device), "settings": run_settings(steps, precision, record_every)}
     with locked(out):
-        folder = RunFolder.create(out, scene.to_json(), command, device=str(simulation.device), overwrite=overwrite)
+        folder = RunFolder.create(out, scene.to_json(), command, overwrite=overwrite, **noted)
         with keeping(lambda: f"the frames so far are in {folder.trajectory}" if folder.trajectory.exists() else ""):
             _compute(simulation, rollout, folder, record_every)
     converged = rollout.diagnostics["converged"]
     warning = "" if converged.all() else f"Mind that {not_converged_sentence(converged)} "
     return f"{warning}The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
+
+
+def run_settings(steps: int, precision: str, record_every: int) -> dict[str, Any]:
+    """What tells one run of a scene from another."""
+    return {"steps": steps, "precision": precision, "record_every": record_every}
 
 
 def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:
@@ -57,9 +64,22 @@ def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record
         _write_trajectory(simulation, rollout, folder, record_every)
     except DivergedError as error:
         _write_pictures(simulation, rollout.substeps, folder, [("ended early", error)])
-        advice = f"{error.advice}; the frames so far are in {folder.path}"
-        raise error.with_advice(advice) from error
+        told = error.with_advice(f"{error.advice}; the frames so far are in {folder.path}")
+        folder.write_result(**_for_machines(simulation, rollout), failures=[str(told)])
+        raise told from error
     _write_pictures(simulation, rollout.substeps, folder, [])
+    folder.write_result(**_for_machines(simulation, rollout), failures=[])
+
+
+def _for_machines(simulation: Simulation, rollout: Rollout) -> dict[str, Any]:
+    """How a run went, by names: of the steps that it came to, the mean of what the solver notes, and the greatest."""
+    noted = {name: np.asarray(values, dtype=np.float64) for name, values in rollout.diagnostics.items() if len(values)}
+    return {
+        "particles": simulation.particles,
+        "steps": len(rollout.diagnostics["converged"]),
+        "mean": {name: values.mean() for name, values in noted.items()},
+        "greatest": {name: values.max() for name, values in noted.items()},
+    }
 
 
 def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:

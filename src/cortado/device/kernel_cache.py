@@ -4,11 +4,13 @@ Containers and clusters often have a home that is read-only or full.
 """
 
 import atexit
+import re
 import shutil
 import struct
 import sys
 import tempfile
 import traceback
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -19,6 +21,8 @@ from cortado.errors import ComputationError
 from cortado.io.terminal import say
 
 VARIABLE = "WARP_CACHE_PATH"
+_COMPILING = re.compile(r"_p\d+_t\d+$")
+"""How Warp ends the name of a folder in which a thread of a process compiles."""
 ROOM = 16 * 2**20
 """[bytes] that must be free for kernels; those of one run take a few MiB."""
 
@@ -89,8 +93,13 @@ def _trouble(folder: str) -> str | None:
         return problem.strerror or str(problem)
     if free < ROOM:
         return f"only {free / 2**20:.1f} MiB are free there"
-    damaged = next((kernel.name for kernel in Path(folder).glob("wp_*") if not _is_whole(kernel)), None)
+    damaged = next((kernel.name for kernel in _kernels(folder) if not _is_whole(kernel)), None)
     return None if damaged is None else f"{damaged} in it is damaged and should be deleted"
+
+
+def _kernels(folder: str) -> Iterator[Path]:
+    """Folders of kernels, without those that a process is compiling at the moment, which Warp renames in the end."""
+    return (kernel for kernel in Path(folder).glob("wp_*") if not _COMPILING.search(kernel.name))
 
 
 def _is_whole(kernel: Path) -> bool:
@@ -117,6 +126,6 @@ def _replacement(folder: str) -> str:
     temporary = tempfile.mkdtemp(prefix="cortado-kernels-")
     atexit.register(shutil.rmtree, temporary, ignore_errors=True)
     with suppress(OSError):
-        for kernel in filter(_is_whole, Path(folder).glob("wp_*")):
+        for kernel in filter(_is_whole, _kernels(folder)):
             (Path(temporary) / kernel.name).symlink_to(kernel)
     return temporary

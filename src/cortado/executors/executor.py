@@ -19,6 +19,10 @@ class Executor(ABC):
     Where an executor computes changes no bit of a result on the same kind of processor.
     """
 
+    def threads(self) -> int:
+        """How many items are computed at a time."""
+        return 1
+
     @abstractmethod
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None

@@ -9,7 +9,7 @@ from cortado.arrays import as_numbers
 from cortado.errors import InputError, shown
 from cortado.executors.executor import Executor, InProcess, checked_executor
 from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator
-from cortado.gradients.points import Evaluation, Point, Sample
+from cortado.gradients.points import Point, Sample, evaluated
 from cortado.parameters.values import Arrays, Values
 from cortado.rollout import Observer
 from cortado.scene.fields import as_number
@@ -63,7 +63,7 @@ class Ensemble:
         """Estimates at points, in their order. Where ``observe`` is given they are computed in this process, which has
         the states that it is called with."""
         executor = self.executor if observe is None else InProcess()
-        return executor.map(Evaluation(problem, observe), points)
+        return evaluated(problem, points, executor, observe)
 
     def _spread(self, name: str) -> float:
         if isinstance(self.spread, Mapping) and name not in self.spread:

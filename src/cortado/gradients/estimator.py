@@ -1,6 +1,7 @@
 """The protocols of gradient estimators, which are given to `Problem.value_and_gradient`, and what these return."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -8,7 +9,7 @@ import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number
 from cortado.device.state import Parameters, State
-from cortado.errors import InputError
+from cortado.errors import DivergedError, InputError
 from cortado.parameters.values import Arrays, Values
 from cortado.rollout import BackwardStep, Observer, Rollout
 from cortado.solvers.solver import Counts
@@ -27,6 +28,11 @@ class Estimate:
     """The strength of `AdjointViscosity`; where two were extrapolated, the smaller one."""
     standard_error: Arrays | None = None
     """Of every component of the gradient, where it is an average (`RandomizedSmoothing`, `EnsembleMean`)."""
+
+    def member(self, number: int, shapes: Mapping[str, tuple[int, ...]]) -> "Estimate":
+        """That of one scene of a batch, with gradients of these shapes."""
+        gradient = {name: bar[number].reshape(shapes[name]) for name, bar in self.gradient.items()}
+        return replace(self, loss=float(self.loss[number]), gradient=gradient)
 
     def __repr__(self) -> str:
         strength = "" if self.strength is None else f", strength {self.strength:.4g}"
@@ -64,6 +70,20 @@ class Differentiable(Protocol):
 
     def forward_pass(self, parameters: Values) -> ForwardPass:
         """A forward run that reverse passes may follow."""
+
+
+@runtime_checkable
+class Batchable(Protocol):
+    """A problem that can be evaluated at many points in one launch."""
+
+    def room(self, estimator: "AdjointEstimator | None" = None) -> int:
+        """How many points `together` takes at a time, for a gradient by an estimator or for losses alone."""
+
+    def together(
+        self, points: Sequence[Values], estimator: "AdjointEstimator | None" = None
+    ) -> list[Estimate | DivergedError]:
+        """Estimates at points that have the same parameters in the same shapes, in one launch for all, each with the
+        bits that it has alone; without an estimator of the loss alone. Where a particle is lost there is the error."""
 
 
 class GradientEstimator(Protocol):
@@ -114,6 +134,11 @@ def tuned(estimator: GradientEstimator, problem: Differentiable, parameters: Val
 
 class AdjointEstimator(ABC):
     """An estimator that makes one reverse pass through one rollout, step by step."""
+
+    @property
+    def batches(self) -> bool:
+        """Whether it treats each scene of a batch by itself; one of your own has to say so."""
+        return False
 
     @abstractmethod
     def derivative(self, rollout: Rollout) -> BackwardStep:

@@ -20,6 +20,8 @@ class Exact(AdjointEstimator):
     has about twice the neighbour sums of a forward one.
     """
 
+    batches = True
+
     def derivative(self, rollout: Rollout) -> BackwardStep:
         return _AdjointStep(rollout, frozen_geometry=False)
 
@@ -41,6 +43,8 @@ class FrozenGeometry(AdjointEstimator):
     Prior art: the default of DiffFR (Li et al. 2023).
     """
 
+    batches = True
+
     def derivative(self, rollout: Rollout) -> BackwardStep:
         return _AdjointStep(rollout, frozen_geometry=True)
 
@@ -51,6 +55,8 @@ class Tape(AdjointEstimator):
 
     It is slower than `Exact`, with atomics on a GPU, and is kept to check it.
     """
+
+    batches = True
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
         return _TapeStep(rollout)

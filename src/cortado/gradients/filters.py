@@ -70,6 +70,10 @@ class AdjointViscosity(AdjointEstimator):
             wanted = f'a number from 0 to {most} with an order of {self.order}, or "auto"'
             raise InputError(f"strength is {shown(self.strength)}, but must be {wanted}.")
 
+    @property
+    def batches(self) -> bool:
+        return self.strength != "auto" and self.base.batches
+
     def derivative(self, rollout: Rollout) -> "ViscousStep":
         if self.strength == "auto":
             raise InputError('strength is "auto", but must be a number where it is the base of another estimator.')
@@ -152,6 +156,10 @@ class Damped(AdjointEstimator):
     def __post_init__(self) -> None:
         if not (isinstance(self.rate, (int, float, np.number)) and np.isfinite(self.rate) and self.rate >= 0.0):
             raise InputError(f"rate is {shown(self.rate)}, but must be a number of at least 0, in 1/s.")
+
+    @property
+    def batches(self) -> bool:
+        return self.base.batches
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
         return _DampedStep(self.base.derivative(rollout), rollout, self.rate)

@@ -1,9 +1,15 @@
 """Points of the space of parameters at which a problem is evaluated, each on its own, wherever an executor computes."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import groupby, islice
+from typing import Any
 
-from cortado.errors import InputError
-from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator
+import numpy as np
+
+from cortado.errors import DivergedError, InputError
+from cortado.executors.executor import Executor, OnResult
+from cortado.gradients.estimator import AdjointEstimator, Batchable, Differentiable, Estimate, GradientEstimator
 from cortado.parameters.values import Values
 from cortado.rollout import Observer
 
@@ -36,12 +42,66 @@ class Sample(Point):
             raise InputError(f"A sample of the ensemble does not fit: {error} {advice}") from error
 
 
+Group = tuple[Point, ...]
+"""Points that are evaluated together."""
+
+
 @dataclass(frozen=True)
 class Evaluation:
-    """A problem as a function of points, which a worker process keeps."""
+    """A problem as a function of groups of points, which a worker process keeps. What is wrong with a point, or with
+    the run there, is said as it would be of the point alone."""
 
     problem: Differentiable
     observe: Observer | None = None
 
-    def __call__(self, point: Point) -> Estimate:
-        return point.evaluated(self.problem, self.observe)
+    def __call__(self, group: Group) -> list[Estimate]:
+        if len(group) == 1 or self.observe is not None or not isinstance(self.problem, Batchable):
+            return [point.evaluated(self.problem, self.observe) for point in group]
+        estimator = group[0].estimator
+        assert isinstance(estimator, AdjointEstimator | None)
+        try:
+            found = self.problem.together([point.values for point in group], estimator)
+        except InputError:
+            return [point.evaluated(self.problem) for point in group]
+        return [
+            point.evaluated(self.problem) if isinstance(one, DivergedError) else one
+            for one, point in zip(found, group, strict=True)
+        ]
+
+    def groups(self, points: Iterable[Point], share: int) -> Iterator[Group]:
+        """The points in their order, as many at a time as one launch of the problem takes, shared out among so many
+        threads of workers."""
+        for (estimator, _), alike in groupby(points, _kind):
+            room = 1
+            if isinstance(self.problem, Batchable) and isinstance(estimator, AdjointEstimator | None):
+                room = max(self.problem.room(estimator) // share, 1)
+            while group := tuple(islice(alike, room)):
+                yield group
+
+
+def evaluated(
+    problem: Differentiable,
+    points: Iterable[Point],
+    executor: Executor,
+    observe: Observer | None = None,
+    on_result: OnResult | None = None,
+) -> list[Estimate]:
+    """Estimates at points, in their order, computed where an executor says, as many at a time as one launch takes."""
+    evaluation, firsts = Evaluation(problem, observe), [0]
+
+    def groups() -> Iterator[Group]:
+        for group in evaluation.groups(points, executor.threads()):
+            firsts.append(firsts[-1] + len(group))
+            yield group
+
+    def tell(number: int, group: list[Estimate]) -> None:
+        if on_result is not None:
+            for k, one in enumerate(group):
+                on_result(firsts[number] + k, one)
+
+    return [one for group in executor.map(evaluation, groups(), tell) for one in group]
+
+
+def _kind(point: Point) -> tuple[Any, ...]:
+    """Points of one kind can be evaluated in one launch."""
+    return point.estimator, {name: np.shape(value) for name, value in point.values.items()}

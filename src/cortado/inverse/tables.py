@@ -18,6 +18,7 @@ from pydantic import (
 )
 
 from cortado.errors import Words
+from cortado.executors import Executor, InProcess
 from cortado.gradients import AdjointEstimator, AdjointViscosity, EnsembleMean, Exact, FrozenGeometry, GradientEstimator
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, Optimiser
@@ -185,15 +186,16 @@ class GradientTable(Table):
     def _order(self) -> int:
         return 2 if self.samples > 1 else 1
 
-    def estimator(self) -> GradientEstimator:
-        """As an object."""
+    def estimator(self, executor: Executor | None = None) -> GradientEstimator:
+        """As an object; ``executor`` computes the samples of an ensemble."""
         one = ESTIMATORS[self.name]
         if isinstance(one, AdjointViscosity):
             one = AdjointViscosity("auto" if self.strength is None else self.strength, order=self._order)
         if self.spread is None:
             return one
         spread = {name: float(number) for name, number in self.spread.items()}
-        return EnsembleMean(spread, self.samples, self.position_noise, estimator=one)
+        executor = InProcess() if executor is None else executor
+        return EnsembleMean(spread, self.samples, self.position_noise, estimator=one, executor=executor)
 
 
 class OptimiseTable(Table):

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, Protocol, TextIO
 
 LINE_INTERVAL = 10.0
@@ -16,6 +17,19 @@ class Advance(Protocol):
     """Reports `n` more steps done, with the latest values of anything worth seeing (loss=0.1)."""
 
     def __call__(self, n: int = 1, **fields: Any) -> None: ...
+
+
+_hidden: ContextVar[bool] = ContextVar("hidden", default=False)
+
+
+@contextmanager
+def untracked() -> Iterator[None]:
+    """Nothing that is computed within it, in this thread, shows its progress: it is a part of something larger."""
+    token = _hidden.set(True)
+    try:
+        yield
+    finally:
+        _hidden.reset(token)
 
 
 @contextmanager
@@ -30,7 +44,9 @@ def track(
                 advance(loss=loss)
     """
     stream = sys.stderr if stream is None else stream
-    if stream.isatty():
+    if _hidden.get():
+        yield _nothing
+    elif stream.isatty():
         with _bar(total, description, stream) as advance:
             yield advance
     else:
@@ -58,6 +74,10 @@ def _bar(total: int, description: str, stream: TextIO) -> Iterator[Advance]:
             progress.advance(task, n)
 
         yield advance
+
+
+def _nothing(n: int = 1, **fields: Any) -> None:
+    pass
 
 
 class _Lines:

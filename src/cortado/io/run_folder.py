@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -21,7 +22,7 @@ _RESUMABLE = "optimise"
 """The command that has --resume."""
 _LARGEST = 2**31
 """Bytes of a file that is read again when a run goes on."""
-_FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html")
+_FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "result.json")
 _FOLDERS = ("checkpoint", "figures")
 _PICTURES = ("particles", "rendered", "density_errors", "loss", "images", "progress", *NAMES)
 FIGURES = (*(f"{name}.png" for name in _PICTURES), "run.mp4", "estimate.mp4")
@@ -103,23 +104,30 @@ class RunFolder:
             ComputationError: the disk is full.
         """
         folder = cls.open(path)
+        folder.require(scene_json, kind, settings)
         noted = _read_json(folder.environment)
-        former = noted.get("kind", kind)
-        if former != kind:
-            raise InputError(
-                f"{folder.path} holds what `cortado {former}` wrote, with which `cortado {kind}` cannot go on; choose "
-                f"another --out, or replace it with --overwrite."
-            )
-        if folder.scene.exists():
-            require_same(_read_json(folder.scene), json.loads(scene_json), folder.path)
-        if "settings" in noted:
-            require_same(noted["settings"], as_json(settings or {}), folder.path)
         noted.setdefault("resumed", []).append(session(command, device))
         with sentences(folder.path):
+            folder.result.unlink(missing_ok=True)
             folder._remove_unfinished()
             folder._complete(noted, scene_json)
             _cut_torn_line(folder.metrics)
         return folder
+
+    def require(self, scene_json: str, kind: str, settings: Mapping[str, Any] | None = None) -> None:
+        """Raises `InputError` unless the run in the folder is of this kind, scene and settings; the sentence says what
+        differs."""
+        noted = _read_json(self.environment)
+        former = noted.get("kind", kind)
+        if former != kind:
+            raise InputError(
+                f"{self.path} holds what `cortado {former}` wrote, with which `cortado {kind}` cannot go on; choose "
+                f"another --out, or replace it with --overwrite."
+            )
+        if self.scene.exists():
+            require_same(_read_json(self.scene), json.loads(scene_json), self.path)
+        if "settings" in noted:
+            require_same(noted["settings"], as_json(settings or {}), self.path)
 
     @property
     def scene(self) -> Path:
@@ -155,6 +163,19 @@ class RunFolder:
     def report(self) -> Path:
         """The page that shows it all."""
         return self.path / "report.html"
+
+    @property
+    def result(self) -> Path:
+        """What came out, for machines; it is there when the run has ended."""
+        return self.path / "result.json"
+
+    def write_result(self, **values: Any) -> None:
+        """Writes result.json, the last file of a run; takes NumPy values too. A number that is not finite is null."""
+        write_atomically(self.result, json.dumps(_finite(as_json(values)), indent=2) + "\n")
+
+    def read_result(self) -> dict[str, Any] | None:
+        """What result.json holds; None of a run that has not ended. Raises `InputError` for a damaged file."""
+        return _read_json(self.result) if self.result.exists() else None
 
     def append_metrics(self, **values: Any) -> None:
         """Adds one line to metrics.jsonl, kept even if the process is killed next; takes NumPy values too."""
@@ -220,6 +241,15 @@ class RunFolder:
     def _checkpoints(self) -> list[Path]:
         """The folders with the logs of one search after the other, that of the first one last, as it holds the rest."""
         return [*self.checkpoint.glob("[0-9]*/"), self.checkpoint]
+
+
+def _finite(value: Any) -> Any:
+    """A value without numbers that JSON does not have."""
+    if isinstance(value, dict):
+        return {name: _finite(entry) for name, entry in value.items()}
+    if isinstance(value, list):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _bytes_of(path: Path) -> bytes:

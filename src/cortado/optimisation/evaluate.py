@@ -9,7 +9,7 @@ from cortado.errors import DivergedError
 from cortado.executors.executor import Executor, InProcess, OnResult, checked_executor
 from cortado.gradients import Estimate, GradientEstimator
 from cortado.gradients.estimator import Differentiable, checked_estimator
-from cortado.gradients.points import Evaluation, Point
+from cortado.gradients.points import Point, evaluated
 from cortado.parameters.values import Values
 from cortado.rollout import Observer
 
@@ -41,7 +41,7 @@ def evaluate(
     made = (Point(values, estimator) for values in points)
     if loss_if_diverged is not None:
         made = (_Daring(point.values, point.estimator, loss_if_diverged) for point in made)
-    return chosen.map(Evaluation(problem), made, on_result)
+    return evaluated(problem, made, chosen, on_result=on_result)
 
 
 @dataclass(frozen=True)

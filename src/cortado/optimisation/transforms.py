@@ -4,7 +4,7 @@ Whatever u is, p(u) is a parameter that can be: fractions that add up to 1, a nu
 over time that changes slowly.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -12,9 +12,9 @@ import numpy as np
 from scipy.special import softmax
 
 from cortado.arrays import as_numbers
-from cortado.errors import InputError
-from cortado.gradients import Estimate, ForwardPass, GradientEstimator, estimate
-from cortado.parameters.values import Arrays
+from cortado.errors import DivergedError, InputError
+from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator, estimate
+from cortado.parameters.values import Arrays, Values
 from cortado.problem import Problem
 from cortado.rollout import BackwardStep, Observer
 
@@ -134,6 +134,20 @@ class Transformed:
         """A forward run that estimators can go back through."""
         return TransformedPass(self.problem.forward_pass(self.parameters(u)), self.coordinates, u)
 
+    def room(self, estimator: AdjointEstimator | None = None) -> int:
+        """See `Batchable.room`."""
+        return self.problem.room(estimator)
+
+    def together(
+        self, points: Sequence[Values], estimator: AdjointEstimator | None = None
+    ) -> list[Estimate | DivergedError]:
+        """See `Batchable.together`."""
+        found = self.problem.together([self.parameters(u) for u in points], estimator)
+        for u, one in zip(points, found, strict=True):
+            if isinstance(one, Estimate):
+                one.gradient.update(coordinates_adjoint(self.coordinates, u, one.gradient))
+        return found
+
 
 class TransformedPass:
     """A forward run of a problem, and the reverse pass to coordinates."""
@@ -145,7 +159,10 @@ class TransformedPass:
     def back(self, derivative: BackwardStep, observe: Observer | None = None) -> Arrays:
         """The gradient with respect to the coordinates."""
         gradient = self._pass.back(derivative, observe)
-        for name, coordinates in self._coordinates.items():
-            if name in gradient:
-                gradient[name] = coordinates.adjoint(np.asarray(self._u[name]), gradient[name])
-        return gradient
+        return gradient | coordinates_adjoint(self._coordinates, self._u, gradient)
+
+
+def coordinates_adjoint(coordinates: Mapping[str, Bijector], u: Mapping[str, Any], gradient: Arrays) -> Arrays:
+    """The derivatives with respect to coordinates, given those with respect to the parameters."""
+    names = coordinates.keys() & gradient.keys()
+    return {name: coordinates[name].adjoint(np.asarray(u[name]), gradient[name]) for name in names}

@@ -1,0 +1,165 @@
+"""``cortado sweep``: a scene or a task with every combination of some values, on any number of processes."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cortado.commands.executor import HERE, Where
+from cortado.commands.optimise import optimise_task, search_settings
+from cortado.commands.run import run_scene, run_settings
+from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
+from cortado.inverse.task import load_task
+from cortado.io.folder_lock import LOCK, locked
+from cortado.io.interruption import keeping
+from cortado.io.progress import track, untracked
+from cortado.io.run_folder import RunFolder
+from cortado.scene.scene import load_scene
+from cortado.scene.toml import read_toml
+from cortado.simulation import check_steps
+from cortado.sweep.combinations import Combination, combinations
+from cortado.sweep.table import NAME, failed, write_table
+from cortado.words import counted
+
+STEPS = 200
+"""Of a scene, where nothing else is asked for."""
+
+
+@dataclass(frozen=True)
+class Member:
+    """How each combination of a sweep is computed: what a worker process is sent."""
+
+    file: Path
+    """The scene or the task."""
+    steps: int | None
+    """Of a scene; None for a task, which says itself."""
+    out: Path
+    """The folder of the sweep."""
+    device: str
+    precision: str
+
+    def __call__(self, combination: Combination) -> dict[str, Any]:
+        """What came out, as in result.json; of a folder that is finished, what is there. Warnings name the folder."""
+        if not (self.out / LOCK).exists():
+            raise InputError(
+                f"A worker does not see {self.out}, but the task and the folder of a sweep must be in a file system "
+                "that all machines share."
+            )
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            found = self.finished(combination) or self._computed(combination)
+        for warning in caught:
+            if issubclass(warning.category, CortadoWarning):
+                warnings.warn(f"{combination.name}: {warning.message}", CortadoWarning, stacklevel=2)
+        return found
+
+    def finished(self, combination: Combination) -> dict[str, Any] | None:
+        """What came out of a combination; None where it has not ended. Raises `InputError` where its scene or task is
+        wrong, or another one than that in its folder."""
+        overrides = combination.overrides
+        if self.steps is None:
+            task = load_task(self.file, overrides)
+            scene, kind, settings = task.scene, "optimise", search_settings(task, self.precision)
+        else:
+            scene, kind = load_scene(self.file, overrides), "run"
+            settings = run_settings(self.steps, self.precision, self._record_every)
+        folder = self._folder(combination)
+        if folder is None:
+            return None
+        folder.require(scene.to_json(), kind, settings)
+        return folder.read_result()
+
+    def _folder(self, combination: Combination) -> RunFolder | None:
+        """The folder of a combination; None where there is no run in it."""
+        path = self.out / combination.name
+        return RunFolder.open(path) if (path / "environment.json").exists() else None
+
+    @property
+    def _record_every(self) -> int:
+        """About a hundred frames."""
+        return max((self.steps or 0) // 100, 1)
+
+    def _computed(self, combination: Combination) -> dict[str, Any]:
+        """Compute a combination, or go on with it; what fails is said in the result."""
+        out, overrides = self.out / combination.name, combination.overrides
+        begun = self._folder(combination) is not None
+        words = [str(self.file), *(word for one in overrides for word in ("--set", one)), "--out", str(out)]
+        words += ["--device", self.device, "--precision", self.precision]
+        try:
+            with untracked():
+                if self.steps is None:
+                    command = ["cortado", "optimise", *words]
+                    optimise_task(self.file, out, overrides, self.device, self.precision, begun, False, command)
+                else:
+                    every = self._record_every
+                    command = ["cortado", "run", *words, "--steps", str(self.steps), "--record-every", str(every)]
+                    run_scene(self.file, self.steps, out, overrides, self.device, self.precision, every, begun, command)
+        except CortadoError as error:
+            folder = self._folder(combination)
+            return (folder and folder.read_result()) or {"failures": [str(error)]}
+        folder = self._folder(combination)
+        assert folder is not None
+        return folder.read_result() or {"failures": ["It left no result."]}
+
+
+def run_sweep(
+    file: Path,
+    options: list[str],
+    steps: int | None,
+    out: Path,
+    device: str,
+    precision: str,
+    where: Where,
+) -> str:
+    """Compute what is not there yet; returns a sentence that says where the table is. Raises `ComputationError` where
+    some combinations failed."""
+    chosen, member = combinations(options), _member(file, steps, out, device, precision)
+    done = _there(member, chosen)
+    left = [number for number in range(len(chosen)) if number not in done]
+    there = len(done)
+
+    def kept() -> str:
+        return f"{len(done)} of {len(chosen)} are finished, in {out.absolute()}; the same command goes on with the rest"
+
+    def note(number: int, result: dict[str, Any]) -> None:
+        done[left[number]] = result
+        write_table(out, chosen, done)
+        advance(failed=sum(map(failed, done.values())))
+
+    with (
+        (where if left else HERE).executor(device) as executor,
+        locked(out),
+        keeping(kept),
+        track(len(left), "sweep") as advance,
+    ):
+        write_table(out, chosen, done)
+        executor.map(member, [chosen[number] for number in left], note)
+    failures = sum(map(failed, done.values()))
+    all_of_them = f"Of {counted(len(chosen), 'combination')}{f', {there} of them there already,' if there else ''}"
+    table = f"the table is {out.absolute() / NAME}, beside a folder for each."
+    if failures:
+        raise ComputationError(f"{all_of_them} {failures} failed; {table}")
+    return f"{all_of_them} none failed; {table}"
+
+
+def _there(member: Member, chosen: list[Combination]) -> dict[int, dict[str, Any]]:
+    """What came out of the combinations that have ended, by their numbers. All of them are looked at, so that a mistake
+    is found before anything is computed; what there is to warn of is said when they are."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CortadoWarning)
+        found = {number: member.finished(one) for number, one in enumerate(chosen)}
+    return {number: result for number, result in found.items() if result is not None}
+
+
+def _member(file: Path, steps: int | None, out: Path, device: str, precision: str) -> Member:
+    """Of a task where the file has the table [optimise], else of a scene."""
+    is_task = "optimise" in read_toml(file)
+    if is_task and steps is not None:
+        raise InputError("--steps is given, but must be left out, as the task says problem.steps.")
+    return Member(
+        file.absolute(),
+        None if is_task else check_steps(STEPS if steps is None else steps),
+        out.absolute(),
+        device,
+        precision,
+    )

@@ -1,0 +1,273 @@
+"""Sweeps: combinations, their folders and their table; interrupted, gone on with, and on workers of which one is
+killed."""
+
+import csv
+import json
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+import cortado.commands.sweep
+from bad_scenes import assert_one_sentence
+from bad_tasks import GOOD_TASK, TINY_SCENE
+from compiling_notice import without_compiling
+from cortado import InputError
+from cortado.cli import main
+from cortado.executors import Distributed
+from cortado.executors import distributed as of_dask
+from cortado.sweep.combinations import combinations
+from cortado.sweep.table import write_table
+from dask_processes import PATIENCE, scheduler
+
+RATES = ("--set", "optimise.learning_rate=0.5,0.25")
+FOUR = (*RATES, "--set", "problem.steps=4,5")
+TASK = GOOD_TASK[: GOOD_TASK.index("[optimise.check]")]
+"""Content with any result."""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """A working directory with a scene and a task."""
+    (tmp_path / "scene.toml").write_text(TINY_SCENE)
+    (tmp_path / "task.toml").write_text(TASK)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """A sweep of four searches, computed in this process."""
+    folder = tmp_path_factory.mktemp("alone")
+    (folder / "task.toml").write_text(TASK)
+    main(["sweep", str(folder / "task.toml"), *FOUR, "--out", str(folder / "all")])
+    return folder / "all"
+
+
+@pytest.fixture
+def sweep(capfd):
+    """Runs `cortado sweep` in this process: (exit code, stdout, stderr)."""
+
+    def run(*arguments):
+        capfd.readouterr()
+        try:
+            main(["sweep", *map(str, arguments)])
+            code = 0
+        except SystemExit as end:
+            code = end.code
+        out, err = capfd.readouterr()
+        return code, out, without_compiling(err)
+
+    return run
+
+
+def rows(out):
+    with open(Path(out) / "sweep.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# ---- combinations ------------------------------------------------------------------------------------------------
+
+
+def test_the_first_key_changes_slowest():
+    found = combinations(["a=1,2", "b.c=[0, -9.81],[1,2]", "name='x,y'"])
+    assert [one.overrides for one in found] == [
+        ["a=1", "b.c=[0, -9.81]", "name='x,y'"],
+        ["a=1", "b.c=[1,2]", "name='x,y'"],
+        ["a=2", "b.c=[0, -9.81]", "name='x,y'"],
+        ["a=2", "b.c=[1,2]", "name='x,y'"],
+    ]
+
+
+def test_values_may_hold_commas_within_brackets_and_quotes():
+    (one, other) = combinations(["fluid.0.upper=[[1, 2], {a = 3, b = ','}],[4]"])
+    assert one.values == (("fluid.0.upper", "[[1, 2], {a = 3, b = ','}]"),) and other.values[0][1] == "[4]"
+
+
+def test_folders_have_names_of_their_own_that_say_what_is_in_them():
+    plain, strange, other, long = (
+        combinations([option])[0].name for option in ("solver.time_step=1e-3", "a=[1, 2]", "a=[1; 2]", f"a={'x' * 300}")
+    )
+    assert plain == "solver.time_step=1e-3"
+    assert strange.startswith("a=_1,_2_-") and other.startswith("a=_1_2_-") and strange != other
+    assert len(long) < 140 and len({strange, other, long}) == 3
+    assert combinations(["a=../../b"])[0].name.count("/") == 0
+    assert combinations(["a=2,[1, 2]"])[1].name == strange, "whatever else is swept"
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ([], "--set is missing"),
+        (["a"], "--set is 'a', but must have the form key=value,value"),
+        (["a="], "--set is 'a='"),
+        (["=1"], "--set is '=1'"),
+        (["a=1,,2"], "--set is 'a=1,,2'"),
+        (["a=1,2", "a=3"], "--set gives a twice"),
+        (["a=1,2,1"], "must give each value of a once"),
+        ([f"{key}={','.join(map(str, range(100)))}" for key in "abc"], "makes 1,000,000 combinations"),
+    ],
+)
+def test_options_that_make_no_combinations_are_a_sentence(options, words):
+    with pytest.raises(InputError) as caught:
+        combinations(options)
+    assert_one_sentence(str(caught.value))
+    assert words in str(caught.value)
+
+
+def test_the_table_keeps_the_order_whatever_has_ended(tmp_path):
+    chosen = combinations(["a=1,2,3"])
+    results = {
+        2: {"loss": 0.5, "error": {"g": 0.25}, "x": [1.0, 2.0], "many": [0.0] * 50, "failures": []},
+        0: {"steps": 3, "failures": ["It fell, and broke.", "Twice."]},
+    }
+    write_table(tmp_path, chosen, results)
+    first, second = rows(tmp_path)
+    assert (first["folder"], first["a"], first["status"], first["steps"]) == ("a=1", "1", "failed", "3")
+    assert first["failures"] == "It fell, and broke. Twice." and first["loss"] == ""
+    assert (second["status"], second["loss"], second["error.g"], second["x"]) == ("done", "0.5", "0.25", "[1.0, 2.0]")
+    assert "many" not in second and list(second)[-1] == "failures"
+
+
+# ---- in this process ---------------------------------------------------------------------------------------------
+
+
+def test_a_task_is_optimised_with_every_combination(alone, folder):
+    found = rows(alone)
+    assert [(row["optimise.learning_rate"], row["problem.steps"]) for row in found] == [
+        ("0.5", "4"),
+        ("0.5", "5"),
+        ("0.25", "4"),
+        ("0.25", "5"),
+    ]
+    assert {row["status"] for row in found} == {"done"} and all(float(row["loss"]) < 1e-7 for row in found)
+
+    main(["optimise", "task.toml", "--set", "optimise.learning_rate=0.5", "--set", "problem.steps=4", "--out", "one"])
+    member = alone / found[0]["folder"]
+    for name in ("metrics.jsonl", "result.json", "checkpoint/replay.log"):
+        assert (member / name).read_bytes() == (folder / "one" / name).read_bytes(), name
+    noted = json.loads((member / "environment.json").read_text())
+    assert noted["command"][:2] == ["cortado", "optimise"] and "problem.steps=4" in noted["command"]
+
+
+def test_what_is_finished_is_not_repeated(alone, sweep):
+    before = {path: path.stat().st_mtime_ns for path in alone.glob("*/*")}
+    code, out, err = sweep(alone.parent / "task.toml", *FOUR, "--out", alone)
+    assert (code, err) == (0, "")
+    sentence = "Of 4 combinations, 4 of them there already, none failed; the table is"
+    assert out == f"{sentence} {alone / 'sweep.csv'}, beside a folder for each.\n"
+    assert before == {path: path.stat().st_mtime_ns for path in alone.glob("*/*")} and len(before) > 20
+
+
+def test_a_scene_is_run_and_what_diverges_is_in_the_table(sweep, folder):
+    code, out, err = sweep("scene.toml", "--set", "solver.time_step=0.001,0.2", "--steps", 6, "--out", "runs")
+    assert (code, out) == (1, "")
+    warning, sentence = err.splitlines()
+    assert warning.startswith("Warning: solver.time_step=0.2: solver.time_step is 0.2 s, but the limit")
+    assert sentence.startswith("Of 2 combinations 1 failed; the table is ")
+    good, bad = rows("runs")
+    assert (good["status"], good["steps"], good["particles"], good["mean.iterations"]) == ("done", "6", "64", "3.0")
+    assert bad["status"] == "failed" and bad["failures"].startswith("The simulation diverged in step 1: ")
+    assert (folder / "runs" / "solver.time_step=0.2" / "report.html").exists()
+
+    code, out, err = sweep("scene.toml", "--set", "solver.time_step=0.2,0.001,0.002", "--steps", 6, "--out", "runs")
+    assert (code, out) == (1, "")
+    assert err.startswith("Of 3 combinations, 2 of them there already, 1 failed; ")
+    assert [row["status"] for row in rows("runs")] == ["failed", "done", "done"]
+
+
+def test_an_interrupted_sweep_goes_on(sweep, folder, monkeypatch):
+    optimise_task, begun = cortado.commands.sweep.optimise_task, []
+
+    def stopped(*arguments):
+        begun.append(arguments)
+        if len(begun) == 2:
+            raise KeyboardInterrupt
+        return optimise_task(*arguments)
+
+    monkeypatch.setattr(cortado.commands.sweep, "optimise_task", stopped)
+    code, out, err = sweep("task.toml", *RATES, "--out", "all")
+    wanted = f"Interrupted; 1 of 2 are finished, in {folder / 'all'}; the same command goes on with the rest.\n"
+    assert (code, out, err) == (130, "", wanted)
+    assert [row["folder"] for row in rows("all")] == ["optimise.learning_rate=0.5"]
+    code, out, err = sweep("task.toml", *RATES, "--out", "all")
+    assert (code, err) == (0, "") and out.startswith("Of 2 combinations, 1 of them there already, none failed; ")
+    assert len(begun) == 3 and len(rows("all")) == 2
+
+
+def test_another_task_is_not_gone_on_with(sweep, folder):
+    assert sweep("task.toml", "--set", "optimise.learning_rate=0.5", "--out", "all")[0] == 0
+    (folder / "task.toml").write_text(GOOD_TASK.replace("[0.0, -7.0]", "[0.0, -8.0]"))
+    code, out, err = sweep("task.toml", *RATES, "--out", "all")
+    assert (code, out) == (2, "") and "was begun with optimise.start.gravity = [0.0, -7.0]" in err
+    assert not (folder / "all" / "optimise.learning_rate=0.25").exists()
+
+
+def test_a_worker_that_does_not_see_the_folder_says_so(folder):
+    member = cortado.commands.sweep.Member(folder / "task.toml", None, folder / "elsewhere", "cpu", "float32")
+    with pytest.raises(InputError, match=r"^A worker does not see \S+elsewhere, but the task and the folder"):
+        member(combinations(["problem.steps=4"])[0])
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["task.toml"], "--set is missing"),
+        (["task.toml", *RATES, "--steps", "5"], "--steps is given, but must be left out"),
+        (["task.toml", "--set", "optimise.learning_rate=0.5,-1"], "optimise.learning_rate is -1"),
+        (["scene.toml", "--set", "solver.time_step=0.001", "--steps", "0"], "steps is 0"),
+        (["scene.toml", "--set", "solver.time_stop=0.001,0.002"], "solver.time_stop"),
+        (["task.toml", *RATES, "--workers", "0"], "number is 0"),
+        (["task.toml", *RATES, "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "--scheduler and --workers"),
+        (["task.toml", *RATES, "--scheduler", "tcp://127.0.0.1:1"], "There is no scheduler at 'tcp://127.0.0.1:1'"),
+        (["task.toml", *RATES, "--scheduler", "nowhere"], "There is no scheduler at 'nowhere'"),
+        (["nothing.toml", *RATES], "nothing.toml"),
+    ],
+)
+def test_wrong_arguments_are_refused(sweep, folder, monkeypatch, arguments, words):
+    monkeypatch.setattr(of_dask, "REACHED", 0.2)
+    code, out, err = sweep(*arguments, "--out", "all")
+    assert (code, out) == (2, "") and words in err
+    assert_one_sentence(err.removesuffix("\n"))
+    assert not (folder / "all").exists()
+
+
+# ---- on workers --------------------------------------------------------------------------------------------------
+
+
+def test_a_worker_that_is_killed_half_way_changes_nothing(alone, sweep, folder):
+    with scheduler(folder, workers=2) as processes:
+        with Distributed(processes.address) as executor:
+            end = time.monotonic() + PATIENCE
+            while time.monotonic() < end and executor.threads() < 2:
+                time.sleep(0.02)
+
+        def kill():
+            end = time.monotonic() + PATIENCE
+            while time.monotonic() < end and not (Path("many/sweep.csv").exists() and rows("many")):
+                time.sleep(0.02)
+            processes.workers[0].kill()
+
+        killer = threading.Thread(target=kill)
+        killer.start()
+        code, _, err = sweep("task.toml", *FOUR, "--out", "many", "--scheduler", processes.address)
+        killer.join()
+    assert code == 0 and "was lost; what it was computing is computed again by another one" in err
+    assert (folder / "many" / "sweep.csv").read_bytes() == (alone / "sweep.csv").read_bytes()
+    logs = [sorted(out.glob("*/checkpoint/replay.log")) for out in (alone, folder / "many")]
+    assert len(logs[0]) == 4 and [path.read_bytes() for path in logs[0]] == [path.read_bytes() for path in logs[1]]
+
+
+def test_a_search_with_an_ensemble_has_the_same_bits_on_workers(folder, capfd):
+    options = ("--set", "optimise.iterations=2", "--set", "optimise.gradient.samples=4")
+    options += ("--set", "optimise.gradient.spread.gravity=0.1")
+    main(["optimise", "task.toml", *options, "--out", "alone"])
+    main(["optimise", "task.toml", *options, "--out", "many", "--workers", "2"])
+    logs = [(folder / out / "checkpoint" / "replay.log").read_bytes() for out in ("alone", "many")]
+    assert logs[0] == logs[1] and len(logs[0]) > 100
+    with pytest.raises(SystemExit) as end:
+        main(["optimise", "task.toml", "--out", "more", "--workers", "2"])
+    assert end.value.code == 2 and not Path("more").exists()
+    wanted = "--workers is given, but must be left out, as optimise.gradient.samples is 1.\n"
+    assert without_compiling(capfd.readouterr().err) == wanted
