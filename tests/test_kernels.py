@@ -56,11 +56,11 @@ class Kernels:
     density_ratio = density_ratio_kernels(DISCRETISATION)
     pressure = pressure_kernels(DISCRETISATION)
     force = pressure_force_kernels(DISCRETISATION)
-    integration = integration_kernels(FLOAT64)
-    gravity = gravity_kernels(FLOAT64)
+    integration = integration_kernels(FLOAT64, False)
+    gravity = gravity_kernels(FLOAT64, False)
     pairwise = viscosity_kernels(DISCRETISATION, pairwise)
     laminar = viscosity_kernels(DISCRETISATION, laminar)
-    mixture = mixture_kernels(FLOAT64, 3)
+    mixture = mixture_kernels(FLOAT64, 3, False)
     diffusion = MappingProxyType(
         {
             variant: diffusion_kernels(Diffusion(DISCRETISATION, *kinds))

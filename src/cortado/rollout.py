@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
+from cortado.device.compiling import compile_ahead, compile_ahead_adjoint
 from cortado.device.launching import CapturedGraph, add
 from cortado.device.memory import require, step_parts, within
 from cortado.device.state import Parameters, State
@@ -112,6 +113,8 @@ class Rollout:
         state, step = self.initial, 0
         self.solver.set_substeps(self.substeps)
         self._forget_stale_graphs()
+        if self.steps > 0:
+            compile_ahead(self.solver, self._device)
         self.solver.reset()
         try:
             while step < self.steps:
@@ -189,6 +192,8 @@ class Rollout:
             raise InputError(f"bars has the state {beyond[0]}, but must have states from 0 to {self.steps}.")
         self._require("backward", self._kept)
         self.solver.set_substeps(self.substeps)
+        if self.steps > 0:
+            compile_ahead_adjoint(derivative, self._device)
         derivative.begin()
         self._forget_stale_graphs()
         self._bar.clear()

@@ -6,6 +6,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.kernels import kind_of
 from cortado.device.lanes import set_lanes
 from cortado.device.precision import Precision
 from cortado.device.smoothing import smoothing_functions
@@ -24,14 +25,21 @@ class Discretisation:
     precision: Precision
     lanes: int = 1
     """Threads for each particle, in kernels that are made for them: see `cortado.device.lanes`."""
+    taped: bool = False
+    """Whether a tape can differentiate the forward kernels: they get Warp's own adjoint, which takes one lane."""
 
-    def module(self, differentiable: bool, topic: str = "pcisph") -> Any:
-        """The Warp module of these kernels; only the forward kernels get Warp's own adjoint, where there is one lane
-        (for `gradients.Tape`)."""
-        kind = "forward" if differentiable else "derivative"
+    def module(self, forward: bool, topic: str = "pcisph") -> Any:
+        """The Warp module of forward kernels, or of those of the adjoint; `tangent_module` has the others."""
+        return self._module(kind_of(forward, self.taped), topic, forward and self.taped)
+
+    def tangent_module(self, topic: str = "pcisph") -> Any:
+        """The Warp module of the kernels of forward mode, which no gradient needs."""
+        return self._module("tangent", topic, False)
+
+    def _module(self, kind: str, topic: str, enable_backward: bool) -> Any:
         beside = "" if self.lanes == 1 else f"_{self.lanes}_lanes"
         module = wp.get_module(f"cortado_{topic}_{kind}_{self.smoothing.name}_{self.precision.name}{beside}")
-        module.options["enable_backward"] = differentiable and self.lanes == 1
+        module.options["enable_backward"] = enable_backward
         set_lanes(module, self.lanes)
         return module
 

@@ -58,7 +58,7 @@ def particle_system(
             _phases(scene, discretisation, free_energy),
             _nozzle(scene, discrete),
             _walled(scene, discrete),
-            of_one_lane=lambda: system(replace(discretisation, lanes=1)),
+            of_one_lane=lambda: system(replace(discretisation, lanes=1, taped=True)),
         )
 
     return system(shared)

@@ -109,7 +109,7 @@ def density_kernels(discretisation: Discretisation) -> Kernels:
             return
         n[i] = s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
     def density_tangent(
         s: neighbourhood,
         x: wp.array(dtype=vector),

@@ -147,7 +147,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
             return
         acceleration[i] = acceleration_in[i] + (kappa / (m[i] * n[i])) * total
 
-    @wp.kernel(module=discretisation.module(False, name), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module(name), enable_backward=False)
     def viscosity_tangent(
         s: neighbourhood,
         kappa: real,

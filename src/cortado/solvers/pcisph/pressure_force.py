@@ -96,7 +96,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         v_star[i] = velocity
         x_star[i] = x[i] + dt * velocity
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
     def pressure_force_tangent(
         s: neighbourhood,
         k: int,

@@ -64,7 +64,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
             return
         y[i] = real(1.0) / (real(1.0) + wp.dot(total, total))
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
     def wall_relaxation_tangent(
         s: neighbourhood,
         x: wp.array(dtype=vector),
