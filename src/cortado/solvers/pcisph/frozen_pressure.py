@@ -18,6 +18,7 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
+    neighbour, wall_position, wall_weight = pair.neighbour, pair.wall_position, pair.wall_weight
     separation, gradient, vectors, numbers = pair.separation, pair.gradient, pair.vectors, pair.numbers
     LANES = discretisation.lanes
     lanes = lane_functions(discretisation.precision, LANES)
@@ -67,9 +68,9 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
                 divergence += wp.dot(g_ij, push_bar_i - push_bar_j[u])
                 work += (c_i + c_j[u]) * wp.dot(g_ij, push_bar_i)
         for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = s.neighbours[k, i]
-            g_ib = gradient(separation(x_i, s.wall_positions[b], s), s)
-            wall_divergence = s.wall_weights[b] * wp.dot(g_ib, push_bar_i)
+            b = neighbour(k, i, s)
+            g_ib = gradient(separation(x_i, wall_position(b, s), s), s)
+            wall_divergence = wall_weight(b, s) * wp.dot(g_ib, push_bar_i)
             divergence += wall_divergence
             work += c_i * wall_divergence
         divergence = add_up(divergence)
