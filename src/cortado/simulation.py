@@ -75,7 +75,7 @@ class Simulation:
         self.scene = scene
         self.device = _device(device)
         self.precision = precision_named(precision)
-        begin_headers(sum_and_maximum_kernel(self.precision), self.device)
+        begin_headers(sum_and_maximum_kernel(self.precision, self.device.is_cpu).kernel, self.device)
         discrete = discretise(scene)
         room = first_capacity(scene.discretisation.support, scene.dimension)
         counts = (self.batch or 1) * len(discrete.fluid.positions), len(discrete.walls.positions)

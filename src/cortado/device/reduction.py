@@ -110,6 +110,7 @@ def _of_blocks(name: str, dtype: Any, combine: str) -> ReductionKernel:
         block(count, stride, values, partial)
 
     kernel = _kernel(name, f"{name}_{type_name(dtype)}_blocks", reduce, grid_stride=False)
+    kernel.module.options["block_dim"] = threads
     return ReductionKernel(kernel, threads, threads * EACH)
 
 
