@@ -19,7 +19,8 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
     neighbour, wall_position, wall_weight = pair.neighbour, pair.wall_position, pair.wall_weight
-    separation, gradient, vectors, numbers = pair.separation, pair.gradient, pair.vectors, pair.numbers
+    separation, slope, gradient = pair.separation, pair.slope, pair.gradient
+    vectors, numbers = pair.vectors, pair.numbers
     LANES = discretisation.lanes
     lanes = lane_functions(discretisation.precision, LANES)
     lane, add_up = lanes.lane, lanes.add_up
@@ -64,9 +65,10 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
             c_j = numbers(c, k, i, s)
             push_bar_j = vectors(push_bar, k, i, s)
             for u in range(UNROLL):
-                g_ij = gradient(separation(x_i, x_j[u], s), s)
-                divergence += wp.dot(g_ij, push_bar_i - push_bar_j[u])
-                work += (c_i + c_j[u]) * wp.dot(g_ij, push_bar_i)
+                x_ij = separation(x_i, x_j[u], s)
+                a = slope(x_ij, s)
+                divergence += a * wp.dot(x_ij, push_bar_i - push_bar_j[u])
+                work += ((c_i + c_j[u]) * a) * wp.dot(x_ij, push_bar_i)
         for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
             b = neighbour(k, i, s)
             g_ib = gradient(separation(x_i, wall_position(b, s), s), s)
