@@ -37,7 +37,6 @@ def around(search: NeighbourSearch, period: np.ndarray, precision: Precision) ->
     s.filling, s.count = search.filling, search.count
     s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
     s.support, s.reach = SUPPORT, REACH
-    s.periodic = int(any(period))
     s.period = precision.vector(*padded(period[None])[0])
     s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in padded(period[None])[0]))
     return s
@@ -78,7 +77,7 @@ def lists(
     lower, upper = grid_over or (everything.min(axis=0), everything.max(axis=0))
     lower = np.where(period > 0, 0.0, lower)
     grid = Grid.around(lower, upper, period, REACH, most)
-    discretisation = Discretisation(CUBIC_SPLINE, precision)
+    discretisation = Discretisation(CUBIC_SPLINE, precision, periodic=any(period))
     names = np.arange(len(walls), dtype=np.float64)  # as weights, so that sorted walls tell who they were
     search = NeighbourSearch(discretisation, grid, padded(walls), names, Layout(n, 1, precision, CPU), capacity)
     memory = wp.full((n, capacity + 8), GUARD, dtype=wp.int32, device=CPU)

@@ -233,11 +233,10 @@ def _neighbourhood(system: ParticleSystem) -> Any:
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count
     s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
-    s.support, s.reach = lattice.support, (1.0 + SKIN) * lattice.support
+    s.support, s.per_support, s.reach = lattice.support, 1.0 / lattice.support, (1.0 + SKIN) * lattice.support
     s.normalisation = lattice.normalisation
     s.self_weight, s.volume, s.response_scale = lattice.self_weight, lattice.volume, lattice.response**-0.5
     s.laplacian_correction = lattice.laplacian_correction
-    s.periodic = int(any(periods))
     s.period = precision.vector(*periods)
     s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in periods))
     return s
