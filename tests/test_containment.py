@@ -158,9 +158,10 @@ def test_the_device_finds_the_particles_that_numpy_finds(name, precision):
     assert wanted.sum() == 2 if name == "space" else 10 < wanted.sum() < n - 10
     device = wp.get_device("cpu")
     near = Region.between(np.full(d, -2.0), np.full(d, 3.0))
-    containment = Containment(Walled(region, near, spacing), real, KernelLauncher(n, device, record_tape=False), n)
+    layout, launch = Layout(n, 1, real, device), KernelLauncher(n, device, record_tape=False)
+    containment = Containment(Walled(region, near, spacing), layout, launch, n)
     order = random.permutation(n)
-    state = Layout(n, 1, real, device).state((POSITIONS, VELOCITIES))
+    state = layout.state((POSITIONS, VELOCITIES))
     state.set({"positions": after})
     containment.look(
         wp.array(np.tile(order, 2), dtype=wp.int32, device=device),

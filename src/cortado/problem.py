@@ -189,7 +189,7 @@ class Problem:
         return self._rollout.lost
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """See `Differentiable.room`."""
+        """See `Batchable.room`."""
         if self.simulation.batch is not None or (estimator is not None and not estimator.batches):
             return 1
         return self.simulation.room(self.steps, self.memory_budget if estimator else 0.0)
@@ -198,7 +198,7 @@ class Problem:
     def together(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
-        """See `Differentiable.together`."""
+        """See `Batchable.together`."""
         problem = self._batch_of(len(points))
         over_time = {name for name in points[0] if name in OVER_TIME and np.ndim(points[0][name]) == 1}
         rows = [{name: [value] if name in over_time else value for name, value in point.items()} for point in points]

@@ -146,9 +146,9 @@ class Simulation:
         controls: Mapping[str, Any] | None = None,
         record_every: int = 1,
         state: RestartState | Sequence[RestartState] | None = None,
-    ) -> Any:
-        """Run from the scene's first state and return a `Trajectory` of the frames, the first and the last state
-        included; of a batch a `TrajectoryBatch`.
+    ) -> Trajectory:
+        """Run from the scene's first state and return the frames, the first and the last state included; of a batch a
+        `TrajectoryBatch`.
 
         ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity; so does any other parameter
         of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same scene, the run goes on
@@ -159,7 +159,7 @@ class Simulation:
         return self.collect(self.rollout(steps, controls, state), record_every)
 
     @in_turn
-    def collect(self, rollout: Rollout, record_every: int = 1) -> Any:
+    def collect(self, rollout: Rollout, record_every: int = 1) -> Trajectory:
         """Run a rollout forward and return its frames; warnings and errors as of `run`."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
@@ -179,7 +179,7 @@ class Simulation:
         if rollout.lost:
             warnings.warn(lost_sentence(rollout.lost, rollout.solver.layout.members), CortadoWarning, stacklevel=5)
         fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
-        return self._trajectory(rollout, np.array(steps), fields)
+        return self._trajectory(rollout, np.array(steps), fields)  # type: ignore[return-value]  # of a batch
 
     def _trajectory(self, rollout: Rollout, steps: np.ndarray, fields: Arrays) -> Trajectory | TrajectoryBatch:
         """Of fields (frames, ...) after so many steps (frames,), in a batch (frames, batch, ...)."""

@@ -71,6 +71,11 @@ class Differentiable(Protocol):
     def forward_pass(self, parameters: Values) -> ForwardPass:
         """A forward run that reverse passes may follow."""
 
+
+@runtime_checkable
+class Batchable(Protocol):
+    """A problem that can be evaluated at many points in one launch."""
+
     def room(self, estimator: "AdjointEstimator | None" = None) -> int:
         """How many points `together` takes at a time, for a gradient by an estimator or for losses alone."""
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from cortado.errors import DivergedError, InputError
 from cortado.executors.executor import Executor, OnResult
-from cortado.gradients.estimator import AdjointEstimator, Differentiable, Estimate, GradientEstimator
+from cortado.gradients.estimator import AdjointEstimator, Batchable, Differentiable, Estimate, GradientEstimator
 from cortado.parameters.values import Values
 from cortado.rollout import Observer
 
@@ -55,7 +55,7 @@ class Evaluation:
     observe: Observer | None = None
 
     def __call__(self, group: Group) -> list[Estimate]:
-        if len(group) == 1 or self.observe is not None:
+        if len(group) == 1 or self.observe is not None or not isinstance(self.problem, Batchable):
             return [point.evaluated(self.problem, self.observe) for point in group]
         estimator = group[0].estimator
         assert isinstance(estimator, AdjointEstimator | None)
@@ -72,8 +72,9 @@ class Evaluation:
         """The points in their order, as many at a time as one launch of the problem takes, shared out among so many
         threads of workers."""
         for (estimator, _), alike in groupby(points, _kind):
-            fits = isinstance(estimator, AdjointEstimator | None) and self.observe is None
-            room = max(self.problem.room(estimator) // share, 1) if fits else 1
+            room = 1
+            if isinstance(self.problem, Batchable) and isinstance(estimator, AdjointEstimator | None):
+                room = max(self.problem.room(estimator) // share, 1)
             while group := tuple(islice(alike, room)):
                 yield group
 

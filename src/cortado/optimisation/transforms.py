@@ -135,13 +135,13 @@ class Transformed:
         return TransformedPass(self.problem.forward_pass(self.parameters(u)), self.coordinates, u)
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """See `Differentiable.room`."""
+        """See `Batchable.room`."""
         return self.problem.room(estimator)
 
     def together(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
-        """See `Differentiable.together`."""
+        """See `Batchable.together`."""
         found = self.problem.together([self.parameters(u) for u in points], estimator)
         for u, one in zip(points, found, strict=True):
             if isinstance(one, Estimate):

@@ -78,7 +78,6 @@ class PcisphSteps(ParticleSolver):
             c=it.c[before],
             error=self.pressure_loop.errors,
         )
-        predicted = {"x_before": it.x_star[before], "v_before": it.v_star[before]}
+        going |= {"x_before": it.x_star[before], "v_before": it.v_star[before]}
         new = {"x_star": it.x_star[slot], "v_star": it.v_star[slot]}
-        now = {"acceleration": self.accelerations[-1], "c": it.c[before]}
-        context.launch(kernels.force.forward, going, **now, **predicted, **new)
+        context.launch(kernels.force.forward, going, acceleration=self.accelerations[-1], c=it.c[before], **new)
