@@ -27,7 +27,7 @@ LAYERS = """
     scene.containers scene.model scene.stability
     device device.cores device.kernels device.memory device.precision device.lanes device.reduction device.silence
     device.kernel_cache device.smoothing device.neighbourhood device.arrays device.fields
-    device.threads device.launching device.state device.cells device.neighbours
+    device.threads device.launching device.state device.cells device.candidates device.neighbours
     scene.checks scene.scene
     parameters.checks
     discretise.sampling discretise.discrete_scene
