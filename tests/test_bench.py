@@ -135,7 +135,7 @@ def test_a_watcher_sees_every_launch_and_only_within_its_block():
 
     with simulation.turn, watched(watch):
         solver.step(rollout.initial, solver.new_state(), rollout.parameters, rollout.log)
-    assert seen.count("pressure") == ITERATIONS and {"radix_sort", "fill", "record"} <= set(seen)
+    assert seen.count("pressure") == ITERATIONS and {"cell_sort", "fill", "record"} <= set(seen)
     number = len(seen)
     simulation.run(1)
     assert len(seen) == number

@@ -5,9 +5,11 @@ import pytest
 import warp as wp
 
 from cortado import Problem, Simulation, gradients, losses
+from cortado.device.cells import CellSort, Grid
 from cortado.device.launching import sum_and_maximum, sum_of
-from cortado.device.precision import FLOAT64
+from cortado.device.precision import FLOAT32, FLOAT64
 from scenes import HONEY, plane, plane_of_three, splash, two_layers
+from test_neighbours import CLOUDS, check_same, lists
 
 pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
 
@@ -147,3 +149,36 @@ def test_short_lists_grow():
     simulation.solver.resize(8)
     np.testing.assert_array_equal(simulation.run(40).positions, wanted)
     assert simulation.solver.search.capacity > 8
+
+
+@pytest.mark.parametrize("short", [400, 12])
+@pytest.mark.parametrize("lanes", [1, 2, 4, 8, 16, 32])
+@pytest.mark.parametrize("name", CLOUDS)
+def test_lists_are_those_of_the_cpu(name, lanes, short):
+    positions, options = CLOUDS[name]
+    walls = np.random.default_rng(1).uniform(0.0, 0.4, (60, positions.shape[1]))
+    options = options | {"walls": walls, "precision": FLOAT64, "capacity": short}
+    check_same(lists(positions, **options, lanes=lanes, device=wp.get_device("cuda:0")), lists(positions, **options))
+
+
+@pytest.mark.parametrize("spread", [1.0, 0.2, 0.0], ids=["cloud", "crowd", "one place"])
+@pytest.mark.parametrize(("members", "particles"), [(1, 30_000), (5, 6_000), (3, 1)])
+def test_the_order_of_cells_is_that_of_the_cpu(members, particles, spread):
+    """Again and again, and in a captured graph: particles arrive in their cells in another order each time."""
+    grid = Grid.around(np.zeros(3), np.ones(3), np.zeros(3), 0.05, 10**5)
+    x = spread * np.random.default_rng(0).uniform(0.0, 1.0, (members * particles, 3))
+    x[:: max(particles // 3, 1)] = np.nan
+    found = []
+    for name in ("cpu", "cuda:0"):
+        device = wp.get_device(name)
+        sort = CellSort(grid, particles, FLOAT32, device, members)
+        positions = wp.array(x.astype(np.float32), dtype=FLOAT32.vector, device=device)
+        sort(positions)
+        with wp.ScopedCapture(device=device) as capture:
+            sort(positions)
+        for _ in range(4):
+            found.append((sort.order.numpy(), sort.grid.starts.numpy()))
+            wp.capture_launch(capture.graph)
+    for order, starts in found:
+        np.testing.assert_array_equal(order, found[0][0])
+        np.testing.assert_array_equal(starts, found[0][1])

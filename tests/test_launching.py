@@ -4,7 +4,7 @@ import pytest
 import warp as wp
 
 from cortado import Simulation
-from cortado.device.launching import KernelLauncher, bound, launch
+from cortado.device.launching import KernelLauncher, bound, launch, launch_together, watched
 from cortado.device.neighbourhood import neighbourhood_type
 from cortado.device.precision import FLOAT64
 from cortado.sph.integration import integration_kernels
@@ -82,3 +82,29 @@ def test_a_sum_over_neighbours_begins_where_its_range_begins():
     )
     with pytest.raises(TypeError, match=r"count_neighbours takes the neighbourhood s, .* i = s\.first \+ wp\.tid\(\)"):
         context.launch(count_neighbours, found=found)
+
+
+def test_launches_together_are_one_to_a_watcher():
+    """It may repeat them, but only all of them."""
+    seen, done = [], []
+
+    def watch(name, threads, arguments, work):
+        seen.append((name, threads))
+        work()
+        work()
+
+    def work():
+        for total in (first, second):
+            launch(count, 3, "cpu", total=total)
+            done.append(total)
+
+    @wp.kernel(enable_backward=False)
+    def count(total: wp.array(dtype=wp.int32)):
+        wp.atomic_add(total, 0, 1)
+
+    first, second = (wp.zeros(1, dtype=wp.int32, device="cpu") for _ in range(2))
+    with watched(watch):
+        launch_together("both", 3, (first, second), work)
+        launch(count, 3, "cpu", total=first)
+    assert seen == [("both", 3), (count.key, 3)]
+    assert done == [first, second] * 2 and first.numpy() == 12 and second.numpy() == 6

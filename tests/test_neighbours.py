@@ -1,6 +1,7 @@
 """Neighbour lists against all pairs: whatever the dimension, the periods, the precision and the place."""
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cortado.device import candidates
 from cortado.device.cells import Grid
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type
 from cortado.device.neighbours import NeighbourSearch
@@ -68,6 +70,9 @@ def lists(
     capacity: int = 400,
     grid_over: tuple[np.ndarray, np.ndarray] | None = None,
     most: int = 4096,
+    kind: type[Discretisation] = Discretisation,
+    lanes: int = 1,
+    device: Any = CPU,
 ) -> Found:
     """Neighbours of positions (n, d) by the engine; the memory behind the lists is guarded."""
     n, dimension = positions.shape
@@ -77,18 +82,19 @@ def lists(
     lower, upper = grid_over or (everything.min(axis=0), everything.max(axis=0))
     lower = np.where(period > 0, 0.0, lower)
     grid = Grid.around(lower, upper, period, REACH, most)
-    discretisation = Discretisation(CUBIC_SPLINE, precision, periodic=any(period))
+    discretisation = kind(CUBIC_SPLINE, precision, lanes, periodic=any(period))
     names = np.arange(len(walls), dtype=np.float64)  # as weights, so that sorted walls tell who they were
-    search = NeighbourSearch(discretisation, grid, padded(walls), names, Layout(n, 1, precision, CPU), capacity)
-    memory = wp.full((n, capacity + 8), GUARD, dtype=wp.int32, device=CPU)
-    search.neighbours = memory[:, :capacity].transpose((1, 0))
+    search = NeighbourSearch(discretisation, grid, padded(walls), names, Layout(n, 1, precision, device), capacity)
+    memory = wp.full((n, capacity + 8) if device.is_cpu else (capacity + 8, n), GUARD, dtype=wp.int32, device=device)
+    search.neighbours = memory[:, :capacity].transpose((1, 0)) if device.is_cpu else memory[:capacity]
     neighbourhood = around(search, period, precision)
     given_positions = padded(positions).astype(precision.numpy)
-    search.sort(wp.array(given_positions, dtype=precision.vector, device=CPU))
+    search.sort(wp.array(given_positions, dtype=precision.vector, device=device))
     order = search.order.numpy()[:n]
-    nothing_lost = wp.full(1, -1, dtype=wp.int32, device=CPU)
-    search.fill(neighbourhood, wp.array(given_positions[order], dtype=precision.vector, device=CPU), nothing_lost)
-    rows, fluid_count, count = memory.numpy(), search.fluid_count.numpy(), search.count.numpy()
+    nothing_lost = wp.full(1, -1, dtype=wp.int32, device=device)
+    search.fill(neighbourhood, wp.array(given_positions[order], dtype=precision.vector, device=device), nothing_lost)
+    rows = memory.numpy() if device.is_cpu else memory.numpy().T
+    fluid_count, count = search.fluid_count.numpy(), search.count.numpy()
     own = fluid_count - search.filling.numpy()
     wall_names = search.wall_weights.numpy().astype(int)
     fluid: list[np.ndarray] = [np.zeros(0)] * n
@@ -138,15 +144,34 @@ def check(positions: np.ndarray, period: Any = 0.0, walls: np.ndarray | None = N
     assert found.needed == longest <= found.search.capacity
     assert (found.rows[:, found.search.capacity :] == GUARD).all()
     check_order(found, positions, precision)
+    check_lists(found, positions, precision)
     return found
+
+
+def check_lists(found: Found, positions: np.ndarray, precision: Precision) -> None:
+    """Neighbours stand in the list as their cells are visited: layer by layer, row by row, along x."""
+    cells, shape = cells_of(positions, found.grid, precision), np.array(found.grid.shape)
+    c = np.stack([cells % shape[0], cells // shape[0] % shape[1], cells // (shape[0] * shape[1])], axis=1)
+    around = [range(-1 if n > 2 else 0, 2 if n > 1 else 1) for n in shape]
+    steps = [np.array(step[::-1]) for step in product(*around[::-1])]
+    place = np.argsort(found.order)
+    for i, listed in enumerate(found.fluid):
+        visited = {tuple((c[i] + step) % shape): k for k, step in enumerate(steps)}
+        keys = [(visited[tuple(c[j])], place[j]) for j in listed]
+        assert keys == sorted(keys), f"the list of particle {i} is in another order"
+
+
+def cells_of(positions: np.ndarray, grid: Grid, precision: Precision) -> np.ndarray:
+    """(n,) the cell of each particle."""
+    real = precision.numpy
+    s = (padded(positions).astype(real) - grid.origin.astype(real)) * (1.0 / grid.cell).astype(real)
+    c = np.floor(s).astype(np.int64) % np.array(grid.shape)
+    return (c[:, 2] * grid.shape[1] + c[:, 1]) * grid.shape[0] + c[:, 0]
 
 
 def check_order(found: Found, positions: np.ndarray, precision: Precision) -> None:
     """Cells in ascending order, and within a cell the order that was given."""
-    real, grid = precision.numpy, found.grid
-    s = (padded(positions).astype(real) - grid.origin.astype(real)) * (1.0 / grid.cell).astype(real)
-    c = np.floor(s).astype(np.int64) % np.array(grid.shape)
-    cells = (c[:, 2] * grid.shape[1] + c[:, 1]) * grid.shape[0] + c[:, 0]
+    cells = cells_of(positions, found.grid, precision)
     np.testing.assert_array_equal(found.order, np.argsort(cells, kind="stable"))
 
 
@@ -251,6 +276,65 @@ def test_the_lists_reach_beyond_the_support(dimension, precision):
 def test_how_far_the_lists_reach(distance, listed, precision):
     found = check(np.array([[0.2, 0.2], [0.2 + distance * SUPPORT, 0.2]]), precision=precision)
     assert (len(found.fluid[0]) == 1) is listed
+
+
+@precisions
+def test_a_crowd_in_one_cell(precision):
+    """More candidates than one thread compares before it appends, and lists as long."""
+    positions = 0.05 + cloud(150, 3, 0.04)
+    found = check(positions, walls=cloud(70, 3, 0.1, seed=1), precision=precision, grid_over=(np.zeros(3), np.ones(3)))
+    assert all(len(listed) == 149 for listed in found.fluid)
+
+
+class FewLanes(Discretisation):
+    """Scans as with a few lanes, of which a CPU has one."""
+
+    def module(self, differentiable, topic="pcisph"):
+        return super().module(differentiable, f"{topic}_{type(self).__name__}")
+
+
+class ManyLanes(FewLanes):
+    """Scans as with many lanes, of which a CPU has one."""
+
+
+CLOUDS = {
+    "space": (cloud(300, 3, 0.6), {}),
+    "plane": (cloud(300, 2, 0.6), {}),
+    "period": (cloud(200, 3, [0.52, 0.43, 0.37]), {"period": [0.52, 0.43, 0.37]}),
+    "period along x": (cloud(200, 2, [0.52, 0.43]), {"period": [0.52, 0.0]}),
+    "short periods": (cloud(120, 3, [0.12, 0.22, 0.33]), {"period": [0.12, 0.22, 0.33]}),
+    "far outside": (cloud(240, 3, 0.4) - [[31.7, 7.3, 0.0]], {"grid_over": (np.zeros(3), np.full(3, 0.4)), "most": 64}),
+    "crowd": (cloud(90, 3, 0.05), {}),
+    "alone": (np.full((1, 3), 0.3), {}),
+    "lost": (np.concatenate([cloud(60, 3, 0.3), np.full((5, 3), np.nan)]), {"grid_over": (np.zeros(3), np.ones(3))}),
+}
+
+
+def check_same(found: Found, wanted: Found) -> None:
+    """The same lists, to the order of what they list."""
+    np.testing.assert_array_equal(found.order, wanted.order)
+    np.testing.assert_array_equal(found.lengths, wanted.lengths)
+    np.testing.assert_array_equal(found.search.fluid_count.numpy(), wanted.search.fluid_count.numpy())
+    np.testing.assert_array_equal(found.search.filling.numpy(), wanted.search.filling.numpy())
+    assert found.needed == wanted.needed
+    assert (found.rows[:, found.search.capacity :] == GUARD).all(), "something was written behind the end of a list"
+    for ours, theirs, length in zip(found.rows, wanted.rows, wanted.lengths, strict=True):
+        np.testing.assert_array_equal(ours[:length], theirs[:length])
+
+
+@precisions
+@pytest.mark.parametrize("short", [400, 12])
+@pytest.mark.parametrize("kind", [FewLanes, ManyLanes])
+@pytest.mark.parametrize("name", CLOUDS)
+def test_lanes_list_the_same_as_one_thread(name, kind, short, precision, monkeypatch):
+    positions, options = CLOUDS[name]
+    options = options | {"walls": cloud(60, positions.shape[1], 0.4, seed=1), "precision": precision, "capacity": short}
+    wanted = lists(positions, **options)
+    monkeypatch.setattr(candidates, "scan_by_bits", candidates.scan_by_lanes)
+    if kind is ManyLanes:
+        monkeypatch.setattr(candidates, "LEAST_AT_ONCE", 1)
+    found = lists(positions, **options, kind=kind)
+    check_same(found, wanted)
 
 
 def test_one_particle_alone():

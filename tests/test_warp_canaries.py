@@ -327,15 +327,6 @@ def guarded_root_if(a: reals, b: reals):
         b[i] = wp.sqrt(a[i])
 
 
-# ---- integers
-
-
-@wp.kernel(enable_backward=False)
-def find_first(keys: integers, count: int, found: integers):
-    v = wp.tid()
-    found[v] = wp.lower_bound(keys, 0, count, v)
-
-
 # ---- the harness
 
 
@@ -553,25 +544,3 @@ def test_guarded_root_needs_an_if():
     assert derivative_at(guarded_root_where, 4.0) == derivative_at(guarded_root_if, 4.0) == 0.25
     assert np.isnan(derivative_at(guarded_root_where, 0.0)), "wp.where(x > 0, sqrt(x), 0) had the derivative NaN at 0"
     assert derivative_at(guarded_root_if, 0.0) == 0.0, "if x > 0: sqrt(x) had the derivative 0 at 0"
-
-
-def test_lower_bound_names_the_last_element_where_every_key_is_smaller():
-    """`cells.find_starts` steps over that element."""
-    keys = np.array([1, 1, 3, 3, 3, 4], dtype=np.int32)
-    padded = wp.array(np.append(keys, [0, 9]).astype(np.int32), dtype=wp.int32, device="cpu")
-    found = wp.zeros(7, dtype=wp.int32, device="cpu")
-    launch(find_first, [padded, len(keys)], [found])
-    expected = np.searchsorted(keys, np.arange(7))
-    expected[5:] = len(keys) - 1
-    np.testing.assert_array_equal(found.numpy(), expected)
-
-
-def test_radix_sort_is_stable():
-    """`CellSort` lets ties keep the given order."""
-    count, random = 1000, np.random.default_rng(4)
-    keys = random.integers(0, 32, count).astype(np.int32)
-    pair_keys = wp.array(np.concatenate([keys, keys]), dtype=wp.int32, device="cpu")
-    order = wp.array(np.tile(np.arange(count, dtype=np.int32), 2), dtype=wp.int32, device="cpu")
-    wp.utils.radix_sort_pairs(pair_keys, order, count, 0, 5)
-    np.testing.assert_array_equal(order.numpy()[:count], np.argsort(keys, kind="stable"))
-    np.testing.assert_array_equal(pair_keys.numpy()[:count], np.sort(keys))

@@ -19,8 +19,7 @@ from cortado.rollout import Rollout
 LOG_ROWS = 100_000
 """Steps that a log has room for while the launch that counts steps is repeated."""
 PASSES = {
-    "cell": "sort by cell",
-    "radix_sort": "sort by cell",
+    "cell_sort": "sort by cell",
     "fill": "neighbour list",
     "sum_and_maximum": "error sums",
     "convergence": "error sums",

@@ -5,14 +5,17 @@ the cells divide the period, elsewhere cells that share a number are told apart 
 """
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from cortado.device.launching import launch, sort_pairs
+from cortado.device.launching import launch, launch_together
 from cortado.device.precision import Precision
+
+FURTHEST = 2.0**24
+"""Cells from the grid, further than particles may go: a scene with one that far away has long lost it."""
 
 
 @dataclass(frozen=True)
@@ -114,72 +117,136 @@ def cell_functions(precision: Precision) -> CellFunctions:
 
 @dataclass(frozen=True)
 class _CellKernels:
-    """The kernels of a sort by cell."""
+    """The kernels of a sort by cell, in the order in which they are launched. Between the first two, sums of the counts
+    say where the cells start."""
 
-    number_cells: Any
-    find_starts: Any
+    count: Any
+    place: Any
+    rank: Any
 
 
 @cache
-def _cell_kernels(precision: Precision) -> _CellKernels:
-    vector = precision.vector
+def cell_kernels(precision: Precision) -> _CellKernels:
+    """The kernels of a counting sort: atomic additions count the particles of each cell, and give each the next free
+    place in its cell. That leaves the particles of a cell in an order that differs from run to run; then each counts
+    those of its cell that come before it in the given order, and takes the place of that number."""
+    vector, real = precision.vector, precision.real
     grid_type = cell_grid_type(precision)
     cell_of = cell_functions(precision).cell_of
     module = wp.get_module(f"cortado_cells_{precision.name}")
     module.options["enable_backward"] = False
 
+    @wp.func
+    def is_astray(x: vector, grid: grid_type) -> bool:
+        """Whether a position is further from the grid than `FURTHEST` cells, or is not a number."""
+        s = wp.cw_mul(x - grid.origin, grid.frequency)
+        furthest = real(wp.static(FURTHEST))
+        return not (wp.abs(s[0]) < furthest and wp.abs(s[1]) < furthest and wp.abs(s[2]) < furthest)
+
     @wp.kernel(module=module, enable_backward=False)
-    def number_cells(
+    def count(
         grid: grid_type,
         particles: int,
         x: wp.array(dtype=vector),
+        # in and out
+        counts: wp.array(dtype=wp.int32),
         # out
-        keys: wp.array(dtype=wp.int32),
-        order: wp.array(dtype=wp.int32),
+        arrivals: wp.array(dtype=wp.vec2i),
     ):
+        """``arrivals``: each particle's cell, and how many had arrived there before it. ``counts`` begins at 0."""
         i = wp.tid()
+        member = i // particles
+        cells = grid.shape[0] * grid.shape[1] * grid.shape[2]
         c = cell_of(x[i], grid)
-        layer = i // particles * grid.shape[2] + c[2]
-        keys[i] = (layer * grid.shape[1] + c[1]) * grid.shape[0] + c[0]
-        order[i] = i
+        cell = (c[2] * grid.shape[1] + c[1]) * grid.shape[0] + c[0]
+        if is_astray(x[i], grid):
+            cell = (i - member * particles) % cells
+        cell = member * cells + cell
+        arrivals[i] = wp.vec2i(cell, wp.atomic_add(counts, cell, 1))
 
     @wp.kernel(module=module, enable_backward=False)
-    def find_starts(keys: wp.array(dtype=wp.int32), count: int, starts: wp.array(dtype=wp.int32)):
-        cell = wp.tid()
-        first = wp.lower_bound(keys, 0, count, cell)
-        # Warp's lower_bound names the last element where every key is smaller; there the cell starts behind it.
-        if keys[first] < cell:
-            first = first + 1
-        starts[cell] = first
+    def place(
+        arrivals: wp.array(dtype=wp.vec2i),
+        starts: wp.array(dtype=wp.int32),
+        # out
+        counts: wp.array(dtype=wp.int32),
+        placed: wp.array(dtype=wp.int32),
+        before: wp.array(dtype=wp.int32),
+    ):
+        """``placed``: who stands at each place; ``before``: how many of the same cell stand before it. ``counts``
+        becomes 0 for the next sort."""
+        i = wp.tid()
+        arrival = arrivals[i]
+        p = starts[arrival[0]] + arrival[1]
+        placed[p] = i
+        before[p] = arrival[1]
+        counts[arrival[0]] = 0
 
-    return _CellKernels(number_cells=number_cells, find_starts=find_starts)
+    @wp.kernel(module=module, enable_backward=False)
+    def rank(
+        placed: wp.array(dtype=wp.int32),
+        before: wp.array(dtype=wp.int32),
+        # out
+        order: wp.array(dtype=wp.int32),
+    ):
+        """Behind the last place ``before`` is -1: there the last cell ends."""
+        p = wp.tid()
+        i = placed[p]
+        first = p - before[p]
+        smaller = int(0)
+        q = int(first)
+        while before[q] == q - first:
+            if placed[q] < i:
+                smaller += 1
+            q += 1
+        order[first + smaller] = i
+
+    return _CellKernels(count=count, place=place, rank=rank)
 
 
 class CellSort:
-    """Sorts a fixed number of particles by scene and by cell, on one device and without a host read."""
+    """Sorts a fixed number of particles by scene and by cell, on one device and without a host read.
+
+    On a GPU the work grows with the square of how many particles are in one cell. The fill of the neighbour lists
+    compares the same pairs and more, so that it takes longer still; and particles that are so far away that they cannot
+    be neighbours, which may be all of an exploded scene, are spread over all cells. On a CPU, which counts particles in
+    the given order, they arrive in their cells in that order, and need no rank.
+    """
 
     def __init__(self, grid: Grid, particles: int, precision: Precision, device: Any, members: int = 1):
         """``particles`` of each of ``members`` scenes."""
         self._particles, self._all, self._device = particles, members * particles, device
-        self._kernels = _cell_kernels(precision)
-        self._bits = max(int(members * grid.cells - 1).bit_length(), 1)
-        self._keys = wp.empty(2 * self._all, dtype=wp.int32, device=device)
-        self.order = wp.empty(2 * self._all, dtype=wp.int32, device=device)
-        """(2 n,): sorted -> given, in the first half."""
+        self._kernels = cell_kernels(precision)
+        cells = members * grid.cells
+        self._counts = wp.zeros(cells + 1, dtype=wp.int32, device=device)
+        self._arrivals = wp.empty(self._all, dtype=wp.vec2i, device=device)
+        self._before = wp.full(self._all + 1, -1, dtype=wp.int32, device=device)
+        self.order = wp.empty(self._all, dtype=wp.int32, device=device)
+        """(n,): sorted -> given."""
+        self._placed = self.order if device.is_cpu else wp.empty_like(self.order)
         self.grid = cell_grid_type(precision)()
         """What kernels see."""
         self.grid.origin = precision.vector(*grid.origin)
         self.grid.frequency = precision.vector(*(1.0 / grid.cell))
         self.grid.shape = wp.vec3i(*grid.shape)
-        self.grid.starts = wp.zeros(members * grid.cells + 1, dtype=wp.int32, device=device)
+        self.grid.starts = wp.zeros(cells + 1, dtype=wp.int32, device=device)
 
     def __call__(self, positions: wp.array) -> None:
         """Find the order of cells of positions (members n,) [m]; ties keep the given order."""
-        count, device = self._all, self._device
-        if count == 0:
+        if self._all == 0:
             return
-        numbered = {"grid": self.grid, "keys": self._keys, "order": self.order}
-        launch(self._kernels.number_cells, count, device, numbered, particles=self._particles, x=positions)
-        sort_pairs(self._keys, self.order, count, self._bits)
-        starts = self.grid.starts
-        launch(self._kernels.find_starts, len(starts), device, keys=self._keys, count=count, starts=starts)
+        seen = (positions, self.order, self.grid.starts)
+        launch_together("cell_sort", self._all, seen, partial(self._sort, positions))
+
+    def _sort(self, positions: wp.array) -> None:
+        kernels, count, device, starts = self._kernels, self._all, self._device, self.grid.starts
+        arrays = {"arrivals": self._arrivals, "counts": self._counts, "placed": self._placed, "before": self._before}
+        try:
+            launch(kernels.count, count, device, arrays, grid=self.grid, particles=self._particles, x=positions)
+            wp.utils.array_scan(self._counts, starts, inclusive=False)
+            launch(kernels.place, count, device, arrays, starts=starts)
+        except BaseException:  # such as an interruption: the next sort begins with counts of 0 all the same
+            self._counts.zero_()
+            raise
+        if not device.is_cpu:
+            launch(kernels.rank, count, device, arrays, order=self.order)

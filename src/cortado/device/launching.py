@@ -94,11 +94,19 @@ def launch(
     _perform(kernel.key, threads, inputs, work)
 
 
-def sort_pairs(keys: wp.array, values: wp.array, count: int, bits: int) -> None:
-    """Sort the first ``count`` keys by so many of their lowest bits, and values with them; ties keep their order. The
-    arrays have room for twice as many."""
-    work = partial(wp.utils.radix_sort_pairs, keys, values, count, 0, bits)
-    _perform("radix_sort", count, (keys, values), work)
+def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Callable[[], None]) -> None:
+    """Do work that launches several kernels, none of which may be repeated without the others: watchers see one
+    launch."""
+
+    def unwatched() -> None:
+        watchers = _watchers.copy()
+        _watchers.clear()
+        try:
+            work()
+        finally:
+            _watchers.extend(watchers)
+
+    _perform(name, threads, arguments, unwatched)
 
 
 class KernelLauncher:

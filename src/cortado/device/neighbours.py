@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.device.candidates import scan_around
 from cortado.device.cells import CellSort, Grid, cell_functions, cell_grid_type
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import MOST_PARTS, KernelLauncher
-from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
+from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type
 from cortado.device.state import Layout
 
 
@@ -27,69 +28,17 @@ def fill_kernel(discretisation: Discretisation) -> Any:
     vector = precision.vector
     grid_type = cell_grid_type(precision)
     neighbourhood = neighbourhood_type(precision)
-    cells = cell_functions(precision)
-    wrap, cell_of, below, above = cells.wrap, cells.cell_of, cells.below, cells.above
-    separation = pair_functions(discretisation).separation
+    cell_of = cell_functions(precision).cell_of
+    scan = scan_around(discretisation)
     LANES = discretisation.lanes
-    lanes = lane_functions(precision, LANES)
-    lane, vote, ones, before = lanes.lane, lanes.vote, lanes.ones, lanes.before
-
-    @wp.func
-    def scan(
-        i: int,
-        own: int,
-        first: int,
-        last: int,
-        found: int,
-        x_i: vector,
-        positions: wp.array(dtype=vector),
-        s: neighbourhood,
-    ) -> int:
-        """Append the particles first ... last - 1 that lie within reach; ``own`` is left out."""
-        capacity = s.neighbours.shape[0]
-        total = found
-        limit = s.reach * s.reach
-        for candidate in range(first, last, LANES):
-            j = candidate + lane()
-            near = False
-            if j < last and j != own:
-                x_ij = separation(x_i, positions[j], s)
-                near = wp.dot(x_ij, x_ij) < limit
-            votes = vote(near)
-            place = total + before(votes)
-            if near and place < capacity:
-                s.neighbours[place, i] = j
-            total = total + ones(votes)
-        return total
-
-    @wp.func
-    def scan_row(
-        i: int,
-        own: int,
-        row: int,
-        c_x: int,
-        found: int,
-        x_i: vector,
-        positions: wp.array(dtype=vector),
-        grid: grid_type,
-        s: neighbourhood,
-    ) -> int:
-        """The cells c_x - 1, c_x, c_x + 1 of one row; away from the ends of the row they are one range."""
-        n = grid.shape[0]
-        total = found
-        if c_x > 0 and c_x + 1 < n:
-            total = scan(i, own, grid.starts[row + c_x - 1], grid.starts[row + c_x + 2], total, x_i, positions, s)
-        else:
-            for o in range(below(n), above(n)):
-                cell = row + wrap(c_x + o, n)
-                total = scan(i, own, grid.starts[cell], grid.starts[cell + 1], total, x_i, positions, s)
-        return total
+    lane = lane_functions(precision, LANES).lane
 
     @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
     def fill(
         s: neighbourhood,
         grid: grid_type,
         wall_grid: grid_type,
+        near_walls: wp.array(dtype=wp.bool),
         bad_step: wp.array(dtype=wp.int32),
         x: wp.array(dtype=vector),
         # out
@@ -99,7 +48,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
         needed: wp.array(dtype=wp.int32),
     ):
         """``needed``, for each range, becomes the longest list, also where that is more than there is room for. Scenes
-        that have lost a particle, in ``bad_step``, get empty lists."""
+        that have lost a particle, in ``bad_step``, get empty lists. ``near_walls`` as `_near_walls`."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if bad_step[member] >= 0:
@@ -110,25 +59,15 @@ def fill_kernel(discretisation: Discretisation) -> Any:
             return
         x_i = x[i]
         c = cell_of(x_i, grid)
-        n_y = grid.shape[1]
-        n_z = grid.shape[2]
         capacity = s.neighbours.shape[0]
-        found = int(0)
-        for o_z in range(below(n_z), above(n_z)):
-            for o_y in range(below(n_y), above(n_y)):
-                layer = member * n_z + wrap(c[2] + o_z, n_z)
-                row = (layer * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]
-                found = scan_row(i, i, row, c[0], found, x_i, x, grid, s)
+        found = scan(i, i, member * grid.shape[2], c, 0, x_i, x, grid, s)
         filled = (found + wp.static(UNROLL - 1)) // wp.static(UNROLL) * wp.static(UNROLL)
         for k in range(found + lane(), wp.min(filled, capacity), LANES):
             s.neighbours[k, i] = i
         to_fill = filled - found
         found = filled
-        if s.wall_positions.shape[0] > 0:
-            for o_z in range(below(n_z), above(n_z)):
-                for o_y in range(below(n_y), above(n_y)):
-                    row = (wrap(c[2] + o_z, n_z) * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]
-                    found = scan_row(i, -1, row, c[0], found, x_i, s.wall_positions, wall_grid, s)
+        if near_walls[(c[2] * grid.shape[1] + c[1]) * grid.shape[0] + c[0]]:
+            found = scan(i, -1, 0, c, found, x_i, s.wall_positions, wall_grid, s)
         if lane() > 0:
             return
         filling[i] = to_fill
@@ -138,6 +77,15 @@ def fill_kernel(discretisation: Discretisation) -> Any:
             wp.atomic_max(needed, s.part, found)
 
     return fill
+
+
+def _near_walls(grid: Grid, starts: np.ndarray) -> np.ndarray:
+    """(cells,) whether there are walls in a cell or around it; ``starts`` (cells + 1,): where each has its first wall
+    particle."""
+    near = np.diff(starts).reshape(grid.shape[::-1]) > 0
+    for axis in range(3):
+        near = near | np.roll(near, 1, axis) | np.roll(near, -1, axis)
+    return near.ravel()
 
 
 class NeighbourSearch:
@@ -171,6 +119,8 @@ class NeighbourSearch:
         self.wall_weights = wp.array(wall_weights, dtype=precision.real, device=device)
         self._wall_sort = CellSort(grid, len(walls), precision, device)
         self._unsorted_walls: tuple[np.ndarray, np.ndarray] | None = (walls, wall_weights)
+        self._near_walls = wp.zeros(grid.cells, dtype=wp.bool, device=device)
+        self._grid = grid
         self.allocate(capacity)
 
     def allocate(self, capacity: int) -> None:
@@ -192,9 +142,10 @@ class NeighbourSearch:
 
     def _sort_walls(self, walls: np.ndarray, wall_weights: np.ndarray) -> None:
         self._wall_sort(self.wall_positions)
-        sorted_to_given = self._wall_sort.order.numpy()[: len(walls)]
+        sorted_to_given = self._wall_sort.order.numpy()
         self.wall_positions.assign(walls[sorted_to_given])
         self.wall_weights.assign(wall_weights[sorted_to_given])
+        self._near_walls.assign(_near_walls(self._grid, self._wall_sort.grid.starts.numpy()))
 
     def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:
         """List the neighbours of sorted positions (members n,) [m], but none where the ``bad_step`` (members,) of a
@@ -204,6 +155,7 @@ class NeighbourSearch:
             s=neighbourhood,
             grid=self._sort.grid,
             wall_grid=self._wall_sort.grid,
+            near_walls=self._near_walls,
             bad_step=bad_step,
             x=positions,
             fluid_count=self.fluid_count,
