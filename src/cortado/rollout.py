@@ -22,9 +22,9 @@ from cortado.restart import Clock
 from cortado.solvers.containment import Lost
 from cortado.solvers.solver import Counts, Solver
 
-CHUNK = 16
+CHUNK = 32
 """Steps between two looks of the host, at most."""
-FILLED = {"cpu": 32_000, "cuda": 1_600_000}
+FILLED = {"cpu": 32_000, "cuda": 16_000_000}
 """Particles in the steps of a chunk, beyond which a look of the host costs hardly anything beside them."""
 MEMORY_BUDGET = 8 * 2**30
 """Bytes of checkpoints; beyond it states are kept less often and recomputed on the way back."""
@@ -85,11 +85,14 @@ class Rollout:
         """What the solver noted of the steps of the last forward run."""
         state_bytes = sum(self.initial[f.name].capacity for f in self.initial.fields if not f.is_constant)
         self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
-        self._states: dict[int, State] = {}
+        self._states: dict[int, Callable[[], State]] = {}
+        """Checkpoints by their number, each as what gives the state."""
         self._buffer, self._bar = self.initial.following(), self.initial.like()
         particles = max(solver.layout.all_particles, 1)
         filled = FILLED["cpu" if self._device.is_cpu else "cuda"] // particles
-        self._chunk = StateSeries(self.initial, max(min(CHUNK, filled, steps), 1))
+        length = max(min(CHUNK, filled, steps), 1)
+        self._series = StateSeries(self.initial, length)
+        self._chunk = [self._series.state(k) for k in range(length)]
         """The states of the last chunk."""
         self._generation = -1
         self._forget_stale_graphs()
@@ -115,7 +118,7 @@ class Rollout:
         """Run all steps and return the last state. ``observe`` is given every state; ``keep`` checkpoints for a way
         back. Raises `DivergedError` after the good states were observed; a batch goes on without the scenes that have
         ``lost`` a particle."""
-        self._states, self._kept, self._run = {0: self.initial}, -1, -1
+        self._states, self._kept, self._run = {0: lambda: self.initial}, -1, -1
         self.lost = {}
         state, step = self.initial, 0
         self.solver.set_substeps(self.substeps)
@@ -125,7 +128,7 @@ class Rollout:
         self.solver.reset()
         try:
             while step < self.steps:
-                last = min(step + len(self._chunk.states), self.steps)
+                last = min(step + len(self._chunk), self.steps)
                 chunk = self._advance(state, step, last)
                 if self.solver.make_room():
                     self._forget_stale_graphs()
@@ -159,23 +162,26 @@ class Rollout:
         if count not in self._chunks:
             self._chunks[count] = CapturedGraph(partial(self._take, count), self.solver.launch)
         self._chunks[count]()
-        return self._chunk.states[:count]
+        return self._chunk[:count]
 
     def _take(self, count: int) -> None:
         """So many steps from the state in the buffer."""
         state = self._buffer
-        for new_state in self._chunk.states[:count]:
+        for new_state in self._chunk[:count]:
             self.solver.step(state, new_state, self.parameters, self.log)
             state = new_state
 
     def _keep(self, step: int, chunk: list[State]) -> None:
         """Keep checkpoints among the states after a step."""
         numbers = [n for n in range(step + 1, step + len(chunk) + 1) if n % self._interval == 0]
-        if len(numbers) == len(self._chunk.states):
-            self._states |= zip(numbers, self._chunk.copy().states, strict=True)
-        for n in numbers if len(numbers) < len(self._chunk.states) else ():
-            self._states[n] = self.initial.following()
-            self._states[n].assign(chunk[n - step - 1])
+        if len(numbers) == len(self._chunk):
+            copy = self._series.copy()
+            self._states |= {n: partial(copy.state, k) for k, n in enumerate(numbers)}
+            return
+        for n in numbers:
+            state = self.initial.following()
+            state.assign(chunk[n - step - 1])
+            self._states[n] = partial(_itself, state)
 
     def _forget_stale_graphs(self) -> None:
         """Begin anew with graphs where arrays of the solver were replaced, by this rollout or by another."""
@@ -277,9 +283,14 @@ class Rollout:
             for m in range(start, n):
                 counts = self.log.seek(m)
                 self.solver.step_number.fill_(m)
-                self.solver.replay(self._states[m], self.parameters, counts)
-                self._states[m + 1] = self.initial.following()
-                self.solver.write_state(counts, self.parameters, self._states[m + 1])
+                self.solver.replay(self._states[m](), self.parameters, counts)
+                new_state = self.initial.following()
+                self.solver.write_state(counts, self.parameters, new_state)
+                self._states[m + 1] = partial(_itself, new_state)
         if (n + 1) % self._interval:
             self._states.pop(n + 1, None)
-        return self._states[n]
+        return self._states[n]()
+
+
+def _itself(state: State) -> State:
+    return state

@@ -13,7 +13,6 @@ import numpy as np
 import warp as wp
 
 from cortado.device.compiling import begin_headers
-from cortado.device.fields import first_values
 from cortado.device.kernel_cache import start_warp
 from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import Precision, precision_named
@@ -26,6 +25,7 @@ from cortado.io.trajectory import Trajectory
 from cortado.io.trajectory_batch import TrajectoryBatch
 from cortado.lattice.calibration import diffusion_limit
 from cortado.parameters.checks import check_sizes
+from cortado.parameters.scene_parameters import SceneParameters
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import Arrays, scene_values
 from cortado.render.renderer import Renderer
@@ -101,7 +101,7 @@ class Simulation:
         self.solver: Solver = self._built(discrete)
         self.state = self.solver.new_state()
         """The first state on the device."""
-        first = first_values(self.state.fields, self.parameters())
+        first = SceneParameters(self, 0).first(self.parameters())
         self.state.set(first if self.batch is None else {name: [a] * self.batch for name, a in first.items()})
         for array in (self.positions, self.velocities, self.mass_fractions):
             array.setflags(write=False)

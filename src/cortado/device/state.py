@@ -1,6 +1,6 @@
 """What a step depends on, as Warp arrays by name: the state before it, and the parameters."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -86,10 +86,11 @@ class State(Arrays):
                 flat = given if self.batch is None else given.reshape(-1, *given.shape[2:])
                 self[field.name].assign(padded(flat) if field.entry is Entry.VECTOR else flat)
 
-    def numpy(self, dimension: int, constants: bool = True) -> dict[str, np.ndarray]:
+    def numpy(self, dimension: int, constants: bool = True, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """Every field as a new array: vectors (n, dimension), numbers (n,), fractions (n, phases), in a batch
-        (batch, n, ...); ``constants``: also what no step changes."""
-        arrays = {f: self[f.name].numpy() for f in self.fields if constants or not f.is_constant}
+        (batch, n, ...); ``constants``: also what no step changes; ``only`` fields of these names."""
+        names = set(self.names if only is None else only)
+        arrays = {f: self[f.name].numpy() for f in self.fields if f.name in names and (constants or not f.is_constant)}
         found = {f.name: (a[:, :dimension] if f.entry is Entry.VECTOR else a).copy() for f, a in arrays.items()}
         if self.batch is None:
             return found
@@ -104,10 +105,9 @@ class StateSeries:
         self._like, self._length = like, length
         changed = {field.name: like[field.name] for field in like.fields if not field.is_constant}
         self._whole = {name: wp.empty(length * len(a), dtype=a.dtype, device=a.device) for name, a in changed.items()}
-        self.states = [self._state(k) for k in range(length)]
-        """Views of the arrays."""
 
-    def _state(self, k: int) -> State:
+    def state(self, k: int) -> State:
+        """One of them, as a view of the arrays."""
         size = {name: len(array) // self._length for name, array in self._whole.items()}
         own = {name: array[k * size[name] : (k + 1) * size[name]] for name, array in self._whole.items()}
         arrays = {field.name: own.get(field.name, self._like[field.name]) for field in self._like.fields}
@@ -128,11 +128,19 @@ class Parameters(Arrays):
     numbers, with one member for each scene of a batch.
     """
 
+    def __init__(self, arrays: Mapping[str, wp.array]):
+        super().__init__(arrays)
+        self._written: dict[str, np.ndarray] = {}
+        """What `set` has written last, and need not write again."""
+
     def set(self, values: Mapping[str, Any]) -> None:
         """Write some by name, the same for all members or with an axis of them: a vector (d,) for every step, or
-        vectors (steps, d); numbers or arrays of them."""
+        vectors (steps, d); numbers or arrays of them. Nothing else may write to arrays that are set again."""
         for name, value in values.items():
-            array, given = self[name], np.asarray(value, dtype=np.float64)
+            array, given = self[name], np.array(value, dtype=np.float64)
+            if name in self._written and np.array_equal(self._written[name], given):
+                continue
+            self._written[name] = given
             if name in OVER_TIME:
                 table = np.zeros((*array.shape, 3))
                 table[..., : given.shape[-1]] = given

@@ -83,6 +83,9 @@ class SceneParameters:
     def first(self, values: Arrays) -> Arrays:
         """The fields of the first state that differ from the scene's under these values. Raises `InputError` for mass
         fractions without a volume: a little below 0, as diffusion may leave them."""
+        fields = first_values(self._simulation.state.fields, values)
+        if values.keys().isdisjoint(COMPOSITION):
+            return fields
         fractions, density = self._composition(values)
         with np.errstate(divide="ignore"):
             found = reference_density(fractions, density)
@@ -92,7 +95,7 @@ class SceneParameters:
                 f"mass_fractions of particle {bad[0]} are {fractions[bad[0]].tolist()}, but must be such that its "
                 "volume, the sum of the fractions over the rest densities of the phases, is greater than 0."
             )
-        return {**first_values(self._simulation.state.fields, values), DENSITY: found}
+        return {**fields, DENSITY: found}
 
     def direction(self, values: Arrays, along: Arrays) -> tuple[Arrays, Arrays]:
         """A direction by name as tangents of the fields of the first state and of what steps depend on."""

@@ -11,7 +11,7 @@ from cortado.device.threads import WARP
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.parameters.checks import check_places, check_sizes, check_state, unstable_sentence
 from cortado.parameters.registry import Role, names
-from cortado.parameters.scene_parameters import RUN, SceneParameters, Simulated
+from cortado.parameters.scene_parameters import DENSITY, RUN, SceneParameters, Simulated
 from cortado.parameters.values import OVER_TIME, Arrays, Values, check_known, checked_value
 from cortado.restart import Clock, RestartState
 from cortado.rollout import Rollout
@@ -103,9 +103,11 @@ class ParameterSpace:
         """Adjoints of the first state and of the parameters, for the names and in the shapes of ``values``; in a batch
         each has a first axis with an entry for each scene, whether or not the value has one."""
         dimension = self._simulation.dimension
-        run = {name: parameters[name].numpy().astype(np.float64) for name in RUN}
+        read = {"gravity" if name == "tilt" else name for name in values}
+        run = {name: parameters[name].numpy().astype(np.float64) for name in RUN if name in read}
         run |= {name: run[name][..., :dimension] for name in OVER_TIME if name in run}
-        first = {name: bar.astype(np.float64) for name, bar in state.numpy(dimension).items()}
+        fields = [f.name for f in state.fields if f.first in values or f.name == DENSITY]
+        first = {name: bar.astype(np.float64) for name, bar in state.numpy(dimension, only=fields).items()}
         if self._batch is None:
             return self._one.gradient(values, first, _entry(run, 0))
         members = self.members(values)

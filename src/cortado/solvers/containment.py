@@ -71,10 +71,13 @@ class Containment:
 
     def reset(self, step: int = 0) -> None:
         """Forget what was lost from a step on; from the first on, an earlier run."""
-        steps = self.bad_step.numpy()
+        steps = self.bad_step.numpy() if step > 0 else np.array([-1])
         kept = (steps >= 0) & (steps < step)
         for array, well in ((self.bad_step, -1), (self.bad_particle, NO_PARTICLE), (self._count, 0)):
-            array.assign(np.where(kept, array.numpy(), well))
+            if kept.any():
+                array.assign(np.where(kept, array.numpy(), well))
+            else:
+                array.fill_(well)
 
     def look(
         self, order: wp.array, x_before: wp.array, rho_0: wp.array, x_free: wp.array, v_free: wp.array, state: State
