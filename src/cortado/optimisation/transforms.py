@@ -145,7 +145,7 @@ class Transformed:
         found = self.problem.together([self.parameters(u) for u in points], estimator)
         for u, one in zip(points, found, strict=True):
             if isinstance(one, Estimate):
-                one.gradient.update(coordinates_adjoint(self.coordinates, u, one.gradient))
+                one.gradient.update(by_coordinates(self.coordinates, u, one.gradient))
         return found
 
 
@@ -159,10 +159,10 @@ class TransformedPass:
     def back(self, derivative: BackwardStep, observe: Observer | None = None) -> Arrays:
         """The gradient with respect to the coordinates."""
         gradient = self._pass.back(derivative, observe)
-        return gradient | coordinates_adjoint(self._coordinates, self._u, gradient)
+        return gradient | by_coordinates(self._coordinates, self._u, gradient)
 
 
-def coordinates_adjoint(coordinates: Mapping[str, Bijector], u: Mapping[str, Any], gradient: Arrays) -> Arrays:
+def by_coordinates(coordinates: Mapping[str, Bijector], u: Mapping[str, Any], gradient: Arrays) -> Arrays:
     """The derivatives with respect to coordinates, given those with respect to the parameters."""
     names = coordinates.keys() & gradient.keys()
     return {name: coordinates[name].adjoint(np.asarray(u[name]), gradient[name]) for name in names}

@@ -68,6 +68,7 @@ def convergence_kernels(precision: Precision) -> ConvergenceKernels:
     @wp.kernel(module=module, enable_backward=False)
     def record(
         particles: int,
+        undecided: int,
         is_last: int,
         sums: wp.array(dtype=pair),
         bad: wp.array(dtype=wp.int32),
@@ -81,11 +82,11 @@ def convergence_kernels(precision: Precision) -> ConvergenceKernels:
         iterations: wp.array2d(dtype=wp.int32),
         errors: wp.array2d(dtype=pair),
     ):
-        """Record the loop's iterations and its (average, greatest) error, and after the last loop count the step. The
-        next loop begins with all scenes."""
+        """Record the loop's iterations, those that were ``undecided`` included, and its (average, greatest) error, and
+        after the last loop count the step. The next loop begins with all scenes."""
         b = wp.tid()
         n = step[b]
-        iterations[n, b] = iteration[b]
+        iterations[n, b] = iteration[b] + undecided
         errors[n, b] = pair(sums[b][0] / real(particles), sums[b][1])
         iteration[b] = 0
         rounds[b] = wp.static(UNKNOWN)

@@ -110,6 +110,9 @@ class Loop:
         self._launch, self._kernels = launch, convergence_kernels(precision)
         self._sum = sum_and_maximum(layout.particles, precision, device, layout.members)
         self._sums = wp.zeros(layout.members, dtype=precision.pair, device=device)
+        is_fixed = limits is not None and limits.minimum_iterations == limits.maximum_iterations
+        self._fixed = limits.minimum_iterations if limits is not None and is_fixed else 0
+        """Iterations of every step, where nothing is to be decided; else 0."""
         self._iteration = wp.zeros(layout.members, dtype=wp.int32, device=device)
         self._active = wp.full(1, layout.members, dtype=wp.int32, device=device)
 
@@ -134,11 +137,13 @@ class Loop:
             return
         for k in range(limits.minimum_iterations):
             iterate(k)
-        self._decide(limits, limits.minimum_iterations)
+        self._sums = self._sum(self.errors)
         if limits.maximum_iterations > limits.minimum_iterations:
+            self._decide(limits, limits.minimum_iterations)
 
             def once_more() -> None:
                 iterate(limits.maximum_iterations)
+                self._sums = self._sum(self.errors)
                 self._decide(limits, 1)
 
             wp.capture_while(self._active, once_more)
@@ -148,6 +153,7 @@ class Loop:
         self._launch(
             self._kernels.record,
             particles=self.layout.particles,
+            undecided=self._fixed,
             is_last=int(is_last),
             sums=self._sums,
             bad=containment.bad_particle,
@@ -162,7 +168,6 @@ class Loop:
         )
 
     def _decide(self, limits: LoopLimits, done: int) -> None:
-        self._sums = self._sum(self.errors)
         self._launch(
             self._kernels.decide,
             done=done,

@@ -45,7 +45,9 @@ class Mixture:
         self._layout = layout
         self._options = {"device": layout.device, "requires_grad": requires_grad}
         self.c: list[wp.array] = [self.fractions()]
-        """Sorted fractions (n,) before each substep, and after the last."""
+        """Sorted fractions (n,) before each substep, and after the last; 1 for a single phase, never sorted."""
+        if phases.count == 1:
+            self.c[0].fill_(1.0)
         self.chi: list[wp.array] = []
         """Chemical potentials (n,) of each substep [-]."""
         self.w: list[wp.array] = []
@@ -70,7 +72,8 @@ class Mixture:
 
     def diffuse(self, step: StepContext, mass_fractions: wp.array) -> None:
         """From ``mass_fractions`` in the scene's order, and write rest densities and viscosities."""
-        step.launch(self.kernels.order.sort, a_scene=mass_fractions, a=self.c[0])
+        if self.phases.count > 1:
+            step.launch(self.kernels.order.sort, a_scene=mass_fractions, a=self.c[0])
         for k in range(self.substeps):
             assert self.diffusion is not None
             now = {"c": self.c[k], "chi": self.chi[k], "w": self.w[k]}
@@ -102,7 +105,8 @@ class MixtureAdjoint:
             step.launch(diffusion.scale_adjoint, substeps=substeps, c_bar=c_bar, y=y)
             step.launch(diffusion.flux.adjoint, *known, strength=strength, c=c, chi=chi, w=w, y=y, c_bar=c_bar, z=z)
             step.launch(diffusion.potential.adjoint, *known, c=c, z=z, c_bar=c_bar)
-        step.launch(kernels.order.unsort, a=c_bar, a_scene=fractions_bar)
+        if mixture.phases.count > 1:
+            step.launch(kernels.order.unsort, a=c_bar, a_scene=fractions_bar)
 
 
 class MixtureTangent:
@@ -118,7 +122,8 @@ class MixtureTangent:
         """From the tangent of the old fractions, in scene order, to those of the materials; `result` writes the new."""
         mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, dot.named
         substeps, now = mixture.substeps, {"chi_dot": self._chi_dot, "w_dot": self._w_dot}
-        step.launch(kernels.order.sort, a_scene=fractions_dot, a=self._c_dot[0])
+        if mixture.phases.count > 1:
+            step.launch(kernels.order.sort, a_scene=fractions_dot, a=self._c_dot[0])
         for k in range(substeps):
             assert diffusion is not None
             c_dot, c_new_dot = self._c_dot[k % 2], self._c_dot[(k + 1) % 2]
