@@ -289,3 +289,13 @@ def test_an_estimator_of_a_users_own_is_not_trusted_with_a_batch():
     single = Problem(Simulation(scenes.plane()), 3, CentreOfMass([0.1, 0.1]))
     assert single.room(ByNorm()) == 1
     single.value_and_gradient(given, gradients.EnsembleMean(estimator=ByNorm()))
+
+
+def test_states_are_shared_with_other_libraries():
+    problem = Problem(Simulation(scenes.two_layers(), batch=2), 2, CentreOfMass(np.full(3, 0.1)))
+    end = problem.end({"time_step": np.array([0.001, 0.0011])})
+    np.testing.assert_array_equal(np.from_dlpack(end.state.numbers("positions")), end.positions.astype(np.float32))
+    assert end.state.numbers("mass_fractions").shape == (2, 125, 2)
+    assert end.state.numbers("reference_density").shape == (2, 125)
+    np.from_dlpack(end.state.numbers("positions"))[1, 3] = [1.0, 2.0, 3.0]
+    np.testing.assert_array_equal(end[1].state.positions.numpy()[3], [1.0, 2.0, 3.0])

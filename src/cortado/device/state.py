@@ -67,6 +67,17 @@ class State(Arrays):
         views = {name: self[name][number * size : (number + 1) * size] for name, size in sizes.items()}
         return type(self)(self.fields, views)
 
+    def numbers(self, name: str) -> wp.array:
+        """A field as a Warp array of numbers, vectors (n, 3), fractions (n, phases), in a batch (batch, n, ...), that
+        shares its memory: what speaks DLPack, such as PyTorch and JAX, takes it without a copy."""
+        field = self[name]
+        shape = (len(field),) if self.batch is None else (self.batch, len(field) // self.batch)
+        entries = getattr(field.dtype, "_shape_", ())
+        dtype = getattr(field.dtype, "_wp_scalar_type_", field.dtype)
+        view = wp.array(ptr=field.ptr, dtype=dtype, shape=(*shape, *entries), device=field.device)
+        view._ref = field  # keeps the memory
+        return view
+
     def set(self, values: Mapping[str, Any]) -> None:
         """Write fields by name: vectors (n, d), numbers (n,), fractions (n, phases), in a batch (batch, n, ...)."""
         for field in self.fields:
