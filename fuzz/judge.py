@@ -10,7 +10,7 @@ CODES = (0, 1, 2)
 """Exit codes that the command line promises."""
 LONGEST_SENTENCE = 1500
 """Characters of what a failed command says."""
-_PROGRESS = re.compile(r"\w+ \d+/\d+, [\d:]+ left.*|Compiling kernels for the first time, .*")
+_PROGRESS = re.compile(r"\w+ \d+/\d+, [\d:]+ left.*|Compiling (\d+ kernel modules|kernels).*")
 _CRASHES = ("Traceback (most recent call last)", "Fatal Python error", "Segmentation fault", "terminate called")
 
 

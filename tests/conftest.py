@@ -58,6 +58,11 @@ SLOW_TESTS = {
         "test_run_writes_its_folder",
         "test_the_check_writes_a_figure",
     },
+    "test_compiling": {
+        "test_a_fork_while_headers_are_precompiled",
+        "test_one_phase_loads_what_it_needs_and_no_more",
+        "test_two_processes_start_cold_at_once",
+    },
     "test_estimators": {
         "test_a_mistake_is_a_sentence",
         "test_an_average_finds_its_strength_once",

@@ -237,3 +237,65 @@ def test_estimators_that_run_batches_are_given_single_scenes():
             problem.value_and_gradient({"gravity": [0.0, -9.0]}, estimator)
     with pytest.raises(InputError, match='strength is "auto", but must be a number for a batch'):
         problem.value_and_gradient({"gravity": [0.0, -9.0]}, gradients.AdjointViscosity())
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        gradients.RandomizedSmoothing(spread={"gravity": 0.5, "viscosity": 0.02}, samples=3),
+        gradients.EnsembleMean(spread={"gravity": 0.5, "viscosity": 0.02}, estimator=gradients.Exact(), samples=6),
+    ],
+    ids=["smoothing", "mean"],
+)
+def test_ensembles_run_in_batches_with_the_same_bits(estimator, monkeypatch):
+    problem = Problem(Simulation(scenes.scene(solver=FREE)), STEPS, CentreOfMass(np.full(3, 0.1)))
+    given, sizes = {"gravity": [0.5, -9.0, 0.0], "viscosity": 0.1}, []
+    monkeypatch.setattr(Simulation, "batch_of", _noted(sizes, Simulation.batch_of))
+    found = problem.estimate(given, estimator)
+    assert sizes, "no batch was made"
+    monkeypatch.setattr(Problem, "room", lambda *_: 1)
+    wanted = problem.estimate(given, estimator)
+    for name in given:
+        np.testing.assert_array_equal(found.gradient[name], wanted.gradient[name])
+        np.testing.assert_array_equal(found.standard_error[name], wanted.standard_error[name])
+
+
+def _noted(sizes: list[int], method: Any) -> Any:
+    def batch_of(simulation: Simulation, size: int) -> Simulation:
+        sizes.append(size)
+        return method(simulation, size)
+
+    return batch_of
+
+
+class Normalised(gradients.Filtered):
+    """An adjoint that is divided by its norm: over all scenes of a batch, if nobody looked."""
+
+    def filter(self, bar: Any) -> None:
+        values = bar.velocities.numpy()
+        bar.velocities.assign(values / np.linalg.norm(values))
+
+
+class ByNorm(gradients.AdjointEstimator):
+    def derivative(self, rollout: Any) -> Any:
+        return Normalised(gradients.Exact().derivative(rollout))
+
+
+def test_an_estimator_of_a_users_own_is_not_trusted_with_a_batch():
+    given = {"gravity": [0.0, -9.0]}
+    batch = Problem(Simulation(scenes.plane(), batch=2), 3, CentreOfMass([0.1, 0.1]))
+    with pytest.raises(InputError, match=r"ByNorm is given a batch, but has no `batches = True`"):
+        batch.value_and_gradient(given, ByNorm())
+    single = Problem(Simulation(scenes.plane()), 3, CentreOfMass([0.1, 0.1]))
+    assert single.room(ByNorm()) == 1
+    single.value_and_gradient(given, gradients.EnsembleMean(estimator=ByNorm()))
+
+
+def test_states_are_shared_with_other_libraries():
+    problem = Problem(Simulation(scenes.two_layers(), batch=2), 2, CentreOfMass(np.full(3, 0.1)))
+    end = problem.end({"time_step": np.array([0.001, 0.0011])})
+    np.testing.assert_array_equal(np.from_dlpack(end.state.numbers("positions")), end.positions.astype(np.float32))
+    assert end.state.numbers("mass_fractions").shape == (2, 125, 2)
+    assert end.state.numbers("reference_density").shape == (2, 125)
+    np.from_dlpack(end.state.numbers("positions"))[1, 3] = [1.0, 2.0, 3.0]
+    np.testing.assert_array_equal(end[1].state.positions.numpy()[3], [1.0, 2.0, 3.0])

@@ -23,7 +23,7 @@ def test_gravity_adds_to_its_adjoint():
     shares = Shares(["time_step"], solver.layout)
     ones = wp.array(np.ones((n, 3)), dtype=wp.vec3d, device=simulation.device)
     solver.step_number.fill_(1)
-    gravity = Gravity(solver.layout)
+    gravity = Gravity(solver.layout, taped=False)
     for _ in range(2):
         gravity.adjoint(solver.context(solver.new_parameters(2)), ones, Adjoints(fields, bar, shares))
     np.testing.assert_array_equal(bar["gravity"].numpy(), [[[0.5] * 3, [0.5 + 2 * n] * 3]])

@@ -6,6 +6,7 @@ import warp as wp
 
 from cortado import Problem, Simulation, gradients, losses
 from cortado.device.cells import CellSort, Grid
+from cortado.device.launching import sum_and_maximum, sum_of
 from cortado.device.precision import FLOAT32, FLOAT64
 from scenes import HONEY, plane, plane_of_three, splash, two_layers
 from test_neighbours import CLOUDS, check_same, lists
@@ -95,6 +96,50 @@ def test_the_tape_follows_kernels_of_one_lane(name):
     taped = problem.value_and_gradient(point, gradients.Tape())[1]
     for name, wanted in exact.items():
         assert np.linalg.norm(taped[name] - wanted) <= 1e-9 * np.linalg.norm(wanted)
+
+
+@pytest.mark.parametrize("members", [1, 3])
+@pytest.mark.parametrize("size", [1, 5, 1000, 1024, 1025, 8192, 8193, 100_003])
+def test_sums_of_every_length(size, members):
+    device, random = wp.get_device("cuda:0"), np.random.default_rng(size)
+    for dtype, shape in ((wp.float64, ()), (wp.vec3d, (3,)), (wp.types.matrix((3, 3), wp.float64), (3, 3))):
+        values = random.standard_normal((members, size, *shape))
+        array = wp.array(values.reshape(-1, *shape), dtype=dtype, device=device)
+        found = sum_of(dtype, size, device, members)(array).numpy()
+        np.testing.assert_allclose(found, values.sum(axis=1), atol=1e-10 * size)
+    pairs = random.uniform(-1.0, 1.0, (members, size, 2))
+    array = wp.array(pairs.reshape(-1, 2), dtype=wp.vec2d, device=device)
+    found = sum_and_maximum(size, FLOAT64, device, members)(array).numpy()
+    np.testing.assert_allclose(found[:, 0], pairs[..., 0].sum(axis=1), atol=1e-10 * size)
+    np.testing.assert_array_equal(found[:, 1], pairs[..., 1].max(axis=1))
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("made", [splash(**TOLERANT), two_layers(), plane()], ids=["tolerance", "two fluids", "plane"])
+def test_a_scene_of_a_batch_has_the_bits_of_its_single_run(made, precision):
+    single, many = (Simulation(made, "cuda:0", precision, batch=batch) for batch in (None, 7))
+    gravity = np.random.default_rng(1).normal(-3.0, 6.0, (7, 1, single.dimension))
+    loss = losses.FinalPositions(single.positions)
+    problem, alone = Problem(many, 40, loss), Problem(single, 40, loss)
+    for _ in range(3):
+        found, gradient = problem.value_and_gradient({"gravity": gravity, "time_step": 0.002})
+    for b in range(7):
+        wanted, bars = alone.value_and_gradient({"gravity": gravity[b, 0], "time_step": 0.002})
+        assert wanted == found[b]
+        for name, bar in bars.items():
+            np.testing.assert_array_equal(gradient[name][b].reshape(bar.shape), bar)
+
+
+def test_ensembles_run_in_batches_with_the_same_bits(monkeypatch):
+    simulation = Simulation(splash(**TOLERANT), "cuda:0")
+    problem = Problem(simulation, 30, losses.FinalPositions(simulation.positions))
+    for estimator in (gradients.RandomizedSmoothing(samples=2), gradients.EnsembleMean(estimator=EXACT)):
+        together = problem.value_and_gradient({"gravity": GRAVITY}, estimator)[1]["gravity"]
+        monkeypatch.setattr(Problem, "room", lambda *_: 1)
+        np.testing.assert_array_equal(
+            problem.value_and_gradient({"gravity": GRAVITY}, estimator)[1]["gravity"], together
+        )
+        monkeypatch.undo()
 
 
 def test_short_lists_grow():

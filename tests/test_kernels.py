@@ -43,7 +43,8 @@ from finite_differences import central_difference, decades, plateau
 N, WALLS = 60, 40
 SUPPORT = 1.0
 CPU = wp.get_device("cpu")
-DISCRETISATION = Discretisation(CUBIC_SPLINE, FLOAT64)
+DISCRETISATION = Discretisation(CUBIC_SPLINE, FLOAT64, periodic=True)
+"""Of clouds with a period of 0 too, which have no other image."""
 
 Values = dict[str, np.ndarray]
 
@@ -56,11 +57,11 @@ class Kernels:
     density_ratio = density_ratio_kernels(DISCRETISATION)
     pressure = pressure_kernels(DISCRETISATION)
     force = pressure_force_kernels(DISCRETISATION)
-    integration = integration_kernels(FLOAT64)
-    gravity = gravity_kernels(FLOAT64)
+    integration = integration_kernels(FLOAT64, False)
+    gravity = gravity_kernels(FLOAT64, False)
     pairwise = viscosity_kernels(DISCRETISATION, pairwise)
     laminar = viscosity_kernels(DISCRETISATION, laminar)
-    mixture = mixture_kernels(FLOAT64, 3)
+    mixture = mixture_kernels(FLOAT64, 3, False)
     diffusion = MappingProxyType(
         {
             variant: diffusion_kernels(Diffusion(DISCRETISATION, *kinds))
@@ -139,11 +140,11 @@ def cloud(name: str) -> Cloud:
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count
     s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
-    s.support, s.reach = SUPPORT, 1.03 * SUPPORT
+    s.support, s.per_support, s.reach = SUPPORT, 1.0 / SUPPORT, 1.03 * SUPPORT
     s.normalisation = CUBIC_SPLINE.normalisation(dimension, SUPPORT)
     s.self_weight = float(CUBIC_SPLINE.weight(np.zeros(1), dimension, SUPPORT)[0])
     s.volume, s.response_scale, s.laplacian_correction = 0.11, 30.0**-0.5, 1.3
-    s.periodic, s.period = int(period.any()), wp.vec3d(*period)
+    s.period = wp.vec3d(*period)
     s.frequency = wp.vec3d(1.0 / side if period.any() else 0.0, 0.0, 0.0)
     search.sort(array(x))
     x = x[search.order.numpy()[:N]]

@@ -10,6 +10,7 @@ from cortado.device.lanes import BY_SIZE, lanes_for, lanes_of
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.neighbours import fill_kernel
 from cortado.device.precision import FLOAT32, FLOAT64
+from cortado.device.reduction import SHARED, sum_and_maximum_kernel, sum_kernel
 from cortado.gradients.filter_kernels import adjoint_filter_kernels
 from cortado.lattice.smoothing import CUBIC_SPLINE, WENDLAND_C4
 from cortado.solvers.pcisph.density_ratio_relaxation import density_ratio_kernels
@@ -73,11 +74,28 @@ def compiles(module, folder):
         pytest.fail(f"{module.name}: {error}")
 
 
-@pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp cannot compile for a GPU")
+NVRTC = pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this Warp cannot compile for a GPU")
+
+
+@NVRTC
+@pytest.mark.parametrize("dtype", [wp.float32, wp.vec2d, FLOAT64.fractions(3), wp.types.matrix((4, 3), wp.float64)])
+def test_sums_by_blocks_compile_for_a_gpu_that_is_not_there(dtype, tmp_path):
+    level = sum_kernel(dtype, is_cpu=False)
+    assert level.threads * wp.types.type_size_in_bytes(dtype) <= SHARED
+    compiles(level.kernel.module, tmp_path)
+
+
+@NVRTC
+@pytest.mark.parametrize("precision", [FLOAT32, FLOAT64])
+def test_error_sums_by_blocks_compile_for_a_gpu_that_is_not_there(precision, tmp_path):
+    compiles(sum_and_maximum_kernel(precision, is_cpu=False).kernel.module, tmp_path)
+
+
+@NVRTC
 @pytest.mark.parametrize(("smoothing", "precision", "lanes"), [(CUBIC_SPLINE, FLOAT32, 8), (WENDLAND_C4, FLOAT64, 16)])
 def test_kernels_for_lanes_compile_for_a_gpu_that_is_not_there(smoothing, precision, lanes, tmp_path):
     kernels = kernels_of(Discretisation(smoothing, precision, lanes))
     assert {lanes_of(kernel) for kernel in kernels} == {lanes}
-    assert lanes_of(integration_kernels(precision).sort) == 1
+    assert lanes_of(integration_kernels(precision, False).sort) == 1
     for module in {kernel.module.name: kernel.module for kernel in kernels}.values():
         compiles(module, tmp_path)

@@ -11,7 +11,7 @@ from cortado.sph.integration import integration_kernels
 from scenes import plane
 
 CPU = wp.get_device("cpu")
-PREDICT = integration_kernels(FLOAT64).predict
+PREDICT = integration_kernels(FLOAT64, False).predict
 NAMES = ("particles", "time_step", "x", "v", "acceleration", "x_star", "v_star")
 
 

@@ -25,9 +25,10 @@ LAYERS = """
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights
     scene.containers scene.model scene.stability
-    device device.cores device.kernels device.memory device.precision device.lanes device.reduction device.silence
-    device.kernel_cache device.smoothing device.neighbourhood device.arrays device.fields
-    device.threads device.launching device.state device.cells device.candidates device.neighbours
+    device device.cores device.kernels device.memory device.precision device.arithmetic device.loads device.lanes
+    device.reduction device.silence device.threads device.compiling device.kernel_cache device.smoothing
+    device.neighbourhood device.arrays device.fields device.launching device.state device.cells
+    device.candidates device.neighbours
     scene.checks scene.scene
     parameters.checks
     discretise.sampling discretise.discrete_scene

@@ -39,7 +39,6 @@ def around(search: NeighbourSearch, period: np.ndarray, precision: Precision) ->
     s.filling, s.count = search.filling, search.count
     s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
     s.support, s.reach = SUPPORT, REACH
-    s.periodic = int(any(period))
     s.period = precision.vector(*padded(period[None])[0])
     s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in padded(period[None])[0]))
     return s
@@ -83,7 +82,7 @@ def lists(
     lower, upper = grid_over or (everything.min(axis=0), everything.max(axis=0))
     lower = np.where(period > 0, 0.0, lower)
     grid = Grid.around(lower, upper, period, REACH, most)
-    discretisation = kind(CUBIC_SPLINE, precision, lanes)
+    discretisation = kind(CUBIC_SPLINE, precision, lanes, periodic=any(period))
     names = np.arange(len(walls), dtype=np.float64)  # as weights, so that sorted walls tell who they were
     search = NeighbourSearch(discretisation, grid, padded(walls), names, Layout(n, 1, precision, device), capacity)
     memory = wp.full((n, capacity + 8) if device.is_cpu else (capacity + 8, n), GUARD, dtype=wp.int32, device=device)
@@ -290,8 +289,8 @@ def test_a_crowd_in_one_cell(precision):
 class FewLanes(Discretisation):
     """Scans as with a few lanes, of which a CPU has one."""
 
-    def module(self, differentiable, topic="pcisph"):
-        return super().module(differentiable, f"{topic}_{type(self).__name__}")
+    def module(self, forward, topic="pcisph"):
+        return super().module(forward, f"{topic}_{type(self).__name__}")
 
 
 class ManyLanes(FewLanes):

@@ -85,7 +85,12 @@ def expected_hessian(name, dimension, x):
 @cache
 def evaluator(kernel, precision):
     functions = smoothing_functions(kernel, precision)
-    weight, gradient, hessian_product = functions.weight, functions.gradient, functions.hessian_product
+    weight, gradient, slope, slope_change = (
+        functions.weight,
+        functions.gradient,
+        functions.slope,
+        functions.slope_change,
+    )
     real, vector = precision.real, precision.vector
     module = wp.get_module(f"test_smoothing_{kernel.name}_{precision.name}")
     module.options.update({"enable_backward": False, "optimization_level": 1})
@@ -94,16 +99,16 @@ def evaluator(kernel, precision):
     def evaluate(
         x: wp.array(dtype=vector),
         u: wp.array(dtype=vector),
-        h: real,
+        per_h: real,
         sigma: real,
         w: wp.array(dtype=real),
         g: wp.array(dtype=vector),
         hu: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        w[i] = weight(x[i], h, sigma)
-        g[i] = gradient(x[i], h, sigma)
-        hu[i] = hessian_product(x[i], u[i], h, sigma)
+        w[i] = weight(x[i], per_h, sigma)
+        g[i] = gradient(x[i], per_h, sigma)
+        hu[i] = slope(x[i], per_h, sigma) * u[i] + slope_change(x[i], u[i], per_h, sigma) * x[i]
 
     return evaluate
 
@@ -114,7 +119,7 @@ def evaluate(name, precision, dimension, x, u):
     inputs = [wp.array(values, dtype=precision.vector, device="cpu") for values in (x, u)]
     outputs = [wp.zeros(n, dtype=dtype, device="cpu") for dtype in (precision.real, precision.vector, precision.vector)]
     normalisation = kernel.normalisation(dimension, SUPPORT)
-    wp.launch(evaluator(kernel, precision), n, inputs + [SUPPORT, normalisation], outputs, device="cpu")
+    wp.launch(evaluator(kernel, precision), n, inputs + [1.0 / SUPPORT, normalisation], outputs, device="cpu")
     return [out.numpy() for out in outputs]
 
 

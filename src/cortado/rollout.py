@@ -2,7 +2,7 @@
 
 Steps are launched in chunks without a host read in between; at the end of a chunk the host looks whether the
 neighbour lists were long enough (if not, they grow and the chunk is repeated) and whether a particle was lost. A chunk
-is one step on a CPU. A step is a captured graph on a GPU, and on a CPU where launches take one thread.
+of steps, or a step back, is a captured graph on a GPU, and on a CPU where launches take one thread.
 """
 
 from collections.abc import Callable, Mapping
@@ -12,9 +12,10 @@ from typing import Protocol
 
 import numpy as np
 
+from cortado.device.compiling import compile_ahead, compile_ahead_adjoint
 from cortado.device.launching import CapturedGraph, add
 from cortado.device.memory import require, step_parts, within
-from cortado.device.state import Parameters, State
+from cortado.device.state import Parameters, State, StateSeries
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.restart import Clock
@@ -22,11 +23,14 @@ from cortado.solvers.containment import Lost
 from cortado.solvers.solver import Counts, Solver
 
 CHUNK = 16
-"""Steps between two looks of the host, on a GPU."""
+"""Steps between two looks of the host, at most."""
+FILLED = {"cpu": 32_000, "cuda": 1_600_000}
+"""Particles in the steps of a chunk, beyond which a look of the host costs hardly anything beside them."""
 MEMORY_BUDGET = 8 * 2**30
 """Bytes of checkpoints; beyond it states are kept less often and recomputed on the way back."""
 
 Observer = Callable[[int, State], None]
+"""Is given the number of a state and the state, which later steps overwrite."""
 
 
 class BackwardStep(Protocol):
@@ -83,6 +87,10 @@ class Rollout:
         self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
         self._states: dict[int, State] = {}
         self._buffer, self._bar = self.initial.following(), self.initial.like()
+        particles = max(solver.layout.all_particles, 1)
+        filled = FILLED["cpu" if self._device.is_cpu else "cuda"] // particles
+        self._chunk = StateSeries(self.initial, max(min(CHUNK, filled, steps), 1))
+        """The states of the last chunk."""
         self._generation = -1
         self._forget_stale_graphs()
         self.evaluation = 0
@@ -112,10 +120,12 @@ class Rollout:
         state, step = self.initial, 0
         self.solver.set_substeps(self.substeps)
         self._forget_stale_graphs()
+        if self.steps > 0:
+            compile_ahead(self.solver, self._device)
         self.solver.reset()
         try:
             while step < self.steps:
-                last = min(step + (1 if self._device.is_cpu else CHUNK), self.steps)
+                last = min(step + len(self._chunk.states), self.steps)
                 chunk = self._advance(state, step, last)
                 if self.solver.make_room():
                     self._forget_stale_graphs()
@@ -128,8 +138,8 @@ class Rollout:
                 for number, new_state in enumerate(chunk[: lost[0].step - step] if stops else chunk, step + 1):
                     if observe is not None:
                         observe(number, new_state)
-                    if keep and number % self._interval == 0:
-                        self._states[number] = new_state
+                if keep and not stops:
+                    self._keep(step, chunk)
                 if stops:
                     step = lost[0].step + 1
                     raise self.lost[0]
@@ -139,25 +149,41 @@ class Rollout:
         self._run = self.evaluation
         if keep:
             self._kept = self.evaluation
-        return state
+        return state.copy()
 
     def _advance(self, state: State, first: int, last: int) -> list[State]:
+        """Take the steps from one to another and return the states after them, which the next chunk overwrites."""
         self.solver.step_number.fill_(first)
-        chunk = []
         self._buffer.assign(state)
-        for _ in range(first, last):
-            self._step()
-            chunk.append(self._buffer.following())
-            chunk[-1].assign(self._buffer)
-        return chunk
+        count = last - first
+        if count not in self._chunks:
+            self._chunks[count] = CapturedGraph(partial(self._take, count), self.solver.launch)
+        self._chunks[count]()
+        return self._chunk.states[:count]
+
+    def _take(self, count: int) -> None:
+        """So many steps from the state in the buffer."""
+        state = self._buffer
+        for new_state in self._chunk.states[:count]:
+            self.solver.step(state, new_state, self.parameters, self.log)
+            state = new_state
+
+    def _keep(self, step: int, chunk: list[State]) -> None:
+        """Keep checkpoints among the states after a step."""
+        numbers = [n for n in range(step + 1, step + len(chunk) + 1) if n % self._interval == 0]
+        if len(numbers) == len(self._chunk.states):
+            self._states |= zip(numbers, self._chunk.copy().states, strict=True)
+        for n in numbers if len(numbers) < len(self._chunk.states) else ():
+            self._states[n] = self.initial.following()
+            self._states[n].assign(chunk[n - step - 1])
 
     def _forget_stale_graphs(self) -> None:
         """Begin anew with graphs where arrays of the solver were replaced, by this rollout or by another."""
         if self._generation == self.solver.generation:
             return
         self._generation = self.solver.generation
-        step = partial(self.solver.step, self._buffer, self._buffer, self.parameters, self.log)
-        self._step = CapturedGraph(step, self.solver.launch)
+        self._chunks: dict[int, CapturedGraph] = {}
+        """Graphs by their number of steps."""
         self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
 
     def _diverged(self, member: int, lost: Lost, state: State) -> DivergedError:
@@ -189,6 +215,8 @@ class Rollout:
             raise InputError(f"bars has the state {beyond[0]}, but must have states from 0 to {self.steps}.")
         self._require("backward", self._kept)
         self.solver.set_substeps(self.substeps)
+        if self.steps > 0:
+            compile_ahead_adjoint(derivative, self._device)
         derivative.begin()
         self._forget_stale_graphs()
         self._bar.clear()

@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.device.compiling import begin_headers
 from cortado.device.fields import first_values
 from cortado.device.kernel_cache import start_warp
 from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import Precision, precision_named
+from cortado.device.reduction import sum_and_maximum_kernel
 from cortado.device.state import State
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.discretise.discrete_scene import DiscreteScene, discretise
@@ -73,6 +75,7 @@ class Simulation:
         self.scene = scene
         self.device = _device(device)
         self.precision = precision_named(precision)
+        begin_headers(sum_and_maximum_kernel(self.precision, self.device.is_cpu).kernel, self.device)
         discrete = discretise(scene)
         room = first_capacity(scene.discretisation.support, scene.dimension)
         counts = (self.batch or 1) * len(discrete.fluid.positions), len(discrete.walls.positions)

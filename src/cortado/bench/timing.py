@@ -18,10 +18,11 @@ Work = Callable[[], object]
 
 
 def median_seconds(work: Work, repeats: int, wait: Work = lambda: None, before: Work = lambda: None) -> float:
-    """Seconds of the median of some repeats, after one that compiles kernels and fills caches. ``wait`` waits for the
-    device; ``before`` is done before each repeat and not timed."""
-    before()
-    work()
+    """Seconds of the median of some repeats, after one that compiles kernels and one that captures graphs. ``wait``
+    waits for the device; ``before`` is done before each repeat and not timed."""
+    for _ in range(2):
+        before()
+        work()
     times = []
     for _ in range(repeats):
         before()

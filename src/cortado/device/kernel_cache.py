@@ -15,7 +15,8 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-from cortado.device.silence import announce_compilation, silenced
+from cortado.device.compiling import watch_compilation
+from cortado.device.silence import silenced
 from cortado.errors import ComputationError
 from cortado.io.terminal import say
 
@@ -33,7 +34,7 @@ def start_warp() -> None:
     there is none either."""
     import warp as wp
 
-    announce_compilation()
+    watch_compilation()
     reason = _start()
     folder = wp.config.kernel_cache_dir
     reason = reason or _trouble(folder)

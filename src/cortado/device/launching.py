@@ -11,12 +11,8 @@ import warp as wp
 from cortado.device.cores import usable_cores
 from cortado.device.lanes import lanes_of
 from cortado.device.precision import Precision
-from cortado.device.reduction import add_kernel, sum_and_maximum_kernel, sum_kernel
+from cortado.device.reduction import ReductionKernel, add_kernel, sum_and_maximum_kernel, sum_kernel
 from cortado.device.threads import MOST_CORES, WARP, helpers
-
-BRANCHES = 32
-"""Values that one thread of a tree sum adds up."""
-
 
 MOST_PARTS = 32
 """Ranges of particles at most that a launch on a CPU is cut into."""
@@ -88,10 +84,13 @@ def starts_at_first(kernel: wp.Kernel) -> bool:
     return f"{kernel.adj.args[0].label}.first" in kernel.adj.source
 
 
-def launch(kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, **arguments: Any) -> None:
-    """Launch a kernel, off any tape, with arguments by name; ``threads``: their number, or a shape."""
-    inputs = bound(kernel, groups, arguments)
-    work = partial(wp.launch, kernel, threads, inputs=inputs, device=device, record_tape=False)
+def launch(
+    kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, block: int | None = None, **arguments: Any
+) -> None:
+    """Launch a kernel, off any tape, with arguments by name; ``threads``: their number, or a shape; ``block``: how many
+    threads of a GPU share memory, if it matters."""
+    inputs, sizes = bound(kernel, groups, arguments), {} if block is None else {"block_dim": block}
+    work = partial(wp.launch, kernel, threads, inputs=inputs, device=device, record_tape=False, **sizes)
     _perform(kernel.key, threads, inputs, work)
 
 
@@ -216,32 +215,34 @@ class CapturedGraph:
 class TreeReduction:
     """Adds one value of each particle on the device, scene by scene, in the same order every time."""
 
-    def __init__(self, kernel: Any, dtype: Any, particles: int, device: Any, members: int = 1):
+    def __init__(self, level: ReductionKernel, dtype: Any, particles: int, device: Any, members: int = 1):
         """``particles`` of each of ``members`` scenes."""
-        self._kernel, self._device, self._particles = kernel, device, particles
-        self._levels: list[tuple[int, wp.array]] = []
+        self._level, self._device, self._particles = level, device, particles
+        self._partials: list[tuple[int, wp.array]] = []
         size = particles
-        while size > 1 or not self._levels:
-            size = -(-size // BRANCHES)
-            self._levels.append((size, wp.zeros(members * size, dtype=dtype, device=device)))
+        while size > 1 or not self._partials:
+            size = -(-size // level.most)
+            self._partials.append((size, wp.zeros(members * size, dtype=dtype, device=device)))
 
     def __call__(self, values: wp.array) -> wp.array:
         """The sums as an array (members,), which the next call overwrites."""
-        count = self._particles
-        for size, level in self._levels:
-            launch(self._kernel, len(level), self._device, count=count, stride=size, values=values, partial=level)
-            count, values = size, level
+        count, level, device = self._particles, self._level, self._device
+        for size, sums in self._partials:
+            arguments = {"count": count, "stride": size, "values": values, "partial": sums}
+            launch(level.kernel, len(sums) * level.threads, device, block=level.threads, **arguments)
+            count, values = size, sums
         return values
 
 
 def sum_of(dtype: Any, particles: int, device: Any, members: int = 1) -> TreeReduction:
     """Sums of (members n,) numbers, vectors or matrices of a Warp type."""
-    return TreeReduction(sum_kernel(dtype), dtype, particles, device, members)
+    return TreeReduction(sum_kernel(dtype, device.is_cpu), dtype, particles, device, members)
 
 
 def sum_and_maximum(particles: int, precision: Precision, device: Any, members: int = 1) -> TreeReduction:
     """Sums of first and maxima of second components of pairs (members n,)."""
-    return TreeReduction(sum_and_maximum_kernel(precision), precision.pair, particles, device, members)
+    level = sum_and_maximum_kernel(precision, device.is_cpu)
+    return TreeReduction(level, precision.pair, particles, device, members)
 
 
 def add(values: wp.array, total: wp.array) -> None:

@@ -6,7 +6,10 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.arithmetic import arithmetic
+from cortado.device.kernels import kind_of
 from cortado.device.lanes import set_lanes
+from cortado.device.loads import loads
 from cortado.device.precision import Precision
 from cortado.device.smoothing import smoothing_functions
 from cortado.lattice.smoothing import SmoothingKernel
@@ -24,14 +27,25 @@ class Discretisation:
     precision: Precision
     lanes: int = 1
     """Threads for each particle, in kernels that are made for them: see `cortado.device.lanes`."""
+    periodic: bool = False
+    """Whether particles see the nearest images of one another: see ``period`` in the neighbourhood."""
+    taped: bool = False
+    """Whether a tape can differentiate the forward kernels: they get Warp's own adjoint, which takes one lane."""
 
-    def module(self, differentiable: bool, topic: str = "pcisph") -> Any:
-        """The Warp module of these kernels; only the forward kernels get Warp's own adjoint, where there is one lane
-        (for `gradients.Tape`)."""
-        kind = "forward" if differentiable else "derivative"
-        beside = "" if self.lanes == 1 else f"_{self.lanes}_lanes"
+    def module(self, forward: bool, topic: str = "pcisph") -> Any:
+        """The Warp module of forward kernels, or of those of the adjoint; `tangent_module` has the others."""
+        return self._module(kind_of(forward, self.taped), topic, forward and self.taped)
+
+    def tangent_module(self, topic: str = "pcisph") -> Any:
+        """The Warp module of the kernels of forward mode, which no gradient needs."""
+        return self._module("tangent", topic, False)
+
+    def _module(self, kind: str, topic: str, enable_backward: bool) -> Any:
+        images = "_periodic" if self.periodic else ""
+        lanes = "" if self.lanes == 1 else f"_{self.lanes}_lanes"
+        beside = f"{images}{lanes}_beside_taped" if self.taped and not enable_backward else f"{images}{lanes}"
         module = wp.get_module(f"cortado_{topic}_{kind}_{self.smoothing.name}_{self.precision.name}{beside}")
-        module.options["enable_backward"] = differentiable and self.lanes == 1
+        module.options["enable_backward"] = enable_backward
         set_lanes(module, self.lanes)
         return module
 
@@ -61,6 +75,8 @@ def neighbourhood_type(precision: Precision) -> Any:
         """w_b [-]: what a wall particle counts for in the density, a fluid particle being 1."""
         support: real
         """Support radius h [m]."""
+        per_support: real
+        """1 / h [1 / m]."""
         reach: real
         """Neighbours are listed up to this distance [m], a little beyond the support."""
         normalisation: real
@@ -73,9 +89,8 @@ def neighbourhood_type(precision: Precision) -> Any:
         """What second derivatives are multiplied with [-], see `cortado.lattice.calibration`."""
         volume: real
         """Volume V of a particle on the rest lattice [m^d]: with it that lattice has the rest density."""
-        periodic: wp.int32
         period: vector
-        """[m], 0 along an axis that is not periodic."""
+        """[m], 0 along an axis that is not periodic; read where the `Discretisation` is periodic."""
         frequency: vector
         """1 / period [1 / m], or 0."""
 
@@ -90,11 +105,16 @@ class PairFunctions:
 
     separation: Any
     weight: Any
+    slope: Any
+    slope_change: Any
     gradient: Any
     hessian_product: Any
-    size: Any
+    per_size: Any
     factor: Any
     factor_gradient: Any
+    neighbour: Any
+    wall_position: Any
+    wall_weight: Any
     vectors: Any
     numbers: Any
 
@@ -103,79 +123,115 @@ class PairFunctions:
 def pair_functions(discretisation: Discretisation) -> PairFunctions:
     """Warp functions of a separation in given neighbourhood.
 
-    ``separation``, ``weight``, ``gradient``, ``hessian_product``; ``size`` (|x|^2 + 0.01 h^2, which covers coincident
-    particles), ``factor`` (F = laplacian_correction x . G / size, of second derivatives after Brookshaw 1985) and
-    ``factor_gradient``;
-    and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have before any of it is used, so that the
-    loads do not wait for one another (on a GPU a tenth of a whole step).
+    ``separation`` (x_i - x_j, of the nearest image), ``weight``, ``slope`` (a of G = a x), ``slope_change``
+    (grad a . u), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x); ``per_size``
+    (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction per_size x . G, of
+    second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the list of i),
+    ``wall_position`` and ``wall_weight``; and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have
+    before any of it is used, so that the loads do not wait for one another (on a GPU a tenth of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
-    smooth = smoothing_functions(discretisation.smoothing, discretisation.precision)
-    smooth_weight, smooth_gradient = smooth.weight, smooth.gradient
-    smooth_hessian_product = smooth.hessian_product
+    smooth = smoothing_functions(discretisation.smoothing, discretisation.precision, discretisation.taped)
+    smooth_weight, smooth_slope, smooth_slope_change = smooth.weight, smooth.slope, smooth.slope_change
+    reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
+    load = loads(discretisation.precision, discretisation.taped)
+    load_neighbour, load_vector, load_number = load.neighbour, load.vector, load.number
     rows = wp.types.matrix(shape=(UNROLL, 3), dtype=real)
     row = wp.types.vector(length=UNROLL, dtype=real)
 
     @wp.func
-    def separation(x_i: vector, x_j: vector, s: neighbourhood) -> vector:
-        """x_i - x_j, of the nearest image."""
+    def difference(x_i: vector, x_j: vector, s: neighbourhood) -> vector:
+        return x_i - x_j
+
+    @wp.func
+    def nearest_image(x_i: vector, x_j: vector, s: neighbourhood) -> vector:
         x_ij = x_i - x_j
-        if s.periodic != 0:
-            turns = vector(
-                wp.round(x_ij[0] * s.frequency[0]),
-                wp.round(x_ij[1] * s.frequency[1]),
-                wp.round(x_ij[2] * s.frequency[2]),
-            )
-            return x_ij - wp.cw_mul(turns, s.period)
-        return x_ij
+        turns = vector(
+            wp.round(x_ij[0] * s.frequency[0]),
+            wp.round(x_ij[1] * s.frequency[1]),
+            wp.round(x_ij[2] * s.frequency[2]),
+        )
+        return x_ij - wp.cw_mul(turns, s.period)
 
     @wp.func
     def weight(x: vector, s: neighbourhood) -> real:
-        return smooth_weight(x, s.support, s.normalisation)
+        return smooth_weight(x, s.per_support, s.normalisation)
+
+    @wp.func
+    def slope(x: vector, s: neighbourhood) -> real:
+        return smooth_slope(x, s.per_support, s.normalisation)
+
+    @wp.func
+    def slope_change(x: vector, u: vector, s: neighbourhood) -> real:
+        return smooth_slope_change(x, u, s.per_support, s.normalisation)
 
     @wp.func
     def gradient(x: vector, s: neighbourhood) -> vector:
-        return smooth_gradient(x, s.support, s.normalisation)
+        return slope(x, s) * x
 
     @wp.func
     def hessian_product(x: vector, u: vector, s: neighbourhood) -> vector:
-        return smooth_hessian_product(x, u, s.support, s.normalisation)
+        return slope(x, s) * u + slope_change(x, u, s) * x
 
     @wp.func
-    def size(x: vector, s: neighbourhood) -> real:
-        return wp.dot(x, x) + real(0.01) * s.support * s.support
+    def per_size(x: vector, s: neighbourhood) -> real:
+        return reciprocal(wp.dot(x, x) + real(0.01) * s.support * s.support)
 
     @wp.func
     def factor(x: vector, s: neighbourhood) -> real:
-        return s.laplacian_correction * wp.dot(x, gradient(x, s)) / size(x, s)
+        return s.laplacian_correction * slope(x, s) * wp.dot(x, x) * per_size(x, s)
 
     @wp.func
     def factor_gradient(x: vector, s: neighbourhood) -> vector:
-        d = size(x, s)
-        g = gradient(x, s)
-        return (s.laplacian_correction / d) * (g + hessian_product(x, x, s) - (real(2.0) * wp.dot(x, g) / d) * x)
+        per_d = per_size(x, s)
+        a = slope(x, s)
+        change = real(2.0) * a + slope_change(x, x, s) - real(2.0) * a * wp.dot(x, x) * per_d
+        return (s.laplacian_correction * per_d * change) * x
+
+    @wp.func
+    def neighbour(k: int, i: int, s: neighbourhood) -> int:
+        return load_neighbour(s.neighbours, k, i)
+
+    @wp.func
+    def wall_position(b: int, s: neighbourhood) -> vector:
+        return load_vector(s.wall_positions, b)
+
+    @wp.func
+    def wall_weight(b: int, s: neighbourhood) -> real:
+        return load_number(s.wall_weights, b)
 
     @wp.func
     def vectors(a: wp.array(dtype=vector), k: int, i: int, s: neighbourhood) -> rows:
         return wp.matrix_from_rows(
-            a[s.neighbours[k, i]], a[s.neighbours[k + 1, i]], a[s.neighbours[k + 2, i]], a[s.neighbours[k + 3, i]]
+            load_vector(a, neighbour(k, i, s)),
+            load_vector(a, neighbour(k + 1, i, s)),
+            load_vector(a, neighbour(k + 2, i, s)),
+            load_vector(a, neighbour(k + 3, i, s)),
         )
 
     @wp.func
     def numbers(a: wp.array(dtype=real), k: int, i: int, s: neighbourhood) -> row:
         return row(
-            a[s.neighbours[k, i]], a[s.neighbours[k + 1, i]], a[s.neighbours[k + 2, i]], a[s.neighbours[k + 3, i]]
+            load_number(a, neighbour(k, i, s)),
+            load_number(a, neighbour(k + 1, i, s)),
+            load_number(a, neighbour(k + 2, i, s)),
+            load_number(a, neighbour(k + 3, i, s)),
         )
 
     return PairFunctions(
-        separation=separation,
+        separation=nearest_image if discretisation.periodic else difference,
         weight=weight,
+        slope=slope,
+        slope_change=slope_change,
         gradient=gradient,
         hessian_product=hessian_product,
-        size=size,
+        per_size=per_size,
         factor=factor,
         factor_gradient=factor_gradient,
+        neighbour=neighbour,
+        wall_position=wall_position,
+        wall_weight=wall_weight,
         vectors=vectors,
         numbers=numbers,
     )

@@ -33,7 +33,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
 
-    @wp.kernel(module=discretisation.module(False, "neighbours"), enable_backward=False)
+    @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
     def fill(
         s: neighbourhood,
         grid: grid_type,
@@ -118,12 +118,8 @@ class NeighbourSearch:
         self.wall_positions = wp.array(walls, dtype=precision.vector, device=device)
         self.wall_weights = wp.array(wall_weights, dtype=precision.real, device=device)
         self._wall_sort = CellSort(grid, len(walls), precision, device)
-        self._wall_sort(self.wall_positions)
-        sorted_to_given = self._wall_sort.order.numpy()
-        self.wall_positions.assign(walls[sorted_to_given])
-        self.wall_weights.assign(wall_weights[sorted_to_given])
-        near_walls = _near_walls(grid, self._wall_sort.grid.starts.numpy())
-        self._near_walls = wp.array(near_walls, dtype=wp.bool, device=device)
+        self._unsorted_walls: tuple[np.ndarray, np.ndarray] | None = (walls, wall_weights)
+        self._grid, self._near_walls = grid, wp.zeros(grid.cells, dtype=wp.bool, device=device)
         self.allocate(capacity)
 
     def allocate(self, capacity: int) -> None:
@@ -138,7 +134,17 @@ class NeighbourSearch:
     def sort(self, positions: wp.array) -> None:
         """Find the order of cells (``order``: sorted -> given) of positions (members n,) [m]; ties keep the given
         order."""
+        if self._unsorted_walls is not None:  # once, and not before kernels are compiled side by side
+            self._sort_walls(*self._unsorted_walls)
+            self._unsorted_walls = None
         self._sort(positions)
+
+    def _sort_walls(self, walls: np.ndarray, wall_weights: np.ndarray) -> None:
+        self._wall_sort(self.wall_positions)
+        sorted_to_given = self._wall_sort.order.numpy()
+        self.wall_positions.assign(walls[sorted_to_given])
+        self.wall_weights.assign(wall_weights[sorted_to_given])
+        self._near_walls.assign(_near_walls(self._grid, self._wall_sort.grid.starts.numpy()))
 
     def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:
         """List the neighbours of sorted positions (members n,) [m], but none where the ``bad_step`` (members,) of a

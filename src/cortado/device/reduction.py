@@ -1,14 +1,36 @@
-"""Sums over particles in a fixed order: a tree of partial sums, so that the same bits come back every time.
+"""Sums over particles in a fixed order, so that the same bits come back every time.
 
-Each scene of a batch has ``count`` values, one scene behind the other, which ``stride`` threads add up.
+Each scene of a batch has ``count`` values, one scene behind the other, which come down to ``stride`` partial ones. On a
+CPU each of these is the work of one thread, on a GPU of a block of threads, which add up in a tree in shared memory.
 """
 
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import warp as wp
 
 from cortado.device.precision import Precision
+
+BRANCHES = 32
+"""Values that one thread adds up on a CPU."""
+BLOCK = 1024
+"""Threads of a block on a GPU at most."""
+EACH = 8
+"""Values that each of them adds up before the tree."""
+SHARED = 32 * 1024
+"""[bytes] of shared memory that a block takes at most, of the 48 KiB that there are."""
+
+
+@dataclass(frozen=True)
+class ReductionKernel:
+    """One level of a reduction."""
+
+    kernel: Any
+    threads: int
+    """For each partial value."""
+    most: int
+    """Values that a partial one is made of, at most."""
 
 
 def type_name(dtype: Any) -> str:
@@ -18,42 +40,86 @@ def type_name(dtype: Any) -> str:
 
 
 @cache
-def sum_kernel(dtype: Any) -> Any:
-    """Sums of numbers, vectors or matrices of one type: of each scene partial[t] from values t, t + T, t + 2 T, ..."""
-    module = wp.get_module(f"cortado_sum_{type_name(dtype)}")
-    module.options["enable_backward"] = False
+def sum_kernel(dtype: Any, is_cpu: bool) -> ReductionKernel:
+    """Sums of numbers, vectors or matrices of one type."""
 
-    @wp.kernel(module=module, enable_backward=False)
-    def add(count: int, stride: int, values: wp.array(dtype=dtype), partial: wp.array(dtype=dtype)):
+    @wp.func
+    def plus(a: dtype, b: dtype) -> dtype:
+        return a + b
+
+    return _of_threads("sum", dtype, plus) if is_cpu else _of_blocks("sum", dtype, "a + b")
+
+
+@cache
+def sum_and_maximum_kernel(precision: Precision, is_cpu: bool) -> ReductionKernel:
+    """Sums of the first and maxima of the second components of pairs."""
+    pair = precision.pair
+
+    @wp.func
+    def sum_and_maximum(a: pair, b: pair) -> pair:
+        return pair(a[0] + b[0], wp.max(a[1], b[1]))
+
+    if is_cpu:
+        return _of_threads("sum_and_maximum", pair, sum_and_maximum)
+    return _of_blocks("sum_and_maximum", pair, "T(a[0] + b[0], wp::max(a[1], b[1]))")
+
+
+def _of_threads(name: str, dtype: Any, combine: Any) -> ReductionKernel:
+    """partial[t] from values t, t + T, t + 2 T, ... of a scene."""
+
+    def reduce(count: int, stride: int, values: wp.array(dtype=dtype), partial: wp.array(dtype=dtype)):
         t = wp.tid() % stride
         first = wp.tid() // stride * count
         total = values[first + t]
         for k in range(t + stride, count, stride):
-            total += values[first + k]
+            total = combine(total, values[first + k])
         partial[wp.tid()] = total
 
-    return add
+    return ReductionKernel(_kernel(name, f"{name}_{type_name(dtype)}", reduce), 1, BRANCHES)
 
 
-@cache
-def sum_and_maximum_kernel(precision: Precision) -> Any:
-    """Sums of the first and maxima of the second components of pairs, in the same way."""
-    pair = precision.pair
-    module = wp.get_module(f"cortado_sum_and_maximum_{precision.name}")
+def _of_blocks(name: str, dtype: Any, combine: str) -> ReductionKernel:
+    """The same with a block of threads for each t, which shares the values out among them. ``combine`` is an expression
+    of C++ in a and b, of the type T."""
+    threads = BLOCK
+    while threads * wp.types.type_size_in_bytes(dtype) > SHARED:
+        threads //= 2
+
+    @wp.func_native(f"""
+        auto total = values.data[0];
+        typedef decltype(total) T;
+        auto combine = [](const T& a, const T& b) -> T {{ return {combine}; }};
+        __shared__ alignas(16) char shared[sizeof(T) * {threads}];
+        T* room = reinterpret_cast<T*>(shared);
+        const long long t = threadIdx.x, part = blockIdx.x % stride, first = blockIdx.x / stride * (long long)count;
+        const long long own = part * {threads} + t;
+        if (own < count) total = values.data[first + own];
+        for (long long k = own + (long long)stride * {threads}; k < count; k += (long long)stride * {threads})
+            total = combine(total, values.data[first + k]);
+        room[t] = total;
+        const long long there = count - part * {threads} < {threads} ? count - part * {threads} : {threads};
+        for (int half = {threads // 2}; half > 0; half /= 2) {{
+            __syncthreads();
+            if (t < half && t + half < there) room[t] = combine(room[t], room[t + half]);
+        }}
+        if (t == 0) partial.data[blockIdx.x] = room[0];
+    """)
+    def block(count: wp.int32, stride: wp.int32, values: wp.array(dtype=dtype), partial: wp.array(dtype=dtype)): ...
+
+    def reduce(count: int, stride: int, values: wp.array(dtype=dtype), partial: wp.array(dtype=dtype)):
+        block(count, stride, values, partial)
+
+    kernel = _kernel(name, f"{name}_{type_name(dtype)}_blocks", reduce, grid_stride=False)
+    kernel.module.options["block_dim"] = threads
+    return ReductionKernel(kernel, threads, threads * EACH)
+
+
+def _kernel(name: str, module_name: str, function: Any, **options: Any) -> Any:
+    """A kernel of that name in a module of its own: what compiles for a GPU alone is in no module for a CPU."""
+    module = wp.get_module(f"cortado_{module_name}")
     module.options["enable_backward"] = False
-
-    @wp.kernel(module=module, enable_backward=False)
-    def sum_and_maximum(count: int, stride: int, values: wp.array(dtype=pair), partial: wp.array(dtype=pair)):
-        t = wp.tid() % stride
-        first = wp.tid() // stride * count
-        total = values[first + t][0]
-        largest = values[first + t][1]
-        for k in range(t + stride, count, stride):
-            total += values[first + k][0]
-            largest = wp.max(largest, values[first + k][1])
-        partial[wp.tid()] = pair(total, largest)
-
-    return sum_and_maximum
+    function.__qualname__ = name
+    return wp.kernel(function, module=module, enable_backward=False, **options)
 
 
 @cache

@@ -67,6 +67,17 @@ class State(Arrays):
         views = {name: self[name][number * size : (number + 1) * size] for name, size in sizes.items()}
         return type(self)(self.fields, views)
 
+    def numbers(self, name: str) -> wp.array:
+        """A field as a Warp array of numbers, vectors (n, 3), fractions (n, phases), in a batch (batch, n, ...), that
+        shares its memory: what speaks DLPack, such as PyTorch and JAX, takes it without a copy."""
+        field = self[name]
+        shape = (len(field),) if self.batch is None else (self.batch, len(field) // self.batch)
+        entries = getattr(field.dtype, "_shape_", ())
+        dtype = getattr(field.dtype, "_wp_scalar_type_", field.dtype)
+        view = wp.array(ptr=field.ptr, dtype=dtype, shape=(*shape, *entries), device=field.device)
+        view._ref = field  # keeps the memory
+        return view
+
     def set(self, values: Mapping[str, Any]) -> None:
         """Write fields by name: vectors (n, d), numbers (n,), fractions (n, phases), in a batch (batch, n, ...)."""
         for field in self.fields:
@@ -83,6 +94,31 @@ class State(Arrays):
         if self.batch is None:
             return found
         return {name: a.reshape(self.batch, -1, *a.shape[1:]) for name, a in found.items()}
+
+
+class StateSeries:
+    """States of one run one behind the other in the same arrays, so that all of them are copied at once."""
+
+    def __init__(self, like: State, length: int):
+        """``length`` states of the fields and sizes of one, still to be written; what no step changes is its array."""
+        self._like, self._length = like, length
+        changed = {field.name: like[field.name] for field in like.fields if not field.is_constant}
+        self._whole = {name: wp.empty(length * len(a), dtype=a.dtype, device=a.device) for name, a in changed.items()}
+        self.states = [self._state(k) for k in range(length)]
+        """Views of the arrays."""
+
+    def _state(self, k: int) -> State:
+        size = {name: len(array) // self._length for name, array in self._whole.items()}
+        own = {name: array[k * size[name] : (k + 1) * size[name]] for name, array in self._whole.items()}
+        arrays = {field.name: own.get(field.name, self._like[field.name]) for field in self._like.fields}
+        return State(self._like.fields, arrays, self._like.batch)
+
+    def copy(self) -> Self:
+        """The same in arrays of their own."""
+        new = type(self)(self._like, self._length)
+        for name, array in self._whole.items():
+            wp.copy(new._whole[name], array)
+        return new
 
 
 class Parameters(Arrays):

@@ -17,9 +17,9 @@ def printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else _escape(letter) for letter in text)
 
 
-def say(sentence: str) -> None:
-    """One line on stderr: a mistake, a warning, what is being done."""
-    print(printable(sentence), file=sys.stderr, flush=True)
+def say(sentence: str, end: str = "\n") -> None:
+    """One line on stderr: a mistake, a warning, what is being done; the beginning of one with another ``end``."""
+    print(printable(sentence), end=end, file=sys.stderr, flush=True)
 
 
 def tell(result: str) -> None:

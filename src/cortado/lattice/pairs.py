@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from cortado.lattice.shapes import Points
 
@@ -23,6 +22,8 @@ def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 
         lower: (d,) where the period begins [m].
         lengths: (d,) the lengths of the period [m], 0 for axes without one; the nearest image counts.
     """
+    from scipy.spatial import cKDTree
+
     lengths = np.broadcast_to(np.asarray(lengths, dtype=np.float64), some.shape[1:])
     some, others = (_wrapped(x - np.asarray(lower, dtype=np.float64), lengths) for x in (some, others))
     tree = cKDTree(others, boxsize=lengths)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from cortado.arrays import as_numbers, as_one_number
 from cortado.errors import InputError, shown
@@ -83,6 +82,8 @@ class Camera:
 
         These are the coordinates, at zero, in which the renderer gives the derivative with respect to the pose.
         """
+        from scipy.spatial.transform import Rotation
+
         turn = Rotation.from_rotvec(vector("rotation", rotation)).as_matrix()
         position = np.add(self.position, vector("translation", translation))
         look_at = position + turn @ np.subtract(self.look_at, self.position)

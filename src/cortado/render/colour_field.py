@@ -121,6 +121,7 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
         nodes: nodes_struct,
         grid: grid_type,
         h: real,
+        per_h: real,
         sigma: real,
     ) -> rgba:
         """Over the particles of the cells c_x - 1, c_x and c_x + 1 of one row."""
@@ -131,7 +132,7 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
             for j in range(grid.starts[cell], grid.starts[cell + 1]):
                 x_gj = nearest(x_g - x[j], nodes)
                 if wp.dot(x_gj, x_gj) < h * h:
-                    total += weight(x_gj, h, sigma) * rgba(colour[j][0], colour[j][1], colour[j][2], real(1.0))
+                    total += weight(x_gj, per_h, sigma) * rgba(colour[j][0], colour[j][1], colour[j][2], real(1.0))
         return total
 
     @wp.kernel(module=module, enable_backward=False)
@@ -139,6 +140,7 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
         nodes: nodes_struct,
         grid: grid_type,
         h: real,
+        per_h: real,
         sigma: real,
         volume: real,
         x: wp.array(dtype=vector),
@@ -155,7 +157,7 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
         for o_z in range(below(n_z), above(n_z)):
             for o_y in range(below(n_y), above(n_y)):
                 row = (wrap(c[2] + o_z, n_z) * n_y + wrap(c[1] + o_y, n_y)) * grid.shape[0]
-                total += row_sum(row, c[0], x_g, x, colour, nodes, grid, h, sigma)
+                total += row_sum(row, c[0], x_g, x, colour, nodes, grid, h, per_h, sigma)
         field[k, j, i] = volume * total
 
     @wp.func
@@ -167,6 +169,7 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
     def colour_field_adjoint(
         nodes: nodes_struct,
         h: real,
+        per_h: real,
         sigma: real,
         volume: real,
         order: wp.array(dtype=wp.int32),
@@ -192,8 +195,8 @@ def colour_field_kernels(discretisation: Discretisation) -> ColourFieldKernels:
                         x_gq = place(i, j, k, nodes) - x_q
                         if wp.dot(x_gq, x_gq) < h * h:
                             bar = field_bar[k, j, i]
-                            rgba_bar += weight(x_gq, h, sigma) * bar
-                            x_bar += -wp.dot(bar, rgba_p) * gradient(x_gq, h, sigma)
+                            rgba_bar += weight(x_gq, per_h, sigma) * bar
+                            x_bar += -wp.dot(bar, rgba_p) * gradient(x_gq, per_h, sigma)
         x_scene_bar[order[p]] = volume * x_bar
         colour_scene_bar[order[p]] = volume * vector(rgba_bar[0], rgba_bar[1], rgba_bar[2])
 

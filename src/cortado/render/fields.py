@@ -71,7 +71,8 @@ class ColourField:
         self._device = device
         grid = Grid.around(lower, upper, periods, support, MOST_CELLS)
         self._sort = CellSort(grid, particles, precision, device)
-        self._kernel = {"h": support, "sigma": smoothing.normalisation(len(lower), support), "volume": volume}
+        sigma = smoothing.normalisation(len(lower), support)
+        self._kernel = {"h": support, "per_h": 1.0 / support, "sigma": sigma, "volume": volume}
         zeros, mix, palette = (
             partial(wp.zeros, device=device),
             precision.fractions(phases),

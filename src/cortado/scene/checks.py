@@ -4,7 +4,6 @@ from itertools import product
 
 import numpy as np
 from pydantic_core import PydanticCustomError
-from scipy.spatial import cKDTree
 
 from cortado.device.memory import sampling_parts, shortage
 from cortado.errors import InputError, Words, shown
@@ -169,6 +168,8 @@ def _check_distinct(index: int, fluid: Fluid, spacing: float) -> None:
     distinct, counts = np.unique(points, axis=0, return_counts=True)
     if len(distinct) < len(points):
         raise field_error(("fluid", index), *_overlap("itself", distinct[np.argmax(counts)], spacing))
+    from scipy.spatial import cKDTree
+
     distances = cKDTree(points).query(points, k=[2])[0].ravel()
     if distances.min() < _nearest(spacing):
         raise field_error(("fluid", index), *_overlap("itself", points[np.argmin(distances)], spacing))
@@ -197,6 +198,8 @@ def _meeting(first: Body, second: Body, shift: Points, spacing: float) -> Points
     near = moved[((moved > lower - spacing) & (moved < upper + spacing)).all(axis=1)]
     if not len(near):
         return None
+    from scipy.spatial import cKDTree
+
     distances = cKDTree(first.particles(spacing)).query(near)[0]
     return near[np.argmin(distances)] if distances.min() < _nearest(spacing) else None
 

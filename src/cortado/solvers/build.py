@@ -43,7 +43,7 @@ def particle_system(
 ) -> ParticleSystem:
     """A scene that is cut into particles, on a device; ``batch`` of it in one launch."""
     layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, batch)
-    shared = Discretisation(discrete.kernel, precision, lanes_for(layout.particles, device))
+    shared = Discretisation(discrete.kernel, precision, lanes_for(layout.particles, device), any(discrete.periods))
     search = _search(scene, discrete, shared, layout)
 
     def system(discretisation: Discretisation) -> ParticleSystem:
@@ -58,7 +58,7 @@ def particle_system(
             _phases(scene, discretisation, free_energy),
             _nozzle(scene, discrete),
             _walled(scene, discrete),
-            of_one_lane=lambda: system(replace(discretisation, lanes=1)),
+            of_one_lane=lambda: system(replace(discretisation, lanes=1, taped=True)),
         )
 
     return system(shared)

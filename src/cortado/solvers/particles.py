@@ -66,12 +66,14 @@ class ParticleSolver:
     def __init__(self, system: ParticleSystem, requires_grad: bool = False):
         discretisation, search, layout, nozzle = system.discretisation, system.search, system.layout, system.nozzle
         precision, particles, device = layout.precision, layout.all_particles, layout.device
+        if requires_grad and not discretisation.taped:
+            raise TypeError("a tape needs the kernels of system.of_one_lane(): make the solver of that system.")
         self.system, self.discretisation, self.lattice, self.search = system, discretisation, system.lattice, search
         self.layout, self.device, self.forces = layout, device, tuple(system.forces)
         self.launch = KernelLauncher(particles, device, record_tape=requires_grad)
         self.turn = Turn(device)
         """Whose arrays these are now."""
-        self.density, self.integration = density_kernels(discretisation), integration_kernels(precision)
+        self.density, self.integration = density_kernels(discretisation), integration_kernels(precision, requires_grad)
         self.mixture = Mixture(system.phases, layout, requires_grad)
         self.emitter = Emitter(nozzle, layout, requires_grad) if nozzle else None
         self.carried = Carried(self.carried_fields, layout, requires_grad)
@@ -231,11 +233,10 @@ def _neighbourhood(system: ParticleSystem) -> Any:
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count
     s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
-    s.support, s.reach = lattice.support, (1.0 + SKIN) * lattice.support
+    s.support, s.per_support, s.reach = lattice.support, 1.0 / lattice.support, (1.0 + SKIN) * lattice.support
     s.normalisation = lattice.normalisation
     s.self_weight, s.volume, s.response_scale = lattice.self_weight, lattice.volume, lattice.response**-0.5
     s.laplacian_correction = lattice.laplacian_correction
-    s.periodic = int(any(periods))
     s.period = precision.vector(*periods)
     s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in periods))
     return s

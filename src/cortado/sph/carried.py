@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 import warp as wp
 
 from cortado.device.fields import StateField
+from cortado.device.kernels import kind_of
 from cortado.device.reduction import type_name
 from cortado.device.state import Layout, State
 from cortado.sph.order import OrderKernels, order_kernels
@@ -39,4 +40,6 @@ class Carried:
 
 
 def _kernels(a: wp.array) -> OrderKernels:
-    return order_kernels(a.dtype, wp.get_module(f"cortado_order_{type_name(a.dtype)}"))
+    module = wp.get_module(f"cortado_order_{kind_of(True, a.requires_grad)}_{type_name(a.dtype)}")
+    module.options["enable_backward"] = a.requires_grad
+    return order_kernels(a.dtype, module)

@@ -34,7 +34,8 @@ def density_sums(discretisation: Discretisation) -> DensitySums:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
-    separation, weight, gradient = pair.separation, pair.weight, pair.gradient
+    neighbour, wall_position, wall_weight = pair.neighbour, pair.wall_position, pair.wall_weight
+    separation, weight, slope, gradient = pair.separation, pair.weight, pair.slope, pair.gradient
     vectors, numbers = pair.vectors, pair.numbers
     LANES = discretisation.lanes
     lanes = lane_functions(discretisation.precision, LANES)
@@ -49,8 +50,8 @@ def density_sums(discretisation: Discretisation) -> DensitySums:
             for u in range(UNROLL):
                 total += weight(separation(x_i, x_j[u], s), s)
         for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = s.neighbours[k, i]
-            total += s.wall_weights[b] * weight(separation(x_i, s.wall_positions[b], s), s)
+            b = neighbour(k, i, s)
+            total += wall_weight(b, s) * weight(separation(x_i, wall_position(b, s), s), s)
         return add_up(total)
 
     @wp.func
@@ -60,12 +61,12 @@ def density_sums(discretisation: Discretisation) -> DensitySums:
         total = real(0.0)
         for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
+                j = neighbour(k + u, i, s)
                 total += wp.dot(gradient(separation(x_i, x[j], s), s), x_dot_i - x_dot[j])
         for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = s.neighbours[k, i]
-            g_ib = gradient(separation(x_i, s.wall_positions[b], s), s)
-            total += s.wall_weights[b] * wp.dot(g_ib, x_dot_i)
+            b = neighbour(k, i, s)
+            g_ib = gradient(separation(x_i, wall_position(b, s), s), s)
+            total += wall_weight(b, s) * wp.dot(g_ib, x_dot_i)
         return add_up(total)
 
     @wp.func
@@ -77,10 +78,11 @@ def density_sums(discretisation: Discretisation) -> DensitySums:
             x_j = vectors(x, k, i, s)
             r_j = numbers(r, k, i, s)
             for u in range(UNROLL):
-                total += (r_i + r_j[u]) * gradient(separation(x_i, x_j[u], s), s)
+                x_ij = separation(x_i, x_j[u], s)
+                total += ((r_i + r_j[u]) * slope(x_ij, s)) * x_ij
         for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = s.neighbours[k, i]
-            total += (s.wall_weights[b] * r_i) * gradient(separation(x_i, s.wall_positions[b], s), s)
+            b = neighbour(k, i, s)
+            total += (wall_weight(b, s) * r_i) * gradient(separation(x_i, wall_position(b, s), s), s)
         return add_up_vectors(total)
 
     return DensitySums(weights=weights, weights_tangent=weights_tangent, weights_adjoint=weights_adjoint)
@@ -109,7 +111,7 @@ def density_kernels(discretisation: Discretisation) -> Kernels:
             return
         n[i] = s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
     def density_tangent(
         s: neighbourhood,
         x: wp.array(dtype=vector),

@@ -34,10 +34,17 @@ class Diffusion:
     energy: FreeEnergy
     mobility: Mobility
 
-    def module(self, differentiable: bool) -> Any:
-        """The Warp module of these kernels."""
-        topic = f"diffusion_{self.phases}_{self.energy.name}_{self.mobility.name}"
-        return self.discretisation.module(differentiable, topic)
+    def module(self, forward: bool) -> Any:
+        """The Warp module of forward kernels, or of those of the adjoint."""
+        return self.discretisation.module(forward, self._topic)
+
+    def tangent_module(self) -> Any:
+        """The Warp module of the kernels of forward mode."""
+        return self.discretisation.tangent_module(self._topic)
+
+    @property
+    def _topic(self) -> str:
+        return f"diffusion_{self.phases}_{self.energy.name}_{self.mobility.name}"
 
 
 @dataclass(frozen=True)
@@ -120,7 +127,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
             return
         c_new[i] = c[i] + (time_step[member] / real(substeps) * s.volume / m[i]) * total
 
-    @wp.kernel(module=diffusion.module(False), enable_backward=False)
+    @wp.kernel(module=diffusion.tangent_module(), enable_backward=False)
     def potential_tangent(
         s: neighbourhood,
         strength: real,
@@ -158,7 +165,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
             mobile_gradient(c[i]), c_dot[i]
         )
 
-    @wp.kernel(module=diffusion.module(False), enable_backward=False)
+    @wp.kernel(module=diffusion.tangent_module(), enable_backward=False)
     def flux_tangent(
         s: neighbourhood,
         substeps: int,

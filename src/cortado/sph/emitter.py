@@ -45,7 +45,7 @@ class Emitter:
         self.free = layout.state((POSITIONS, VELOCITIES), requires_grad)
         """Room for the end of a step if no particle were prescribed."""
         precision, device = layout.precision, layout.device
-        self.kernels = emitter_kernels(precision)
+        self.kernels = emitter_kernels(precision, requires_grad)
         self.constants = {
             "first": nozzle.first,
             "upstream": wp.array(nozzle.upstream, dtype=precision.real, device=device),

@@ -32,7 +32,7 @@ class EmitterKernels(Kernels):
 
 
 @cache
-def emitter_kernels(precision: Precision) -> EmitterKernels:
+def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
     """The kernels for a precision. Of each scene b, ``outlet`` (members,) is q_(n-1) [m], ``emitted`` (members,) l at
     the end of the step [m]; ``first`` and ``upstream`` count the particles p of one scene."""
     real, vector = precision.real, precision.vector
@@ -49,7 +49,7 @@ def emitter_kernels(precision: Precision) -> EmitterKernels:
             return real(0.0)
         return real(wp.float64(upstream[p - first]) - emitted)
 
-    @wp.kernel(module=integration_module(precision, True))
+    @wp.kernel(module=integration_module(precision, True, taped))
     def begin(
         area: real,
         flow_rate: wp.array(dtype=real),
@@ -64,7 +64,7 @@ def emitter_kernels(precision: Precision) -> EmitterKernels:
         outlet[b] = outlet_in[b]
         emitted[b] = emitted_in[b] + advance(flow_rate[b], area, time_step[b])
 
-    @wp.kernel(module=integration_module(precision, True))
+    @wp.kernel(module=integration_module(precision, True, taped))
     def prescribe(
         particles: int,
         first: int,

@@ -1,10 +1,11 @@
 """Gravity: the same acceleration everywhere, one for each step."""
 
-from functools import cache
+from functools import cache, cached_property
 
 import warp as wp
 
 from cortado.device.kernels import Kernels
+from cortado.device.launching import TreeReduction
 from cortado.device.precision import Precision
 from cortado.device.state import Layout
 from cortado.sph.integration import integration_module
@@ -12,11 +13,11 @@ from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 
 
 @cache
-def gravity_kernels(precision: Precision) -> Kernels:
+def gravity_kernels(precision: Precision, taped: bool) -> Kernels:
     """The kernels; the tangent is the acceleration itself, of another table."""
     vector = precision.vector
 
-    @wp.kernel(module=integration_module(precision, True))
+    @wp.kernel(module=integration_module(precision, True, taped))
     def accelerate(
         particles: int,
         gravity: wp.array2d(dtype=vector),
@@ -48,9 +49,13 @@ class Gravity:
 
     shares: tuple[str, ...] = ()
 
-    def __init__(self, layout: Layout):
-        self._kernels, self._members = gravity_kernels(layout.precision), layout.members
-        self._sum = layout.sum_of(layout.precision.vector)
+    def __init__(self, layout: Layout, taped: bool):
+        self._kernels, self._layout, self._members = gravity_kernels(layout.precision, taped), layout, layout.members
+
+    @cached_property
+    def _sum(self) -> TreeReduction:
+        """Of the adjoint alone, so that its kernel is not compiled for a run forward."""
+        return self._layout.sum_of(self._layout.precision.vector)
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         step.launch(self._kernels.forward, acceleration_in=before, acceleration=after)
@@ -66,4 +71,4 @@ class Gravity:
 
 def force(setting: Setting) -> Gravity:
     """Gravity in every scene."""
-    return Gravity(setting.layout)
+    return Gravity(setting.layout, setting.discretisation.taped)

@@ -6,14 +6,14 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.kernels import kind_of
 from cortado.device.precision import Precision
 
 
-def integration_module(precision: Precision, differentiable: bool) -> Any:
-    """The Warp module of kernels that need no smoothing kernel."""
-    kind = "forward" if differentiable else "derivative"
-    module = wp.get_module(f"cortado_integration_{kind}_{precision.name}")
-    module.options["enable_backward"] = differentiable
+def integration_module(precision: Precision, forward: bool, taped: bool = False) -> Any:
+    """The Warp module of kernels that need no smoothing kernel; ``taped`` forward kernels get Warp's own adjoint."""
+    module = wp.get_module(f"cortado_integration_{kind_of(forward, taped)}_{precision.name}")
+    module.options["enable_backward"] = forward and taped
     return module
 
 
@@ -43,12 +43,13 @@ class IntegrationKernels:
 
 
 @cache
-def integration_kernels(precision: Precision) -> IntegrationKernels:
-    """Kernels of the time step: ``sort`` and ``unsort`` a state, ``predict`` without pressure, and derivatives."""
+def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels:
+    """Kernels of the time step: ``sort`` and ``unsort`` a state, ``predict`` without pressure, and derivatives; a tape
+    can differentiate ``taped`` ones."""
     real, vector = precision.real, precision.vector
     adjoin_prediction = prediction_share(precision)
 
-    @wp.kernel(module=integration_module(precision, True))
+    @wp.kernel(module=integration_module(precision, True, taped))
     def sort(
         order: wp.array(dtype=wp.int32),
         x_scene: wp.array(dtype=vector),
@@ -64,7 +65,7 @@ def integration_kernels(precision: Precision) -> IntegrationKernels:
         v[i] = v_scene[order[i]]
         m[i] = m_scene[order[i]]
 
-    @wp.kernel(module=integration_module(precision, True))
+    @wp.kernel(module=integration_module(precision, True, taped))
     def unsort(
         order: wp.array(dtype=wp.int32),
         x: wp.array(dtype=vector),
@@ -77,7 +78,7 @@ def integration_kernels(precision: Precision) -> IntegrationKernels:
         x_scene[order[i]] = x[i]
         v_scene[order[i]] = v[i]
 
-    @wp.kernel(module=integration_module(precision, True))
+    @wp.kernel(module=integration_module(precision, True, taped))
     def predict(
         particles: int,
         time_step: wp.array(dtype=real),

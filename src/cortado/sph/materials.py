@@ -13,16 +13,16 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.kernels import Kernels
+from cortado.device.kernels import Kernels, kind_of
 from cortado.device.precision import Precision
 from cortado.sph.order import OrderKernels, order_kernels
 
 
-def mixture_module(precision: Precision, phases: int, differentiable: bool) -> Any:
-    """The Warp module of kernels for a number of phases that need no smoothing kernel."""
-    kind = "forward" if differentiable else "derivative"
-    module = wp.get_module(f"cortado_mixture_{kind}_{phases}_{precision.name}")
-    module.options["enable_backward"] = differentiable
+def mixture_module(precision: Precision, phases: int, forward: bool, taped: bool = False) -> Any:
+    """The Warp module of kernels for a number of phases that need no smoothing kernel; ``taped`` forward kernels get
+    Warp's own adjoint."""
+    module = wp.get_module(f"cortado_mixture_{kind_of(forward, taped)}_{phases}_{precision.name}")
+    module.options["enable_backward"] = forward and taped
     return module
 
 
@@ -35,8 +35,9 @@ class MixtureKernels:
 
 
 @cache
-def mixture_kernels(precision: Precision, phases: int) -> MixtureKernels:
-    """The kernels for a number of phases; their materials are arrays (members, phases)."""
+def mixture_kernels(precision: Precision, phases: int, taped: bool) -> MixtureKernels:
+    """The kernels for a number of phases; their materials are arrays (members, phases). A tape can differentiate
+    ``taped`` ones."""
     real, fractions = precision.real, precision.fractions(phases)
     tiny = wp.constant(real(precision.tiny))
 
@@ -45,7 +46,7 @@ def mixture_kernels(precision: Precision, phases: int) -> MixtureKernels:
         """tiny stands in for a phase without viscosity, of which any amount makes a mixture thin."""
         return wp.log(viscosity + tiny)
 
-    @wp.kernel(module=mixture_module(precision, phases, True))
+    @wp.kernel(module=mixture_module(precision, phases, True, taped))
     def blend(
         particles: int,
         c: wp.array(dtype=fractions),
@@ -126,5 +127,5 @@ def mixture_kernels(precision: Precision, phases: int) -> MixtureKernels:
         viscosity_bar[i] = viscosity_bar_i
         c_bar[i] = c_bar_i
 
-    order = order_kernels(fractions, mixture_module(precision, phases, True))
+    order = order_kernels(fractions, mixture_module(precision, phases, True, taped))
     return MixtureKernels(order, Kernels(blend, blend_tangent, blend_adjoint))

@@ -36,7 +36,7 @@ class Mixture:
         self.phases = phases
         self.fields = (replace(MASS_FRACTIONS, is_constant=phases.count == 1), REFERENCE_DENSITY)
         """What it carries from step to step: one phase stays what it is."""
-        self.kernels = mixture_kernels(layout.precision, phases.count)
+        self.kernels = mixture_kernels(layout.precision, phases.count, requires_grad)
         self.diffusion = diffusion_kernels(phases.diffusion) if phases.diffusion else None
         self.shares = ("rest_density", "viscosity", *(("mobility", "interface_width") if phases.diffusion else ()))
         """Parameters, numbers or those of phases, in whose adjoints every particle has a share."""

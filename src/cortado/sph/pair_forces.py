@@ -35,28 +35,30 @@ def pairwise(discretisation: Discretisation) -> PairForce:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
-    gradient, hessian_product, size = pair.gradient, pair.hessian_product, pair.size
+    slope, slope_change, per_size = pair.slope, pair.slope_change, pair.per_size
 
     @wp.func
     def force(x: vector, v: vector, s: neighbourhood) -> vector:
-        return (wp.dot(v, x) / size(x, s)) * gradient(x, s)
+        return (wp.dot(v, x) * per_size(x, s) * slope(x, s)) * x
 
     @wp.func
     def tangent(x: vector, v: vector, x_dot: vector, v_dot: vector, s: neighbourhood) -> vector:
-        d = size(x, s)
-        b = wp.dot(v, x) / d
-        b_dot = (wp.dot(v_dot, x) + wp.dot(v, x_dot) - real(2.0) * b * wp.dot(x, x_dot)) / d
-        return b_dot * gradient(x, s) + b * hessian_product(x, x_dot, s)
+        per_d = per_size(x, s)
+        a = slope(x, s)
+        b = wp.dot(v, x) * per_d
+        b_dot = (wp.dot(v_dot, x) + wp.dot(v, x_dot) - real(2.0) * b * wp.dot(x, x_dot)) * per_d
+        return (b_dot * a + b * slope_change(x, x_dot, s)) * x + (b * a) * x_dot
 
     @wp.func
     def adjoint_x(x: vector, v: vector, w: vector, s: neighbourhood) -> vector:
-        d = size(x, s)
-        b = wp.dot(v, x) / d
-        return b * hessian_product(x, w, s) + (wp.dot(gradient(x, s), w) / d) * (v - real(2.0) * b * x)
+        a = slope(x, s)
+        b = wp.dot(v, x) * per_size(x, s)
+        t = a * per_size(x, s) * wp.dot(x, w)
+        return (b * a) * w + t * v + (b * (slope_change(x, w, s) - real(2.0) * t)) * x
 
     @wp.func
     def adjoint_v(x: vector, v: vector, w: vector, s: neighbourhood) -> vector:
-        return (wp.dot(gradient(x, s), w) / size(x, s)) * x
+        return (slope(x, s) * per_size(x, s) * wp.dot(x, w)) * x
 
     return PairForce(force, tangent, adjoint_x, adjoint_v)
 

@@ -72,7 +72,7 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
             return
         normals[i] = inverse * total
 
-    @wp.kernel(module=discretisation.module(False, "surface_tension"), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module("surface_tension"), enable_backward=False)
     def normal_tangent(
         s: neighbourhood,
         inverse: real,

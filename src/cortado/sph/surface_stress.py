@@ -149,7 +149,7 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
             return
         acceleration[i] = acceleration_in[i] - (scale * surface_tension[member] / m[i]) * total
 
-    @wp.kernel(module=discretisation.module(False, "surface_tension"), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module("surface_tension"), enable_backward=False)
     def accelerate_tangent(
         s: neighbourhood,
         scale: real,

@@ -16,6 +16,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.arithmetic import arithmetic
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
@@ -29,28 +30,31 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
+    neighbour, wall_position, wall_weight = pair.neighbour, pair.wall_position, pair.wall_weight
     separation, vectors, numbers = pair.separation, pair.vectors, pair.numbers
     phi = form(discretisation)
     phi_force, phi_tangent, phi_adjoint_x, phi_adjoint_v = phi.force, phi.tangent, phi.adjoint_x, phi.adjoint_v
     LANES = discretisation.lanes
     lanes = lane_functions(discretisation.precision, LANES)
     lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
+    reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
+    tiny = wp.constant(real(discretisation.precision.tiny))
     name = form.__name__  # a module for each form: their functions have the same names
+
+    @wp.func
+    def part(a: real, b: real) -> real:
+        """b / (a + b), and half where both are 0."""
+        return wp.where(a + b > tiny, b * reciprocal(a + b), real(0.5))
 
     @wp.func
     def pair_viscosity(a: real, b: real) -> real:
         """mu_ij, the harmonic mean of two viscosities; 0 where both are 0."""
-        if a + b > real(0.0):
-            return real(2.0) * a * b / (a + b)
-        return real(0.0)
+        return real(2.0) * a * part(a, b)
 
     @wp.func
     def pair_viscosity_derivative(a: real, b: real) -> real:
         """d mu_ij / d mu_i; where both are 0, the derivative for both increasing together."""
-        if a + b > real(0.0):
-            part = b / (a + b)
-            return real(2.0) * part * part
-        return real(0.5)
+        return real(2.0) * part(a, b) * part(a, b)
 
     @wp.func_grad(pair_viscosity)
     def adjoin_pair_viscosity(a: real, b: real, bar: real):
@@ -77,13 +81,13 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
             n_j = numbers(n, k, i, s)
             mu_j = numbers(mu, k, i, s)
             for u in range(UNROLL):
-                weight = pair_viscosity(mu_i, mu_j[u]) * s.volume / n_j[u]
+                weight = pair_viscosity(mu_i, mu_j[u]) * s.volume * reciprocal(n_j[u])
                 total += weight * phi_force(separation(x_i, x_j[u], s), v_i - v_j[u], s)
         if friction != real(0.0):
             for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-                b = s.neighbours[k, i]
-                x_ib = separation(x_i, s.wall_positions[b], s)
-                total += (mu_i * friction * s.volume * s.wall_weights[b]) * phi_force(x_ib, v_i, s)
+                b = neighbour(k, i, s)
+                x_ib = separation(x_i, wall_position(b, s), s)
+                total += (mu_i * friction * s.volume * wall_weight(b, s)) * phi_force(x_ib, v_i, s)
         return add_up_vectors(total)
 
     @wp.func
@@ -109,7 +113,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         total = vector()
         for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
+                j = neighbour(k + u, i, s)
                 x_ij = separation(x_i, x[j], s)
                 v_ij = v_i - v[j]
                 volume_j = s.volume / n[j]
@@ -120,9 +124,9 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
                 total += (volume_j * mu_ij) * phi_tangent(x_ij, v_ij, x_dot_i - x_dot[j], v_dot_i - v_dot[j], s)
         if friction != real(0.0):
             for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-                b = s.neighbours[k, i]
-                x_ib = separation(x_i, s.wall_positions[b], s)
-                wall_volume = friction * s.volume * s.wall_weights[b]
+                b = neighbour(k, i, s)
+                x_ib = separation(x_i, wall_position(b, s), s)
+                wall_volume = friction * s.volume * wall_weight(b, s)
                 total += (wall_volume * mu_dot_i) * phi_force(x_ib, v_i, s)
                 total += (wall_volume * mu_i) * phi_tangent(x_ib, v_i, x_dot_i, v_dot_i, s)
         return add_up_vectors(total)
@@ -147,7 +151,7 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
             return
         acceleration[i] = acceleration_in[i] + (kappa / (m[i] * n[i])) * total
 
-    @wp.kernel(module=discretisation.module(False, name), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module(name), enable_backward=False)
     def viscosity_tangent(
         s: neighbourhood,
         kappa: real,
@@ -214,21 +218,21 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
             for u in range(UNROLL):
                 x_ij = separation(x_i, x_j[u], s)
                 v_ij = v_i - v_j[u]
-                w_ij = w_i - w_j[u] / m_j[u]
-                volume_j = s.volume / n_j[u]
+                w_ij = w_i - reciprocal(m_j[u]) * w_j[u]
+                volume_j = s.volume * reciprocal(n_j[u])
                 weight = volume_j * pair_viscosity(mu_i, mu_j[u])
                 force = phi_force(x_ij, v_ij, s)
                 force_work = wp.dot(force, w_ij)
-                x_sum += weight * phi_adjoint_x(x_ij, v_ij, w_ij, s)
-                v_sum += weight * phi_adjoint_v(x_ij, v_ij, w_ij, s)
+                x_sum += phi_adjoint_x(x_ij, v_ij, weight * w_ij, s)
+                v_sum += phi_adjoint_v(x_ij, v_ij, weight * w_ij, s)
                 work += weight * force_work
                 own_work += weight * wp.dot(force, w_i)
                 mu_work += volume_j * pair_viscosity_derivative(mu_i, mu_j[u]) * force_work
         if friction != real(0.0):
             for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-                b = s.neighbours[k, i]
-                x_ib = separation(x_i, s.wall_positions[b], s)
-                wall_volume = friction * s.volume * s.wall_weights[b]
+                b = neighbour(k, i, s)
+                x_ib = separation(x_i, wall_position(b, s), s)
+                wall_volume = friction * s.volume * wall_weight(b, s)
                 x_sum += (mu_i * wall_volume) * phi_adjoint_x(x_ib, v_i, w_i, s)
                 v_sum += (mu_i * wall_volume) * phi_adjoint_v(x_ib, v_i, w_i, s)
                 wall_work = wall_volume * wp.dot(phi_force(x_ib, v_i, s), w_i)

@@ -29,7 +29,7 @@ class OneKernelTape(Tape):
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
         step = super().derivative(rollout)
-        loops = one_kernel_loops(rollout.solver.discretisation)
+        loops = one_kernel_loops(step.solver.discretisation)
         wrong = {topic: Kernels(loops[topic], None, None) for topic in self.topics}
         step.solver.density = wrong.pop("density", step.solver.density)
         step.solver.kernels = replace(step.solver.kernels, **wrong)

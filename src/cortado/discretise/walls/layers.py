@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import brentq
 
 from cortado.lattice.calibration import lattice_offsets, shear_factor
 from cortado.lattice.smoothing import SmoothingKernel
@@ -91,6 +90,8 @@ def wall_layers(kernel: SmoothingKernel, spacing: float, support: float, dimensi
     def push(deepest: float) -> float:
         slopes = [planes.slope(heights[0] + depth) for depth in depths(deepest)]
         return float(weights(deepest) @ slopes - pull)
+
+    from scipy.optimize import brentq
 
     deepest = brentq(push, 0.5 * spacing, support - (0.5 + 1e-3) * spacing, xtol=1e-14 * spacing)
     layers = depths(deepest)

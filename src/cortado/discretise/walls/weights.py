@@ -1,10 +1,9 @@
 """What every wall particle of a container counts for in the density, by least squares, in float64."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import lsq_linear
-from scipy.sparse import coo_array, csr_array, identity, vstack
 
 from cortado.discretise.walls.places import Places
 from cortado.lattice.calibration import lattice_offsets
@@ -12,6 +11,9 @@ from cortado.lattice.pairs import pairs_within
 from cortado.lattice.region import Region
 from cortado.lattice.shapes import Points
 from cortado.lattice.smoothing import SmoothingKernel
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 STIFFNESS = 3e-3
 """How much a weight resists a change, relative, beside an error of the density: where densities leave a weight open it
@@ -83,6 +85,9 @@ class Surface:
         cup, and across the seam of a period. Against the push, as in `wall_layers`, the wall's part in the gradient is
         twice that of the fluid that is missing.
         """
+        from scipy.optimize import lsq_linear
+        from scipy.sparse import identity, vstack
+
         count = len(self.walls)
         if not count:
             return np.zeros(0)
@@ -93,8 +98,10 @@ class Surface:
         changes = lsq_linear(sums, wanted - sums.sum(axis=1), bounds=(-1.0, np.inf), lsq_solver="lsmr", tol=1e-10).x
         return np.asarray(self.flat * (1.0 + changes), dtype=np.float64)
 
-    def _demands(self, places: Places) -> tuple[csr_array, Points]:
+    def _demands(self, places: Places) -> tuple["csr_array", Points]:
         """A matrix (m, b) that gives, with the weights of the walls over their flat ones, what is wanted, (m,)."""
+        from scipy.sparse import coo_array, vstack
+
         place, wall, _ = pairs_within(places.points, self.walls, self.lattice.support, self.lower, self.lengths)
         apart = places.points[place] - self.walls[wall]
         apart -= self.lengths * np.rint(apart / np.where(self.lengths > 0.0, self.lengths, np.inf))

@@ -89,7 +89,7 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
         t[i] = s.volume * total
         y[i] = wall_y[i] / (real(1.0) + excess(s.volume * total))
 
-    @wp.kernel(module=discretisation.module(False, "density_ratio"), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module("density_ratio"), enable_backward=False)
     def density_ratio_tangent(
         s: neighbourhood,
         x: wp.array(dtype=vector),

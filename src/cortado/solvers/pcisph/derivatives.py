@@ -60,7 +60,7 @@ class PcisphAdjoint(ParticleAdjoint):
             context.launch(kernels.pressure.adjoint, going, *known, r=self._r, push_bar=push_bar, **predicted)
         context.launch(solver.integration.acceleration_adjoint, *known, acceleration_bar=self._acceleration_bar)
         self.accelerate(context, self._acceleration_bar)
-        if solver.mixture.phases.count > 1:
+        if kernels.density_ratio:
             factors = {"t": solver.density_ratio, "y": solver.pressure_relaxation, "y_bar": self._y_bar}
             context.launch(kernels.density_ratio.factor_adjoint, **factors, t_bar=self._t_bar)
             context.launch(kernels.density_ratio.adjoint, *known, t_bar=self._t_bar)
@@ -128,10 +128,9 @@ class PcisphTangent(ParticleTangent):
     def _relax(self, known: tuple[Named, ...], context: StepContext) -> None:
         """The tangent of the pressure relaxation."""
         solver, kernels = self._solver, self._solver.kernels
-        several = solver.mixture.phases.count > 1
-        y_dot = self._wall_y_dot if several else self._y_dot
+        y_dot = self._wall_y_dot if kernels.density_ratio else self._y_dot
         context.launch(kernels.wall_relaxation.tangent, *known, y=solver.wall_relaxation, y_dot=y_dot)
-        if several:
+        if kernels.density_ratio:
             factors = {
                 "t": solver.density_ratio,
                 "y": solver.pressure_relaxation,

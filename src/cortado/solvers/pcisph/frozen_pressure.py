@@ -18,7 +18,9 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
-    separation, gradient, vectors, numbers = pair.separation, pair.gradient, pair.vectors, pair.numbers
+    neighbour, wall_position, wall_weight = pair.neighbour, pair.wall_position, pair.wall_weight
+    separation, slope, gradient = pair.separation, pair.slope, pair.gradient
+    vectors, numbers = pair.vectors, pair.numbers
     LANES = discretisation.lanes
     lanes = lane_functions(discretisation.precision, LANES)
     lane, add_up = lanes.lane, lanes.add_up
@@ -63,13 +65,14 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
             c_j = numbers(c, k, i, s)
             push_bar_j = vectors(push_bar, k, i, s)
             for u in range(UNROLL):
-                g_ij = gradient(separation(x_i, x_j[u], s), s)
-                divergence += wp.dot(g_ij, push_bar_i - push_bar_j[u])
-                work += (c_i + c_j[u]) * wp.dot(g_ij, push_bar_i)
+                x_ij = separation(x_i, x_j[u], s)
+                a = slope(x_ij, s)
+                divergence += a * wp.dot(x_ij, push_bar_i - push_bar_j[u])
+                work += ((c_i + c_j[u]) * a) * wp.dot(x_ij, push_bar_i)
         for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = s.neighbours[k, i]
-            g_ib = gradient(separation(x_i, s.wall_positions[b], s), s)
-            wall_divergence = s.wall_weights[b] * wp.dot(g_ib, push_bar_i)
+            b = neighbour(k, i, s)
+            g_ib = gradient(separation(x_i, wall_position(b, s), s), s)
+            wall_divergence = wall_weight(b, s) * wp.dot(g_ib, push_bar_i)
             divergence += wall_divergence
             work += c_i * wall_divergence
         divergence = add_up(divergence)

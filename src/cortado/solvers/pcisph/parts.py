@@ -18,16 +18,17 @@ class PcisphKernels:
     """The kernels that only PCISPH needs, each topic with its forward, tangent and adjoint."""
 
     wall_relaxation: Kernels
-    density_ratio: DensityRatioKernels
+    density_ratio: DensityRatioKernels | None
+    """Only where there are several phases."""
     pressure: Kernels
     force: Kernels
 
     @classmethod
-    def of(cls, discretisation: Discretisation) -> "PcisphKernels":
-        """Those for a smoothing kernel and a precision."""
+    def of(cls, discretisation: Discretisation, phases: int) -> "PcisphKernels":
+        """Those for a smoothing kernel, a precision and a number of phases."""
         return cls(
             wall_kernels(discretisation),
-            density_ratio_kernels(discretisation),
+            density_ratio_kernels(discretisation) if phases > 1 else None,
             pressure_kernels(discretisation),
             pressure_force_kernels(discretisation),
         )

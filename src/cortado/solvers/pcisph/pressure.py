@@ -74,7 +74,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         c[i] = p_i / (n[i] * n[i])
         error[i] = pair_of(compression, compression)
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
     def pressure_tangent(
         s: neighbourhood,
         k: int,

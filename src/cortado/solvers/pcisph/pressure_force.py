@@ -15,7 +15,9 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
-    separation, gradient, hessian_product = pair.separation, pair.gradient, pair.hessian_product
+    neighbour, wall_position, wall_weight = pair.neighbour, pair.wall_position, pair.wall_weight
+    separation, slope, slope_change = pair.separation, pair.slope, pair.slope_change
+    gradient, hessian_product = pair.gradient, pair.hessian_product
     vectors, numbers = pair.vectors, pair.numbers
     LANES = discretisation.lanes
     lanes = lane_functions(discretisation.precision, LANES)
@@ -30,10 +32,11 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
             x_j = vectors(x, k, i, s)
             c_j = numbers(c, k, i, s)
             for u in range(UNROLL):
-                total += (c_i + c_j[u]) * gradient(separation(x_i, x_j[u], s), s)
+                x_ij = separation(x_i, x_j[u], s)
+                total += ((c_i + c_j[u]) * slope(x_ij, s)) * x_ij
         for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = s.neighbours[k, i]
-            total += (s.wall_weights[b] * c_i) * gradient(separation(x_i, s.wall_positions[b], s), s)
+            b = neighbour(k, i, s)
+            total += (wall_weight(b, s) * c_i) * gradient(separation(x_i, wall_position(b, s), s), s)
         return add_up_vectors(total)
 
     @wp.func
@@ -52,15 +55,15 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         total = vector()
         for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
+                j = neighbour(k + u, i, s)
                 x_ij = separation(x_i, x[j], s)
                 total += (c_dot_i + c_dot[j]) * gradient(x_ij, s)
                 total += (c_i + c[j]) * hessian_product(x_ij, x_dot_i - x_dot[j], s)
         for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = s.neighbours[k, i]
-            x_ib = separation(x_i, s.wall_positions[b], s)
-            total += (s.wall_weights[b] * c_dot_i) * gradient(x_ib, s)
-            total += (s.wall_weights[b] * c_i) * hessian_product(x_ib, x_dot_i, s)
+            b = neighbour(k, i, s)
+            x_ib = separation(x_i, wall_position(b, s), s)
+            total += (wall_weight(b, s) * c_dot_i) * gradient(x_ib, s)
+            total += (wall_weight(b, s) * c_i) * hessian_product(x_ib, x_dot_i, s)
         return add_up_vectors(total)
 
     @wp.kernel(module=discretisation.module(True))
@@ -96,7 +99,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         v_star[i] = velocity
         x_star[i] = x[i] + dt * velocity
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
     def pressure_force_tangent(
         s: neighbourhood,
         k: int,
@@ -178,15 +181,16 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
             push_bar_j = vectors(push_bar, k, i, s)
             for u in range(UNROLL):
                 x_ij = separation(x_i, x_j[u], s)
-                g_ij = gradient(x_ij, s)
                 u_ij = push_bar_i - push_bar_j[u]
-                divergence += wp.dot(g_ij, u_ij)
-                hessian_products += (c_i + c_j[u]) * hessian_product(x_ij, u_ij, s)
-                work += (c_i + c_j[u]) * wp.dot(g_ij, push_bar_i)
+                a = slope(x_ij, s)
+                c_ij = c_i + c_j[u]
+                divergence += a * wp.dot(x_ij, u_ij)
+                hessian_products += (c_ij * a) * u_ij + (c_ij * slope_change(x_ij, u_ij, s)) * x_ij
+                work += (c_ij * a) * wp.dot(x_ij, push_bar_i)
         for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = s.neighbours[k, i]
-            x_ib = separation(x_i, s.wall_positions[b], s)
-            weight = s.wall_weights[b]
+            b = neighbour(k, i, s)
+            x_ib = separation(x_i, wall_position(b, s), s)
+            weight = wall_weight(b, s)
             wall_divergence = weight * wp.dot(gradient(x_ib, s), push_bar_i)
             divergence += wall_divergence
             hessian_products += (weight * c_i) * hessian_product(x_ib, push_bar_i, s)

@@ -18,7 +18,7 @@ class PcisphSteps(ParticleSolver):
     def __init__(self, system: ParticleSystem, limits: LoopLimits | None, requires_grad: bool = False):
         """``limits`` None leaves the pressure out."""
         super().__init__(system, requires_grad)
-        self.limits, self.kernels = limits, PcisphKernels.of(self.discretisation)
+        self.limits, self.kernels = limits, PcisphKernels.of(self.discretisation, self.mixture.phases.count)
         self.wall_relaxation, self.density_ratio = self.numbers(), self.numbers()
         self.pressure_relaxation = self.numbers() if self.mixture.phases.count > 1 else self.wall_relaxation
         """(n,) what delta is multiplied with [-]: beside walls, and with several phases among lighter neighbours."""
@@ -52,7 +52,7 @@ class PcisphSteps(ParticleSolver):
         """Everything but the pressure, and the first prediction."""
         it, kernels, context = self.iterates, self.kernels, self.sort(state, parameters)
         context.launch(kernels.wall_relaxation.forward, y=self.wall_relaxation)
-        if self.mixture.phases.count > 1:
+        if kernels.density_ratio:
             context.launch(
                 kernels.density_ratio.forward,
                 wall_y=self.wall_relaxation,

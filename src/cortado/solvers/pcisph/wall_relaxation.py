@@ -27,6 +27,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
+    neighbour, wall_position, wall_weight = pair.neighbour, pair.wall_position, pair.wall_weight
     separation, gradient, hessian_product = pair.separation, pair.gradient, pair.hessian_product
 
     LANES = discretisation.lanes
@@ -37,17 +38,17 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
     def wall_gradient(i: int, x: wp.array(dtype=vector), s: neighbourhood) -> vector:
         total = vector()
         for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = s.neighbours[k, i]
-            total += (s.response_scale * s.wall_weights[b]) * gradient(separation(x[i], s.wall_positions[b], s), s)
+            b = neighbour(k, i, s)
+            total += (s.response_scale * wall_weight(b, s)) * gradient(separation(x[i], wall_position(b, s), s), s)
         return add_up_vectors(total)
 
     @wp.func
     def wall_hessian_product(i: int, x: wp.array(dtype=vector), u: vector, s: neighbourhood) -> vector:
         total = vector()
         for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = s.neighbours[k, i]
-            total += (s.response_scale * s.wall_weights[b]) * hessian_product(
-                separation(x[i], s.wall_positions[b], s), u, s
+            b = neighbour(k, i, s)
+            total += (s.response_scale * wall_weight(b, s)) * hessian_product(
+                separation(x[i], wall_position(b, s), s), u, s
             )
         return add_up_vectors(total)
 
@@ -64,7 +65,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
             return
         y[i] = real(1.0) / (real(1.0) + wp.dot(total, total))
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
     def wall_relaxation_tangent(
         s: neighbourhood,
         x: wp.array(dtype=vector),

@@ -1,0 +1,153 @@
+"""What is compiled for a step, and when: all at once, only what the scene needs, and by several processes at a time."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import warp as wp
+
+import cortado
+from compiling_notice import COMPILING
+from cortado.device.compiling import kernels_of
+from cortado.device.kernels import is_derivative
+from scenes import plane, pour
+
+FIRST = {
+    "cells_float32",
+    "containment_float32",
+    "convergence_float32",
+    "integration_forward_float32",
+    "mixture_forward_1_float32",
+    "neighbours_forward_cubic_spline_float32",
+    "pairwise_forward_cubic_spline_float32",
+    "pcisph_forward_cubic_spline_float32",
+    "sum_and_maximum_float32",
+}
+"""What the first step of one phase loads. Every module is about 0.1 s of everybody's first step, more where its kernels
+sum over neighbours: what joins this list should be needed by every scene."""
+BACK = {
+    "add_float32",
+    "add_float32_1",
+    "add_float32_3",
+    "integration_derivative_float32",
+    "matching_float32",
+    "mixture_derivative_1_float32",
+    "pairwise_derivative_cubic_spline_float32",
+    "pcisph_derivative_cubic_spline_float32",
+    "sum_float32",
+    "sum_float32_1",
+    "sum_float32_3",
+    "sum_float64",
+}
+"""What the first gradient adds: no tangents, nothing that a tape needs."""
+RUN = """
+import os
+import cortado
+from warp._src.context import user_modules
+
+def loaded():
+    return sorted(name.removeprefix("cortado_") for name, module in user_modules.items() if module.execs)
+
+simulation = cortado.Simulation("docs/figures/dam_break_plane.toml")
+WORK
+"""
+
+
+def process(cache, work):
+    environment = {**os.environ, "WARP_CACHE_PATH": str(cache)}
+    program = RUN.replace("WORK", work)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen([sys.executable, "-c", program], env=environment, text=True, **pipes)
+
+
+def result(started):
+    out, err = started.communicate(timeout=300)
+    assert started.returncode == 0, err
+    return out, err
+
+
+GRADIENT = """
+simulation.run(1)
+print(*loaded())
+problem = cortado.Problem(simulation, 1, cortado.losses.FinalPositions(simulation.positions + 0.01))
+problem.value_and_gradient({"gravity": [0.0, -9.81]})
+print(*loaded())
+"""
+
+
+def test_one_phase_loads_what_it_needs_and_no_more(tmp_path):
+    out, err = result(process(tmp_path, GRADIENT))
+    first, both = (set(line.split()) for line in out.splitlines())
+    assert first == FIRST
+    assert both - first == BACK
+    assert all(COMPILING.fullmatch(line + "\n") for line in err.splitlines()) and err.count("\n") == 2
+
+
+def test_two_processes_start_cold_at_once(tmp_path):
+    work = "print(float(simulation.run(3)[-1].positions.sum()).hex())"
+    started = [process(tmp_path, work) for _ in range(2)]
+    (one, _), (other, _) = (result(each) for each in started)
+    assert one == other
+    again, err = result(process(tmp_path, work))
+    assert again == one and err == ""
+
+
+FORK = """
+child = os.fork()
+simulation.run(2)
+if child == 0:
+    os._exit(0)
+assert os.waitpid(child, 0)[1] == 0
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_a_fork_while_headers_are_precompiled(tmp_path):
+    result(process(tmp_path, FORK))
+
+
+TENSION = {"gravity": [0.0, -9.81], "viscosity": "laminar", "surface_tension": 0.01}
+SCENES = {
+    "one phase": plane(),
+    "laminar, surface tension": plane(forces=TENSION),
+    "no pressure": plane(forces={"gravity": [0.0, -9.81], "pressure": False}),
+    "two phases, an emitter": pour(),
+}
+
+
+@pytest.fixture
+def launched(monkeypatch):
+    """The modules of the kernels that are launched."""
+    found, launch = set(), wp.launch
+
+    def noted(kernel, *arguments, **options):
+        found.add(kernel.module.name)
+        return launch(kernel, *arguments, **options)
+
+    monkeypatch.setattr(wp, "launch", noted)
+    return found
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+def test_what_a_step_launches_is_compiled_ahead_and_little_more(launched, scene):
+    """What Simulation itself does is no launch."""
+    simulation = cortado.Simulation(scene)
+    assert not launched
+    ahead = {k.module.name for k in kernels_of(simulation.solver) if not is_derivative(k.module)}
+    simulation.run(1)
+    assert launched <= ahead
+    if scene.forces.pressure:
+        assert ahead == launched
+
+
+def test_what_a_step_back_launches_is_compiled_ahead(launched):
+    simulation = cortado.Simulation(plane())
+    problem = cortado.Problem(simulation, 1, cortado.losses.FinalPositions(np.zeros_like(simulation.positions)))
+    derivative = cortado.gradients.Exact().derivative(simulation.rollout(1))
+    ahead = {kernel.module.name for kernel in kernels_of(derivative)}
+    problem.value_and_gradient({"gravity": [0.0, -9.81]})
+    back = {name for name in launched if "_derivative_" in name}
+    assert back and back <= ahead
