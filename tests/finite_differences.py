@@ -26,6 +26,18 @@ def central_difference(
     return (ahead - behind) / (2.0 * h)
 
 
+def fourth_order_difference(
+    value: Callable[[Mapping[str, Any]], Any], point: Mapping[str, Any], directions: Mapping[str, Any], h: float
+) -> Any:
+    """The same of fourth order, by Richardson's extrapolation: it bears larger steps, with less round-off."""
+    return (
+        4.0 * central_difference(value, point, directions, h) - central_difference(value, point, directions, 2.0 * h)
+    ) / 3.0
+
+
+Difference = Callable[[Callable[[Mapping[str, Any]], Any], Mapping[str, Any], Mapping[str, Any], float], Any]
+
+
 def distance(
     value: Callable[[Mapping[str, Any]], float],
     point: Mapping[str, Any],
@@ -33,11 +45,12 @@ def distance(
     derivative: float,
     steps: Sequence[float],
     enough: float = 0.0,
+    difference: Difference = central_difference,
 ) -> float:
-    """Relative distance of a derivative from a plateau of central differences; stops where that is small enough."""
+    """Relative distance of a derivative from a plateau of differences; stops where that is small enough."""
     errors: list[float] = []
     for h in steps:
-        errors.append(abs(central_difference(value, point, directions, h) - derivative) / abs(derivative))
+        errors.append(abs(difference(value, point, directions, h) - derivative) / abs(derivative))
         if len(errors) >= PLATEAU and plateau(errors) < enough:
             break
     return plateau(errors)

@@ -23,7 +23,7 @@ FIRST = {
     "neighbours_forward_cubic_spline_float32",
     "pairwise_forward_cubic_spline_float32",
     "pcisph_forward_cubic_spline_float32",
-    "sum_and_maximum_float32",
+    "sum_and_maximum_float32_2",
 }
 """What the first step of one phase loads. Every module is about 0.1 s of everybody's first step, more where its kernels
 sum over neighbours: what joins this list should be needed by every scene."""

@@ -12,7 +12,7 @@ from cortado.losses.image_losses import Pyramid, SquaredDifference
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
 from cortado.render.views import TopView
-from finite_differences import decades, distance
+from finite_differences import decades, distance, fourth_order_difference
 from scenes import plane_of_three, two_layers
 
 RESOLUTION = [20, 16]
@@ -87,7 +87,10 @@ def test_gradient_equals_tangent_and_differences(name, what):
     adjoint = sum((gradient[k] * direction).sum() for k, direction in directions.items())
     tangent = problem.tangent(point, directions)
     assert abs(adjoint - tangent) <= 1e-10 * abs(tangent)
-    assert distance(problem.value, point, directions, tangent, decades(2.0, 6.0), enough=1e-7) < 1e-6
+    # In the plane the loss of 1.26 has a derivative of 2e-7 with respect to the viscosities: differences of second
+    # order end at the round-off of the loss, some 1e-6 of it, where those of fourth order come to 5e-9.
+    given = {"steps": decades(1.5, 5.5), "enough": 1e-7, "difference": fourth_order_difference}
+    assert distance(problem.value, point, directions, tangent, **given) < 1e-6
 
 
 @scenes

@@ -27,8 +27,8 @@ LAYERS = """
     scene.containers scene.model scene.stability
     device device.cores device.kernels device.memory device.precision device.arithmetic device.loads device.lanes
     device.reduction device.silence device.threads device.compiling device.kernel_cache device.smoothing
-    device.neighbourhood device.arrays device.fields device.launching device.state device.cells device.candidates
-    device.neighbours
+    device.neighbourhood device.arrays device.fields device.launching device.state device.cells
+    device.candidates device.neighbours
     scene.checks scene.scene
     parameters.checks
     discretise.sampling discretise.discrete_scene

@@ -289,8 +289,8 @@ def test_a_crowd_in_one_cell(precision):
 class FewLanes(Discretisation):
     """Scans as with a few lanes, of which a CPU has one."""
 
-    def module(self, differentiable, topic="pcisph"):
-        return super().module(differentiable, f"{topic}_{type(self).__name__}")
+    def module(self, forward, topic="pcisph"):
+        return super().module(forward, f"{topic}_{type(self).__name__}")
 
 
 class ManyLanes(FewLanes):

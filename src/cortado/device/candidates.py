@@ -15,8 +15,8 @@ import warp as wp
 
 from cortado.device.cells import cell_functions, cell_grid_type
 from cortado.device.lanes import lane_functions
+from cortado.device.loads import loads
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
-from cortado.device.precision import Precision
 
 BITS = 32
 """Candidates that one thread compares before it appends."""
@@ -24,18 +24,6 @@ ROWS = 9
 """Rows of cells to visit, at most."""
 LEAST_AT_ONCE = 8
 """Lanes that take the rows at once; fewer take one after the other. Measured on an H200."""
-
-
-@cache
-def _at(precision: Precision) -> Any:
-    """A Warp function: a vector of an array without gaps. What Warp computes to find one in any array is a quarter of
-    the time of a fill on a CPU."""
-    vector = precision.vector
-
-    @wp.func_native("return vectors.data[j];")
-    def at(vectors: wp.array(dtype=vector), j: int) -> vector: ...
-
-    return at
 
 
 @cache
@@ -62,7 +50,8 @@ def scan_by_bits(discretisation: Discretisation) -> Any:
     out."""
     vector = discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
-    separation, at = pair_functions(discretisation).separation, _at(discretisation.precision)
+    separation = pair_functions(discretisation).separation
+    load = loads(discretisation.precision, discretisation.taped).vector
 
     @wp.func
     def scan(
@@ -82,10 +71,10 @@ def scan_by_bits(discretisation: Discretisation) -> Any:
         for begin in range(first, last, BITS):
             near = wp.uint32(0)
             for j in range(begin, wp.min(last, begin + BITS), UNROLL):
-                x_0 = at(positions, j)
-                x_1 = at(positions, wp.min(j + 1, final))
-                x_2 = at(positions, wp.min(j + 2, final))
-                x_3 = at(positions, wp.min(j + 3, final))
+                x_0 = load(positions, j)
+                x_1 = load(positions, wp.min(j + 1, final))
+                x_2 = load(positions, wp.min(j + 2, final))
+                x_3 = load(positions, wp.min(j + 3, final))
                 x_j = wp.matrix_from_rows(x_0, x_1, x_2, x_3)
                 of_four = wp.uint32(0)
                 for u in range(wp.static(UNROLL)):
@@ -114,7 +103,8 @@ def scan_by_lanes(discretisation: Discretisation) -> Any:
     """The same as `scan_by_bits`, for several lanes."""
     vector = discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
-    separation, at = pair_functions(discretisation).separation, _at(discretisation.precision)
+    separation = pair_functions(discretisation).separation
+    load = loads(discretisation.precision, discretisation.taped).vector
     LANES = discretisation.lanes
     lane, append = lane_functions(discretisation.precision, LANES).lane, _append(discretisation)
 
@@ -135,7 +125,7 @@ def scan_by_lanes(discretisation: Discretisation) -> Any:
             j = candidate + lane()
             near = False
             if j < last and j != own:
-                x_ij = separation(x_i, at(positions, j), s)
+                x_ij = separation(x_i, load(positions, j), s)
                 near = wp.dot(x_ij, x_ij) < limit
             total = append(i, j, near, total, s)
         return total
@@ -201,7 +191,8 @@ def scan_at_once(discretisation: Discretisation) -> Any:
     neighbourhood = neighbourhood_type(discretisation.precision)
     cells = cell_functions(discretisation.precision)
     wrap, below, above = cells.wrap, cells.below, cells.above
-    separation, at = pair_functions(discretisation).separation, _at(discretisation.precision)
+    separation = pair_functions(discretisation).separation
+    load = loads(discretisation.precision, discretisation.taped).vector
     LANES = discretisation.lanes
     lane, append = lane_functions(discretisation.precision, LANES).lane, _append(discretisation)
     scan_rows = scan_by_rows(discretisation)
@@ -253,7 +244,7 @@ def scan_at_once(discretisation: Discretisation) -> Any:
                 for r in range(1, wp.static(ROWS)):
                     j[u] = wp.where(t >= end[r - 1], t + shift[r], j[u])
             x_j = wp.matrix_from_rows(
-                at(positions, j[0]), at(positions, j[1]), at(positions, j[2]), at(positions, j[3])
+                load(positions, j[0]), load(positions, j[1]), load(positions, j[2]), load(positions, j[3])
             )
             for u in range(wp.static(UNROLL)):
                 x_ij = separation(x_i, x_j[u], s)

@@ -119,8 +119,7 @@ class NeighbourSearch:
         self.wall_weights = wp.array(wall_weights, dtype=precision.real, device=device)
         self._wall_sort = CellSort(grid, len(walls), precision, device)
         self._unsorted_walls: tuple[np.ndarray, np.ndarray] | None = (walls, wall_weights)
-        self._near_walls = wp.zeros(grid.cells, dtype=wp.bool, device=device)
-        self._grid = grid
+        self._grid, self._near_walls = grid, wp.zeros(grid.cells, dtype=wp.bool, device=device)
         self.allocate(capacity)
 
     def allocate(self, capacity: int) -> None:
