@@ -299,3 +299,10 @@ def test_states_are_shared_with_other_libraries():
     assert end.state.numbers("reference_density").shape == (2, 125)
     end.state.numbers("positions").fill_(2.0)
     np.testing.assert_array_equal(end[1].state.positions.numpy(), np.full((125, 3), 2.0))
+
+
+def test_a_force_of_a_users_own_is_not_trusted_with_a_batch(monkeypatch):
+    monkeypatch.setattr("cortado.sph.viscosity.Viscosity.batches", False)
+    Simulation(scenes.plane())
+    with pytest.raises(InputError, match=r"batch is 2, .* as the force Viscosity has no `batches = True`"):
+        Simulation(scenes.plane(), batch=2)

@@ -14,6 +14,7 @@ from cortado.device.neighbours import NeighbourSearch
 from cortado.device.precision import Precision
 from cortado.device.state import Layout
 from cortado.discretise.discrete_scene import DiscreteScene
+from cortado.errors import InputError
 from cortado.lattice.calibration import SKIN
 from cortado.parameters.registry import PARAMETERS
 from cortado.scene.containers import NoContainer
@@ -84,7 +85,14 @@ def _forces(scene: Scene, discrete: DiscreteScene, discretisation: Discretisatio
     setting = Setting(scene, discretisation, discrete.lattice, discrete.wall_layers, layout)
     modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene)]
     found = [import_module(name).force(setting) for name in modules]
-    return [force for force in found if force is not None]
+    forces = [force for force in found if force is not None]
+    for force in forces:
+        if layout.batch is not None and not getattr(force, "batches", False):
+            raise InputError(
+                f"batch is {layout.batch}, but must be left out, as the force {type(force).__name__} has no "
+                "`batches = True`, which says that its kernels read the parameters of a particle's own scene."
+            )
+    return forces
 
 
 def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnergy) -> Phases:

@@ -48,6 +48,7 @@ class Gravity:
     """The force of gravity on the particles of one solver."""
 
     shares: tuple[str, ...] = ()
+    batches = True
 
     def __init__(self, layout: Layout, taped: bool):
         self._kernels, self._layout, self._members = gravity_kernels(layout.precision, taped), layout, layout.members

@@ -115,7 +115,8 @@ class Setting:
 
 
 class Force(Protocol):
-    """An explicit force. A step adds up the accelerations [m / s2] of its forces, one after the other."""
+    """An explicit force. A step adds up the accelerations [m / s2] of its forces, one after the other. One that says
+    ``batches = True`` runs in batches: its kernels read the parameters of scene i // particles for particle i."""
 
     shares: tuple[str, ...]
     """Parameters, numbers or those of phases, to whose adjoints every particle adds a share: an adjoint kernel sees

@@ -36,6 +36,7 @@ class SurfaceTension:
     """Surface tension of a number of particles; its arrays are those of the last step."""
 
     shares: tuple[str, ...] = ("surface_tension",)
+    batches = True
 
     def __init__(self, discretisation: Discretisation, inverse: float, scale: float, layout: Layout):
         """``inverse`` and ``scale`` as `tension_constants` gives them."""

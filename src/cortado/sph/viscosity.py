@@ -260,6 +260,7 @@ class Viscosity:
     """A viscous force between neighbours, and with walls."""
 
     shares: tuple[str, ...] = ()  # viscosities reach particles through the mixture, which has the phases' adjoints
+    batches = True
 
     def __init__(self, discretisation: Discretisation, form: PairForm, kappa: float, friction: float):
         """``friction`` 0 lets walls slip freely."""
