@@ -8,6 +8,7 @@ import json
 import re
 import sys
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from matplotlib.ticker import NullFormatter
@@ -159,6 +160,11 @@ def rewritten(page: str, name: str, text: str) -> str:
     return re.sub(f"{re.escape(begin)}.*?{re.escape(end)}", lambda _: f"{begin}\n{text}\n{end}", page, flags=re.DOTALL)
 
 
+def wrapped(text: str) -> str:
+    """The same with sentences, but not rows of tables, in lines of 120 characters."""
+    return "\n".join(line if line.startswith("|") else fill(line, 120) for line in text.split("\n"))
+
+
 def main() -> None:
     runs = [shown(json.loads(Path(file).read_text())["runs"]) for file in sys.argv[1:]]
     last = {kind(run): run for run in runs}
@@ -167,7 +173,8 @@ def main() -> None:
         if name in last:
             picture = f"images/performance_{name}.png"
             draw(last[name], DOCS / picture)
-            page = rewritten(page, name, f"![Milliseconds a step over particles]({picture})\n\n{tables(last[name])}")
+            text = wrapped(tables(last[name]))
+            page = rewritten(page, name, f"![Milliseconds a step over particles]({picture})\n\n{text}")
         else:
             page = rewritten(page, name, MISSING)
     PAGE.write_text(page, encoding="utf-8")

@@ -93,7 +93,8 @@ def _compile(kernels: Sequence[wp.Kernel], device: Any) -> None:
     missing = sorted((module for module in sizes if not _is_compiled(module, device)), key=lambda one: -sizes[one])
     if len(missing) < 2:
         return
-    cores = min(usable_cores(), MOST_CORES, len(missing))
+    # For a GPU one after the other: NVRTC gains less from threads than it loses without its precompiled headers.
+    cores = min(usable_cores(), MOST_CORES, len(missing)) if device.is_cpu else 1
     with _announced(len(missing), device):
         # The smallest comes first, with which the headers are precompiled; then those that take longest.
         _side_by_side([missing[-1], *missing[:-1]], device, cores)
@@ -120,7 +121,6 @@ def _side_by_side(modules: Sequence[Any], device: Any, cores: int) -> None:
         for module in waiting:
             wp.force_load(device, [module], max_workers=0)
 
-    _HEADERS.side_by_side = cores > 1
     called = [helpers().submit(take) for _ in range(cores - 1)]
     try:
         take()
@@ -129,7 +129,6 @@ def _side_by_side(modules: Sequence[Any], device: Any, cores: int) -> None:
             pass
         begun = [helper for helper in called if not helper.cancel()]
         wait(begun)
-        _HEADERS.side_by_side = False
     for helper in begun:
         helper.result()
 
@@ -138,8 +137,6 @@ class _Headers:
     """Warp's headers, precompiled once for all threads of this process."""
 
     def __init__(self) -> None:
-        self.side_by_side = False
-        """Whether several threads compile now."""
         self._lock, self._made = Lock(), set[str]()
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._compiler = Event()
@@ -173,9 +170,8 @@ class _Headers:
         return build(*arguments, **{**options, **own})
 
     def build_cuda(self, build: Callable[..., Any], arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:
-        """Compile a file for a GPU: side by side without precompiled headers, which each thread would make anew."""
-        own = {"use_precompiled_headers": False} if self.side_by_side else {}
-        return build(*arguments, **{**options, **own})
+        """Compile a file for a GPU, as Warp does."""
+        return build(*arguments, **options)
 
     def _path(self) -> str:
         """Of the folder of the headers; they are made again where it is gone, as after a child of a fork has ended."""
