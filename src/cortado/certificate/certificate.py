@@ -143,7 +143,10 @@ def certify(
     """
     if not 0.0 < perturbation < 1.0:
         raise InputError(f"perturbation is {shown(perturbation)}, but must be greater than 0 and less than 1.")
-    problem = in_float64(_problem(problem, steps))
+    problem = _problem(problem, steps)
+    if problem.simulation.batch is not None:
+        raise InputError("What is certified is a batch, but must be one scene: they all have the same derivatives.")
+    problem = in_float64(problem)
     chosen, random = checked_parameters(problem, parameters), np.random.default_rng(seed)
     history, values = LossHistory(problem), everything(problem, chosen)
     norms = AdjointNorms(problem.simulation.solver, problem.steps)
