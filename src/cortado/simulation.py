@@ -225,8 +225,7 @@ class Simulation:
     def constants(self, rollout: Rollout) -> dict[str, np.ndarray]:
         """The fields of a rollout's states that no step changes."""
         names = [field.name for field in rollout.initial.fields if field.is_constant]
-        values = rollout.initial.numpy(self.dimension)
-        return {name: values[name] for name in names}
+        return rollout.initial.numpy(self.dimension, only=names)
 
     @in_turn
     def rollout(

@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import overload
 
 import numpy as np
-import warp as wp
 
 from cortado.device.state import State
 from cortado.losses.loss import ADJOINT_FIELDS, Loss, Snapshot, SnapshotAdjoint
@@ -105,14 +104,9 @@ def values_and_adjoints(loss: Loss, end: SnapshotBatch, members: Sequence[int]) 
             adjoint.colours[b] = bar.colours
             bar = bar.state
         if isinstance(bar, State):
-            _copy(bar, adjoint.state.member(b))
+            adjoint.state.member(b).assign(bar)
             continue
         for name, array in zip(ADJOINT_FIELDS, bar, strict=False):
             arrays.setdefault(name, np.zeros((len(end), *array.shape)))[b] = array
     adjoint.state.set(arrays)
     return found, adjoint
-
-
-def _copy(bar: State, member: State) -> None:
-    for source, target in zip(bar.arrays(), member.arrays(), strict=True):
-        wp.copy(target, source)
