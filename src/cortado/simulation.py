@@ -215,7 +215,7 @@ class Simulation:
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
         """What a trajectory records of a state: the fields that steps change."""
-        return state.numpy(self.dimension, constants=False)
+        return state.numpy(self.dimension, only=[field.name for field in state.fields if not field.is_constant])
 
     def numbers_in_frame(self, components: int) -> int:
         """How many numbers `frame` records at most, if vectors have so many components."""

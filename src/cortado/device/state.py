@@ -86,11 +86,11 @@ class State(Arrays):
                 flat = given if self.batch is None else given.reshape(-1, *given.shape[2:])
                 self[field.name].assign(padded(flat) if field.entry is Entry.VECTOR else flat)
 
-    def numpy(self, dimension: int, constants: bool = True, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """Every field as a new array: vectors (n, dimension), numbers (n,), fractions (n, phases), in a batch
-        (batch, n, ...); ``constants``: also what no step changes; ``only`` fields of these names."""
+    def numpy(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+        """Every field, or only those of some names, as a new array: vectors (n, dimension), numbers (n,), fractions
+        (n, phases), in a batch (batch, n, ...)."""
         names = set(self.names if only is None else only)
-        arrays = {f: self[f.name].numpy() for f in self.fields if f.name in names and (constants or not f.is_constant)}
+        arrays = {f: self[f.name].numpy() for f in self.fields if f.name in names}
         found = {f.name: (a[:, :dimension] if f.entry is Entry.VECTOR else a).copy() for f, a in arrays.items()}
         if self.batch is None:
             return found
