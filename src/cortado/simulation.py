@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.compiling import begin_headers
+from cortado.device.driver import why_no_gpu
 from cortado.device.kernel_cache import start_warp
 from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import Precision, precision_named
@@ -365,7 +366,7 @@ def lost_sentence(lost: Mapping[int, DivergedError], batch: int) -> str:
 
 def _device(name: str) -> Any:
     found = ", ".join(str(device) for device in wp.get_devices())
-    none = "" if wp.get_cuda_device_count() else "; no GPU with a CUDA driver is found"
+    none = "" if wp.get_cuda_device_count() else f"; {why_no_gpu()}"
     try:
         if name == "cuda" and none:
             raise ValueError  # Warp itself would write on stderr

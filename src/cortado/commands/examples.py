@@ -8,6 +8,7 @@ from pathlib import Path
 from cortado.errors import InputError, shown
 from cortado.io.files import sentences, write_atomically
 from cortado.io.shipped import examples_folder
+from cortado.io.terminal import is_quiet
 
 ALL = "all"
 
@@ -40,7 +41,7 @@ def _copied(sources: list[Path], folder: Path) -> str:
         folder.mkdir(parents=True, exist_ok=True)
     for source, target in zip(sources, targets, strict=True):
         write_atomically(target, source.read_bytes())
-    return "\n".join(f"{target}: {_command(target)}" for target in targets)
+    return "" if is_quiet() else "\n".join(f"{target}: {_command(target)}" for target in targets)
 
 
 def _command(path: Path) -> str:
