@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import venv
 from pathlib import Path
 
 ROOT = Path(__file__).parent
@@ -44,7 +43,8 @@ def set_up() -> None:
     sources = [ROOT / "pyproject.toml", *(path for path in (ROOT / "cpp").rglob("*") if path.is_file())]
     if READY.exists() and READY.stat().st_mtime >= max(path.stat().st_mtime for path in sources):
         return
-    venv.create(VENV, with_pip=True)
+    if not BIN.exists():
+        subprocess.run([sys.executable, "-m", "venv", str(VENV)], check=True)
     if run(INSTALL):
         sys.exit(1)
     if run(("python", "-c", "import cortado.reference._engine")):

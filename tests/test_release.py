@@ -90,7 +90,7 @@ def test_what_changed_is_installed_again(tmp_path, monkeypatch, newer):
     ready, ran = tmp_path / "ready", []
     monkeypatch.setattr(tasks, "ROOT", tmp_path)
     monkeypatch.setattr(tasks, "READY", ready)
-    monkeypatch.setattr(tasks.venv, "create", lambda *arguments, **options: None)
+    monkeypatch.setattr(tasks, "BIN", tmp_path)
     monkeypatch.setattr(tasks, "run", lambda command: ran.append(command) or 0)
     tasks.set_up()
     tasks.set_up()
