@@ -61,6 +61,11 @@ def test_phases_and_an_emitter_are_told(capsys):
     assert "milk" in out and "in 3-D" in out and "limits: " in out and "ms a step on cpu in float32" in out
 
 
+def test_a_schedule_is_told(capsys):
+    main(["describe", "scene.toml", "--set", "schedule.gravity={times=[0,0.2],values=[[0,-9.81],[3,-9]]}"])
+    assert "gravity changes until 0.2 s, and is constant from then on" in capsys.readouterr().out
+
+
 def test_the_first_state_is_drawn(capsys):
     found = described(capsys, "scene.toml", "--picture", "a/first.png")
     picture = read_picture(found["picture"])

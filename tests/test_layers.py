@@ -20,7 +20,8 @@ LAYERS = """
     io.shipped io.srgb io.usage io.video io.vtkhdf_layout io.vtkhdf
     lattice lattice.shapes lattice.pairs lattice.region lattice.smoothing lattice.calibration
     parameters parameters.reference_density parameters.registry parameters.table parameters.tilt parameters.values
-    scene scene.fields scene.sentences scene.point_reader scene.points scene.tables scene.fluids scene.emitter
+    scene scene.fields scene.sentences scene.point_reader scene.points scene.tables
+    scene.schedule scene.fluids scene.emitter
     scene.mixture scene.render scene.toml
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights

@@ -86,6 +86,7 @@ def _described(simulation: Simulation, steps: int) -> dict[str, Any]:
         "spacing_m": scene.discretisation.spacing,
         "time_step_s": scene.solver.time_step,
         "time_step_limits_s": {name: limit if math.isfinite(limit) else None for name, limit in limits.items()},
+        "scheduled_until_s": {name: course.times[-1] for name, course in scene.schedule.courses.items()},
         "device": str(simulation.device),
         "precision": simulation.precision.name,
         "steps": steps,
@@ -155,6 +156,8 @@ def _as_text(found: dict[str, Any]) -> str:
             f"{_bytes(found['trajectory_bytes'])} with a frame for every step; --record-every makes it less",
         ),
     ]
+    courses = [f"{name} changes until {last:g} s" for name, last in found["scheduled_until_s"].items()]
+    rows += [("schedule", f"{', '.join(courses)}, and is constant from then on")] if courses else []
     rows += [("picture", found["picture"])] if "picture" in found else []
     return "\n".join([found["name"], *(f"{label:<12}{text}" for label, text in rows)])
 

@@ -68,6 +68,11 @@ minimum_iterations = 3              # of the pressure, in every step
 maximum_iterations = 50
 density_tolerance = 0.01            # the average compression at which they end
 
+# What changes over time: gravity, as in a box that is shaken, "tilt", or the "nozzle_path" of an [emitter].
+#[schedule.gravity]
+#times = [0.0, 0.1, 0.2, 0.3]       # s; linear in between
+#values = $shake
+
 # Pictures of the fluid itself, beside those of its particles.
 #[render]
 #view = "$view"
@@ -87,6 +92,7 @@ _DIMENSIONS = {
         "zero": "[0.0, 0.0]",
         "room": "[0.8, 0.6]",
         "gravity": "[0.0, -9.81]",
+        "shake": "[[0.0, -9.81], [6.0, -9.81], [-6.0, -9.81], [0.0, -9.81]]",
         "view": "plane",
     },
     3: {
@@ -102,6 +108,7 @@ _DIMENSIONS = {
         "zero": "[0.0, 0.0, 0.0]",
         "room": "[0.8, 0.6, 0.48]",
         "gravity": "[0.0, -9.81, 0.0]",
+        "shake": "[[0.0, -9.81, 0.0], [6.0, -9.81, 0.0], [-6.0, -9.81, 0.0], [0.0, -9.81, 0.0]]",
         "view": "top",
     },
 }

@@ -6,6 +6,7 @@ import numpy as np
 
 from cortado.lattice.shapes import Points
 from cortado.parameters.registry import PARAMETERS
+from cortado.parameters.tilt import Tilt
 from cortado.parameters.values import Arrays
 from cortado.scene.model import SceneTables
 
@@ -27,10 +28,11 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
 
     Optional forces have limits of their own, in the registry of parameters.
 
-    ``values``: parameters by name that replace the scene's; of a gravity for each step the strongest counts.
+    ``values``: parameters by name that replace the scene's and its schedule's; of a gravity that changes the strongest
+    counts.
     """
     values = values or {}
-    support, gravity = scene.discretisation.support_radius, np.atleast_2d(values.get("gravity", scene.forces.gravity))
+    support, gravity = scene.discretisation.support_radius, np.atleast_2d(values.get("gravity", _gravity(scene)))
     strength = float(np.linalg.norm(gravity, axis=1).max())
     lower, upper = _extent(scene)
     speed = _first_speed(scene, values) + sqrt(2.0 * float((np.abs(gravity) @ (upper - lower)).max()))
@@ -42,6 +44,14 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
         if p.is_optional and p.present(scene)
     }
     return {"speed": courant, "gravity": force, "viscosity": _viscous_limit(scene, values), **optional}
+
+
+def _gravity(scene: SceneTables) -> Points:
+    """(d,) or (k, d) [m/s2] of the scene, at the times of its schedule if that changes it."""
+    courses = scene.schedule.courses
+    if "tilt" in courses:
+        return Tilt(scene.forces.gravity).gravity(np.array(courses["tilt"].values))
+    return np.array(courses["gravity"].values if "gravity" in courses else scene.forces.gravity)
 
 
 def _first_speed(scene: SceneTables, values: Arrays) -> float:
