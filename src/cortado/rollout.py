@@ -22,7 +22,7 @@ from cortado.restart import Clock
 from cortado.solvers.containment import Lost
 from cortado.solvers.solver import Counts, Solver
 
-CHUNK = 32
+CHUNK = 64
 """Steps between two looks of the host, at most."""
 FILLED = {"cpu": 32_000, "cuda": 16_000_000}
 """Particles in the steps of a chunk, beyond which a look of the host costs hardly anything beside them."""
