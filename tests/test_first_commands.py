@@ -128,6 +128,17 @@ def test_what_is_no_name_of_a_file_is_refused(command, name):
     assert os.listdir() == ["dam.toml"]
 
 
+def test_names_that_are_too_long_are_sentences(command):
+    long = "a" * 300
+    assert_refused(command("new", long), "cannot be written: File name too long")
+    assert_refused(command("examples", "--copy", "pour", "--to", long), "cannot be written: File name too long")
+    assert_refused(command("describe", long), "cannot be read: File name too long")
+    Path("scene.toml").write_text(TINY_SCENE)
+    assert_refused(command("describe", "scene.toml", "--picture", f"{long}.png"), "cannot be written")
+    assert_refused(command("compare", long, long), "There is no run in ")
+    assert_refused(command("run", "scene.toml", "--out", long), "cannot be written")
+
+
 def test_a_name_may_hold_anything_that_a_file_may(command):
     name = 'a "b" \\ c\n'
     assert command("new", name)[0] == 0
