@@ -1,11 +1,14 @@
 """How Sphinx builds the site from this folder: `make docs`."""
 
+import logging
+import os
 import sys
 from pathlib import Path
 
 import cortado
 
-sys.path.insert(0, str(Path(__file__).parent / "site"))
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE / "site"))
 
 project = "Cortado"
 author = "the Cortado authors"
@@ -32,6 +35,13 @@ nb_execution_mode = "cache"
 nb_execution_timeout = 120
 nb_execution_raise_on_error = True
 nb_merge_streams = True
+# Kernels of notebooks warn of how they are reached, on this machine alone, and their client tells of each.
+profile = HERE.parent / "build" / "ipython" / "profile_default"
+profile.mkdir(parents=True, exist_ok=True)
+(profile / "ipython_kernel_config.py").write_text("get_config().IPKernelApp.log_level = 40\n", encoding="utf-8")
+os.environ["IPYTHONDIR"] = str(profile.parent)
+logging.getLogger("traitlets").setLevel(logging.WARNING)
+nb_output_stderr = "remove"  # it says which kernels are compiled, where none are yet
 
 # ---- the API, from docstrings -------------------------------------------------------------------------------------
 autoclass_content = "both"
@@ -48,6 +58,6 @@ html_theme = "furo"
 html_title = f"Cortado {release}"
 html_static_path = ["site/static"]
 html_css_files = ["site.css"]
-html_copy_source = False
+html_domain_indices = False  # the genindex has the same
 html_show_sourcelink = False
 linkcheck_ignore = [r"http://localhost.*"]

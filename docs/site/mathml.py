@@ -7,7 +7,8 @@ from latex2mathml.converter import convert
 
 
 def _write(writer: Any, node: nodes.Node, display: str) -> None:
-    writer.body.append(convert(node.astext(), display=display))
+    # What is over a letter is an accent, such as a bar, and as large as the letter.
+    writer.body.append(convert(node.astext(), display=display).replace("<mover>", '<mover accent="true">'))
     raise nodes.SkipNode
 
 
