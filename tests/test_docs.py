@@ -1,11 +1,14 @@
 """The code in the documents runs as printed, and what they link to is there."""
 
 import re
+import shlex
 import shutil
 from pathlib import Path
 
 import matplotlib.pyplot
 import pytest
+
+from cortado.cli import main
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -13,6 +16,13 @@ DOCUMENTS = {path.relative_to(DOCS).as_posix(): path.read_text(encoding="utf-8")
 BLOCK = re.compile(r"```(?:python|\{code-cell\} python)\n(?:---\n.*?\n---\n)?(.*?)```", re.DOTALL)
 """Code, in a tutorial a cell, which may begin with what is said about its picture."""
 CODE = {name: BLOCK.findall(text) for name, text in DOCUMENTS.items()}
+COMMANDS = {
+    command
+    for text in DOCUMENTS.values()
+    for found in re.findall(r"^    cortado (.*)$|`cortado ([^`\n]+)`", text, re.MULTILINE)
+    for command in found
+    if command
+}
 TUTORIALS = [name for name in CODE if name.startswith("tutorials/")]
 
 
@@ -34,6 +44,20 @@ def test_a_tutorial_is_short_and_ends_in_a_picture(name):
     """That it is drawn without an error is the test before."""
     assert "plt.show()" in CODE[name][-1] and "alt: " in DOCUMENTS[name]
     assert len(DOCUMENTS[name].splitlines()) <= 90
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_a_command_is_one(command, capsys):
+    """It has the options that are written, and files that are named are there."""
+    words = shlex.split(command, comments=True)
+    name = words[: 2 if words[0] == "gradients" else 1]
+    with pytest.raises(SystemExit) as end:
+        main([*name, "--help"])
+    known = capsys.readouterr().out
+    assert end.value.code == 0
+    assert [word for word in words if word.startswith("--") and word not in known] == []
+    files = [word for word in words if word.endswith(".toml") and "/" in word]
+    assert [file for file in files if not (ROOT / file).exists()] == []
 
 
 def test_links_lead_to_files():
@@ -68,4 +92,4 @@ def test_names_in_files_are_there():
 
 def test_there_is_code():
     assert CODE["runs.md"]
-    assert len(TUTORIALS) == 8
+    assert len(TUTORIALS) == 8 and len(COMMANDS) > 15
