@@ -127,6 +127,7 @@ class KernelLauncher:
         self.parts = max(min(most, particles // LEAST_PART), 1)
         """Ranges of particles that a sum over neighbours is cut into."""
         self._bounds = [particles * part // self.parts for part in range(self.parts + 1)]
+        self._side = wp.Stream(device) if device.is_cuda and not record_tape else None
         self._compiled: set[Any] = set()
         self._whole: Any = None
         self._parts: list[Any] = []
@@ -153,6 +154,18 @@ class KernelLauncher:
         options = {"inputs": inputs, "device": self.device, "record_tape": self._record_tape}
         _perform(kernel.key, entries, inputs, partial(wp.launch, kernel, entries * lanes_of(kernel), **options))
         self._compiled.add(kernel)  # only now: an interrupted launch has compiled nothing
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """On a GPU, what is launched within waits for what was launched before, but not for what comes after it, nor
+        that for this until `join`: small kernels that do not need one another run at the same time."""
+        with wp.ScopedStream(self._side) if self._side else nullcontext():
+            yield
+
+    def join(self) -> None:
+        """Let what comes wait for all that went `aside`."""
+        if self._side:
+            wp.wait_stream(self._side)
 
     def _launch_parts(self, kernel: wp.Kernel, inputs: Sequence[Any]) -> None:
         if self._whole is not inputs[0]:
