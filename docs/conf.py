@@ -31,6 +31,7 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 
 # ---- tutorials, which are executed --------------------------------------------------------------------------------
+highlight_language = "none"  # what is indented is an equation or a command
 nb_execution_mode = "cache"
 nb_execution_timeout = 120
 nb_execution_raise_on_error = True

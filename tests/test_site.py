@@ -26,6 +26,7 @@ def entries(page: Path) -> set[Path]:
 
 
 def test_every_page_is_in_one_table_of_contents():
+    """A new page gets its line in docs/index.md."""
     listed = [entry for page in PAGES for entry in entries(page)]
     assert sorted([*listed, DOCS / "index.md"]) == PAGES
 
