@@ -1,11 +1,13 @@
 # make demo: set up and run the main job on the CPU; make test: set up and run lint, types and all tests;
 # make unit, make slow, make validation: one tier of the tests;
+# make docs: build the site, build/docs/index.html; make docs-links: ask whether what it links to elsewhere is there;
+# make docs-browser: look at every page of it with Chromium;
 # make sanitize: check the C++ engine with sanitizers; make fuzz: an hour of hostile input, MINUTES=10 for a part of it.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test lint types tests unit validation slow sanitize fuzz clean
+.PHONY: setup demo test lint types tests unit validation slow docs docs-links docs-browser sanitize fuzz clean
 
 setup: $(VENV)/.ready
 
@@ -38,6 +40,21 @@ validation: setup
 
 slow: setup
 	$(BIN)/pytest -m slow
+
+$(VENV)/.docs: $(VENV)/.ready
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	touch $@
+
+docs: $(VENV)/.docs
+	$(BIN)/sphinx-build --fresh-env --write-all --fail-on-warning --keep-going --quiet docs build/docs
+	@echo 'build/docs/index.html'
+
+docs-links: $(VENV)/.docs
+	$(BIN)/sphinx-build --builder linkcheck --quiet docs build/docs-links
+
+docs-browser: docs
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check playwright
+	$(BIN)/python docs/site/look.py build/docs
 
 sanitize: setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check cmeel-eigen

@@ -47,8 +47,8 @@ LAYERS = """
     executors.executor executors.calls executors.distributed executors.worker_process executors.local executors
     rollout
     parameters.scene_parameters parameters.space
-    losses.image_losses losses.loss losses.centre_of_mass losses.image losses.matching losses.positions
-    losses.recorded losses.batch losses losses.checked
+    losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
+    losses.positions losses.recorded losses losses.checked
     gradients.estimator gradients.points gradients.ensemble_members gradients.exact
     gradients.filter_kernels gradients.adjoint_filters gradients.strength gradients.filters gradients.ensemble gradients
     render.cameras render.colour_field render.interpolation render.phase_colours render.fields render.rays

@@ -84,6 +84,12 @@ def test_a_certificate_is_a_table(certificate):
     assert html.startswith("<pre>") and html.endswith("</pre>") and "│ gravity" in html
 
 
+def test_a_certificate_is_the_same_text_in_a_notebook(certificate, monkeypatch):
+    text = str(certificate)
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    assert str(certificate) == text and "adjoint" in text.splitlines()[2]
+
+
 @pytest.mark.parametrize("name", ["trajectory", "result"])
 def test_a_notebook_shows_a_picture(name, request):
     found = request.getfixturevalue(name)

@@ -65,5 +65,5 @@ def _table(columns: list[str], rows: list[list[str]]) -> str:
     for row in rows:
         table.add_row(*row)
     text = StringIO()
-    Console(file=text, width=WIDTH).print(table)
+    Console(file=text, width=WIDTH, force_jupyter=False).print(table)  # a notebook would show it elsewhere
     return text.getvalue().rstrip()

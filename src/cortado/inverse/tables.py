@@ -115,11 +115,11 @@ class ProblemTable(Table):
     loss: Literal["positions", "image"] = "positions"
     """What is compared with the target: positions of particles, or images."""
     distance: Annotated[str, OneOf(DISTANCES)] = "squared_difference"
-    """How images are compared."""
+    """How images are compared: by their difference, or by a pyramid, for shapes that do not overlap yet."""
     frames: Annotated[int, count(1, 10_000)] = 1
     """Number of states that are compared, evenly spaced up to the last one."""
     target: Values | None = None
-    """The true parameters: the target is what a run with them makes."""
+    """The true parameters by name: the target is what a run with them makes. Either this or a picture is needed."""
     picture: Text | None = None
     """"heart", "rosetta", or a file with a picture, beside the task's own."""
 
@@ -162,13 +162,14 @@ class GradientTable(Table):
     """[optimise.gradient]: which gradient the search follows, see docs/gradients.md."""
 
     name: Annotated[str, OneOf(ESTIMATORS)] = "exact"
-    """Name of the estimator."""
+    """Name of the estimator; "adjoint_viscosity" is for long splashes."""
     strength: Annotated[float, quantity(gt=0.0, le=1.0)] | None = None
-    """Strength of `AdjointViscosity`; None: chosen at the start of a search."""
+    """Strength of `AdjointViscosity`; if left out, chosen at the start of a search."""
     samples: Annotated[int, count(1, 10_000)] = 1
-    """Runs of the ensemble over which the gradient is averaged."""
+    """Runs of the ensemble over which the gradient is averaged: 1, or an even number of at least 4."""
     spread: Values | None = None
-    """Width of the ensemble in each parameter, by name, in the units of what is searched."""
+    """By name, for every parameter that is searched, the width of the ensemble in its units (knots, logarithms); needed
+    with several samples. Samples may be outside of the bounds: make parameters that must stay positive logarithmic."""
     position_noise: Annotated[float, quantity("spacings", ge=0.0)] = EnsembleMean.position_noise
     """Standard deviation of the perturbations of first positions in the ensemble."""
 
@@ -210,22 +211,24 @@ class OptimiseTable(Table):
     """[optimise]: the start of the search, its algorithm, and its length."""
 
     start: Start
-    """Parameters with which the search starts; these are optimised."""
+    """By name the parameters that are searched, as the search starts; first positions and mass fractions may be the
+    word "random"."""
     knots: Annotated[int, count(2, 10_000_000)] | None = None
-    """Number of free rows between which parameters over time are interpolated; None: one row for each step."""
+    """Number of free rows between which parameters over time are interpolated; if left out, one row for each step."""
     logarithmic: tuple[Annotated[str, OneOf(NAMES)], ...] = ()
     """Parameters that are searched by their logarithm."""
     bounds: Values | None = None
-    """By name: two entries, the lower and the upper bound."""
+    """By the name of a parameter the lower and the upper bound; viscosity, mobility and fractions never go below 0
+    anyway."""
     extinction_schedule: Schedule = (1.0,)
     """A continuation schedule: one search for each factor, which starts where the last one ended and sees the fluid
     with the scene's extinction times that factor. A picture of thinner fluid shows what is behind its surface."""
     optimiser: Annotated[str, OneOf(OPTIMISERS)] = "adam"
-    """Name of the algorithm."""
+    """Name of the algorithm; the line search of "lbfgs" needs exact gradients."""
     learning_rate: Annotated[float, quantity("units of the parameters", gt=0.0)]
     """In units of the parameters; for L-BFGS the size of its first step."""
     tolerance: Annotated[float, quantity(gt=0.0, le=0.5)] | None = None
-    """L-BFGS ends where the gradient is this part of the first one; None: where round-off stops it."""
+    """L-BFGS ends where the gradient is this part of the first one; if left out, where round-off stops it."""
     iterations: Annotated[int, count(1, 10_000_000)]
     """Updates at most, of each search."""
     gradient: GradientTable = GradientTable()

@@ -26,17 +26,17 @@ class Search:
     """The problem that an optimiser is given, as a function of one vector."""
 
     evaluate: Callable[[Vector], tuple[float, Vector]]
-    # vector (size,) -> loss, gradient (size,)
+    """Vector (size,) -> loss, gradient (size,)."""
     layout: ParameterLayout
-    # which components of the vectors belong to which parameter
+    """Which components of the vectors belong to which parameter."""
     start: Vector
-    # (size,), within the bounds
+    """(size,), within the bounds."""
     lower: Vector
-    # (size,), -inf where there is no bound
+    """(size,), -inf where there is no bound."""
     upper: Vector
-    # (size,), +inf where there is no bound
+    """(size,), +inf where there is no bound."""
     iterations: int
-    # greatest number of updates
+    """Greatest number of updates."""
 
     def project(self, vector: Vector) -> Vector:
         """The nearest vector within the bounds."""
@@ -48,11 +48,11 @@ class Outcome:
     """What an optimiser returns."""
 
     last: Vector
-    # (size,), the last iterate, which has been evaluated
+    """(size,), the last iterate, which has been evaluated."""
     converged: bool
-    # whether the optimiser's own test was met
+    """Whether the optimiser's own test was met."""
     message: str
-    # a sentence
+    """A sentence."""
 
 
 @runtime_checkable
@@ -78,13 +78,13 @@ class Adam:
     """
 
     learning_rate: PerParameter
-    # one number, or one per parameter by name [unit of the parameter]
+    """One number, or one per parameter by name [unit of the parameter]."""
     beta1: float = 0.9
-    # decay of the mean gradient, in [0, 1) [-]
+    """Decay of the mean gradient, in [0, 1) [-]."""
     beta2: float = 0.999
-    # decay of the mean squared gradient, in [0, 1) [-]
+    """Decay of the mean squared gradient, in [0, 1) [-]."""
     epsilon: float = 1e-8
-    # covers the division where the gradient has always been 0, the step is then 0 [unit of the gradient]
+    """Covers the division where the gradient has always been 0, the step is then 0 [unit of the gradient]."""
 
     def __post_init__(self) -> None:
         _require_positive("learning_rate", self.learning_rate)
@@ -123,9 +123,9 @@ class GradientDescent:
     """
 
     learning_rate: PerParameter
-    # one number, or one per parameter by name [unit of the parameter^2 / unit of the loss]
+    """One number, or one per parameter by name [unit of the parameter^2 / unit of the loss]."""
     momentum: float = 0.0
-    # in [0, 1) [-]
+    """In [0, 1) [-]."""
 
     def __post_init__(self) -> None:
         _require_positive("learning_rate", self.learning_rate)
@@ -163,11 +163,11 @@ class LBFGS:
     """
 
     memory: int = 10
-    # number of past updates that make up the approximate Hessian
+    """Number of past updates that make up the approximate Hessian."""
     tolerance: float = 0.0
-    # converged when the greatest component of the projected gradient is this fraction of the first one [-]
+    """Converged when the greatest component of the projected gradient is this fraction of the first one [-]."""
     scale: PerParameter = 1.0
-    # a change worth trying, one number or one per parameter by name [unit of the parameter]
+    """A change worth trying, one number or one per parameter by name [unit of the parameter]."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.memory, int) or self.memory < 1:

@@ -16,14 +16,14 @@ class Record:
     """One evaluation in the history of an optimisation."""
 
     iteration: int
-    # index of the evaluation, from 0; with Adam and gradient descent also the number of updates before it
+    """Index of the evaluation, from 0; with Adam and gradient descent also the number of updates before it."""
     loss: float
     gradient_norm: float
-    # Euclidean, over all the parameters
+    """Euclidean, over all the parameters."""
     parameters: Parameters
-    # at which the loss was evaluated
+    """At which the loss was evaluated."""
     replayed: bool
-    # whether it was read from the checkpoint
+    """Whether it was read from the checkpoint."""
 
     def __repr__(self) -> str:
         return f"Record(iteration {self.iteration}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g})"
@@ -34,19 +34,19 @@ class Result:
     """The best parameters of an optimisation, with its history."""
 
     parameters: Parameters
-    # with the lowest loss seen
+    """With the lowest loss seen."""
     loss: float
-    # the lowest seen
+    """The lowest seen."""
     last_parameters: Parameters
-    # the optimiser's last iterate
+    """The optimiser's last iterate."""
     history: tuple[Record, ...]
-    # one per evaluation, in order
+    """One per evaluation, in order."""
     evaluations: int
-    # how many the optimiser asked for, with those replayed from the checkpoint
+    """How many the optimiser asked for, with those replayed from the checkpoint."""
     message: str
-    # how it ended, a sentence
+    """How it ended, a sentence."""
     converged: bool
-    # whether the optimiser's own test was met; Adam and gradient descent have none
+    """Whether the optimiser's own test was met; Adam and gradient descent have none."""
 
     def __repr__(self) -> str:
         found = f"loss {self.loss:.6g} after {counted(self.evaluations, 'evaluation')}"

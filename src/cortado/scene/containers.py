@@ -75,11 +75,11 @@ class BoxContainer(Container):
 
     shape: Literal["box"] = "box"
     lower: Vector[Length]
-    """(d,) [m]"""
+    """(d,) Corner with the least coordinates [m]."""
     upper: Vector[Length]
-    """(d,) [m]"""
+    """(d,) Corner with the greatest coordinates [m]."""
     periodic: Vector[Flag] = (False, False, False)
-    """(d,) whether what leaves on one side of an axis comes back on the other."""
+    """(d,) Whether what leaves on one side of an axis comes back on the other."""
     slip: Literal["free", "no"] = "free"
     """"no": the viscous force acts between fluid and wall; "free": it does not."""
 
@@ -110,9 +110,9 @@ class CylinderContainer(Container):
 
     shape: Literal["cylinder"] = "cylinder"
     base: Vector[Length]
-    """(3,) centre of the bottom [m]"""
+    """(3,) Middle of the bottom [m]."""
     radius: Annotated[float, quantity("m", gt=0.0)]
-    """[m]"""
+    """From the axis to the side [m]."""
     height: Annotated[float, quantity("m", gt=0.0)]
     """From the base, along the axis [m]."""
     axis: Literal["x", "y", "z"] = "y"

@@ -34,15 +34,15 @@ class Emitter(Body):
     """An opening, a disc or in 2-D a line, out of which a column of fluid comes with one speed."""
 
     outlet: Vector[Length]
-    """(d,) centre of the opening [m]"""
+    """(d,) Middle of the opening [m]."""
     direction: Vector[Annotated[float, quantity()]] = (0.0, -1.0, 0.0)
-    """(d,) of the flow, a unit vector once read"""
+    """(d,) Direction of the flow; its length does not matter."""
     radius: Annotated[float, quantity("m", gt=0.0)]
     """Of the opening [m]."""
     length: Annotated[float, quantity("m", gt=0.0)]
     """Of the column that waits upstream of the opening [m]."""
     flow_rate: Annotated[float, quantity("m3/s (m2/s in 2-D)", gt=0.0)]
-    """Volume that comes out in a second [m3/s], in 2-D [m2/s]."""
+    """Volume, in 2-D area, that comes out in a second [m3/s (m2/s in 2-D)]."""
 
     @field_validator("direction")
     @classmethod

@@ -39,7 +39,7 @@ class Fluid(Body):
     """A body of fluid."""
 
     velocity: Vector[Annotated[float, quantity("m/s")]] = (0.0, 0.0, 0.0)
-    """(d,) [m/s]"""
+    """(d,) Velocity at the start [m/s]."""
 
     def corners(self, spacing: float) -> Points:
         """(2^d, d) the corners of the extent [m]."""
@@ -85,9 +85,9 @@ class BoxFluid(LatticeFluid):
 
     shape: Literal["box"] = "box"
     lower: Vector[Length]
-    """(d,) [m]"""
+    """(d,) Corner with the least coordinates [m]."""
     upper: Vector[Length]
-    """(d,) [m]"""
+    """(d,) Corner with the greatest coordinates [m]."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -106,9 +106,9 @@ class SphereFluid(LatticeFluid):
 
     shape: Literal["sphere"] = "sphere"
     centre: Vector[Length]
-    """(d,) [m]"""
+    """(d,) Middle [m]."""
     radius: Annotated[float, quantity("m", gt=0.0)]
-    """[m]"""
+    """From the middle to the surface [m]."""
 
     def block(self, spacing: float) -> Block:
         return block_about(self.centre, np.full(len(self.centre), self.radius), spacing)
@@ -122,9 +122,9 @@ class CylinderFluid(LatticeFluid):
 
     shape: Literal["cylinder"] = "cylinder"
     base: Vector[Length]
-    """(3,) centre of the bottom [m]"""
+    """(3,) Middle of the bottom [m]."""
     radius: Annotated[float, quantity("m", gt=0.0)]
-    """[m]"""
+    """From the axis to the side [m]."""
     height: Annotated[float, quantity("m", gt=0.0)]
     """From the base, along the axis [m]."""
     axis: Literal["x", "y", "z"] = "y"
@@ -152,8 +152,8 @@ class PointsFluid(Fluid):
 
     shape: Literal["points"] = "points"
     file: Text
-    """An array (n, d) [m] as .npy, or a .vtk, .vtp or .vtkhdf file, of which the first step is read; beside the scene
-    file, and absolute once read."""
+    """Its name: an array (n, d) [m] as .npy, or a .vtk, .vtp or .vtkhdf file, of which the first step is read; beside
+    the scene file, and absolute once read."""
 
     @field_validator("file")
     @classmethod

@@ -27,7 +27,7 @@ class Discretisation(Table):
     spacing: Annotated[float, quantity("m", gt=0.0)]
     """Distance between particles at rest [m]."""
     support: Annotated[float, quantity(ge=1.2, le=4.0)] = 2.0
-    """Support radius / spacing."""
+    """Distance within which particles act on each other: support radius / spacing."""
     kernel: Literal["cubic_spline", "wendland_c2", "wendland_c4"] = "cubic_spline"
     """Name of the smoothing kernel."""
 
@@ -41,22 +41,22 @@ class Phase(Table):
     """A material."""
 
     name: Text
-    """What fluids call it."""
+    """What bodies of fluid call it."""
     rest_density: Annotated[float, quantity("kg/m3", gt=0.0)]
-    """[kg/m3]"""
+    """Density of the fluid at rest [kg/m3]."""
     viscosity: Annotated[float, quantity("Pa s", ge=0.0)]
-    """Dynamic [Pa s]."""
+    """Dynamic viscosity [Pa s]."""
     colour: Colour = (0.1, 0.3, 0.8)
-    """(3,) red, green and blue, each from 0 to 1."""
+    """(3,) Colour in pictures: red, green and blue, each from 0 to 1."""
 
 
 class FixedForces(Table):
     """The forces that every scene has."""
 
     gravity: Vector[Annotated[float, quantity("m/s2")]] = (0.0, -9.81, 0.0)
-    """(d,) [m/s2]"""
+    """(d,) Acceleration that acts on all fluid [m/s2]."""
     viscosity: Literal["pairwise", "laminar", "none"] = "pairwise"
-    """"pairwise": that of Monaghan (2005); "laminar": Morris et al. (1997)."""
+    """Form of the viscous force. "pairwise": that of Monaghan (2005); "laminar": Morris et al. (1997)."""
     pressure: Flag = True
     """Whether the fluid resists compression."""
 
@@ -80,15 +80,15 @@ class Solver(Table):
     kind: Annotated[str, OneOf(SOLVERS)] = "pcisph"
     """Name of the algorithm."""
     time_step: Annotated[float, quantity("s", gt=0.0)]
-    """[s]"""
+    """Length of a step [s]."""
     minimum_iterations: Annotated[int, count(1, 1_000_000)] = 3
     """Pressure iterations of a step, at least."""
     maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
     """Pressure iterations of a step, at most."""
     density_tolerance: Annotated[float, quantity(ge=0.0)] = 0.01
-    """On the average of (rho - rho_0) / rho_0."""
+    """Iterations end once the average of (rho - rho_0) / rho_0 is below it."""
     maximum_density_tolerance: Annotated[float, quantity(ge=0.0)] | None = None
-    """On the maximum of (rho - rho_0) / rho_0; not used if None."""
+    """The same for the maximum of (rho - rho_0) / rho_0; not asked for if left out."""
 
     @model_validator(mode="after")
     def _check_iterations(self) -> Self:
@@ -105,7 +105,7 @@ class SceneTables(Table):
     name: Text = "scene"
     """Shown in titles."""
     dimension: Annotated[int, count(2, 3)]
-    """2 or 3; d below."""
+    """2 for a plane, 3 for space: d, the number of components of vectors."""
     discretisation: Discretisation
     """How the fluid is cut into particles."""
     phase: Several[Phase]

@@ -21,7 +21,7 @@ class Render(Table):
     background: Colour = (1.0, 1.0, 1.0)
     """(3,) red, green and blue, each from 0 to 1"""
     extinction: Annotated[float, quantity("1/m", gt=0.0)] | None = None
-    """How quickly light fades in fluid [1/m]; left to the renderer if None."""
+    """How quickly light fades in fluid [1/m]; chosen by the renderer if left out."""
     position: Place | None = Field(default=None, validate_default=True)
     """(3,) where the camera is [m]; for a view of the volume, which needs it"""
     look_at: Place | None = Field(default=None, validate_default=True)

@@ -1,0 +1,75 @@
+"""Look at every page of the built site in Chromium: ``python docs/site/look.py build/docs [--pictures FOLDER]``.
+
+A page fails if its console has an error, if a file that it needs does not come, if it is wider than the window, if a
+picture has no description, or if one does not show. Chromium has to be installed; where its command is not found,
+Playwright's own is taken.
+"""
+
+import argparse
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import sync_playwright
+
+WIDTHS = (400, 1280)
+"""Of a telephone, and of a laptop [pixels]."""
+PICTURED = ("index", "start", "limits", "scene_file", "adjoint", "api/gradients", "tutorials/first_splash")
+LOOK = """() => {
+  const found = [];
+  const width = document.documentElement.clientWidth;
+  if (document.documentElement.scrollWidth > width)
+    found.push(`is ${document.documentElement.scrollWidth} pixels wide, not ${width}`);
+  for (const image of document.querySelectorAll("article img")) {
+    if (!image.alt || image.alt.includes("_build") || image.alt.length < 10) found.push(`no words for ${image.src}`);
+    if (!image.naturalWidth) found.push(`does not show ${image.src}`);
+  }
+  return found;
+}"""
+
+
+def complaints(browser: Any, page_file: Path, width: int, picture: Path | None) -> Iterator[str]:
+    """What is wrong with a page in a window of a width."""
+    page = browser.new_page(viewport={"width": width, "height": 800})
+    found: list[str] = []
+    page.on("console", lambda message: found.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: found.append(str(error)))
+    page.on("requestfailed", lambda request: found.append(f"does not get {request.url}"))
+    page.goto(page_file.resolve().as_uri(), wait_until="load")
+    for image in page.query_selector_all("article img"):  # those further down are loaded when they are looked at
+        image.scroll_into_view_if_needed()
+    found += page.evaluate(LOOK)
+    if picture:
+        page.screenshot(path=picture, full_page=True)
+    page.close()
+    return (f"{page_file} at {width}: {sentence}" for sentence in found)
+
+
+def main() -> None:
+    """Exit code 1 where there are complaints."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("site", type=Path)
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of some pages")
+    options = parser.parse_args()
+    pages = sorted(options.site.rglob("*.html"))
+    if not pages:
+        sys.exit(f"{options.site} holds no pages: build them with make docs.")
+    found: list[str] = []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        for page in pages:
+            name = page.relative_to(options.site).with_suffix("").as_posix()
+            for width in WIDTHS:
+                pictured = options.pictures and name in PICTURED
+                picture = options.pictures / f"{name.replace('/', '-')}-{width}.png" if pictured else None
+                found += complaints(browser, page, width, picture)
+        browser.close()
+    print(*found, sep="\n")
+    print(f"{len(pages)} pages at widths of {WIDTHS}: {len(found)} complaints")
+    sys.exit(bool(found))
+
+
+if __name__ == "__main__":
+    main()

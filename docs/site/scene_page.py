@@ -1,0 +1,226 @@
+"""The page that lists the tables of a scene file: ``python docs/site/scene_page.py`` writes docs/scene_file.md.
+
+Its tables come from the models in `cortado.scene`, so that they say what is checked. Each table has an example, which
+together with `WHOLE` is a valid scene; `tests/test_reference_pages.py` loads them.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from rows import rows, toml
+
+from cortado.scene.scene import Scene
+
+PAGE = Path(__file__).parents[1] / "scene_file.md"
+
+WHOLE = """
+name = "a block of water"
+dimension = 3
+
+[discretisation]
+spacing = 0.05                      # m
+
+[[phase]]
+name = "water"
+rest_density = 1000.0               # kg/m3
+viscosity = 0.05                    # Pa s
+
+[[fluid]]
+shape = "box"
+lower = [0.0, 0.0, 0.0]             # m
+upper = [0.5, 0.5, 0.5]
+phase = "water"
+
+[container]
+shape = "box"
+lower = [0.0, 0.0, 0.0]
+upper = [1.0, 1.0, 0.5]
+
+[solver]
+time_step = 0.002                   # s
+"""
+
+LINKS = {
+    "discretisation": ("[table](#particles-discretisation)", "How the fluid is cut into particles."),
+    "phase": ("[tables](#materials-phase)", "The materials: in this order the components of mass fractions."),
+    "fluid": ("[tables](#bodies-of-fluid-fluid)", "The bodies of fluid; particles come in this order."),
+    "emitter": ("[table](#a-jet-emitter)", "An opening out of which fluid comes; its particles come after all others."),
+    "container": ("[table](#walls-container)", "What holds the fluid."),
+    "mixture": ("[table](#fluids-that-mix-mixture)", "How phases mix."),
+    "forces": ("[table](#forces-forces)", "Which forces act."),
+    "solver": ("[table](#time-steps-solver)", "How a step is solved."),
+    "render": ("[table](#pictures-render)", "How pictures are taken."),
+}
+"""Of keys that are tables what they are, with the heading that describes them, and their meaning."""
+
+BEGINNING = """# The scene file
+
+A scene file says what a simulation starts from: which fluids there are, where they are, what holds them, which forces
+act, and how long a time step is. It is written in [TOML](https://toml.io). All units are SI. This is a whole file:
+
+{whole}
+    cortado run scene.toml --steps 200 --out runs/block
+
+In Python the same keys are arguments, with a list of tables for `[[phase]]` and `[[fluid]]`:
+`cortado.Scene(dimension=3, discretisation={{"spacing": 0.05}}, phase=[{{...}}], fluid=[{{...}}], solver={{...}})`.
+
+d stands for the number of dimensions, 2 or 3. A key whose last but one column says *needed* has to be there; all others
+may be left out. A key that does not exist, a number out of its range or a missing key is refused in a sentence that
+names the file and the key.
+
+Each example below is a part of a file. Put in the place of the table of the same name in the file above, it makes
+another whole file.
+
+## At the top of the file
+
+{top}
+A file may also hold the tables `[problem]` and `[optimise]`, which make it a [task](task_file.md).
+"""
+
+PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
+    (
+        "## Particles: `[discretisation]`",
+        "Fluid is cut into particles that start on a regular lattice. A smaller spacing shows smaller waves and takes "
+        "more time: half of it means eight times as many particles in 3-D, and time steps about half as long.",
+        (("Discretisation", "", '[discretisation]\nspacing = 0.05\nsupport = 2.6\nkernel = "wendland_c2"'),),
+    ),
+    (
+        "## Materials: `[[phase]]`",
+        "A phase is a material. A scene has one or several.",
+        (
+            (
+                "Phase",
+                "",
+                '[[phase]]\nname = "water"\nrest_density = 1000.0\nviscosity = 0.001\ncolour = [0.1, 0.3, 0.8]',
+            ),
+        ),
+    ),
+    (
+        "## Bodies of fluid: `[[fluid]]`",
+        "What is filled with fluid at the start. There may be several, which must not overlap. `shape` decides which "
+        "other keys a body has.",
+        (
+            (
+                "BoxFluid",
+                "### A box of fluid",
+                '[[fluid]]\nshape = "box"\nlower = [0.1, 0.0, 0.0]\nupper = [0.4, 0.6, 0.5]\n'
+                'velocity = [1.0, 0.0, 0.0]\nphase = "water"',
+            ),
+            (
+                "SphereFluid",
+                "### A sphere of fluid",
+                '[[fluid]]\nshape = "sphere"\ncentre = [0.5, 0.6, 0.25]\nradius = 0.2\nphase = "water"',
+            ),
+            (
+                "CylinderFluid",
+                "### A cylinder of fluid",
+                '[[fluid]]\nshape = "cylinder"\nbase = [0.5, 0.1, 0.25]\nradius = 0.2\nheight = 0.4\nphase = "water"',
+            ),
+            (
+                "PointsFluid",
+                "### Fluid from a file",
+                '[[fluid]]\nshape = "points"\nfile = "drop.npy"\nphase = "water"',
+            ),
+        ),
+    ),
+    (
+        "## A jet: `[emitter]`",
+        "A column of particles waits behind an opening and comes out of it with one speed. Where the opening is may "
+        "change over time: the parameter `nozzle_path`.",
+        (
+            (
+                "Emitter",
+                "",
+                '[emitter]\nphase = "water"\noutlet = [0.75, 0.7, 0.25]\ndirection = [0.0, -1.0, 0.0]\nradius = 0.1\n'
+                "length = 0.2\nflow_rate = 0.02",
+            ),
+        ),
+    ),
+    (
+        "## Walls: `[container]`",
+        "What holds the fluid. Walls are at rest; a container that is tilted is simulated by gravity that leans, the "
+        "parameter `tilt`. Without this table fluid is in free space.",
+        (
+            (
+                "BoxContainer",
+                "### A box with walls",
+                '[container]\nshape = "box"\nlower = [0.0, 0.0, 0.0]\nupper = [1.0, 1.0, 0.5]\n'
+                'periodic = [true, false, true]\nslip = "no"',
+            ),
+            (
+                "CylinderContainer",
+                "### A cup",
+                '[container]\nshape = "cylinder"\nbase = [0.25, 0.0, 0.25]\nradius = 0.5\nheight = 1.0\nlid = false',
+            ),
+            ("NoContainer", "### No walls", '[container]\nshape = "none"'),
+        ),
+    ),
+    (
+        "## Fluids that mix: `[mixture]`",
+        "Where there are several phases, particles may exchange them with their neighbours "
+        "([the equation](discretisation.md#diffusion-between-phases)).",
+        (
+            (
+                "Mixture",
+                "",
+                '[[phase]]\nname = "water"\nrest_density = 1000.0\nviscosity = 0.01\n\n[[phase]]\nname = "ink"\n'
+                'rest_density = 900.0\nviscosity = 0.02\n\n[mixture]\nfree_energy = "miscible"\nmobility = 1e-4\n'
+                'mobility_form = "constant"',
+            ),
+        ),
+    ),
+    (
+        "## Forces: `[forces]`",
+        "",
+        (("Forces", "", '[forces]\ngravity = [0.0, -1.62, 0.0]\nviscosity = "laminar"\nsurface_tension = 0.07'),),
+    ),
+    (
+        "## Time steps: `[solver]`",
+        "In each step the pressure is computed by iterations, until the fluid is compressed by no more than a "
+        "tolerance. A time step beyond the limit of stability is warned of.",
+        (
+            (
+                "Solver",
+                "",
+                "[solver]\ntime_step = 0.002\nminimum_iterations = 3\nmaximum_iterations = 100\n"
+                "density_tolerance = 0.001",
+            ),
+        ),
+    ),
+    (
+        "## Pictures: `[render]`",
+        "How `simulation.renderer()`, `cortado run` and losses of images see the fluid ([rendering](rendering.md)).",
+        (
+            (
+                "Render",
+                "",
+                '[render]\nview = "volume"\nposition = [1.5, 1.2, 2.0]\nlook_at = [0.5, 0.3, 0.25]\n'
+                "field_of_view = 40.0\nresolution = [256, 192]",
+            ),
+        ),
+    ),
+]
+"""Of every section its heading, its words, and tables: name of the model, heading, example."""
+
+
+def examples() -> dict[str, str]:
+    """By the name of the model."""
+    return {model: example for _, _, tables in PARTS for model, _, example in tables}
+
+
+def page() -> str:
+    """The whole page."""
+    schema: dict[str, Any] = Scene.model_json_schema()
+    text = BEGINNING.format(whole=toml(WHOLE), top=rows(schema, LINKS))
+    for heading, words, tables in PARTS:
+        text += f"\n{heading}\n\n" + (f"{words}\n\n" if words else "")
+        for model, below, example in tables:
+            table = schema["$defs"][model]
+            words = table.get("description", "").replace("``", "`")
+            text += (f"{below}\n\n{words}\n\n" if below else "") + rows(table) + "\n" + toml(example) + "\n"
+        text = text.rstrip("\n") + "\n"
+    return text
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

@@ -1,0 +1,92 @@
+"""The page that lists the tables of a task: ``python docs/site/task_page.py`` writes docs/task_file.md.
+
+Its tables come from the models in `cortado.inverse.tables`, so that they say what is checked. Each table has an
+example, which below the scene of `scene_page` is a valid task; `tests/test_reference_pages.py` loads them.
+"""
+
+from pathlib import Path
+
+from rows import rows, toml
+
+from cortado.inverse.tables import TaskTables
+
+PAGE = Path(__file__).parents[1] / "task_file.md"
+
+WHOLE = """
+[problem]
+steps = 50
+target.gravity = [1.0, -9.0, 0.0]   # m/s2
+
+[optimise]
+start.gravity = [0.0, -9.81, 0.0]
+optimiser = "lbfgs"
+learning_rate = 1.0
+iterations = 10
+"""
+
+LINKS = {
+    "gradient": ("[table](#which-gradient-optimisegradient)", "The gradient that the search follows."),
+    "check": ("[table](#what-has-to-be-reached-optimisecheck)", "What the estimate has to reach."),
+}
+
+BEGINNING = f"""# The task file
+
+A task is an inverse problem: which parameters lead to a given end? It is a [scene](scene_file.md) with two more tables:
+`[problem]` says what is to be reached, `[optimise]` how it is searched. [Tasks](tasks.md) explains them, and has
+examples. Below the scene of the page before, these tables make a task that finds gravity:
+
+{toml(WHOLE)}
+    cortado optimise task.toml --out runs/task
+
+Parameters, wherever a table names some, are those of [this list](parameters.md). A key whose last but one column says
+*needed* has to be there. Each example below replaces the table of the same name.
+"""
+
+PARTS = [
+    (
+        "## What is to be reached: `[problem]`",
+        "ProblemTable",
+        "A run of some steps, and a target: the end of a run with other parameters, or a picture.",
+        '[problem]\nsteps = 30\nloss = "image"\ndistance = "pyramid"\nframes = 2\n'
+        "target.gravity = [[1.0, -9.0, 0.0], [-1.0, -9.0, 0.0]]     # at the first and at the last step",
+    ),
+    (
+        "## How it is searched: `[optimise]`",
+        "OptimiseTable",
+        "Which parameters are searched, from where, and how.",
+        "[optimise]\nstart.gravity = [0.0, -9.81, 0.0]\nbounds.gravity = [-20.0, 20.0]       # m/s2\n"
+        'optimiser = "adam"\nlearning_rate = 0.2                 # m/s2\niterations = 40',
+    ),
+    (
+        "## Which gradient: `[optimise.gradient]`",
+        "GradientTable",
+        "In long runs exact gradients may be useless; [gradient estimators](gradients.md) says what to do then.",
+        '[optimise.gradient]\nname = "adjoint_viscosity"\nstrength = 0.2\nsamples = 4\n'
+        "spread.gravity = 0.5                # m/s2",
+    ),
+    (
+        "## What has to be reached: `[optimise.check]`",
+        "CheckTable",
+        "The command fails, with exit code 1, unless all of it is reached.",
+        "[optimise.check]\nloss_reduction = 100.0\nparameter_error = 0.01",
+    ),
+]
+"""Of every section its heading, the name of its model, its words, and an example."""
+
+
+def examples() -> dict[str, str]:
+    """By the name of the model."""
+    return {model: example for _, model, _, example in PARTS}
+
+
+def page() -> str:
+    """The whole page."""
+    tables = TaskTables.model_json_schema()["$defs"]
+    text = BEGINNING
+    for heading, model, words, example in PARTS:
+        text += f"\n{heading}\n\n{words}\n\n{rows(tables[model], LINKS)}\n{toml(example)}"
+    return text
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
