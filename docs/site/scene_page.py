@@ -49,9 +49,16 @@ LINKS = {
     "mixture": ("[table](#fluids-that-mix-mixture)", "How phases mix."),
     "forces": ("[table](#forces-forces)", "Which forces act."),
     "solver": ("[table](#time-steps-solver)", "How a step is solved."),
+    "schedule": ("[table](#what-changes-over-time-schedule)", "What changes while the scene runs."),
     "render": ("[table](#pictures-render)", "How pictures are taken."),
 }
 """Of keys that are tables what they are, with the heading that describes them, and their meaning."""
+COURSES = {
+    "gravity": ("[table](#gravity-over-time)", "Acceleration that acts on all fluid."),
+    "tilt": ("[table](#a-tilt-over-time)", "How far gravity leans, with its size kept; in the place of gravity."),
+    "nozzle_path": ("[table](#a-nozzle-that-moves)", "Where the opening of the emitter is."),
+}
+"""The same of `[schedule]`."""
 
 BEGINNING = """# The scene file
 
@@ -126,7 +133,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     (
         "## A jet: `[emitter]`",
         "A column of particles waits behind an opening and comes out of it with one speed. Where the opening is may "
-        "change over time: the parameter `nozzle_path`.",
+        "change over time: the parameter `nozzle_path`, also in `[schedule]`.",
         (
             (
                 "Emitter",
@@ -188,6 +195,35 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         ),
     ),
     (
+        "## What changes over time: `[schedule]`",
+        "A table for each parameter that changes: its values at some times, linear in between, constant before the "
+        "first and after the last ([how steps take it](runs.md#what-changes-while-a-scene-runs)).",
+        (
+            (
+                "Schedule",
+                "",
+                "[schedule.gravity]\ntimes = [0.0, 0.5]\nvalues = [[0.0, -9.81, 0.0], [3.0, -9.81, 0.0]]",
+            ),
+            (
+                "Course_gravity",
+                "### Gravity over time",
+                "[schedule.gravity]\ntimes = [0.0, 0.1, 0.2]\n"
+                "values = [[0.0, -9.81, 0.0], [6.0, -9.81, 0.0], [0.0, -9.81, 0.0]]",
+            ),
+            (
+                "Course_tilt",
+                "### A tilt over time",
+                "[schedule.tilt]\ntimes = [0.0, 0.2]\nvalues = [[0.0, 0.0], [20.0, 0.0]]",
+            ),
+            (
+                "Course_nozzle_path",
+                "### A nozzle that moves",
+                '[emitter]\nphase = "water"\noutlet = [0.75, 0.7, 0.25]\nradius = 0.1\nlength = 0.2\n'
+                "flow_rate = 0.02\n\n[schedule.nozzle_path]\ntimes = [0.0, 0.3]\nvalues = [[0.75, 0.7, 0.25], [0.65, 0.7, 0.25]]",
+            ),
+        ),
+    ),
+    (
         "## Pictures: `[render]`",
         "How `simulation.renderer()`, `cortado run` and losses of images see the fluid ([rendering](rendering.md)).",
         (
@@ -217,7 +253,13 @@ def page() -> str:
         for model, below, example in tables:
             table = schema["$defs"][model]
             words = table.get("description", "").replace("``", "`")
-            text += (f"{below}\n\n{words}\n\n" if below else "") + rows(table) + "\n" + toml(example) + "\n"
+            text += (
+                (f"{below}\n\n{words}\n\n" if below else "")
+                + rows(table, COURSES if model == "Schedule" else None)
+                + "\n"
+                + toml(example)
+                + "\n"
+            )
         text = text.rstrip("\n") + "\n"
     return text
 
