@@ -219,7 +219,8 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "Course_nozzle_path",
                 "### A nozzle that moves",
                 '[emitter]\nphase = "water"\noutlet = [0.75, 0.7, 0.25]\nradius = 0.1\nlength = 0.2\n'
-                "flow_rate = 0.02\n\n[schedule.nozzle_path]\ntimes = [0.0, 0.3]\nvalues = [[0.75, 0.7, 0.25], [0.65, 0.7, 0.25]]",
+                "flow_rate = 0.02\n\n[schedule.nozzle_path]\ntimes = [0.0, 0.3]\n"
+                "values = [[0.75, 0.7, 0.25], [0.65, 0.7, 0.25]]",
             ),
         ),
     ),
