@@ -98,6 +98,35 @@ def test_a_scene_of_a_batch_has_the_bits_of_its_single_run(case, precision):
             np.testing.assert_array_equal(runs[b].diagnostics[name], column)
 
 
+class _OneByOne:
+    """A loss without what it has for whole batches."""
+
+    def __init__(self, loss):
+        self.value, self.value_and_adjoint = loss.value, loss.value_and_adjoint
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_a_loss_of_all_scenes_at_once_has_the_bits_of_one_by_one(precision):
+    make, own, shared = CASES["iterations"]
+    simulation = Simulation(make(), precision=precision, batch=len(next(iter(own.values()))))
+    loss = FinalPositions(Simulation(make(), precision=precision).positions)
+    at_once, one_by_one = (Problem(simulation, STEPS, each) for each in (loss, _OneByOne(loss)))
+    values, gradient = at_once.value_and_gradient({**own, **shared})
+    wanted, wanted_gradient = one_by_one.value_and_gradient({**own, **shared})
+    np.testing.assert_array_equal(values, wanted)
+    for name, bar in wanted_gradient.items():
+        np.testing.assert_array_equal(gradient[name], bar)
+
+
+def test_a_loss_of_all_scenes_at_once_is_checked():
+    make, own, shared = CASES["iterations"]
+    simulation = Simulation(make(), batch=len(next(iter(own.values()))))
+    loss = FinalPositions(Simulation(make()).positions)
+    loss.values = lambda end: 1.0
+    with pytest.raises(InputError, match=r"the loss's values has shape \(\), but must be \(\d,\)"):
+        Problem(simulation, STEPS, loss).value({**own, **shared})
+
+
 def test_scenes_of_a_batch_iterate_as_often_as_each_needs():
     make, own, shared = CASES["iterations"]
     runs = Simulation(make(), batch=5).run(STEPS, {**own, **shared})

@@ -16,17 +16,19 @@ LAYERS = """
     words
     arrays
     restart
-    io io.files io.folder_lock io.input_files io.interruption io.notebook io.progress io.run_environment io.srgb
-    io.terminal io.usage io.video io.vtkhdf_layout io.vtkhdf
+    io io.files io.folder_lock io.input_files io.interruption io.notebook io.terminal io.progress io.run_environment
+    io.shipped io.srgb io.usage io.video io.vtkhdf_layout io.vtkhdf
     lattice lattice.shapes lattice.pairs lattice.region lattice.smoothing lattice.calibration
     parameters parameters.reference_density parameters.registry parameters.table parameters.tilt parameters.values
-    scene scene.fields scene.sentences scene.point_reader scene.points scene.tables scene.fluids scene.emitter
+    scene scene.fields scene.sentences scene.point_reader scene.points scene.tables
+    scene.schedule scene.fluids scene.emitter
     scene.mixture scene.render scene.toml
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights
     scene.containers scene.model scene.stability
-    device device.cores device.kernels device.memory device.precision device.arithmetic device.loads device.lanes
-    device.reduction device.host device.silence device.threads device.compiling device.kernel_cache device.smoothing
+    device device.cores device.driver device.kernels device.memory device.precision device.arithmetic device.loads
+    device.lanes device.reduction device.host device.silence device.threads device.compiling device.kernel_cache
+    device.smoothing
     device.neighbourhood device.arrays device.fields device.launching device.state device.cells
     device.candidates device.neighbours
     scene.checks scene.scene
@@ -45,8 +47,8 @@ LAYERS = """
     executors.executor executors.calls executors.distributed executors.worker_process executors.local executors
     rollout
     parameters.scene_parameters parameters.space
-    losses.image_losses losses.loss losses.centre_of_mass losses.image losses.matching losses.positions
-    losses.recorded losses.batch losses losses.checked
+    losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
+    losses.positions losses.recorded losses losses.checked
     gradients.estimator gradients.points gradients.ensemble_members gradients.exact
     gradients.filter_kernels gradients.adjoint_filters gradients.strength gradients.filters gradients.ensemble gradients
     render.cameras render.colour_field render.interpolation render.phase_colours render.fields render.rays
@@ -62,7 +64,7 @@ LAYERS = """
     optimisation optimisation.evaluate optimisation.differentiable optimisation.replay_log optimisation.optimisers
     optimisation.named_optimisers optimisation.result optimisation.optimise optimisation.transforms
     io.run_folder io.report
-    inverse inverse.tables inverse.task inverse.setup inverse.figures
+    inverse inverse.tables inverse.file_schema inverse.task inverse.setup inverse.figures
     study study.canvas study.comparison study.estimates study.lyapunov_spectrum study.one_kernel_loops
     study.reference_losses study.scenes study.palette study.sources study.gravity_tangents study.spatial_scales
     study.ensembles study.tables study.experiment study.forces study.gravity_and_precision study.image_horizon
@@ -72,8 +74,10 @@ LAYERS = """
     bench bench.scene bench.timing bench.floor bench.passes bench.memory bench.dam_break bench.environment
     bench.reference_engine bench.text
     sweep sweep.combinations sweep.table
-    commands commands.executor commands.bench commands.check commands.figure commands.optimise commands.run
-    commands.study commands.sweep
+    commands commands.executor commands.bench commands.check commands.compare commands.describe commands.examples
+    commands.figure commands.new commands.optimise commands.overview commands.run_summary commands.run
+    commands.schema commands.study
+    commands.sweep
     cli
     __main__
 """

@@ -16,7 +16,8 @@ import cortado
 
 ROOT = Path(__file__).parent.parent
 
-PACKAGE = ("src/cortado/__init__.py", "src/cortado/py.typed")
+PACKAGE = ("src/cortado/__init__.py", "src/cortado/py.typed", "src/cortado/scene.schema.json")
+EXAMPLE = "examples/pour.toml"
 needs_cmake = pytest.mark.skipif(shutil.which("cmake") is None, reason="CMake is not installed")
 
 
@@ -30,11 +31,12 @@ def build(hook: str, source: Path, out: Path, **environment: str) -> subprocess.
 
 @pytest.fixture
 def small(tmp_path):
-    """A project of one module, with a marker that it has types, that is built as Cortado is."""
+    """A project of one module, with a marker that it has types, a schema and an example, built as Cortado is."""
     source = tmp_path / "source"
     (source / "src/cortado").mkdir(parents=True)
     (source / "cpp").mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE", "cpp/CMakeLists.txt", *PACKAGE):
+    (source / "examples").mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE", "cpp/CMakeLists.txt", *PACKAGE, EXAMPLE):
         shutil.copy(ROOT / name, source / name)
     return source
 
@@ -48,7 +50,8 @@ def test_without_a_compiler_the_wheel_is_pure_python(small, tmp_path, hook):
     (wheel,) = (tmp_path / "dist").glob("*.whl")
     assert wheel.name == f"cortado_sph-{cortado.__version__}-py3-none-any.whl"
     held = set(zipfile.ZipFile(wheel).namelist())
-    assert ({"cortado/__init__.py", "cortado/py.typed"} <= held) == (hook == "build_wheel")
+    wanted = {f"cortado/{EXAMPLE}", *(name.removeprefix("src/") for name in PACKAGE)}
+    assert wanted <= held if hook == "build_wheel" else wanted.isdisjoint(held)
 
 
 @needs_cmake

@@ -9,7 +9,9 @@ import pytest
 
 import cortado.commands.bench
 import cortado.commands.check
+import cortado.commands.describe
 import cortado.commands.figure
+import cortado.commands.new
 import cortado.commands.optimise
 import cortado.commands.run
 import cortado.commands.sweep
@@ -44,6 +46,8 @@ def test_the_code_runs_as_printed(capsys):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_is_one(command, monkeypatch):
     for module, function in (
+        (cortado.commands.new, "new_scene"),
+        (cortado.commands.describe, "describe_scene"),
         (cortado.commands.run, "run_scene"),
         (cortado.commands.optimise, "optimise_task"),
         (cortado.commands.check, "check_scene"),
@@ -61,7 +65,8 @@ def test_a_command_is_one(command, monkeypatch):
 
 
 def test_there_are_commands():
-    assert {command.split()[0] for command in COMMANDS} == {"run", "optimise", "sweep", "gradients", "bench"}
+    wanted = {"new", "describe", "run", "optimise", "sweep", "gradients", "bench"}
+    assert {command.split()[0] for command in COMMANDS} == wanted
 
 
 def test_its_files_are_there():

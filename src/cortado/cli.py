@@ -1,4 +1,4 @@
-"""The command line: ``cortado run | optimise | sweep | gradients | bench``.
+"""The command line; ``cortado`` alone shows what it can do.
 
 Exit codes: 0 done, 1 the computation failed (or a check did), 2 the input is wrong, 130 interrupted. A mistake of the
 user's, or of the machine, is one sentence on stderr, never a traceback.
@@ -10,11 +10,12 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stderr
-from functools import partial
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from functools import partial, wraps
+from inspect import Parameter, signature
 from pathlib import Path
 from signal import SIGINT
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
@@ -24,7 +25,7 @@ from cortado import __version__
 from cortado.device.kernel_cache import complaint, start_warp
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
 from cortado.io.interruption import Interrupted
-from cortado.io.terminal import say, tell, to_stdout
+from cortado.io.terminal import quietly, say, tell, to_stdout
 from cortado.io.usage import usage_sentence
 
 app = SubcommandApp()
@@ -37,9 +38,95 @@ Work = Callable[[], str]
 """What a command does once its arguments are understood; returns what it prints."""
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Overrides = Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")]
+Quiet = Annotated[bool, arg(help="Say nothing but results, warnings and errors.")]
 
 
-@app.command
+def _command(group: SubcommandApp, answers: bool = False) -> Callable[[Callable[..., Work]], Callable[..., Work]]:
+    """Makes a function a command of a group, with an option --quiet. What it prints at the end is either what was asked
+    for, as it ``answers``, or a line about the files that it wrote."""
+
+    def register(function: Callable[..., Work]) -> Callable[..., Work]:
+        @wraps(function)
+        def command(*arguments: Any, quiet: bool = False, **options: Any) -> Work:
+            work = function(*arguments, **options)
+            return partial(_quiet, work, answers) if quiet else work
+
+        own = signature(function)
+        option = Parameter("quiet", Parameter.KEYWORD_ONLY, default=False, annotation=Quiet)
+        command.__signature__ = own.replace(parameters=[*own.parameters.values(), option])  # type: ignore[attr-defined]
+        command.__annotations__ = {**function.__annotations__, "quiet": Quiet}
+        del command.__wrapped__  # of which tyro would take the annotations
+        group.command(command)
+        return function
+
+    return register
+
+
+def _quiet(work: Work, answers: bool) -> str:
+    with quietly():
+        text = work()
+    return text if answers else ""
+
+
+@_command(app)
+def new(
+    name: Annotated[Positional[Path], arg(metavar="NAME")],
+    dimension: int = 2,
+) -> Work:
+    """Write a commented scene that runs at once, and the schema with which editors check it.
+
+    Args:
+        name: The file, dam.toml or only dam.
+        dimension: 2 or 3.
+    """
+    from cortado.commands.new import new_scene
+
+    return partial(new_scene, name, dimension)
+
+
+@_command(app, answers=True)
+def examples(
+    copy: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (),
+    to: Path = Path(),
+) -> Work:
+    """List the examples that come with Cortado, or copy some of them.
+
+    Args:
+        copy: One to copy, or all of them with the name "all"; may be given again.
+        to: The folder to copy to; made if it is missing.
+    """
+    from cortado.commands.examples import list_examples
+
+    return partial(list_examples, _words(copy), to)
+
+
+@_command(app, answers=True)
+def describe(
+    scene: Scene,
+    steps: int = 200,
+    picture: Path | None = None,
+    overrides: Overrides = (),
+    device: str = "cpu",
+    precision: str = "float32",
+    json: bool = False,
+) -> Work:
+    """Describe a scene before it is run: its particles, what limits its time step, its memory, its time.
+
+    Args:
+        scene: The scene file, or a task file.
+        steps: Number of time steps that it shall run.
+        picture: Draw its first state into this PNG file.
+        overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
+        device: "cpu", or "cuda:0" for the first GPU.
+        precision: "float32" or "float64".
+        json: Print JSON for machines.
+    """
+    from cortado.commands.describe import describe_scene
+
+    return partial(describe_scene, scene, steps, _words(overrides), device, precision, picture, json)
+
+
+@_command(app)
 def run(
     scene: Scene,
     steps: int = 200,
@@ -66,10 +153,28 @@ def run(
     from cortado.commands.run import run_scene
 
     words = _words(overrides)
-    return partial(run_scene, scene, steps, out, words, device, precision, record_every, overwrite, _command())
+    return partial(run_scene, scene, steps, out, words, device, precision, record_every, overwrite, _command_line())
 
 
-@app.command
+@_command(app, answers=True)
+def compare(
+    first: Annotated[Positional[Path], arg(metavar="RUN")],
+    second: Annotated[Positional[Path], arg(metavar="RUN")],
+    json: bool = False,
+) -> Work:
+    """Compare two runs: their scenes and settings, their last states, their metrics, and where they were made.
+
+    Args:
+        first: The folder of a run.
+        second: The folder of another.
+        json: Print JSON for machines.
+    """
+    from cortado.commands.compare import compare_runs
+
+    return partial(compare_runs, first, second, json)
+
+
+@_command(app)
 def optimise(
     task: Annotated[Positional[Path], arg(metavar="TASK.toml")],
     out: Path = Path("runs/optimise"),
@@ -100,10 +205,10 @@ def optimise(
     from cortado.commands.optimise import optimise_task
 
     where, words = Where(scheduler, workers), _words(overrides)
-    return partial(optimise_task, task, out, words, device, precision, resume, overwrite, _command(), where)
+    return partial(optimise_task, task, out, words, device, precision, resume, overwrite, _command_line(), where)
 
 
-@app.command
+@_command(app)
 def sweep(
     file: Annotated[Positional[Path], arg(metavar="FILE.toml")],
     sets: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE,VALUE")] = (),
@@ -133,7 +238,7 @@ def sweep(
     return partial(run_sweep, file, _words(sets), steps, out, device, precision, Where(scheduler, workers))
 
 
-@gradients.command
+@_command(gradients, answers=True)
 def check(
     scene: Scene,
     steps: int = 50,
@@ -167,7 +272,7 @@ def check(
     return partial(check_scene, scene, steps, parameters, loss, perturbation, out, words, device, json, seed)
 
 
-@gradients.command
+@_command(gradients)
 def figure(
     experiment: Annotated[Positional[Path], arg(metavar="EXPERIMENT.toml")],
     out: Path | None = None,
@@ -189,7 +294,7 @@ def figure(
     return partial(measure_figure, experiment, out, _words(overrides), reduced, redraw)
 
 
-@gradients.command
+@_command(gradients)
 def study(
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")] = Path("experiments"),
     out: Path = Path("runs/study"),
@@ -209,7 +314,7 @@ def study(
     return partial(run_study, folder, out, reduced, _words(only))
 
 
-@app.command
+@_command(app, answers=True)
 def bench(
     particles: tuple[int, ...] = (8000,),
     steps: int = 20,
@@ -241,6 +346,24 @@ def bench(
         return partial(bench_dam_break, particles, steps, repeats, device, precision, json)
 
 
+@_command(app, answers=True)
+def schema() -> Work:
+    """Print the JSON schema of scenes and tasks, with which editors complete and check them."""
+    from cortado.commands.schema import print_schema
+
+    return print_schema
+
+
+@_command(app, answers=True)
+def completion(shell: Annotated[Positional[Literal["bash", "zsh"]], arg(metavar="SHELL")]) -> Work:
+    """Print what makes a shell complete commands and options: eval "$(cortado completion bash)".
+
+    Args:
+        shell: bash or zsh.
+    """
+    return partial(_completion, shell)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command; exits with its code unless that is 0."""
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -251,7 +374,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             work = _understood(arguments)
             logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where its folder cannot be written it goes on
             start_warp()
-            tell(work())
+            text = work()
+            if text:
+                tell(text)
     except ComputationError as error:
         sys.exit(_say(error, 1))
     except CortadoError as error:
@@ -274,19 +399,36 @@ def _understood(arguments: Sequence[str]) -> Work:
     box = io.StringIO()
     try:
         with redirect_stderr(box), to_stdout():
+            if not arguments:
+                from cortado.commands.overview import overview
+
+                print(overview())
+                sys.exit(0)
             if list(arguments) == ["--version"]:
                 print(f"cortado {__version__}")
                 sys.exit(0)
-            return app.cli(
-                prog="cortado",
-                description="A differentiable SPH fluid simulator. --version prints which one.",
-                args=arguments,
-                config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
-            )
+            return _parsed(arguments)
     except SystemExit as end:
         if not end.code:
             raise
         raise InputError(usage_sentence(box.getvalue(), arguments)) from None
+
+
+def _parsed(arguments: Sequence[str]) -> Any:
+    return app.cli(
+        prog="cortado",
+        description="A differentiable SPH fluid simulator. --version prints which one; cortado alone gives examples.",
+        args=arguments,
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+
+
+def _completion(shell: str) -> str:
+    """The script for a shell, as tyro prints it and exits; bash completes names of files where nothing else fits."""
+    box = io.StringIO()
+    with redirect_stdout(box), suppress(SystemExit):
+        _parsed(["--tyro-print-completion", shell])
+    return box.getvalue().rstrip("\n").replace("complete -F ", "complete -o bashdefault -o default -F ")
 
 
 def _require_at_least(least: int, value: int, option: str) -> None:
@@ -304,7 +446,7 @@ def _words(options: Sequence[str]) -> list[str]:
     return list(options)
 
 
-def _command() -> list[str]:
+def _command_line() -> list[str]:
     return ["cortado", *sys.argv[1:]]
 
 

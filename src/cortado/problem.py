@@ -45,7 +45,8 @@ class Problem:
     - in a scene with surface tension ``surface_tension`` [N / m];
     - with a loss of images ``colours`` (phases, 3).
 
-    What is not given is the scene's. n counts fluid particles in the order in which the scene lists them.
+    What is not given is the scene's, as its schedule changes it. n counts fluid particles in the order in which the
+    scene lists them.
     """
 
     def __init__(

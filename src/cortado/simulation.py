@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.compiling import begin_headers
+from cortado.device.driver import why_no_gpu
 from cortado.device.kernel_cache import start_warp
 from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import Precision, precision_named
@@ -153,11 +154,11 @@ class Simulation:
         """Run from the scene's first state and return the frames, the first and the last state included; of a batch a
         `TrajectoryBatch`.
 
-        ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity; so does any other parameter
-        of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same scene, the run goes on
-        from there, with the same bits as if it had not stopped; a parameter over time is then one of the steps to come.
-        A batch goes on from one state for each scene. Warns when the pressure did not converge; raises `DivergedError`
-        when a particle is lost, where a batch warns, and goes on without the scene.
+        ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity, its schedule included; so
+        does any other parameter of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same
+        scene, the run goes on from there, with the same bits as if it had not stopped; a parameter over time is then
+        one of the steps to come. A batch goes on from one state for each scene. Warns when the pressure did not
+        converge; raises `DivergedError` when a particle is lost, where a batch warns, and goes on without the scene.
         """
         return self.collect(self.rollout(steps, controls, state), record_every)
 
@@ -279,7 +280,7 @@ class Simulation:
         return scene_renderer(self, **settings)
 
     def parameters(self) -> dict[str, np.ndarray]:
-        """Every parameter of `Problem` as the scene has it."""
+        """Every parameter of `Problem` as the scene has it, without what its schedule changes."""
         return scene_values(self)
 
     def substeps(
@@ -365,7 +366,7 @@ def lost_sentence(lost: Mapping[int, DivergedError], batch: int) -> str:
 
 def _device(name: str) -> Any:
     found = ", ".join(str(device) for device in wp.get_devices())
-    none = "" if wp.get_cuda_device_count() else "; no GPU with a CUDA driver is found"
+    none = "" if wp.get_cuda_device_count() else f"; {why_no_gpu()}"
     try:
         if name == "cuda" and none:
             raise ValueError  # Warp itself would write on stderr

@@ -17,9 +17,9 @@ PERTURBATION = 0.05
 def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
     """The values of parameters, given as values or as names of the scene's."""
     simulation = problem.simulation
-    values = simulation.parameters()
+    values = ParameterSpace(simulation, problem.steps).defaults()
     tilt = BY_NAME["tilt"]
-    if tilt.present(simulation.scene):
+    if tilt.present(simulation.scene) and not simulation.scene.schedule.leads_gravity:
         values["tilt"] = tilt.value(simulation)
     if isinstance(parameters, Mapping):
         values = dict(parameters)
@@ -38,10 +38,11 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
 def everything(problem: Problem, chosen: Arrays) -> Arrays:
     """Every parameter of the problem that acts and that can be both increased and decreased, with its values.
 
-    Values are the chosen ones, else the scene's; parameters over time have a row for each step. A viscosity of 0 cannot
-    be decreased and is left out; so is a mobility in a scene of one phase, where it does nothing.
+    Values are the chosen ones, else the scene's, as its schedule has them; parameters over time have a row for each
+    step. A viscosity of 0 cannot be decreased and is left out; so is a mobility in a scene of one phase, where it does
+    nothing.
     """
-    values = {**problem.simulation.parameters(), **chosen}
+    values = {**ParameterSpace(problem.simulation, problem.steps).defaults(), **chosen}
     found = {}
     for name, value in values.items():
         parameter = BY_NAME[name]

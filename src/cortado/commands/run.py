@@ -1,14 +1,18 @@
 """``cortado run``: a scene, forward."""
 
+import time
+import warnings
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from cortado.commands.run_summary import RunSummary
+from cortado.device.compiling import compile_ahead
 from cortado.device.memory import frame_parts, require
 from cortado.device.state import State
-from cortado.errors import DivergedError
+from cortado.errors import CortadoWarning, DivergedError
 from cortado.figures import density_errors, images, particles
 from cortado.io.folder_lock import locked
 from cortado.io.interruption import keeping
@@ -47,10 +51,11 @@ def run_scene(
     with locked(out):
         folder = RunFolder.create(out, scene.to_json(), command, overwrite=overwrite, **noted)
         with keeping(lambda: f"the frames so far are in {folder.trajectory}" if folder.trajectory.exists() else ""):
-            _compute(simulation, rollout, folder, record_every)
+            summary = _compute(simulation, rollout, folder, record_every)
     converged = rollout.diagnostics["converged"]
-    warning = "" if converged.all() else f"Mind that {not_converged_sentence(converged)} "
-    return f"{warning}The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
+    if not converged.all():
+        warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=2)
+    return f"{summary}\nThe results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
 
 
 def run_settings(steps: int, precision: str, record_every: int) -> dict[str, Any]:
@@ -58,17 +63,21 @@ def run_settings(steps: int, precision: str, record_every: int) -> dict[str, Any
     return {"steps": steps, "precision": precision, "record_every": record_every}
 
 
-def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:
+def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> RunSummary:
     """Run, and fill the folder, also where the run diverges."""
+    compile_ahead(rollout.solver, simulation.device)
+    begun = time.perf_counter()
     try:
-        _write_trajectory(simulation, rollout, folder, record_every)
+        last = _write_trajectory(simulation, rollout, folder, record_every)
     except DivergedError as error:
         _write_pictures(simulation, rollout.substeps, folder, [("ended early", error)])
         told = error.with_advice(f"{error.advice}; the frames so far are in {folder.path}")
         folder.write_result(**_for_machines(simulation, rollout), failures=[str(told)])
         raise told from error
-    _write_pictures(simulation, rollout.substeps, folder, [])
-    folder.write_result(**_for_machines(simulation, rollout), failures=[])
+    summary = RunSummary.of(simulation, rollout, last, time.perf_counter() - begun)
+    _write_pictures(simulation, rollout.substeps, folder, [("in short", summary)])
+    folder.write_result(**_for_machines(simulation, rollout), **summary.for_machines(), failures=[])
+    return summary
 
 
 def _for_machines(simulation: Simulation, rollout: Rollout) -> dict[str, Any]:
@@ -82,7 +91,8 @@ def _for_machines(simulation: Simulation, rollout: Rollout) -> dict[str, Any]:
     }
 
 
-def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> None:
+def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> State:
+    """Run, with a frame for every so many steps; returns the last state."""
     steps = rollout.steps
     recorded = np.array([*range(0, steps, record_every), steps])
     times, first = rollout.clocks[0].times(recorded, rollout.time_steps[0]), simulation.frame(rollout.initial)
@@ -99,7 +109,7 @@ def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolde
 
         append_frame(writer, first, 0)
         try:
-            rollout.forward(observe, keep=False)
+            return rollout.forward(observe, keep=False)
         finally:
             found = rollout.diagnostics
             writer.append_steps(**found)

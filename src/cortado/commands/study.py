@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from cortado.errors import ComputationError, CortadoError, InputError
-from cortado.io.terminal import say, tell
+from cortado.io.terminal import note, tell
 from cortado.study.experiment import DeviceSettings, Experiment
 from cortado.study.experiment_files import load_experiment
 from cortado.study.results import Results
@@ -43,7 +43,7 @@ def _verdict(experiment: Experiment, results: Results) -> list[str]:
         return results.verdict()
     if _needs_gpu(experiment) and not _has_gpu():
         return ["Left out: it needs a GPU, and there is none."]
-    say(f"{experiment.name} ...")
+    note(f"{experiment.name} ...")
     return results.measure(experiment)
 
 

@@ -23,7 +23,7 @@ import warp as wp
 from cortado.device.cores import usable_cores
 from cortado.device.kernels import is_derivative
 from cortado.device.threads import MOST_CORES, helpers
-from cortado.io.terminal import say
+from cortado.io.terminal import note
 
 BUILDERS = ("build_cpu", "build_cuda")
 """Functions of Warp that compile the file of a module, one of their first two arguments."""
@@ -200,13 +200,13 @@ class _Said:
 def _announced(count: int, device: Any) -> Iterator[None]:
     """One line on stderr: what is compiled, and at the end how long it took."""
     _Said.anything, begun = True, time.monotonic()
-    say(f"Compiling {count} kernel modules for {device.alias}, once on this machine", end="")
+    note(f"Compiling {count} kernel modules for {device.alias}, once on this machine", end="")
     try:
         yield
     except BaseException:
-        say(".")
+        note(".")
         raise
-    say(f": {time.monotonic() - begun:.1f} s")
+    note(f": {time.monotonic() - begun:.1f} s")
 
 
 def watch_compilation() -> None:
@@ -227,7 +227,7 @@ def _watched(function: Callable[..., Any], built: Callable[..., Any]) -> Callabl
         ours = any(Path(str(argument)).name.startswith(OURS) for argument in arguments[:2])
         if ours and not _Said.anything:
             _Said.anything = True
-            say("Compiling kernels, once on this machine.")
+            note("Compiling kernels, once on this machine.")
         return built(function, arguments, options) if ours else function(*arguments, **options)
 
     return watched

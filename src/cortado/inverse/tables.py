@@ -83,17 +83,25 @@ def _growing(value: Any, check: ValidatorFunctionWrapHandler) -> tuple[float, ..
     raise field_error((), value, words)
 
 
-_VALUES: Any = {
-    "type": "object",
-    "minProperties": 1,
-    "additionalProperties": False,
-    "properties": {
-        name: {"anyOf": [{"type": "number"}, {"type": "array"}], "unit": unit or "-"} for name, unit in UNITS.items()
-    },
-}
+_NUMBERS: list[Any] = [{"type": "number"}, {"type": "array"}]
+
+
+def _schema(words: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The JSON schema of values by name; parameters that can be random may be one of the words too."""
+    allowed = [{"enum": list(words)}] if words else []
+    properties = {
+        name: {"anyOf": [*_NUMBERS, *allowed] if name in CAN_BE_RANDOM else _NUMBERS, "unit": unit or "-"}
+        for name, unit in UNITS.items()
+    }
+    return {"type": "object", "minProperties": 1, "additionalProperties": False, "properties": properties}
+
+
+_VALUES = _schema()
 Values = Annotated[dict[str, Any], BeforeValidator(_arrays), WithJsonSchema(_VALUES)]
 """Parameters by name, each a number, a list of numbers, or a list of lists of numbers."""
-Start = Annotated[dict[str, Any], BeforeValidator(partial(_arrays, words=(RANDOM,))), WithJsonSchema(_VALUES)]
+Start = Annotated[
+    dict[str, Any], BeforeValidator(partial(_arrays, words=(RANDOM,))), WithJsonSchema(_schema(words=(RANDOM,)))
+]
 """Values, of which some may be the word "random"."""
 Schedule = Annotated[Several[Annotated[float, quantity(gt=0.0, le=1.0)]], WrapValidator(_growing)]
 """A continuation schedule: factors that grow to 1."""

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, Protocol, TextIO
 
+from cortado.io.terminal import is_quiet
+
 LINE_INTERVAL = 10.0
 """[s] between two lines when the stream is no terminal."""
 
@@ -44,7 +46,7 @@ def track(
                 advance(loss=loss)
     """
     stream = sys.stderr if stream is None else stream
-    if _hidden.get():
+    if _hidden.get() or is_quiet():
         yield _nothing
     elif stream.isatty():
         with _bar(total, description, stream) as advance:

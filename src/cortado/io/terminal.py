@@ -18,8 +18,35 @@ def printable(text: str) -> str:
 
 
 def say(sentence: str, end: str = "\n") -> None:
-    """One line on stderr: a mistake, a warning, what is being done; the beginning of one with another ``end``."""
+    """One line on stderr: a mistake or a warning; the beginning of one with another ``end``."""
     print(printable(sentence), end=end, file=sys.stderr, flush=True)
+
+
+def note(sentence: str, end: str = "\n") -> None:
+    """What is good to know, on stderr, unless `quietly`: what is being done, how far it is."""
+    if not is_quiet():
+        say(sentence, end)
+
+
+def is_quiet() -> bool:
+    """Whether only results, warnings and errors are wanted."""
+    return _Quiet.depth > 0
+
+
+@contextmanager
+def quietly() -> Iterator[None]:
+    """Within it, in all threads, nothing is said but results, warnings and errors."""
+    _Quiet.depth += 1
+    try:
+        yield
+    finally:
+        _Quiet.depth -= 1
+
+
+class _Quiet:
+    """How often `quietly` was entered and not left."""
+
+    depth = 0
 
 
 def tell(result: str) -> None:

@@ -5,7 +5,10 @@ from collections.abc import Sequence
 
 from cortado.errors import LONGEST
 
-_COMMAND = re.compile(r"(run|optimise|sweep|bench|gradients( (check|figure|study))?)(?= |$)")
+_COMMAND = re.compile(
+    r"(new|examples|describe|run|compare|optimise|sweep|bench|schema|completion"
+    r"|gradients( (check|figure|study))?)(?= |$)"
+)
 _EDGES = "│|╭╮╰╯─-+ "
 _SENTENCES = (
     (r"Expected one of \{(.*)\}", r"a command is missing, one of \1"),

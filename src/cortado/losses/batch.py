@@ -1,14 +1,15 @@
-"""Losses of the scenes of a batch, one by one."""
+"""Losses of the scenes of a batch: of all at once where a loss can, else one by one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import overload
+from typing import Protocol, overload, runtime_checkable
 
 import numpy as np
 
+from cortado.device.precision import Precision
 from cortado.device.state import State
-from cortado.losses.loss import ADJOINT_FIELDS, Loss, Snapshot, SnapshotAdjoint
+from cortado.losses.loss import ADJOINT_FIELDS, Loss, Snapshot, SnapshotAdjoint, precision_of
 from cortado.words import counted
 
 
@@ -41,6 +42,11 @@ class SnapshotBatch(Sequence[Snapshot]):
             return [self[k] for k in range(len(self))[b]]
         number = range(len(self))[b]
         return _Member(self.state.member(number), self.dimension, self.colours[number], self, number)
+
+    @property
+    def precision(self) -> Precision:
+        """Of the Warp arrays."""
+        return precision_of(self.state)
 
     @property
     def positions(self) -> np.ndarray:
@@ -86,9 +92,24 @@ class _Member(Snapshot):
         return self.batch.mass_fractions[self.number]
 
 
+@runtime_checkable
+class Together(Protocol):
+    """A loss that looks at all scenes of a batch at once, which saves a launch and a look of the host for each. Scene b
+    gets the bits that it would get alone."""
+
+    def values(self, end: SnapshotBatch) -> np.ndarray:
+        """(batch,) the losses; of scenes that were lost they mean nothing."""
+
+    def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
+        """The same, and the derivatives with respect to the states, as Warp arrays."""
+
+
 def values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray:
     """(batch,) the losses of some scenes; NaN for others."""
     found = np.full(len(end), np.nan)
+    if isinstance(loss, Together):
+        found[members] = loss.values(end)[members]
+        return found
     for b in members:
         found[b] = loss.value(end[b])
     return found
@@ -96,7 +117,14 @@ def values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray
 
 def values_and_adjoints(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> tuple[np.ndarray, SnapshotAdjoint]:
     """The same, with the adjoints of the states of these scenes; 0 for others."""
-    found, adjoint = np.full(len(end), np.nan), SnapshotAdjoint(end.state.like(), np.zeros_like(end.colours))
+    found = np.full(len(end), np.nan)
+    if isinstance(loss, Together):
+        all_found, state = loss.values_and_adjoint(end)
+        found[members] = all_found[members]
+        for b in set(range(len(end))).difference(members):
+            state.member(b).clear()
+        return found, SnapshotAdjoint(state, np.zeros_like(end.colours))
+    adjoint = SnapshotAdjoint(end.state.like(), np.zeros_like(end.colours))
     arrays: dict[str, np.ndarray] = {}
     for b in members:
         found[b], bar = loss.value_and_adjoint(end[b])

@@ -10,7 +10,8 @@ import warp as wp
 from cortado.arrays import as_numbers, as_one_number
 from cortado.device.state import State
 from cortado.errors import InputError, shown
-from cortado.losses import Loss, Recorded, Snapshot, SnapshotAdjoint
+from cortado.losses import Loss, Recorded, Snapshot, SnapshotAdjoint, SnapshotBatch
+from cortado.losses.batch import Together
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
 
 FORMS = tuple(name.replace("_", " ") for name in ADJOINT_FIELDS)
@@ -38,7 +39,7 @@ class CheckedLoss:
         if isinstance(bar, State):
             return _checked_state(bar, end)
         if isinstance(bar, SnapshotAdjoint):
-            colours = _checked_array("colours", bar.colours, end.colours.shape)
+            colours = _checked_array("adjoint of colours", bar.colours, end.colours.shape)
             return SnapshotAdjoint(_checked_state(bar.state, end), colours)
         if not isinstance(bar, (tuple, list, np.ndarray)) or len(bar) not in (2, 3):
             count = f" of {len(bar)}" if isinstance(bar, (tuple, list)) else ""
@@ -47,7 +48,19 @@ class CheckedLoss:
                 f"derivatives with respect to {', '.join(FORMS[:2])} and {FORMS[2]}, or a State, or a SnapshotAdjoint."
             )
         wanted = (end.positions.shape, end.velocities.shape, end.mass_fractions.shape)
-        return tuple(_checked_array(*entry) for entry in zip(FORMS, bar, wanted, strict=False))
+        forms = (f"adjoint of {form}" for form in FORMS)
+        return tuple(_checked_array(*entry) for entry in zip(forms, bar, wanted, strict=False))
+
+
+class CheckedTogether(CheckedLoss):
+    """The same of a loss that looks at all scenes of a batch at once."""
+
+    def values(self, end: SnapshotBatch) -> np.ndarray:
+        return _checked_array("values", self._loss.values(end), (len(end),))
+
+    def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
+        values, bar = self._loss.values_and_adjoint(end)
+        return _checked_array("values", values, (len(end),)), _checked_state(bar, end)
 
 
 def as_loss(loss: Any) -> Loss:
@@ -58,7 +71,7 @@ def as_loss(loss: Any) -> Loss:
     if derivative is not None and hasattr(loss, "value"):
         for name in ("value", derivative):
             _require_arguments(f"the loss's {name}", getattr(loss, name), ("the end of a trajectory",))
-        return CheckedLoss(loss)
+        return CheckedTogether(loss) if isinstance(loss, Together) else CheckedLoss(loss)
     if not callable(loss):
         raise InputError(f"loss is a {type(loss).__name__}, but must have a value and an adjoint, or be a function.")
     _require_arguments("loss", loss, ("positions", "velocities", "an array for the loss"))
@@ -79,7 +92,7 @@ def _require_arguments(what: str, function: Callable[..., Any], wanted: tuple[st
         ) from None
 
 
-def _checked_state(bar: Any, end: Snapshot) -> State:
+def _checked_state(bar: Any, end: Snapshot | SnapshotBatch) -> State:
     if not isinstance(bar, State):
         raise InputError(f"the loss's adjoint has a {type(bar).__name__} as its state, but must have a State.")
     if bar.names != end.state.names:
@@ -92,10 +105,10 @@ def _checked_state(bar: Any, end: Snapshot) -> State:
     return bar
 
 
-def _checked_array(form: str, bar: Any, shape: tuple[int, ...]) -> np.ndarray:
-    array = as_numbers(f"the loss's adjoint of {form}", bar)
+def _checked_array(what: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    array = as_numbers(f"the loss's {what}", values)
     if array.shape != shape:
-        raise InputError(f"the loss's adjoint of {form} has shape {array.shape}, but must be {shape}.")
+        raise InputError(f"the loss's {what} has shape {array.shape}, but must be {shape}.")
     return array
 
 

@@ -13,6 +13,11 @@ from cortado.errors import InputError, shown
 from cortado.words import counted
 
 
+def precision_of(state: State) -> Precision:
+    """Of the arrays of a state."""
+    return FLOAT64 if state.positions.dtype == FLOAT64.vector else FLOAT32
+
+
 @dataclass(frozen=True)
 class Snapshot:
     """A state of a rollout, the last one as a rule, as NumPy arrays or as Warp arrays, in the scene's order."""
@@ -30,7 +35,7 @@ class Snapshot:
     @property
     def precision(self) -> Precision:
         """Of the Warp arrays."""
-        return FLOAT64 if self.state.positions.dtype == FLOAT64.vector else FLOAT32
+        return precision_of(self.state)
 
     @cached_property
     def positions(self) -> np.ndarray:

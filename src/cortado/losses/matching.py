@@ -19,7 +19,8 @@ class MatchingKernels:
 
 @cache
 def matching_kernels(precision: Precision) -> MatchingKernels:
-    """Kernels ``squared_distance`` (in float64) and ``difference`` (times a factor) of two sets of vectors."""
+    """Kernels ``squared_distance`` (in float64) and ``difference`` (times a factor) of vectors from targets, which
+    are the same for every scene of a batch."""
     real, vector = precision.real, precision.vector
     module = wp.get_module(f"cortado_matching_{precision.name}")
     module.options["enable_backward"] = False
@@ -32,7 +33,7 @@ def matching_kernels(precision: Precision) -> MatchingKernels:
         squares: wp.array(dtype=wp.float64),
     ):
         i = wp.tid()
-        miss = wp.vec3d(x[i] - target[i])
+        miss = wp.vec3d(x[i] - target[i % target.shape[0]])
         squares[i] = wp.dot(miss, miss)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -44,6 +45,6 @@ def matching_kernels(precision: Precision) -> MatchingKernels:
         bar: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        bar[i] = factor * (x[i] - target[i])
+        bar[i] = factor * (x[i] - target[i % target.shape[0]])
 
     return MatchingKernels(squared_distance=squared_distance, difference=difference)

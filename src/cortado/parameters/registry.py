@@ -84,6 +84,8 @@ class Parameter:
     """Whether it is a key of [forces] that scenes may leave out, and its force with it."""
     longest_step: Limit = lambda scene, values: inf
     """The largest at which an optional force is likely to be stable."""
+    moment: float = 0.5
+    """Of a parameter over time: when within a step its row is taken from a schedule; 0 is the start, 1 the end."""
 
     def shapes(self, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:
         """The shapes that its values may have, () for a number, where positions are (n, d)."""
@@ -260,6 +262,7 @@ PARAMETERS = (
         lambda s: s.scene.emitter.outlet,
         components=_vector,
         change=_spacing,
+        moment=1.0,
         present=_has_emitter,
         absent="has no emitter",
     ),

@@ -20,6 +20,8 @@ from cortado.parameters.reference_density import (
 from cortado.parameters.registry import BY_NAME, Axis, Role, Source, names
 from cortado.parameters.tilt import Tilt
 from cortado.parameters.values import OVER_TIME, Arrays, scene_values
+from cortado.restart import Clock
+from cortado.scene.schedule import Course
 
 RUN = names(Role.RUN)
 DENSITY = "reference_density"
@@ -69,6 +71,39 @@ class SceneParameters:
         """The values, with gravity in the place of a tilt."""
         return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values
 
+    def _courses(self, values: Arrays) -> dict[str, Course]:
+        """Those of the schedule that act: a gravity or a tilt that is given replaces either."""
+        replaced = {"gravity", "tilt"} if not values.keys().isdisjoint(("gravity", "tilt")) else set()
+        courses = self._simulation.scene.schedule.courses
+        return {name: course for name, course in courses.items() if name not in values and name not in replaced}
+
+    def _times(self, name: str, values: Arrays, clock: Clock | None = None) -> NDArray:
+        """(steps,) [s] when the rows of a scheduled parameter are."""
+        time_step = float(values.get("time_step", self._simulation.scene.solver.time_step))
+        return (clock or Clock()).times(self._moments(name), time_step)
+
+    def _moments(self, name: str) -> NDArray:
+        """(steps,) the same in steps."""
+        return np.arange(max(self._steps, 1)) + BY_NAME[name].moment
+
+    def _scheduled_rates(self, values: Arrays) -> Arrays:
+        """(steps, d) the derivatives of `scheduled` with respect to the time step."""
+        found = {}
+        for name, course in self._courses(values).items():
+            times = self._times(name, values)
+            rates = course.rates(times) * self._moments(name)[:, None]
+            if name == "tilt":
+                found["gravity"] = self._tilt.tangent(course.at(times), rates)
+            else:
+                found[name] = rates
+        return found
+
+    def scheduled(self, values: Arrays, clock: Clock | None = None) -> Arrays:
+        """What the scene's schedule says of the steps after a clock, with a row for each, in the place of what is not
+        among the ``values``: gravity, also where it is a tilt that is scheduled, and the nozzle's path."""
+        rows = {name: course.at(self._times(name, values, clock)) for name, course in self._courses(values).items()}
+        return {name: value for name, value in self.upright(rows).items() if name in RUN}
+
     def run(self, values: Arrays) -> Arrays:
         """What steps depend on, by the upright ``values``, and the scene's for what is not among them: parameters over
         time as (steps, d), those of phases as (phases,), others as numbers ()."""
@@ -102,13 +137,20 @@ class SceneParameters:
         if "tilt" in along:
             if "gravity" in values:
                 raise InputError("direction tilt is given, but must be left out, as gravity is given in its place.")
+            if "tilt" not in values and self._simulation.scene.schedule.leads_gravity:
+                raise InputError(
+                    "direction tilt is given, but must be left out, as the scene's schedule says where gravity points: "
+                    "give the tilt among the parameters, too."
+                )
             angles = values.get("tilt", np.zeros(self._simulation.dimension - 1))
             along = {**along, "gravity": self._tilt.tangent(angles, along["tilt"])}
+        rates = self._scheduled_rates(values) if "time_step" in along else {}
         along = {name: along.get(name, np.zeros_like(value)) for name, value in self.values.items()}
         fractions_dot, density_dot = along["mass_fractions"], np.atleast_1d(along["rest_density"])
         density = reference_density_tangent(*self._composition(values), fractions_dot, density_dot)
         first = {**first_values(self._simulation.state.fields, along), DENSITY: density}
-        return first, self.run(along)
+        moved = {name: along[name] + along["time_step"] * rate for name, rate in rates.items()}
+        return first, self.run({**along, **moved})
 
     def gradient(self, values: Arrays, first: Arrays, run: Arrays) -> Arrays:
         """From the adjoints of the fields of the first state and of what steps depend on to those of ``values``, in
@@ -122,6 +164,9 @@ class SceneParameters:
                     found[field.first] = first[field.name]
         if "tilt" in values:
             found["tilt"] = self._tilt.adjoint(values["tilt"], run["gravity"])
+        if "time_step" in values:
+            later = sum(float((run[name] * rate).sum()) for name, rate in self._scheduled_rates(values).items())
+            found["time_step"] = found["time_step"] + later
         for name in OVER_TIME:
             if name in values and values[name].ndim == 1:
                 found[name] = found[name].sum(axis=0)

@@ -12,7 +12,7 @@ from cortado.errors import CortadoWarning, InputError, shown
 from cortado.parameters.checks import check_places, check_sizes, check_state, unstable_sentence
 from cortado.parameters.registry import Role, names
 from cortado.parameters.scene_parameters import DENSITY, RUN, SceneParameters, Simulated
-from cortado.parameters.values import OVER_TIME, Arrays, Values, check_known, checked_value
+from cortado.parameters.values import OVER_TIME, Arrays, Values, check_known, checked_value, scene_values
 from cortado.restart import Clock, RestartState
 from cortado.rollout import Rollout
 
@@ -48,6 +48,11 @@ class ParameterSpace:
         different = self._different(values)
         return different if len(different) > 1 else different * (self._batch or 1)
 
+    def defaults(self) -> Arrays:
+        """Every parameter that the scene has, as runs of so many steps take it where it is not given: parameters that
+        the scene's schedule changes with a row for each step, others as `Simulation.parameters` has them."""
+        return {**scene_values(self._simulation), **self._one.scheduled({})}
+
     def colours(self, values: Arrays) -> np.ndarray:
         """(phases, 3) the colours of the phases in one scene."""
         return values.get("colours", self._one.values["colours"])
@@ -56,7 +61,8 @@ class ParameterSpace:
     def begin(
         self, rollout: Rollout, values: Arrays, varied: Iterable[str] = (), states: Sequence[RestartState] = ()
     ) -> None:
-        """Give a rollout its first state and its parameters: ``values``, and the scene's for what is not among them.
+        """Give a rollout its first state and its parameters: ``values``, and for what is not among them the scene's, as
+        its schedule changes it.
 
         ``varied`` are parameters that a derivative is wanted for: with the mobility among them there is a substep of
         diffusion even where it is 0. ``states``, one for each scene, replace the scene's first state.
@@ -67,7 +73,13 @@ class ParameterSpace:
         rollout.initial.assign(simulation.state)
         firsts = [dict(state.fields) for state in states] or [self._one.first(own) for own in members]
         rollout.initial.set(self._together(firsts))
-        chosen = [self._one.run(own) for own in members]
+        if simulation.scene.schedule.courses and len(members) < len(rollout.clocks):
+            members = members * len(rollout.clocks)  # each at its own time
+        clocks = rollout.clocks if len(members) > 1 else rollout.clocks[:1]
+        chosen = [
+            self._one.run({**self._one.scheduled(own, clock), **own})
+            for own, clock in zip(members, clocks, strict=True)
+        ]
         rollout.time_steps[:] = [one["time_step"] for one in chosen]
         rollout.parameters.set(_stacked(chosen))
         substeps = {simulation.substeps(**{name: one[name] for name in DIFFUSION}) for one in chosen}
@@ -104,6 +116,7 @@ class ParameterSpace:
         each has a first axis with an entry for each scene, whether or not the value has one."""
         dimension = self._simulation.dimension
         read = {"gravity" if name == "tilt" else name for name in values}
+        read |= set(OVER_TIME) if "time_step" in values else set()
         run = {name: parameters[name].numpy().astype(np.float64) for name in RUN if name in read}
         run |= {name: run[name][..., :dimension] for name in OVER_TIME if name in run}
         fields = [f.name for f in state.fields if f.first in values or f.name == DENSITY]

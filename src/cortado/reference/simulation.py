@@ -70,6 +70,11 @@ class Simulation:
         unknown = [p.name for p in BY_NAME.values() if p.is_optional and p.present(scene)]
         if unknown:
             raise InputError(f"scene has forces.{unknown[0]}, but must leave it out for the reference engine.")
+        if scene.schedule.courses:
+            raise InputError(
+                "scene has a schedule, but must leave it out for the reference engine, which takes a gravity for each "
+                "step by controls."
+            )
         if precision not in precisions():
             raise InputError(f"precision is {shown(precision)}, but must be one of {', '.join(precisions())}.")
         self.scene, self.precision = scene, precision

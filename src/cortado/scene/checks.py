@@ -8,6 +8,7 @@ from pydantic_core import PydanticCustomError
 from cortado.device.memory import sampling_parts, shortage
 from cortado.errors import InputError, Words, shown
 from cortado.lattice.shapes import Points
+from cortado.parameters.registry import BY_NAME
 from cortado.scene.containers import check_length
 from cortado.scene.emitter import Emitter
 from cortado.scene.fields import FieldPath, field_error
@@ -43,6 +44,7 @@ def check_scene(scene: SceneTables) -> None:
     if scene.emitter is not None:
         _check_outlet(scene, scene.emitter)
     _check_overlaps(scene)
+    _check_schedule(scene)
 
 
 def _bodies(scene: SceneTables) -> list[tuple[FieldPath, Body]]:
@@ -158,6 +160,29 @@ def _check_outlet(scene: SceneTables, emitter: Emitter) -> None:
     if out.any():
         found = Words(f"partly outside along axis {int(np.argmax(out))}, which is periodic")
         raise field_error(("emitter",), found, "inside the container along that axis")
+
+
+def _check_schedule(scene: SceneTables) -> None:
+    """What is scheduled is there, and the opening of an emitter begins where it is and stays inside. Containers are
+    convex: if it is inside at two times it is in between."""
+    courses, spacing = scene.schedule.courses, scene.discretisation.spacing
+    for name in courses:
+        if not BY_NAME[name].present(scene):
+            raise field_error(("schedule", name), Words("given"), f"left out, as the scene {BY_NAME[name].absent}")
+    if "gravity" in courses and "tilt" in courses:
+        raise field_error(("schedule", "gravity"), Words("given"), "left out, as the tilt says where gravity points")
+    path = courses.get("nozzle_path")
+    if path is None or scene.emitter is None:
+        return
+    if np.abs(np.array(path.values[0]) - scene.emitter.outlet).max() > 1e-6 * spacing:
+        wanted = f"emitter.outlet, {shown(scene.emitter.outlet)}, where the opening is at the start"
+        raise field_error(("schedule", "nozzle_path", "values", 0), path.values[0], wanted)
+    opening = scene.emitter.opening(spacing) - np.array(scene.emitter.outlet)
+    region = scene.container.region(scene.dimension).opened(scene.container.periods(scene.dimension)[1])
+    for index, place in enumerate(path.values):
+        if not region.contains(np.array(place) + opening, 1e-6 * spacing).all():
+            wanted = "where all of the opening is inside the container"
+            raise field_error(("schedule", "nozzle_path", "values", index), place, wanted)
 
 
 def _check_distinct(index: int, fluid: Fluid, spacing: float) -> None:

@@ -14,6 +14,7 @@ from cortado.scene.fields import Colour, Flag, OneOf, Several, Text, Vector, cou
 from cortado.scene.fluids import AnyFluid
 from cortado.scene.mixture import Mixture
 from cortado.scene.render import Render
+from cortado.scene.schedule import Schedule
 from cortado.scene.tables import Table
 
 OTHER_TABLES = ("problem", "optimise")
@@ -121,10 +122,12 @@ class SceneTables(Table):
     """Which forces act."""
     solver: Solver
     """How a step is solved."""
+    schedule: Schedule = Schedule()
+    """What changes while the scene runs."""
     render: Render | None = None
     """How pictures are taken."""
 
-    @field_validator("emitter", "container", "forces", "render")
+    @field_validator("emitter", "container", "forces", "schedule", "render")
     @classmethod
     def _resolve(cls, table: Any, info: ValidationInfo) -> Any:
         given = table is not None and "dimension" in info.data

@@ -6,12 +6,19 @@ import numpy as np
 
 from cortado.lattice.shapes import Points
 from cortado.parameters.registry import PARAMETERS
+from cortado.parameters.tilt import Tilt
 from cortado.parameters.values import Arrays
 from cortado.scene.model import SceneTables
 
 
 def stability_limit(scene: SceneTables, values: Arrays | None = None) -> float:
-    """The smallest of several limits [s], infinite if nothing moves; h is the support radius.
+    """The smallest of the `stability_limits` [s], infinite if nothing moves."""
+    return min(stability_limits(scene, values).values())
+
+
+def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
+    """Several limits of the time step by what they are of [s], infinite where nothing is limited; h is the support
+    radius.
 
     Courant: 0.4 h / v, where v is the largest initial speed and that of a free fall through the container, or through
     the extent of the fluid if there is none (Monaghan 1992); an emitter has its speed, and fluid falls from its outlet.
@@ -21,17 +28,30 @@ def stability_limit(scene: SceneTables, values: Arrays | None = None) -> float:
 
     Optional forces have limits of their own, in the registry of parameters.
 
-    ``values``: parameters by name that replace the scene's; of a gravity for each step the strongest counts.
+    ``values``: parameters by name that replace the scene's and its schedule's; of a gravity that changes the strongest
+    counts.
     """
     values = values or {}
-    support, gravity = scene.discretisation.support_radius, np.atleast_2d(values.get("gravity", scene.forces.gravity))
+    support, gravity = scene.discretisation.support_radius, np.atleast_2d(values.get("gravity", _gravity(scene)))
     strength = float(np.linalg.norm(gravity, axis=1).max())
     lower, upper = _extent(scene)
     speed = _first_speed(scene, values) + sqrt(2.0 * float((np.abs(gravity) @ (upper - lower)).max()))
     courant = 0.4 * support / speed if speed > 0.0 else inf
     force = 0.25 * sqrt(support / strength) if strength > 0.0 else inf
-    optional = [p.longest_step(scene, values) for p in PARAMETERS if p.is_optional and p.present(scene)]
-    return min(courant, force, _viscous_limit(scene, values), *optional)
+    optional = {
+        p.name.replace("_", " "): p.longest_step(scene, values)
+        for p in PARAMETERS
+        if p.is_optional and p.present(scene)
+    }
+    return {"speed": courant, "gravity": force, "viscosity": _viscous_limit(scene, values), **optional}
+
+
+def _gravity(scene: SceneTables) -> Points:
+    """(d,) or (k, d) [m/s2] of the scene, at the times of its schedule if that changes it."""
+    courses = scene.schedule.courses
+    if "tilt" in courses:
+        return Tilt(scene.forces.gravity).gravity(np.array(courses["tilt"].values))
+    return np.array(courses["gravity"].values if "gravity" in courses else scene.forces.gravity)
 
 
 def _first_speed(scene: SceneTables, values: Arrays) -> float:

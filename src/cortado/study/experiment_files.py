@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cortado.errors import SceneError
+from cortado.errors import SceneError, Words
 from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, scene_from_dict
 from cortado.scene.sentences import sentences, wanted
@@ -49,9 +49,13 @@ def _scene(value: Any, file: str) -> Scene:
     if not isinstance(table, Mapping):
         raise SceneError(file, "scene", value, "the path of a scene, or a table of what differs from one")
     changes = {key: entry for key, entry in table.items() if key != "file"}
-    if "file" not in table:
-        return scene_from_dict(changes, file)
-    if not isinstance(table["file"], str):
+    if not isinstance(table.get("file", ""), str):
         raise SceneError(file, "scene.file", table["file"], "the path of a scene")
-    base = Path(file).parent / table["file"]
-    return scene_from_dict(merged(read_toml(base), changes), os.fspath(base))
+    if "file" in table:
+        base = Path(file).parent / table["file"]
+        scene = scene_from_dict(merged(read_toml(base), changes), os.fspath(base))
+    else:
+        scene = scene_from_dict(changes, file)
+    if scene.schedule.courses:
+        raise SceneError(file, "scene.schedule", Words("given"), "left out, as experiments say what gravity is")
+    return scene

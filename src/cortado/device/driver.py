@@ -1,0 +1,42 @@
+"""The CUDA driver: which one there is, and what to say where it is too old for Warp, which then finds no GPU."""
+
+import ctypes
+import sys
+from contextlib import suppress
+
+Version = tuple[int, int]
+PLACE = "https://nvidia.github.io/warp/stable/user_guide/installation.html"
+
+
+def why_no_gpu() -> str:
+    """Why Warp, which has started, finds no GPU, in words."""
+    needed, found = _needed(), installed_driver()
+    if needed is None or found is None or found >= needed:
+        return "no GPU with a CUDA driver is found"
+    return (
+        f"the CUDA driver is too old, as it supports CUDA {_shown(found)} and Warp needs {_shown(needed)}: install a "
+        f"newer driver of NVIDIA's, or see {PLACE}"
+    )
+
+
+def installed_driver() -> Version | None:
+    """The version of CUDA that the driver of this machine supports; None where there is none."""
+    with suppress(OSError, AttributeError):
+        library = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+        version = ctypes.c_int()
+        if library.cuDriverGetVersion(ctypes.byref(version)) == 0 and version.value > 0:
+            return version.value // 1000, version.value % 1000 // 10
+    return None
+
+
+def _needed() -> Version | None:
+    """The version that Warp needs; None where it does not say, or was built without CUDA."""
+    with suppress(ImportError, AttributeError):  # Warp keeps it for itself, and may move it
+        from warp._src.context import runtime
+
+        return runtime.min_driver_version
+    return None
+
+
+def _shown(version: Version) -> str:
+    return f"{version[0]}.{version[1]}"

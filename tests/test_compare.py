@@ -1,0 +1,124 @@
+"""`cortado compare`: what differs between two runs, in numbers, and that a difference is no failure."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bad_scenes import assert_one_sentence
+from bad_tasks import GOOD_TASK, TINY_SCENE
+from cortado import Trajectory
+from cortado.cli import main
+
+
+@pytest.fixture(autouse=True)
+def runs(tmp_path, monkeypatch):
+    """Two runs of one scene that are equal."""
+    monkeypatch.chdir(tmp_path)
+    Path("scene.toml").write_text(TINY_SCENE)
+    run("one")
+    shutil.copytree("one", "other")
+
+
+def run(out, *options):
+    main(["run", "scene.toml", "--steps", "4", "--out", out, "--quiet", *options])
+
+
+def compared(capsys, *arguments):
+    capsys.readouterr()
+    main(["compare", *arguments, "--json"])
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_run_equals_itself_made_again(capsys):
+    run("again")
+    found = compared(capsys, "one", "again")
+    assert found["equal"] is True and not found["scene"] and not found["metrics"]
+    assert all(field["greatest"] == 0.0 for field in found["last_state"]["fields"].values())
+    main(["compare", "one", "again"])
+    out = capsys.readouterr().out
+    assert out.endswith("The two runs are equal.\n") and "bit for bit" in out
+
+
+def test_differences_are_numbers_with_units(capsys):
+    run("faster", "--set", "fluid.0.velocity=[0.5,0]", "--precision", "float64")
+    found = compared(capsys, "one", "faster")
+    assert found["equal"] is False
+    assert found["scene"] == {"fluid.0.velocity": [[0.0, 0.0], [0.5, 0.0]]}
+    assert found["settings"] == {"precision": ["float32", "float64"]}
+    ends = [Trajectory.load(f"{name}/trajectory.vtkhdf")[-1] for name in ("one", "faster")]
+    apart = np.linalg.norm(ends[0].positions.astype(float) - ends[1].positions, axis=1)
+    positions = found["last_state"]["fields"]["positions"]
+    assert positions["greatest"] == pytest.approx(apart.max()) and positions["unit"] == "m"
+    assert positions["root_mean_square"] == pytest.approx(np.sqrt((apart**2).mean()))
+    main(["compare", "one", "faster"])
+    out = capsys.readouterr().out
+    assert "fluid.0.velocity: [0.0, 0.0] | [0.5, 0.0]" in out and f"at most {apart.max():.3g} m (particle" in out
+    assert out.endswith("The two runs differ.\n")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "part"),
+    [('"version_of_nothing": 1', "", ""), ('"cortado": "', '"cortado": "9', "environment")],
+)
+def test_another_machine_is_told_but_is_no_difference(capsys, old, new, part):
+    file = Path("other/environment.json")
+    file.write_text(file.read_text().replace(old, new))
+    found = compared(capsys, "one", "other")
+    assert found["equal"] is True and bool(found["environment"]) == bool(part)
+
+
+def test_other_sizes_cannot_be_compared_one_by_one(capsys):
+    run("finer", "--set", "discretisation.spacing=0.04")
+    found = compared(capsys, "one", "finer")
+    assert "cannot be compared one by one" in found["last_state"]["unlike"] and found["equal"] is False
+    run("longer", "--steps", "5")
+    found = compared(capsys, "one", "longer")
+    assert found["metrics"]["lines"] == [4, 5] and found["last_state"]["times_s"] == pytest.approx([0.0084, 0.0105])
+    assert found["equal"] is False
+
+
+def test_one_metric_or_one_particle_is_enough(capsys):
+    metrics = Path("other/metrics.jsonl")
+    lines = metrics.read_text().splitlines()
+    row = json.loads(lines[2])
+    lines[2] = json.dumps({**row, "iterations": row["iterations"] + 2})
+    metrics.write_text("\n".join(lines) + "\n")
+    found = compared(capsys, "one", "other")
+    assert found["metrics"] == {"first_different_line": 3, "greatest_difference": {"iterations": 2}}
+    assert found["equal"] is False
+
+
+def test_searches_can_be_compared_too(capsys):
+    Path("task.toml").write_text(GOOD_TASK)
+    easy = ["--set", "optimise.iterations=1", "--set", "optimise.check={}", "--quiet"]
+    main(["optimise", "task.toml", "--out", "a", *easy])
+    main(["optimise", "task.toml", "--out", "b", *easy, "--set", "optimise.learning_rate=0.1"])
+    found = compared(capsys, "a", "b")
+    assert found["last_state"] is None and "optimise.learning_rate" in found["settings"] and not found["equal"]
+    main(["compare", "a", "one"])
+    assert "kind: 'optimise' | 'run'" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["one"], "RUN is missing"),
+        (["one", "absent"], "There is no run in "),
+        (["one", "."], "There is no run in "),
+        (["scene.toml", "one"], "There is no run in "),
+        (["one", "damaged"], "cannot be read"),
+        (["one", "torn"], "torn"),
+    ],
+)
+def test_mistakes_are_sentences(capsys, arguments, words):
+    for name, file, text in (("damaged", "scene.json", "{"), ("torn", "trajectory.vtkhdf", "nothing")):
+        shutil.copytree("one", name)
+        Path(name, file).write_text(text)
+    with pytest.raises(SystemExit, match="2"):
+        main(["compare", *arguments])
+    out, err = capsys.readouterr()
+    assert_one_sentence(err.removesuffix("\n"))
+    assert out == "" and words in err

@@ -1,0 +1,163 @@
+"""`cortado describe`: what it says of a scene is what the scene has; and the closing line of `cortado run`."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cortado
+from bad_scenes import assert_one_sentence
+from bad_tasks import PARTICLES, TINY_LATTE, TINY_SCENE
+from cortado.cli import main
+from cortado.commands.run_summary import Energy, RunSummary
+from cortado.io.pictures import read_picture
+from cortado.lattice.calibration import SLACK
+from cortado.scene.stability import stability_limit, stability_limits
+from scenes import plane, two_layers
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    (tmp_path / "scene.toml").write_text(TINY_SCENE)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def described(capsys, *arguments):
+    main(["describe", *arguments, "--json"])
+    return json.loads(capsys.readouterr().out)
+
+
+def test_it_says_what_the_scene_has(capsys):
+    found, scene = described(capsys, "scene.toml", "--steps", "30"), cortado.load_scene("scene.toml")
+    simulation = cortado.Simulation(scene)
+    assert found["particles"] == PARTICLES and found["wall_particles"] == len(simulation.walls)
+    limits = {name: limit for name, limit in found["time_step_limits_s"].items() if limit is not None}
+    assert min(limits.values()) == pytest.approx(stability_limit(scene))
+    assert found["simulated_time_s"] == pytest.approx(30 * found["time_step_s"])
+    assert (
+        found["expected_seconds"] == pytest.approx(30 * 1e-3 * found["milliseconds_per_step"])
+        and found["measured_steps"] >= 4
+    )
+    assert 0 < found["memory_bytes"] < found["gradient_memory_bytes"]
+
+
+def test_memory_grows_with_what_is_kept(capsys):
+    none, some, many = (described(capsys, "scene.toml", "--steps", steps) for steps in ("1", "11", "1001"))
+    for name in ("trajectory_bytes", "gradient_memory_bytes", "memory_bytes"):
+        assert many[name] - none[name] == pytest.approx(100 * (some[name] - none[name])) != 0.0
+
+
+def test_phases_and_an_emitter_are_told(capsys):
+    Path("latte.toml").write_text(TINY_LATTE)
+    found = described(capsys, "latte.toml")
+    assert (
+        sum(found["particles_of_phase"].values()) == found["particles"]
+        and min(found["particles_of_phase"].values()) > 0
+    )
+    main(["describe", "latte.toml"])
+    out = capsys.readouterr().out
+    assert "milk" in out and "in 3-D" in out and "limits: " in out and "ms a step on cpu in float32" in out
+
+
+def test_a_schedule_is_told(capsys):
+    main(["describe", "scene.toml", "--set", "schedule.gravity={times=[0,0.2],values=[[0,-9.81],[3,-9]]}"])
+    assert "gravity changes until 0.2 s, and is constant from then on" in capsys.readouterr().out
+
+
+def test_the_first_state_is_drawn(capsys):
+    found = described(capsys, "scene.toml", "--picture", "a/first.png")
+    picture = read_picture(found["picture"])
+    blue = (picture[..., 2] > picture[..., 0] + 0.2).mean()
+    assert picture.shape[2] == 3 and 0.01 < blue < 0.9
+
+
+def test_a_scene_that_does_not_bear_its_first_steps(capsys):
+    found = described(capsys, "scene.toml", "--set", "fluid.0.velocity=[10,25]")
+    assert "diverged in step" in found["diverged"] and "milliseconds_per_step" not in found
+    main(["describe", "scene.toml", "--set", "fluid.0.velocity=[10,25]"])
+    assert "unknown. The simulation diverged" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["absent.toml"], "cannot be read"),
+        (["."], "cannot be read"),
+        (["scene.toml", "--steps", "0"], "steps is 0"),
+        (["scene.toml", "--device", "tpu"], "device is 'tpu'"),
+        (["scene.toml", "--picture", "scene.toml/a.png"], "cannot be written"),
+        (["scene.toml", "--picture", "."], "--picture is '.', but must be the name of a PNG file"),
+    ],
+)
+def test_mistakes_are_sentences(capsys, arguments, words):
+    with pytest.raises(SystemExit, match="2"):
+        main(["describe", *arguments])
+    out, err = capsys.readouterr()
+    assert_one_sentence(err.splitlines()[-1])
+    assert out == "" and words in err
+
+
+def test_every_limit_is_one_of_those_of_the_time_step():
+    scene = plane(forces={"gravity": [0.0, -9.81], "surface_tension": 0.07})
+    assert stability_limits(scene).keys() == {"speed", "gravity", "viscosity", "surface tension"}
+
+
+# ---- the closing line --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [plane, two_layers])
+def test_energies_are_those_of_the_particles(make):
+    simulation = cortado.Simulation(make(), precision="float64")
+    rollout = simulation.rollout(3)
+    summary = RunSummary.of(simulation, rollout, rollout.forward(keep=False), 0.3)
+    trajectory, scene = simulation.run(3), simulation.scene
+    masses = simulation.lattice.volume * trajectory.constants["reference_density"]
+    kinetic = 0.5 * (masses * (trajectory.velocities[-1] ** 2).sum(axis=1)).sum()
+    assert summary.last.kinetic == pytest.approx(kinetic, rel=1e-12) and summary.first.kinetic < summary.last.kinetic
+    lower, gravity = np.array(scene.container.extent()[0]), np.array(scene.forces.gravity)
+    height = -(trajectory.positions[0] - lower) @ gravity
+    assert summary.first.potential == pytest.approx((masses * height).sum(), rel=1e-12)
+    assert summary.milliseconds == pytest.approx(100.0)
+    assert f"energy {summary.last.total:.4g} J" in str(summary)
+
+
+def test_densities_are_those_of_the_rest_lattice():
+    """Fluid that fills a periodic box has its rest density everywhere, less a slack."""
+    scene = cortado.Scene(
+        dimension=2,
+        discretisation={"spacing": 0.05},
+        phase=[{"name": "water", "rest_density": 800.0, "viscosity": 0.1}],
+        fluid=[{"shape": "box", "lower": [0, 0], "upper": [0.5, 0.5], "phase": "water"}],
+        container={"shape": "box", "lower": [0, 0], "upper": [0.5, 0.5], "periodic": [True, True]},
+        forces={"gravity": [0, 0]},
+        solver={"time_step": 0.001},
+    )
+    simulation = cortado.Simulation(scene, precision="float64")
+    rollout = simulation.rollout(2)
+    last = rollout.forward(keep=False)
+    assert RunSummary.of(simulation, rollout, last, 1.0).densities == pytest.approx(
+        [800.0 * (1.0 - SLACK)] * 2, rel=1e-9
+    )
+    at = last.numpy(2)["positions"]
+    at[7] += 0.02
+    last.set({"positions": at})
+    densities = simulation.solver.densities(last, rollout.parameters)
+    assert 7 in np.argsort(np.abs(densities - 800.0))[-4:]
+
+
+def test_a_run_ends_with_them(capsys):
+    main(["run", "scene.toml", "--steps", "4"])
+    summary, place = capsys.readouterr().out.splitlines()
+    assert summary.startswith("4 steps of 0.0021 s in ") and " ms a step; energy " in summary and "kg/m3." in summary
+    result = json.loads(Path("runs/run/result.json").read_text())
+    assert result["density"]["least"] < result["density"]["greatest"] and result["energy"]["last"]["kinetic"] > 0.0
+    assert place.startswith("The results are in ") and "ms a step" in Path("runs/run/report.html").read_text()
+
+
+def test_potential_energy_without_gravity_or_container():
+    scene = plane(forces={"gravity": [0, 0]}, container={"shape": "none"})
+    simulation = cortado.Simulation(scene)
+    rollout = simulation.rollout(1)
+    assert Energy.of(simulation, rollout, rollout.initial, 0).total == 0.0

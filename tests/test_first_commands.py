@@ -1,0 +1,233 @@
+"""The commands with which one begins: `cortado` alone, `new`, `examples`, `schema`, `completion`; and --quiet."""
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import tomllib
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+import cortado
+from bad_scenes import assert_one_sentence
+from bad_tasks import TINY_SCENE
+from compiling_notice import without_compiling
+from cortado.cli import app, gradients, main
+from cortado.commands.new import scene_text
+from cortado.commands.overview import COMMANDS
+from cortado.inverse.file_schema import file_schema, file_schema_text
+from cortado.io.shipped import SCHEMA, examples_folder
+from cortado.io.usage import usage_sentence
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = sorted(examples_folder().glob("*.toml"))
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def command(capfd):
+    """Runs a command in this process: (exit code, stdout, stderr)."""
+
+    def run(*arguments):
+        capfd.readouterr()
+        try:
+            main([str(argument) for argument in arguments])
+            code = 0
+        except SystemExit as end:
+            code = end.code or 0
+        out, err = capfd.readouterr()
+        return code, out, without_compiling(err)
+
+    return run
+
+
+def assert_refused(result, *words):
+    code, out, err = result
+    assert (code, out) == (2, ""), err
+    assert_one_sentence(err.removesuffix("\n"))
+    assert all(word in err for word in words), err
+
+
+# ---- what there is -----------------------------------------------------------------------------------------------
+
+
+def commands():
+    """Every command of the command line, as one types it."""
+    return {*app._subcommands, *(f"gradients {name}" for name in gradients._subcommands)} - {"gradients"}
+
+
+def test_cortado_alone_shows_every_command(command):
+    code, out, err = command()
+    assert (code, err) == (0, "") and cortado.__version__ in out
+    assert all(f"  cortado {name} " in out for name in commands())
+    assert all(len(line) <= 100 for line in out.splitlines())
+
+
+@pytest.mark.parametrize("example", COMMANDS)
+def test_what_it_shows_can_be_typed(example, command, monkeypatch):
+    monkeypatch.setattr("cortado.cli.start_warp", lambda: pytest.fail("the command was understood"))
+    words = shlex.split(example)[1:]
+    with pytest.raises(pytest.fail.Exception, match="understood"):
+        main(words)
+
+
+@pytest.mark.parametrize("name", sorted(commands()))
+def test_the_help_of_each_is_named_where_it_is_misused(name, command):
+    words = name.split()
+    assert command(*words, "--help")[1].count("--quiet") >= 1
+    assert usage_sentence("", [*words, "x"]).endswith(f"see cortado {name} --help.")
+
+
+# ---- new ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_new_scene_runs_at_once(command, dimension):
+    code, out, err = command("new", "dam", "--dimension", dimension)
+    assert (code, err) == (0, "") and "cortado run dam.toml" in out
+    text = Path("dam.toml").read_text()
+    particles = int(re.search(r"(\d+) particles in", text)[1])
+    assert cortado.Simulation("dam.toml").particles == particles
+    code, out, err = command("run", "dam.toml", "--steps", 3)
+    assert (code, err) == (0, "")
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_so_it_does_with_all_that_is_switched_off(command, folder, dimension):
+    text = scene_text(Path("dam.toml"), dimension)
+    Path("dam.toml").write_text(re.sub(r"^#(?=[a-z\[])", "", text, flags=re.MULTILINE))
+    scene = cortado.load_scene("dam.toml")
+    assert len(scene.phase) == len(scene.fluid) == 2 and scene.render is not None and scene.forces.surface_tension
+    jsonschema.validate(tomllib.loads(Path("dam.toml").read_text()), file_schema())
+    assert command("run", "dam.toml", "--steps", 2)[0] == 0
+
+
+def test_nothing_is_replaced(command):
+    Path("scene.schema.json").write_text("{}")
+    assert command("new", "a/b/dam.toml")[0] == 0 and Path("a/b/scene.schema.json").read_bytes() == SCHEMA.read_bytes()
+    assert_refused(command("new", "a/b/dam"), "already there", "NAME")
+    assert command("new", "dam")[0] == 0 and Path("scene.schema.json").read_text() == "{}"
+    Path("gone.toml").symlink_to("nowhere")
+    assert_refused(command("new", "gone"), "already there")
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "dam.toml/under"])
+def test_what_is_no_name_of_a_file_is_refused(command, name):
+    Path("dam.toml").write_text("")
+    assert_refused(command("new", name), "NAME" if len(name) < 3 else "cannot be written")
+    assert_refused(command("new", "x", "--dimension", 4), "--dimension is 4")
+    assert os.listdir() == ["dam.toml"]
+
+
+def test_a_name_may_hold_anything_that_a_file_may(command):
+    name = 'a "b" \\ c\n'
+    assert command("new", name)[0] == 0
+    assert cortado.load_scene(f"{name}.toml").dimension == 2
+
+
+@pytest.mark.skipif(os.geteuid() == 0 if hasattr(os, "geteuid") else True, reason="root may write anywhere")
+def test_a_folder_that_may_not_be_written(command):
+    Path("closed").mkdir(mode=0o500)
+    assert_refused(command("new", "closed/dam"), "cannot be written")
+
+
+# ---- examples ----------------------------------------------------------------------------------------------------
+
+
+def test_examples_are_listed_and_copied(command):
+    code, out, err = command("examples")
+    assert (code, err) == (0, "") and all(path.name in out for path in (ROOT / "examples").iterdir() if path.is_file())
+    code, out, _ = command("examples", "--copy", "pour", "--copy", "first_gradient.py", "--to", "a/b")
+    assert (code, sorted(os.listdir("a/b"))) == (0, ["first_gradient.py", "pour.toml"])
+    assert "cortado optimise a/b/pour.toml" in out and "python a/b/first_gradient.py" in out
+    assert Path("a/b/pour.toml").read_bytes() == (ROOT / "examples/pour.toml").read_bytes()
+
+
+def test_all_of_them_or_none(command):
+    Path("pour.toml").write_text("mine")
+    assert_refused(command("examples", "--copy", "all"), "pour.toml is already there", "--to")
+    assert os.listdir() == ["pour.toml"]
+    assert command("examples", "--copy", "all", "--to", "all")[0] == 0
+    assert len(os.listdir("all")) == len([path for path in (ROOT / "examples").iterdir() if path.is_file()])
+    assert_refused(command("examples", "--copy", "por"), "--copy is 'por', but must be all or one of custom_loss, ")
+    assert_refused(command("examples", "--copy", "pour", "--to", "pour.toml"), "pour.toml")
+
+
+# ---- schema ------------------------------------------------------------------------------------------------------
+
+
+def test_the_schema_that_is_shipped_is_that_of_the_tables(command):
+    renewed = "renew it: python -c 'from cortado.inverse.file_schema import *; print(file_schema_text(), end=\"\")'"
+    assert SCHEMA.read_text("utf-8") == file_schema_text(), renewed
+    assert json.loads(command("schema")[1]) == file_schema()
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_it_bears_the_examples(path):
+    jsonschema.Draft202012Validator.check_schema(file_schema())
+    jsonschema.validate(tomllib.loads(path.read_text("utf-8")), file_schema())
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("dimension = 2", "dimension = 4"),
+        ("spacing", "spacin"),
+        ('shape = "box"', 'shape = "ball"'),
+        ('shape = "box"\n', ""),
+        ("time_step = 0.0021", "time_step = -0.0021"),
+    ],
+)
+def test_it_refuses_what_cortado_refuses(old, new):
+    assert old in TINY_SCENE
+    jsonschema.validate(tomllib.loads(TINY_SCENE), file_schema())
+    wrong = tomllib.loads(TINY_SCENE.replace(old, new, 1))
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(wrong, file_schema())
+    with pytest.raises(cortado.SceneError):
+        cortado.Scene(**wrong)
+
+
+# ---- completion and --quiet --------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+@pytest.mark.parametrize(
+    ("typed", "found"),
+    [("cortado optim", "optimise"), ("cortado run --rec", "--record-every"), ("cortado gradients f", "figure")],
+)
+def test_bash_completes(command, typed, found):
+    code, script, err = command("completion", "bash")
+    assert (code, err) == (0, "")
+    words = typed.split()
+    ask = f"COMP_WORDS=({typed}); COMP_CWORD={len(words) - 1}; _tyro_cortado; echo ${{COMPREPLY[@]}}"
+    done = subprocess.run(["bash", "-c", f"{script}\n{ask}"], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == found, done.stderr
+
+
+def test_zsh_has_a_script(command):
+    code, script, _ = command("completion", "zsh")
+    assert code == 0 and script.startswith("#compdef cortado")
+    assert_refused(command("completion", "fish"), "'fish', but must be one of 'bash', 'zsh'")
+
+
+def test_quiet_says_nothing_but_what_was_asked_for(command, monkeypatch):
+    monkeypatch.setattr("cortado.io.progress.LINE_INTERVAL", 0.0)
+    Path("scene.toml").write_text(TINY_SCENE)
+    assert command("run", "scene.toml", "--steps", 2, "--quiet") == (0, "", "")
+    assert Path("runs/run/report.html").exists()
+    assert command("new", "dam", "--quiet") == (0, "", "")
+    assert command("examples", "--quiet")[1] == command("examples")[1] != ""
+    assert_refused(command("run", "scene.toml", "--quiet"), "already holds a run")
+    _, _, err = command("run", "scene.toml", "--quiet", "--overwrite", "--set", "solver.time_step=0.02", "--steps", 1)
+    assert "limit of stability" in err
+    assert "The results are in" in command("run", "scene.toml", "--steps", 2, "--out", "a")[1]

@@ -1,0 +1,101 @@
+"""What a release consists of: one version, wheels that run anywhere, and tasks without make."""
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+import cortado
+import tasks
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+
+
+def test_the_version_stands_in_one_place():
+    assert PROJECT["project"]["dynamic"] == ["version"] and "version" not in PROJECT["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert citation["version"] == cortado.__version__ and citation["license"] == PROJECT["project"]["license"]
+
+
+def test_wheels_are_for_the_pythons_that_are_promised():
+    promised = {line.rpartition(" ")[2] for line in PROJECT["project"]["classifiers"] if ":: 3." in line}
+    built = {f"3.{one[3:-2]}" for one in PROJECT["tool"]["cibuildwheel"]["build"].split()}
+    assert built == promised == {"3.11", "3.12", "3.13", "3.14"}
+    assert PROJECT["project"]["requires-python"] == ">=3.11"
+
+
+def test_only_an_editable_install_is_for_its_own_processor():
+    build = PROJECT["tool"]["scikit-build"]
+    assert build["cmake"]["define"]["CORTADO_NATIVE"] == "OFF"
+    states = [one["if"] for one in build["overrides"] if "CORTADO_NATIVE" in one.get("cmake", {}).get("define", {})]
+    assert states == [{"state": "editable"}]
+
+
+def test_the_examples_go_into_the_wheel():
+    assert PROJECT["tool"]["scikit-build"]["wheel"]["packages"] == {
+        "cortado": "src/cortado",
+        "cortado/examples": "examples",
+    }
+
+
+def test_what_was_tested_is_pinned():
+    lines = (ROOT / "requirements-tested.txt").read_text("utf-8").splitlines()
+    pinned = {re.sub("[-_.]+", "-", line.partition("==")[0]).lower() for line in lines if "==" in line}
+    wanted = {re.split("[>=]", one)[0] for one in PROJECT["project"]["dependencies"]}
+    assert wanted and wanted <= pinned
+    assert not any("@" in line or "://" in line for line in lines)
+
+
+# ---- python -m tasks ---------------------------------------------------------------------------------------------
+
+
+def test_tasks_are_those_of_make():
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    recipes = dict(re.findall(r"^(\w+): setup\n\t\$\(BIN\)/(.*)$", makefile, re.MULTILINE))
+    recipes["fuzz"] = recipes["fuzz"].partition(" $(if")[0]
+    recipes.pop("sanitize")  # takes GCC or Clang
+    assert recipes == {
+        name: " ".join(f"'{word}'" if " " in word else word for word in words) for name, words in tasks.COMMANDS.items()
+    }
+    (test,) = re.findall(r"^test: (.*)$", makefile, re.MULTILINE)
+    assert tuple(test.split()) == tasks.SEVERAL["test"]
+    assert all(word in makefile for word in (" ".join(tasks.INSTALL[:-1]), tasks.INSTALL[-1]))
+
+
+def test_a_task_ends_with_the_first_failure(monkeypatch):
+    ran = []
+    monkeypatch.setattr(tasks, "set_up", lambda: None)
+    monkeypatch.setattr(tasks, "run", lambda command: ran.append(command[0]) or (3 if command[0] == "mypy" else 0))
+    assert tasks.main(["test"]) == 3 and ran == ["ruff", "mypy"]
+    assert tasks.main(["lint", "--fix"]) == 0
+
+
+@pytest.mark.parametrize("arguments", [[], ["walk"]])
+def test_an_unknown_task_is_told(arguments):
+    done = subprocess.run([sys.executable, "-m", "tasks", *arguments], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "") and "one of: setup, test, demo, lint" in done.stderr
+
+
+@pytest.mark.parametrize("newer", ["pyproject.toml", "cpp/CMakeLists.txt"])
+def test_what_changed_is_installed_again(tmp_path, monkeypatch, newer):
+    (tmp_path / "cpp").mkdir()
+    for name in ("pyproject.toml", "cpp/CMakeLists.txt"):
+        (tmp_path / name).touch()
+    ready, ran = tmp_path / "ready", []
+    monkeypatch.setattr(tasks, "ROOT", tmp_path)
+    monkeypatch.setattr(tasks, "READY", ready)
+    monkeypatch.setattr(tasks, "BIN", tmp_path)
+    monkeypatch.setattr(tasks, "run", lambda command: ran.append(command) or 0)
+    tasks.set_up()
+    tasks.set_up()
+    assert len(ran) == 2 and ran[0] == tasks.INSTALL and ready.exists()
+    later = ready.stat().st_mtime + 10
+    os.utime(tmp_path / newer, (later, later))
+    tasks.set_up()
+    assert len(ran) == 4
