@@ -48,6 +48,7 @@ LINKS = {
     "container": ("[table](#walls-container)", "What holds the fluid."),
     "mixture": ("[table](#fluids-that-mix-mixture)", "How phases mix."),
     "forces": ("[table](#forces-forces)", "Which forces act."),
+    "schedule": ("[table](#changes-over-time-schedule)", "What changes while the scene runs."),
     "solver": ("[table](#time-steps-solver)", "How a step is solved."),
     "render": ("[table](#pictures-render)", "How pictures are taken."),
 }
@@ -175,6 +176,32 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         (("Forces", "", '[forces]\ngravity = [0.0, -1.62, 0.0]\nviscosity = "laminar"\nsurface_tension = 0.07'),),
     ),
     (
+        "## Changes over time: `[schedule]`",
+        "What changes while a scene runs, as values at some times, with straight lines between them. So a box is "
+        "shaken and a cup is tilted: walls stay where they are, and gravity changes ([runs](runs.md)).",
+        (
+            ("Schedule", "", "[schedule.gravity]\ntimes = [0.0, 0.1]\nvalues = [[0.0, -9.81, 0.0], [3.0, -9.81, 0.0]]"),
+            (
+                "Course_gravity",
+                "### Gravity over time: `[schedule.gravity]`",
+                "[schedule.gravity]\ntimes = [0.0, 0.1, 0.2]        # s\n"
+                "values = [[0.0, -9.81, 0.0], [6.0, -9.81, 0.0], [0.0, -9.81, 0.0]]",
+            ),
+            (
+                "Course_tilt",
+                "### A tilt over time: `[schedule.tilt]`",
+                "[schedule.tilt]\ntimes = [0.0, 0.5]\nvalues = [[0.0, 0.0], [20.0, 0.0]]",
+            ),
+            (
+                "Course_nozzle_path",
+                "### A jet that moves: `[schedule.nozzle_path]`",
+                '[emitter]\nphase = "water"\noutlet = [0.75, 0.7, 0.25]\nradius = 0.1\nlength = 0.2\n'
+                "flow_rate = 0.02\n\n[schedule.nozzle_path]\ntimes = [0.0, 0.5]\n"
+                "values = [[0.75, 0.7, 0.25], [0.65, 0.7, 0.25]]",
+            ),
+        ),
+    ),
+    (
         "## Time steps: `[solver]`",
         "In each step the pressure is computed by iterations, until the fluid is compressed by no more than a "
         "tolerance. A time step beyond the limit of stability is warned of.",
@@ -217,7 +244,8 @@ def page() -> str:
         for model, below, example in tables:
             table = schema["$defs"][model]
             words = table.get("description", "").replace("``", "`")
-            text += (f"{below}\n\n{words}\n\n" if below else "") + rows(table) + "\n" + toml(example) + "\n"
+            above = [part for part in (below, words) if below and part]
+            text += "\n\n".join([*above, f"{rows(table)}\n{toml(example)}\n"])
         text = text.rstrip("\n") + "\n"
     return text
 
