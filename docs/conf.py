@@ -3,6 +3,7 @@
 import logging
 import os
 import sys
+from hashlib import sha256
 from pathlib import Path
 
 import cortado
@@ -32,7 +33,10 @@ myst_heading_anchors = 4
 
 # ---- tutorials, which are executed --------------------------------------------------------------------------------
 highlight_language = "none"  # what is indented is an equation or a command
-nb_execution_mode = "cache"
+nb_execution_mode = "cache"  # what was executed stays until a cell, or the package, is another
+sources = sorted(Path(cortado.__file__).parent.rglob("*.py"))
+digest = sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
+nb_execution_cache_path = str(HERE.parent / "build" / "executed" / digest)
 nb_execution_timeout = 120
 nb_execution_raise_on_error = True
 nb_merge_streams = True

@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[2]
 OUTER = {
     "contributing": "CONTRIBUTING.md",
     "changelog": "CHANGELOG.md",
+    "release": "RELEASE.md",
     "validation": "validation/README.md",
     "benchmarks": "benchmarks/README.md",
     "experiments": "experiments/README.md",

@@ -28,7 +28,7 @@ def rows(schema: Schema, links: Mapping[str, tuple[str, str]] | None = None) -> 
 def _row(key: str, field: Schema, needed: bool, link: tuple[str, str] | None) -> str:
     value = field["anyOf"][0] if "anyOf" in field else field
     number = value.get("items", value)
-    number = number.get("items", number)
+    number = number.get("items", number)  # of a list of lists
     unit = {"-": ""}.get(number.get("unit", ""), number.get("unit", ""))
     kind, meaning = link or (_kind(value), _meaning(key, field, unit))
     cells = (f"`{key}`", kind, unit, _range(number), _default(field, needed), meaning)
@@ -45,8 +45,10 @@ def _kind(value: Schema) -> str:
             return f"{len(names)} {_plural(value['items'])}"
         case {"type": "array", "items": items, "maxItems": _}:
             return f"d {_plural(items)}"
-        case {"type": "array", "items": {"type": "array"}}:
-            return "list of lists of numbers"
+        case {"$ref": _}:
+            return "table"
+        case {"type": "array", "items": {"items": items}}:
+            return f"list of lists of {_plural(items)}"
         case {"type": "array", "items": {"enum": _}}:
             return "list of names of parameters"
         case {"type": "array", "items": items}:
@@ -91,7 +93,7 @@ def _meaning(key: str, field: Schema, unit: str) -> str:
     if key == "shape":
         words = "Which shape it is."
     words = re.sub(r"^\((\w+, )*\w+,?\) ?", "", words)
-    words = re.sub(r" \[[^\]]+\](?=[.;,]|$)", "", words) if unit else words
+    words = re.sub(r"^\[[^\]]+\] | \[[^\]]+\](?=[.;,]|$)", "", words) if unit else words
     words = words[:1].upper() + words[1:]
     return words if words.endswith(".") else f"{words}."
 

@@ -48,17 +48,11 @@ LINKS = {
     "container": ("[table](#walls-container)", "What holds the fluid."),
     "mixture": ("[table](#fluids-that-mix-mixture)", "How phases mix."),
     "forces": ("[table](#forces-forces)", "Which forces act."),
+    "schedule": ("[table](#changes-over-time-schedule)", "What changes while the scene runs."),
     "solver": ("[table](#time-steps-solver)", "How a step is solved."),
-    "schedule": ("[table](#what-changes-over-time-schedule)", "What changes while the scene runs."),
     "render": ("[table](#pictures-render)", "How pictures are taken."),
 }
 """Of keys that are tables what they are, with the heading that describes them, and their meaning."""
-COURSES = {
-    "gravity": ("[table](#gravity-over-time)", "Acceleration that acts on all fluid."),
-    "tilt": ("[table](#a-tilt-over-time)", "How far gravity leans, with its size kept; in the place of gravity."),
-    "nozzle_path": ("[table](#a-nozzle-that-moves)", "Where the opening of the emitter is."),
-}
-"""The same of `[schedule]`."""
 
 BEGINNING = """# The scene file
 
@@ -133,7 +127,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     (
         "## A jet: `[emitter]`",
         "A column of particles waits behind an opening and comes out of it with one speed. Where the opening is may "
-        "change over time: the parameter `nozzle_path`, also in `[schedule]`.",
+        "change over time: the parameter `nozzle_path`.",
         (
             (
                 "Emitter",
@@ -182,6 +176,32 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         (("Forces", "", '[forces]\ngravity = [0.0, -1.62, 0.0]\nviscosity = "laminar"\nsurface_tension = 0.07'),),
     ),
     (
+        "## Changes over time: `[schedule]`",
+        "What changes while a scene runs, as values at some times, with straight lines between them. So a box is "
+        "shaken and a cup is tilted: walls stay where they are, and gravity changes ([runs](runs.md)).",
+        (
+            ("Schedule", "", "[schedule.gravity]\ntimes = [0.0, 0.1]\nvalues = [[0.0, -9.81, 0.0], [3.0, -9.81, 0.0]]"),
+            (
+                "Course_gravity",
+                "### Gravity over time: `[schedule.gravity]`",
+                "[schedule.gravity]\ntimes = [0.0, 0.1, 0.2]        # s\n"
+                "values = [[0.0, -9.81, 0.0], [6.0, -9.81, 0.0], [0.0, -9.81, 0.0]]",
+            ),
+            (
+                "Course_tilt",
+                "### A tilt over time: `[schedule.tilt]`",
+                "[schedule.tilt]\ntimes = [0.0, 0.5]\nvalues = [[0.0, 0.0], [20.0, 0.0]]",
+            ),
+            (
+                "Course_nozzle_path",
+                "### A jet that moves: `[schedule.nozzle_path]`",
+                '[emitter]\nphase = "water"\noutlet = [0.75, 0.7, 0.25]\nradius = 0.1\nlength = 0.2\n'
+                "flow_rate = 0.02\n\n[schedule.nozzle_path]\ntimes = [0.0, 0.5]\n"
+                "values = [[0.75, 0.7, 0.25], [0.65, 0.7, 0.25]]",
+            ),
+        ),
+    ),
+    (
         "## Time steps: `[solver]`",
         "In each step the pressure is computed by iterations, until the fluid is compressed by no more than a "
         "tolerance. A time step beyond the limit of stability is warned of.",
@@ -191,36 +211,6 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "",
                 "[solver]\ntime_step = 0.002\nminimum_iterations = 3\nmaximum_iterations = 100\n"
                 "density_tolerance = 0.001",
-            ),
-        ),
-    ),
-    (
-        "## What changes over time: `[schedule]`",
-        "A table for each parameter that changes: its values at some times, linear in between, constant before the "
-        "first and after the last ([how steps take it](runs.md#what-changes-while-a-scene-runs)).",
-        (
-            (
-                "Schedule",
-                "",
-                "[schedule.gravity]\ntimes = [0.0, 0.5]\nvalues = [[0.0, -9.81, 0.0], [3.0, -9.81, 0.0]]",
-            ),
-            (
-                "Course_gravity",
-                "### Gravity over time",
-                "[schedule.gravity]\ntimes = [0.0, 0.1, 0.2]\n"
-                "values = [[0.0, -9.81, 0.0], [6.0, -9.81, 0.0], [0.0, -9.81, 0.0]]",
-            ),
-            (
-                "Course_tilt",
-                "### A tilt over time",
-                "[schedule.tilt]\ntimes = [0.0, 0.2]\nvalues = [[0.0, 0.0], [20.0, 0.0]]",
-            ),
-            (
-                "Course_nozzle_path",
-                "### A nozzle that moves",
-                '[emitter]\nphase = "water"\noutlet = [0.75, 0.7, 0.25]\nradius = 0.1\nlength = 0.2\n'
-                "flow_rate = 0.02\n\n[schedule.nozzle_path]\ntimes = [0.0, 0.3]\n"
-                "values = [[0.75, 0.7, 0.25], [0.65, 0.7, 0.25]]",
             ),
         ),
     ),
@@ -254,13 +244,8 @@ def page() -> str:
         for model, below, example in tables:
             table = schema["$defs"][model]
             words = table.get("description", "").replace("``", "`")
-            text += (
-                (f"{below}\n\n{words}\n\n" if below else "")
-                + rows(table, COURSES if model == "Schedule" else None)
-                + "\n"
-                + toml(example)
-                + "\n"
-            )
+            above = [part for part in (below, words) if below and part]
+            text += "\n\n".join([*above, f"{rows(table)}\n{toml(example)}\n"])
         text = text.rstrip("\n") + "\n"
     return text
 
