@@ -21,7 +21,7 @@ LAYERS = """
     lattice lattice.shapes lattice.pairs lattice.region lattice.smoothing lattice.calibration
     parameters parameters.reference_density parameters.registry parameters.table parameters.tilt parameters.values
     scene scene.fields scene.sentences scene.point_reader scene.points scene.tables scene.fluids scene.emitter
-    scene.mixture scene.render scene.toml
+    scene.mixture scene.picture scene.render scene.toml
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights
     scene.containers scene.model scene.stability
@@ -54,6 +54,8 @@ LAYERS = """
     io.pictures
     figures.canvas figures.particle_sets figures.side_by_side
     io.trajectory io.trajectory_batch
+    shading shading.surface shading.stage shading.shadow shading.optics shading.trace shading.space shading.plane
+    shading.painter shading.labels shading.film
     simulation
     problem
     figures.curves figures

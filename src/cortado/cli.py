@@ -49,6 +49,7 @@ def run(
     precision: str = "float32",
     record_every: int = 1,
     overwrite: bool = False,
+    pictures: bool = True,
 ) -> Work:
     """Run a scene forward and write its trajectory.
 
@@ -61,12 +62,13 @@ def run(
         precision: "float32" or "float64".
         record_every: Steps from one frame of the trajectory to the next.
         overwrite: Replace an earlier run in the same folder.
+        pictures: Draw shaded pictures and a film; --no-pictures leaves them out.
     """
     _require_at_least(1, record_every, "--record-every")
     from cortado.commands.run import run_scene
 
-    words = _words(overrides)
-    return partial(run_scene, scene, steps, out, words, device, precision, record_every, overwrite, _command())
+    words, told = _words(overrides), _command()
+    return partial(run_scene, scene, steps, out, words, device, precision, record_every, overwrite, told, pictures)
 
 
 @app.command

@@ -13,6 +13,7 @@ from cortado.scene.emitter import Emitter
 from cortado.scene.fields import Colour, Flag, OneOf, Several, Text, Vector, count, field_error, quantity
 from cortado.scene.fluids import AnyFluid
 from cortado.scene.mixture import Mixture
+from cortado.scene.picture import Picture
 from cortado.scene.render import Render
 from cortado.scene.tables import Table
 
@@ -123,8 +124,10 @@ class SceneTables(Table):
     """How a step is solved."""
     render: Render | None = None
     """How pictures are taken."""
+    picture: Picture | None = None
+    """How shaded pictures and films are made."""
 
-    @field_validator("emitter", "container", "forces", "render")
+    @field_validator("emitter", "container", "forces", "render", "picture")
     @classmethod
     def _resolve(cls, table: Any, info: ValidationInfo) -> Any:
         given = table is not None and "dimension" in info.data

@@ -36,6 +36,10 @@ class Scene(SceneTables):
         """The scene with all defaults filled in, to be read by `from_json`."""
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
+    def computed_json(self) -> str:
+        """The same without [picture]: what results depend on."""
+        return json.dumps(self.model_dump(mode="json", exclude={"picture"}), indent=2)
+
     @classmethod
     def from_json(cls, text: str) -> "Scene":
         """The scene that `to_json` wrote."""
