@@ -64,7 +64,7 @@ LAYERS = """
     optimisation optimisation.evaluate optimisation.differentiable optimisation.replay_log optimisation.optimisers
     optimisation.named_optimisers optimisation.result optimisation.optimise optimisation.transforms
     io.run_folder io.report
-    inverse inverse.tables inverse.task inverse.setup inverse.figures
+    inverse inverse.tables inverse.task inverse.setup inverse.figures inverse.shaded
     study study.canvas study.comparison study.estimates study.lyapunov_spectrum study.one_kernel_loops
     study.reference_losses study.scenes study.palette study.sources study.gravity_tangents study.spatial_scales
     study.ensembles study.tables study.experiment study.forces study.gravity_and_precision study.image_horizon

@@ -82,6 +82,7 @@ def optimise(
     overwrite: bool = False,
     scheduler: str | None = None,
     workers: int | None = None,
+    pictures: bool = True,
 ) -> Work:
     """Optimise what a task file names, and check the result as the file asks.
 
@@ -95,14 +96,15 @@ def optimise(
         overwrite: Replace an earlier run in the same folder.
         scheduler: Address of a scheduler of Dask's, whose workers compute the samples of an ensemble.
         workers: Number of worker processes on this machine that do; on a GPU each has one of its own.
+        pictures: Draw shaded pictures and films; --no-pictures leaves them out.
     """
     if resume and overwrite:
         raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
     from cortado.commands.executor import Where
     from cortado.commands.optimise import optimise_task
 
-    where, words = Where(scheduler, workers), _words(overrides)
-    return partial(optimise_task, task, out, words, device, precision, resume, overwrite, _command(), where)
+    where, words, told = Where(scheduler, workers), _words(overrides), _command()
+    return partial(optimise_task, task, out, words, device, precision, resume, overwrite, told, where, pictures)
 
 
 @app.command

@@ -43,6 +43,12 @@ class Surroundings:
     """[m] in its own frame"""
     glass_upper: wp.vec3
     """[m]"""
+    has_room: wp.int32
+    """Whether fluid is shown within the container only."""
+    room_lower: wp.vec3
+    """[m] in the frame of the container: where that ends; -FAR where it does not"""
+    room_upper: wp.vec3
+    """[m]"""
     panes: wp.mat33
     """1 where the container has a pane, 0 where it is open: rows for lower and upper ends, columns for axes."""
 
@@ -277,3 +283,70 @@ def background(s: Surroundings, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d
         most = wp.max((s.floor_height - o[1]) / d[1], 0.0)
     passed = glass(s, o, d, most, spread)
     return passed.light + passed.through * open_background(s, shadow, o, d, spread)
+
+
+@wp.func
+def room(s: Surroundings, o: wp.vec3, d: wp.vec3):
+    """From where to where on a ray fluid is shown; from FAR to -FAR where it is not."""
+    enter = -FAR
+    leave = FAR
+    if s.has_room == 0:
+        return wp.vec2(enter, leave)
+    p = s.glass_frame * o
+    q = s.glass_frame * d
+    for a in range(3):
+        if s.glass == 1 or a == 1:
+            if wp.abs(q[a]) > 1.0e-9:
+                t1 = (s.room_lower[a] - p[a]) / q[a]
+                t2 = (s.room_upper[a] - p[a]) / q[a]
+                enter = wp.max(enter, wp.min(t1, t2))
+                leave = wp.min(leave, wp.max(t1, t2))
+            elif p[a] < s.room_lower[a] or p[a] > s.room_upper[a]:
+                leave = -FAR
+    if s.glass == 2:
+        radius = 0.5 * (s.room_upper[0] - s.room_lower[0])
+        x = p[0] - 0.5 * (s.room_lower[0] + s.room_upper[0])
+        z = p[2] - 0.5 * (s.room_lower[2] + s.room_upper[2])
+        a2 = q[0] * q[0] + q[2] * q[2]
+        b = x * q[0] + z * q[2]
+        c = x * x + z * z - radius * radius
+        discriminant = b * b - a2 * c
+        if a2 > 1.0e-12:
+            if discriminant > 0.0:
+                root = wp.sqrt(discriminant)
+                enter = wp.max(enter, (-b - root) / a2)
+                leave = wp.min(leave, (-b + root) / a2)
+            if discriminant <= 0.0:
+                leave = -FAR
+        if a2 <= 1.0e-12 and c > 0.0:
+            leave = -FAR
+    if enter >= leave:
+        return wp.vec2(FAR, -FAR)
+    return wp.vec2(enter, leave)
+
+
+@wp.func
+def wall_normal(s: Surroundings, p: wp.vec3):
+    """Outwards, of the wall that a point is on."""
+    q = s.glass_frame * p
+    n = wp.vec3(0.0)
+    best = FAR
+    for a in range(3):
+        if s.glass == 1 or a == 1:
+            low = wp.abs(q[a] - s.room_lower[a])
+            high = wp.abs(q[a] - s.room_upper[a])
+            if low < best:
+                best = low
+                n = wp.vec3(0.0)
+                n[a] = -1.0
+            if high < best:
+                best = high
+                n = wp.vec3(0.0)
+                n[a] = 1.0
+    if s.glass == 2:
+        x = q[0] - 0.5 * (s.room_lower[0] + s.room_upper[0])
+        z = q[2] - 0.5 * (s.room_lower[2] + s.room_upper[2])
+        away = wp.sqrt(x * x + z * z)
+        if wp.abs(away - 0.5 * (s.room_upper[0] - s.room_lower[0])) < best:
+            n = wp.vec3(x / away, 0.0, z / away)
+    return wp.transpose(s.glass_frame) * n

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from concurrent.futures import wait
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -25,7 +24,7 @@ CONTRAST = 0.02
 """Between neighbouring pixels, in linear light: above, four more rays go through both."""
 BANDS = 8
 """Parts of a picture for each core, and one core may do more of them than another."""
-AROUND, IN_LAMP = 32, 6
+LIGHT_RAYS = {"liquid": (32, 6), "spheres": (10, 1)}
 """Rays that find how much light falls on a point of the surface: from all around, and from the lamp."""
 
 
@@ -36,8 +35,9 @@ class SpacePainter:
         self.stage, self.device = stage, wp.get_device(device)
         self._compiled: set[Any] = set()
         self._surroundings, self._eye = _surroundings(stage), _eye(stage)
-        self._around = wp.array(_directions(AROUND), dtype=wp.vec3, device=self.device)
-        in_lamp = stage.sun + 0.16 * _directions(IN_LAMP)
+        around, lamp = LIGHT_RAYS[stage.picture.surface]
+        self._around = wp.array(_directions(around), dtype=wp.vec3, device=self.device)
+        in_lamp = stage.sun + (0.16 if lamp > 1 else 0.0) * _directions(lamp)
         in_lamp /= np.linalg.norm(in_lamp, axis=1)[:, None]
         self._in_lamp = wp.array(in_lamp, dtype=wp.vec3, device=self.device)
 
@@ -49,8 +49,6 @@ class SpacePainter:
         if picture.surface == "liquid":
             wet, of = stage.wetting(placed)
             surface = liquid(wet, colours[of], stage.spacing)
-            points, normals = stage.held(surface.points, surface.normals)
-            surface = replace(surface, points=points, normals=normals)
         else:
             surface = spheres(placed, colours, stage.spacing)
         light, corner, cell = floor_shadow(stage, placed, colours)
@@ -165,6 +163,9 @@ def _surroundings(stage: Stage) -> Any:
         s.glass = optics.GLASS_BOX if stage.container.shape == "box" else optics.GLASS_CYLINDER
         s.glass_frame = wp.mat33(*stage.glass_frame.ravel())
         s.glass_lower, s.glass_upper = wp.vec3(*lower), wp.vec3(*upper)
+        lower, upper = (np.clip(end, -1e8, 1e8) for end in stage.room)
+        s.room_lower, s.room_upper = wp.vec3(*lower), wp.vec3(*upper)
+        s.has_room = int(stage.cuts and picture.surface == "liquid")
         s.panes = wp.mat33(*stage.panes.ravel(), 0.0, 0.0, 0.0)
     return s
 

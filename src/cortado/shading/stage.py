@@ -92,9 +92,9 @@ class Stage:
 
     def wetting(self, points: Points) -> tuple[Points, np.ndarray]:
         """Points (n, 3) [m] in the frame of the picture and their mirror images behind walls that they touch, and which
-        point each is or shows, (m,): a surface around them all passes through the walls."""
+        point each shows, (m,): a surface around them all goes on beyond the walls, at which it is cut."""
         of = np.arange(len(points))
-        if self.container.extent() is None:
+        if not self.cuts:
             return points, of
         own, reach = points @ self.glass_frame.T, TOUCHING * self.spacing
         for image in self._images:
@@ -117,36 +117,14 @@ class Stage:
         def around(own: Points) -> tuple[Points, Points]:
             off = (own - middle) * (1.0, 0.0, 1.0)
             away = np.maximum(np.linalg.norm(off, axis=1), 1e-30)
-            distance = np.where(own[:, 1] < upper[1], radius - away, np.inf)
-            return own + off * (2.0 * (radius - away) / away)[:, None], distance
+            return own + off * (2.0 * (radius - away) / away)[:, None], radius - away
 
-        if isinstance(self.container, BoxContainer):
-            return [partial(flat, axis=k, place=end[k]) for k in range(3) for end in (lower, upper)]
-        lid = [partial(flat, axis=1, place=upper[1])] if self.container.lid else []
-        return [partial(flat, axis=1, place=lower[1]), *lid, around]
-
-    def held(self, points: Points, normals: Points) -> tuple[Points, Points]:
-        """Points (p, 3) [m] of a surface, in the frame of the picture, with its normals (p, 3): those that are behind a
-        wall are moved to it, and it gives them its normal."""
-        if self.container.extent() is None:
-            return points, normals
-        own, inset = points @ self.glass_frame.T, 0.001 * self.size
-        lower, upper = self.glass_ends
-        if isinstance(self.container, BoxContainer):
-            held = np.clip(own, lower + inset, upper - inset)
-        else:
-            middle, radius = 0.5 * (lower + upper), 0.5 * (upper - lower)[0] - inset
-            off = (own - middle) * (1.0, 0.0, 1.0)
-            away = np.linalg.norm(off, axis=1)
-            outside = (own[:, 1] < upper[1]) & (away > radius)
-            held = own - off * np.where(outside, 1.0 - radius / np.maximum(away, 1e-30), 0.0)[:, None]
-            held[:, 1] = np.maximum(held[:, 1], lower[1] + inset)
-            if self.container.lid:
-                held[:, 1] = np.minimum(held[:, 1], upper[1] - inset)
-        moved = own - held
-        way = np.linalg.norm(moved, axis=1)[:, None]
-        outwards = (moved / np.maximum(way, 1e-30)) @ self.glass_frame
-        return held @ self.glass_frame, np.where(way > 1e-3 * inset, outwards, normals)
+        ends = self.room
+        box = isinstance(self.container, BoxContainer)
+        walls = [(k, end[k]) for k in range(3) for end in ends if (box or k == 1) and np.isfinite(end[k])]
+        sides: list[Callable[[Points], tuple[Points, Points]]]
+        sides = [partial(flat, axis=axis, place=place) for axis, place in walls]
+        return sides if box else [*sides, around]
 
     @property
     def glass_frame(self) -> Points:
@@ -162,6 +140,25 @@ class Stage:
         """Lower and upper ends of the container [m], (3,) each, in the frame of the glass."""
         points = self.placed(corners(*self.container.extent())) @ self.glass_frame.T
         return points.min(axis=0), points.max(axis=0)
+
+    @property
+    def cuts(self) -> bool:
+        """Whether fluid is shown within the container only: not where it may come over a rim."""
+        return self.container.extent() is not None and getattr(self.container, "lid", True)
+
+    @property
+    def room(self) -> tuple[Points, Points]:
+        """Where fluid is shown, (3,) each [m], in the frame of the glass; infinite upwards, where an emitter may be,
+        and along an axis that is periodic."""
+        lower, upper = (end.copy() for end in self.glass_ends)
+        up = self.glass_frame @ (0.0, 1.0, 0.0)
+        axis = int(np.abs(up).argmax())
+        if isinstance(self.container, BoxContainer) or axis == 1:
+            (upper if up[axis] > 0.0 else lower)[axis] = np.copysign(np.inf, up[axis])
+        if isinstance(self.container, BoxContainer):
+            periodic = np.abs(self.frame) @ np.asarray(self.container.periodic, dtype=float) > 0.5
+            lower[periodic], upper[periodic] = -np.inf, np.inf
+        return lower, upper
 
     @property
     def panes(self) -> Points:

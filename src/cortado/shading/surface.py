@@ -15,6 +15,9 @@ FINE, COARSE = 30_000, 200_000
 NEIGHBOURS = 24
 """Particles that a point of the surface has its colour from."""
 
+ROUND = 10_000
+"""Spheres up to which each has 128 triangles, and 32 beyond."""
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -80,7 +83,7 @@ def nearest_colours(points: Points, positions: Points, colours: Points, spacing:
 
 def spheres(positions: Points, colours: Points, spacing: float) -> Surface:
     """A sphere around each of the particles (n, 3) [m], in its colour (n, 3), that touches those next to it."""
-    corners, triangles = _sphere(2 if len(positions) <= FINE else 1)
+    corners, triangles = _sphere(2 if len(positions) <= ROUND else 1)
     n, k = len(positions), len(corners)
     return Surface(
         points=(positions[:, None] + 0.5 * spacing * corners).reshape(-1, 3),

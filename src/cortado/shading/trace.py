@@ -8,11 +8,13 @@ and of what remains fluid takes away the colours that it does not have.
 
 import warp as wp
 
-from cortado.shading.optics import FAR, Surroundings, background, glass, mirrored, schlick, sky
+from cortado.shading.optics import FAR, Surroundings, background, glass, mirrored, room, schlick, sky, wall_normal
 
 SEGMENTS = 6
 INDEX = wp.constant(wp.float32(1.33))
 """Refractive index, of water."""
+TINT = wp.constant(wp.float32(2.6))
+"""How much sooner light takes the colour of the fluid than it is scattered."""
 
 
 @wp.struct
@@ -55,12 +57,6 @@ def at_corners(surface: FluidSurface, values: wp.array(dtype=wp.vec3), face: wp.
 
 
 @wp.func
-def matt(surface: FluidSurface, face: wp.int32, u: wp.float32, v: wp.float32):
-    """The colour of the surface where it is seen by way of something else."""
-    return wp.cw_mul(at_corners(surface, surface.colours, face, u, v), at_corners(surface, surface.light, face, u, v))
-
-
-@wp.func
 def facing(normal: wp.vec3, face_normal: wp.vec3, d: wp.vec3):
     """An interpolated normal on the side of the triangle that the ray comes from."""
     outside = face_normal
@@ -72,6 +68,81 @@ def facing(normal: wp.vec3, face_normal: wp.vec3, d: wp.vec3):
     if cosine > -0.02:
         n = n - (cosine + 0.02) * d
     return wp.normalize(n)
+
+
+@wp.struct
+class Meeting:
+    """Where a ray meets the surface of the fluid."""
+
+    found: wp.bool
+    t: wp.float32
+    normal: wp.vec3
+    """On the side that the ray comes from."""
+    colour: wp.vec3
+    light: wp.vec3
+
+
+@wp.func
+def at_surface(surface: FluidSurface, t: wp.float32, d: wp.vec3, face: wp.int32, u: wp.float32, v: wp.float32):
+    """A meeting with a triangle."""
+    i = surface.corners[3 * face]
+    j = surface.corners[3 * face + 1]
+    k = surface.corners[3 * face + 2]
+    mesh = wp.mesh_get(surface.mesh)
+    flat = wp.normalize(wp.cross(mesh.points[j] - mesh.points[i], mesh.points[k] - mesh.points[i]))
+    met = Meeting()
+    met.found = True
+    met.t = t
+    met.normal = facing(at_corners(surface, surface.normals, face, u, v), flat, d)
+    met.colour = at_corners(surface, surface.colours, face, u, v)
+    met.light = at_corners(surface, surface.light, face, u, v)
+    return met
+
+
+@wp.func
+def at_wall(s: Surroundings, surface: FluidSurface, o: wp.vec3, d: wp.vec3, t: wp.float32):
+    """A meeting with the wall that fluid touches, beyond which its triangles go on: they are near."""
+    p = o + t * d
+    near = wp.mesh_query_point_no_sign(surface.mesh, p, s.size)
+    met = at_surface(surface, t, d, near.face, near.u, near.v)
+    n = wall_normal(s, p)
+    met.normal = wp.where(wp.dot(n, d) > 0.0, -n, n)
+    return met
+
+
+@wp.func
+def meet(s: Surroundings, surface: FluidSurface, o: wp.vec3, d: wp.vec3):
+    """Where a ray from outside of the fluid comes into it."""
+    none = Meeting()
+    none.found = False
+    none.t = FAR
+    part = room(s, o, d)
+    start = wp.max(part[0], 0.0)
+    if part[1] <= start:
+        return none
+    hit = wp.mesh_query_ray(surface.mesh, o + start * d, d, FAR)
+    if not hit.result:
+        return none
+    if hit.sign < 0.0 and part[0] > 0.0:
+        return at_wall(s, surface, o, d, start)
+    if start + hit.t > part[1]:
+        return none
+    return at_surface(surface, start + hit.t, d, hit.face, hit.u, hit.v)
+
+
+@wp.func
+def leave(s: Surroundings, surface: FluidSurface, o: wp.vec3, d: wp.vec3):
+    """Where a ray within the fluid comes out of it."""
+    part = room(s, o, d)
+    hit = wp.mesh_query_ray(surface.mesh, o, d, FAR)
+    if hit.result and (hit.t <= part[1] or part[1] <= 0.0):
+        return at_surface(surface, hit.t, d, hit.face, hit.u, hit.v)
+    if hit.result:
+        return at_wall(s, surface, o, d, part[1])
+    none = Meeting()
+    none.found = False
+    none.t = 0.0
+    return none
 
 
 @wp.func
@@ -106,23 +177,22 @@ def within(
     lit = light
     inside = wp.bool(True)
     for _ in range(SEGMENTS):
-        hit = wp.mesh_query_ray(surface.mesh, o, d, FAR)
         if inside:
-            way = 0.0
-            if hit.result:
-                way = hit.t
-            left = wp.exp(-surface.scattering * way)
+            met = leave(s, surface, o, d)
+            left = wp.exp(-surface.scattering * met.t)
             soft = 0.55 * lit + wp.vec3(0.40)
             found += wp.cw_mul(through, wp.cw_mul(c, soft)) * (1.0 - left)
-            taken = surface.scattering * way * 2.6
+            taken = surface.scattering * met.t * TINT
             tint = wp.vec3(
                 wp.pow(wp.max(c[0], 0.02), taken), wp.pow(wp.max(c[1], 0.02), taken), wp.pow(wp.max(c[2], 0.02), taken)
             )
             through = wp.cw_mul(through, tint) * left
-        if not hit.result or wp.max(wp.max(through[0], through[1]), through[2]) < 0.01:
+        else:
+            met = meet(s, surface, o, d)
+        if not met.found or wp.max(wp.max(through[0], through[1]), through[2]) < 0.01:
             break
-        p = o + hit.t * d
-        n = facing(at_corners(surface, surface.normals, hit.face, hit.u, hit.v), hit.normal, d)
+        p = o + met.t * d
+        n = met.normal
         cosine = -wp.dot(n, d)
         if inside:
             sine2 = INDEX * INDEX * (1.0 - cosine * cosine)
@@ -134,15 +204,15 @@ def within(
                 o = p - s.nearest * n
                 inside = False
         else:
-            passed = glass(s, o, d, hit.t, spread)
+            passed = glass(s, o, d, met.t, spread)
             found += wp.cw_mul(through, passed.light)
             through = through * passed.through
             reflectance = schlick(0.02, cosine)
             r = wp.normalize(mirrored(d, n))
             found += wp.cw_mul(through, sky(s, wp.vec3(r[0], wp.abs(r[1]), r[2]))) * reflectance
             through = through * (1.0 - reflectance)
-            c = at_corners(surface, surface.colours, hit.face, hit.u, hit.v)
-            lit = at_corners(surface, surface.light, hit.face, hit.u, hit.v)
+            c = met.colour
+            lit = met.light
             sine2 = (1.0 - cosine * cosine) / (INDEX * INDEX)
             d = wp.normalize(d / INDEX + (cosine / INDEX - wp.sqrt(1.0 - sine2)) * n)
             o = p - s.nearest * n
@@ -162,39 +232,33 @@ def seen(
     spread: wp.float32,
 ):
     """The light that comes to the eye against a ray."""
-    hit = wp.mesh_query_ray(surface.mesh, o, d, FAR)
+    met = meet(s, surface, o, d)
     floor_at = FAR
     if s.has_floor > 0 and d[1] < -1.0e-4:
         floor_at = (s.floor_height - o[1]) / d[1]
-    if not hit.result or hit.t > floor_at:
+    if met.t > floor_at or not met.found:
         found = background(s, shadow, o, d, spread)
         if floor_at < FAR:  # the floor is a little glossy
-            p = o + floor_at * d
             r = wp.vec3(d[0], -d[1], d[2])
-            mirror = wp.mesh_query_ray(surface.mesh, p, r, FAR)
-            if mirror.result:
-                behind = sky(s, r)
-                strength = schlick(0.04, -d[1]) * wp.exp(-2.5 * mirror.t / s.size)
-                found += strength * (matt(surface, mirror.face, mirror.u, mirror.v) - behind)
+            image = meet(s, surface, o + floor_at * d, r)
+            if image.found:
+                strength = schlick(0.04, -d[1]) * wp.exp(-2.5 * image.t / s.size)
+                found += strength * (wp.cw_mul(image.colour, image.light) - sky(s, r))
         return toned(found)
-    p = o + hit.t * d
-    n = facing(at_corners(surface, surface.normals, hit.face, hit.u, hit.v), hit.normal, d)
-    colour = at_corners(surface, surface.colours, hit.face, hit.u, hit.v)
-    light = at_corners(surface, surface.light, hit.face, hit.u, hit.v)
+    p = o + met.t * d
+    n = met.normal
     cosine = -wp.dot(n, d)
     reflectance = schlick(0.02, cosine)
     r = wp.normalize(mirrored(d, n))
     start = p + s.nearest * n
-    other = wp.mesh_query_ray(surface.mesh, start, r, FAR)
-    reflected = wp.vec3(0.0)
-    if other.result:
-        reflected = matt(surface, other.face, other.u, other.v)
-    if not other.result:
+    other = meet(s, surface, start, r)
+    reflected = wp.cw_mul(other.colour, other.light)
+    if not other.found:
         reflected = background(s, shadow, start, r, spread)
     sine2 = (1.0 - cosine * cosine) / (INDEX * INDEX)
     refracted = wp.normalize(d / INDEX + (cosine / INDEX - wp.sqrt(1.0 - sine2)) * n)
-    body = within(s, shadow, surface, p - s.nearest * n, refracted, colour, light, spread)
-    passed = glass(s, o, d, hit.t, spread)
+    body = within(s, shadow, surface, p - s.nearest * n, refracted, met.colour, met.light, spread)
+    passed = glass(s, o, d, met.t + 2.0 * s.nearest, spread)
     return toned(passed.light + passed.through * (reflectance * reflected + (1.0 - reflectance) * body))
 
 
