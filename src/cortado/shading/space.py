@@ -20,11 +20,11 @@ from cortado.shading.trace import Eye, FluidSurface, illuminate, trace
 
 ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 """Where in a pixel four more rays go, in pixels from its middle."""
-CONTRAST = 0.02
+CONTRAST = 0.03
 """Between neighbouring pixels, in linear light: above, four more rays go through both."""
 BANDS = 8
 """Parts of a picture for each core, and one core may do more of them than another."""
-LIGHT_RAYS = {"liquid": (32, 6), "spheres": (10, 1)}
+LIGHT_RAYS = {"liquid": (20, 4), "spheres": (10, 1)}
 """Rays that find how much light falls on a point of the surface: from all around, and from the lamp."""
 
 
@@ -65,6 +65,7 @@ class SpacePainter:
         mesh = wp.Mesh(points, corners)
         fluid = FluidSurface()
         fluid.mesh, fluid.corners, fluid.scattering = mesh.id, corners, self._scattering
+        fluid.reach = 2.0 * self.stage.spacing
         fluid.normals = wp.array(surface.normals, dtype=wp.vec3, device=device)
         fluid.colours = wp.array(surface.colours, dtype=wp.vec3, device=device)
         fluid.light = wp.zeros(len(points), dtype=wp.vec3, device=device)

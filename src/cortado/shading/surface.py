@@ -10,7 +10,7 @@ from cortado.lattice.shapes import Points
 
 MISSING = "Shaded pictures need pysplashsurf, which is not installed: pip install 'cortado-sph[pictures]'."
 FINE, COARSE = 30_000, 200_000
-"""Particles up to which cells are a quarter of a spacing wide, and three eighths; half a spacing beyond."""
+"""Particles up to which cells are a third of a spacing wide, and two fifths; half a spacing beyond."""
 
 NEIGHBOURS = 24
 """Particles that a point of the surface has its colour from."""
@@ -50,7 +50,7 @@ def liquid(positions: Points, colours: Points, spacing: float) -> Surface:
         np.ascontiguousarray(positions[order], dtype=np.float64),
         particle_radius=0.5 * spacing,
         smoothing_length=3.0,
-        cube_size=0.5 if n <= FINE else 0.75 if n <= COARSE else 1.0,
+        cube_size=0.65 if n <= FINE else 0.8 if n <= COARSE else 1.0,
         iso_surface_threshold=0.6,
         mesh_cleanup=True,
         mesh_smoothing_iters=25,

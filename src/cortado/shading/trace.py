@@ -10,7 +10,7 @@ import warp as wp
 
 from cortado.shading.optics import FAR, Surroundings, background, glass, mirrored, room, schlick, sky, wall_normal
 
-SEGMENTS = 6
+SEGMENTS = 4
 INDEX = wp.constant(wp.float32(1.33))
 """Refractive index, of water."""
 TINT = wp.constant(wp.float32(2.6))
@@ -32,6 +32,8 @@ class FluidSurface:
     """(points,) light that falls on the surface, of which white reflects 1"""
     scattering: wp.float32
     """[1/m]"""
+    reach: wp.float32
+    """How far behind a wall the triangles of fluid that touches it are, at most [m]."""
 
 
 @wp.struct
@@ -103,7 +105,9 @@ def at_surface(surface: FluidSurface, t: wp.float32, d: wp.vec3, face: wp.int32,
 def at_wall(s: Surroundings, surface: FluidSurface, o: wp.vec3, d: wp.vec3, t: wp.float32):
     """A meeting with the wall that fluid touches, beyond which its triangles go on: they are near."""
     p = o + t * d
-    near = wp.mesh_query_point_no_sign(surface.mesh, p, s.size)
+    near = wp.mesh_query_point_no_sign(surface.mesh, p, surface.reach)
+    if not near.result:  # deep within fluid that has just reached the wall
+        near = wp.mesh_query_point_no_sign(surface.mesh, p, s.size)
     met = at_surface(surface, t, d, near.face, near.u, near.v)
     n = wall_normal(s, p)
     met.normal = wp.where(wp.dot(n, d) > 0.0, -n, n)
@@ -189,7 +193,7 @@ def within(
             through = wp.cw_mul(through, tint) * left
         else:
             met = meet(s, surface, o, d)
-        if not met.found or wp.max(wp.max(through[0], through[1]), through[2]) < 0.01:
+        if not met.found or wp.max(wp.max(through[0], through[1]), through[2]) < 0.02:
             break
         p = o + met.t * d
         n = met.normal
