@@ -74,7 +74,8 @@ LAYERS = """
     bench bench.scene bench.timing bench.floor bench.passes bench.memory bench.dam_break bench.environment
     bench.reference_engine bench.text
     sweep sweep.combinations sweep.table
-    commands commands.executor commands.bench commands.check commands.figure commands.optimise commands.run
+    commands commands.executor commands.bench commands.check commands.figure commands.optimise commands.picture
+    commands.run
     commands.study commands.sweep
     cli
     __main__

@@ -1,4 +1,4 @@
-"""The command line: ``cortado run | optimise | sweep | gradients | bench``.
+"""The command line: ``cortado run | optimise | picture | sweep | gradients | bench``.
 
 Exit codes: 0 done, 1 the computation failed (or a check did), 2 the input is wrong, 130 interrupted. A mistake of the
 user's, or of the machine, is one sentence on stderr, never a traceback.
@@ -105,6 +105,30 @@ def optimise(
 
     where, words, told = Where(scheduler, workers), _words(overrides), _command()
     return partial(optimise_task, task, out, words, device, precision, resume, overwrite, told, where, pictures)
+
+
+@app.command
+def picture(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    frame: int = -1,
+    film: bool = False,
+    out: Path | None = None,
+    overrides: Overrides = (),
+    device: str = "cpu",
+) -> Work:
+    """Draw a shaded picture, or a film, of a run that `cortado run` wrote.
+
+    Args:
+        run: The folder of the run.
+        frame: Number of a recorded frame, counted from the end where it is negative.
+        film: A film of all frames in its place.
+        out: Where to write it; into the run's figures if left out.
+        overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
+        device: "cpu", or "cuda:0" for the first GPU.
+    """
+    from cortado.commands.picture import draw_run
+
+    return partial(draw_run, run, frame, film, out, _words(overrides), device)
 
 
 @app.command

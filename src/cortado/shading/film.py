@@ -43,12 +43,7 @@ def lacking(scene: Scene) -> str | None:
 
 def run_pictures(scene: Scene, trajectory: Trajectory, folder: Path, device: Any) -> Figures:
     """Draw the first and the last state of a run, and a film of it, into a folder; (caption, path) of each."""
-    artist = painter(scene, trajectory.positions, device)
-
-    def image(k: int) -> Points:
-        frame = trajectory[k]
-        return artist.image(frame.positions, colours_of(scene, frame.mass_fractions, trajectory.particles))
-
+    image = state_images(scene, trajectory, device)
     last, most = len(trajectory) - 1, (scene.picture or Picture()).film_frames
     stills: Figures = []
     for k, name, words in ((0, "first", "at the start"), (last, "last", "at the end")):
@@ -58,6 +53,17 @@ def run_pictures(scene: Scene, trajectory: Trajectory, folder: Path, device: Any
     if not most or not last:
         return stills
     return [("The run.", film(folder / "film.mp4", image, range(last + 1), most)), *stills]
+
+
+def state_images(scene: Scene, trajectory: Trajectory, device: Any) -> Callable[[int], Points]:
+    """A function from the number of a frame to its picture (rows, columns, 3), linear; all are taken from one place."""
+    artist = painter(scene, trajectory.positions, device)
+
+    def image(k: int) -> Points:
+        frame = trajectory[k]
+        return artist.image(frame.positions, colours_of(scene, frame.mass_fractions, trajectory.particles))
+
+    return image
 
 
 def film(path: Path, image: Callable[[int], Points], frames: Sequence[int], most: int) -> Path:
