@@ -11,8 +11,10 @@ from cortado.scene.scene import Scene
 
 FILLED = 0.80
 """The part of the picture's width or height that the container takes."""
-SUPPORT = 1.5
+SUPPORT = 1.3
 """In spacings: how far a particle is felt."""
+DROP = 0.8
+"""How strongly a particle is felt that is alone: a drop about as large as a spacing."""
 GRID = 4
 """Nodes of the field for each spacing, along an axis."""
 TOUCHING = 0.9
@@ -109,7 +111,7 @@ class PlanePainter:
         reach, cell = 2.0 * SUPPORT * self.spacing, self.spacing / GRID
         wet_tree = cKDTree(wet)
         own = _weight(_distances(wet_tree, wet, reach), reach)
-        strength = 1.0 / own.sum(axis=1)  # alone, a particle is a drop as large as a spacing
+        strength = np.minimum(1.0 / own.sum(axis=1), DROP)
         corner = wet.min(axis=0) - reach
         counts = np.ceil((wet.max(axis=0) + reach - corner) / cell).astype(int) + 1
         field, tinted = _splat(wet, strength, colours[of], corner, cell, counts, reach)

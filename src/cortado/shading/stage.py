@@ -15,6 +15,8 @@ from cortado.scene.scene import Scene
 
 MARGIN = 1.10
 """How much wider a picture is than what it shows."""
+AIR = 0.1
+"""Beside fluid that no container holds, in its widths."""
 FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
 """Elevation of the camera [degrees]: where the fluid is drawn on, as in latte art, and elsewhere."""
 TOUCHING = 0.8
@@ -51,9 +53,13 @@ class Stage:
         """That of a scene in 3-D, the fluid of which is between lower and upper (3,) [m]."""
         picture = scene.picture or Picture()
         ends = scene.container.extent()
-        if ends is not None:
+        frame = upright(np.asarray(scene.forces.gravity))
+        if ends is None:
+            air = 0.5 * scene.discretisation.spacing + AIR * (1.0 - np.abs(frame[1])) * (upper - lower)
+            lower, upper = lower - air, upper + air
+        else:
             lower, upper = np.minimum(lower, ends[0]), np.maximum(upper, ends[1])
-        frame, origin = upright(np.asarray(scene.forces.gravity)), 0.5 * (lower + upper)
+        origin = 0.5 * (lower + upper)
         shown = (corners(lower, upper) - origin) @ frame.T
         low, high = shown.min(axis=0), shown.max(axis=0)
         several = len(scene.phase) > 1
