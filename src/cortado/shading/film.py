@@ -17,7 +17,7 @@ from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
 from cortado.shading.painter import colours_of, painter
 
-SECONDS = 45.0
+SECONDS = 40.0
 """[s] that a film may take to draw, about; it has fewer frames where one takes long."""
 LEAST_FRAMES = 12
 """Of a film, however long they take."""
