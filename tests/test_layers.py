@@ -26,7 +26,7 @@ LAYERS = """
     discretise.walls.weights
     scene.containers scene.model scene.stability
     device device.cores device.kernels device.memory device.precision device.arithmetic device.loads device.lanes
-    device.reduction device.silence device.threads device.compiling device.kernel_cache device.smoothing
+    device.reduction device.host device.silence device.threads device.compiling device.kernel_cache device.smoothing
     device.neighbourhood device.arrays device.fields device.launching device.state device.cells
     device.candidates device.neighbours
     scene.checks scene.scene

@@ -22,7 +22,7 @@ from cortado.restart import Clock
 from cortado.solvers.containment import Lost
 from cortado.solvers.solver import Counts, Solver
 
-CHUNK = 32
+CHUNK = 64
 """Steps between two looks of the host, at most."""
 FILLED = {"cpu": 32_000, "cuda": 16_000_000}
 """Particles in the steps of a chunk, beyond which a look of the host costs hardly anything beside them."""
@@ -115,9 +115,9 @@ class Rollout:
 
     @in_turn
     def forward(self, observe: Observer | None = None, keep: bool = True) -> State:
-        """Run all steps and return the last state. ``observe`` is given every state; ``keep`` checkpoints for a way
-        back. Raises `DivergedError` after the good states were observed; a batch goes on without the scenes that have
-        ``lost`` a particle."""
+        """Run all steps and return the last state, which the next run overwrites. ``observe`` is given every state;
+        ``keep`` checkpoints for a way back. Raises `DivergedError` after the good states were observed; a batch goes on
+        without the scenes that have ``lost`` a particle."""
         self._states, self._kept, self._run = {0: lambda: self.initial}, -1, -1
         self.lost = {}
         state, step = self.initial, 0
@@ -152,7 +152,7 @@ class Rollout:
         self._run = self.evaluation
         if keep:
             self._kept = self.evaluation
-        return state.copy()
+        return state
 
     def _advance(self, state: State, first: int, last: int) -> list[State]:
         """Take the steps from one to another and return the states after them, which the next chunk overwrites."""

@@ -127,6 +127,8 @@ class KernelLauncher:
         self.parts = max(min(most, particles // LEAST_PART), 1)
         """Ranges of particles that a sum over neighbours is cut into."""
         self._bounds = [particles * part // self.parts for part in range(self.parts + 1)]
+        self._side = wp.Stream(device) if device.is_cuda and not record_tape else None
+        self._went_aside = False
         self._compiled: set[Any] = set()
         self._whole: Any = None
         self._parts: list[Any] = []
@@ -153,6 +155,23 @@ class KernelLauncher:
         options = {"inputs": inputs, "device": self.device, "record_tape": self._record_tape}
         _perform(kernel.key, entries, inputs, partial(wp.launch, kernel, entries * lanes_of(kernel), **options))
         self._compiled.add(kernel)  # only now: an interrupted launch has compiled nothing
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """On a GPU, what is launched within waits for what was launched before, but not for what comes after it, nor
+        that for this until `join`: small kernels that do not need one another run at the same time."""
+        if self._side is None:
+            yield
+            return
+        self._went_aside = True
+        with wp.ScopedStream(self._side):
+            yield
+
+    def join(self) -> None:
+        """Let what comes wait for all that went `aside`."""
+        if self._went_aside:  # a stream that a capture has not seen must not be waited for within it
+            wp.wait_stream(self._side)
+            self._went_aside = False
 
     def _launch_parts(self, kernel: wp.Kernel, inputs: Sequence[Any]) -> None:
         if self._whole is not inputs[0]:

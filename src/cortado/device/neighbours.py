@@ -16,6 +16,7 @@ import warp as wp
 
 from cortado.device.candidates import scan_around
 from cortado.device.cells import CellSort, Grid, cell_functions, cell_grid_type
+from cortado.device.host import HostCopy
 from cortado.device.lanes import lane_functions
 from cortado.device.launching import MOST_PARTS, KernelLauncher
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type
@@ -115,6 +116,7 @@ class NeighbourSearch:
         self.count = wp.zeros(particles, dtype=wp.int32, device=device)
         self._launch = KernelLauncher(particles, device, record_tape=False)
         self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
+        self._seen = HostCopy(self._needed)
         self.wall_positions = wp.array(walls, dtype=precision.vector, device=device)
         self.wall_weights = wp.array(wall_weights, dtype=precision.real, device=device)
         self._wall_sort = CellSort(grid, len(walls), precision, device)
@@ -166,7 +168,7 @@ class NeighbourSearch:
     @property
     def needed(self) -> int:
         """The longest list since `forget_needed`; more than the capacity if there was too little room."""
-        return int(self._needed.numpy().max())
+        return int(self._seen.read().max())
 
     def forget_needed(self) -> None:
         """Begin anew with `needed`."""

@@ -56,9 +56,8 @@ class State(Arrays):
 
     def copy(self) -> Self:
         """The same in arrays of its own."""
-        new = self.like()
-        new.assign(self)
-        return new
+        own = {name: wp.clone(self[name], requires_grad=False) for name in self.names}
+        return type(self)(self.fields, own, self.batch)
 
     def member(self, number: int) -> Self:
         """One scene of a batch, as a view of these arrays."""

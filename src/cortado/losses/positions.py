@@ -8,8 +8,7 @@ import warp as wp
 
 from cortado.arrays import as_numbers
 from cortado.device.arrays import to_device
-from cortado.device.launching import launch, sum_of
-from cortado.device.precision import Precision
+from cortado.device.launching import TreeReduction, launch, sum_of
 from cortado.device.state import State
 from cortado.device.threads import WARP
 from cortado.errors import InputError
@@ -28,7 +27,8 @@ class FinalPositions:
         self.target.setflags(write=False)
         self.fingerprint = sha256(self.target.tobytes()).hexdigest()
         """Tells one target from another, for checkpoints."""
-        self._on_device: dict[Any, wp.array] = {}
+        self._on_device: dict[Any, tuple[wp.array, TreeReduction]] = {}
+        """The target and the sum over particles, by device and precision."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled and copied as what it is made from."""
@@ -36,28 +36,28 @@ class FinalPositions:
 
     @WARP
     def value(self, end: Snapshot) -> float:
-        x, target, device = self._positions_and_target(end)
-        return self._mean_square(x, target, device, end.precision)
+        return self._mean_square(end, *self._made(end))
 
     @WARP
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, State]:
-        x, target, device = self._positions_and_target(end)
-        bar = end.state.like()
+        target, total = self._made(end)
+        x, bar = end.state.positions, end.state.like()
         factor, kernel = 2.0 / len(x), matching_kernels(end.precision).difference
-        launch(kernel, len(x), device, factor=factor, x=x, target=target, bar=bar.positions)
-        return self._mean_square(x, target, device, end.precision), bar
+        launch(kernel, len(x), x.device, factor=factor, x=x, target=target, bar=bar.positions)
+        return self._mean_square(end, target, total), bar
 
-    def _mean_square(self, x: wp.array, target: wp.array, device: Any, precision: Precision) -> float:
-        squares = wp.empty(len(x), dtype=wp.float64, device=device)
-        launch(matching_kernels(precision).squared_distance, len(x), device, x=x, target=target, squares=squares)
-        total = sum_of(wp.float64, len(x), device)(squares)
-        return float(total.numpy()[0]) / len(x)
+    def _mean_square(self, end: Snapshot, target: wp.array, total: TreeReduction) -> float:
+        x = end.state.positions
+        squares = wp.empty(len(x), dtype=wp.float64, device=x.device)
+        launch(matching_kernels(end.precision).squared_distance, len(x), x.device, x=x, target=target, squares=squares)
+        return float(total(squares).numpy()[0]) / len(x)
 
-    def _positions_and_target(self, end: Snapshot) -> tuple[wp.array, wp.array, Any]:
+    def _made(self, end: Snapshot) -> tuple[wp.array, TreeReduction]:
         x = end.state.positions
         if (len(x), end.dimension) != self.target.shape:
             raise InputError(f"target has shape {self.target.shape}, but must be {(len(x), end.dimension)}.")
         key = (str(x.device), end.precision)
         if key not in self._on_device:
-            self._on_device[key] = to_device(self.target, end.precision, x.device)
-        return x, self._on_device[key], x.device
+            total = sum_of(wp.float64, len(x), x.device)
+            self._on_device[key] = to_device(self.target, end.precision, x.device), total
+        return self._on_device[key]

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.arrays import padded
+from cortado.device.host import HostCopy
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import Precision
 from cortado.device.state import Layout, State
@@ -68,6 +69,7 @@ class Containment:
         self.bad_particle = wp.full(members, NO_PARTICLE, dtype=wp.int32, device=device)
         """(members,) the first particle that was lost in it; `NO_PARTICLE` while none was."""
         self._count = wp.zeros(members, dtype=wp.int32, device=device)
+        self._seen = HostCopy(self.bad_step)
 
     def reset(self, step: int = 0) -> None:
         """Forget what was lost from a step on; from the first on, an earlier run."""
@@ -100,7 +102,7 @@ class Containment:
 
     def lost(self) -> dict[int, Lost]:
         """Which particles were lost since `reset`, by the number of their scene; reads from the device."""
-        steps = self.bad_step.numpy()
+        steps = self._seen.read()
         members = np.flatnonzero(steps >= 0).tolist()
         if not members:
             return {}

@@ -1,12 +1,14 @@
 """Loops of a step that go round until an error is small enough, and what is noted of them in every step."""
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from cortado.device.host import HostCopy
 from cortado.device.launching import KernelLauncher, sum_and_maximum
 from cortado.device.state import Layout
 from cortado.solvers.containment import Containment
@@ -36,12 +38,14 @@ class LoopRecord:
         self.errors = wp.zeros(shape, dtype=layout.precision.pair, device=layout.device)
         """(steps, members) average and greatest error, on the device."""
         self.loop = loop
+        self._seen = HostCopy(self.iterations), HostCopy(self.errors)
         self.read(0)
 
     def read(self, steps: int) -> None:
         """Read so many steps from the device."""
         loop, kept = self.loop, (slice(None), 0 if self.loop.layout.batch is None else slice(None))
-        iterations, errors = self.iterations.numpy()[:steps].astype(int), self.errors.numpy()[:steps]
+        iterations, errors = (copy.read()[:steps] for copy in self._seen)
+        iterations = iterations.astype(int)
         self.counts = iterations.max(axis=1)
         """(steps,) how often the loop went round, in the scene of a batch that took most."""
         self.diagnostics: dict[str, NDArray] = {
@@ -137,7 +141,8 @@ class Loop:
             return
         for k in range(limits.minimum_iterations):
             iterate(k)
-        self._sums = self._sum(self.errors)
+        with self._launch.aside() if self._fixed else nullcontext():
+            self._sums = self._sum(self.errors)
         if limits.maximum_iterations > limits.minimum_iterations:
             self._decide(limits, limits.minimum_iterations)
 
@@ -150,6 +155,7 @@ class Loop:
 
     def note(self, record: LoopRecord, containment: Containment, step_number: wp.array, is_last: bool) -> None:
         """Record what the loop did in this step; the last loop of a step counts it."""
+        self._launch.join()
         self._launch(
             self._kernels.record,
             particles=self.layout.particles,

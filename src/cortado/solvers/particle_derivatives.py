@@ -1,5 +1,7 @@
 """Tangent and adjoint of what solvers of particles have in common; a solver adds those of its own loops."""
 
+from contextlib import nullcontext
+
 import warp as wp
 
 from cortado.device.arrays import Fields
@@ -103,9 +105,10 @@ class ParticleAdjoint:
 
     def mix(self, context: StepContext, state_bar: State) -> None:
         """Of the mixture, and of the particles' masses, in `ParticleSolver.sort`."""
-        self._mixture.step(context, self.bar, state_bar.mass_fractions)
         m_scene_bar = state_bar["reference_density"]
-        context.launch(self._solver.integration.collect_masses, *self.bar.named, m_scene_bar=m_scene_bar)
+        with context.aside() if not self._solver.mixture.substeps else nullcontext():
+            self._mixture.step(context, self.bar, state_bar.mass_fractions)
+            context.launch(self._solver.integration.collect_masses, *self.bar.named, m_scene_bar=m_scene_bar)
 
     def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:
         """Of the rest of `ParticleSolver.sort`."""
@@ -114,3 +117,4 @@ class ParticleAdjoint:
         scene = {"x_scene": state_bar.positions, "v_scene": state_bar.velocities}
         context.launch(solver.integration.unsort, x=b["x"], v=b["v"], **scene)
         self.carried_bar.unsort(context, carried_bar, state_bar)
+        context.join()

@@ -169,9 +169,12 @@ class ParticleSolver:
         scene = {"x_scene": state.positions, "v_scene": state.velocities, "m_scene": state["reference_density"]}
         context.launch(self.integration.sort, **scene)
         self.carried.sort(context, state)
+        with context.aside():
+            self.mixture.sort(context, state.mass_fractions)
         self.search.fill(self._neighbourhood, self.fields["x"], self.containment.bad_step)
         context.launch(self.density.forward)
-        self.mixture.diffuse(context, state.mass_fractions)
+        context.join()
+        self.mixture.diffuse(context)
         return context
 
     def accelerate(self, context: StepContext) -> wp.array:

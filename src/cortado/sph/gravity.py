@@ -66,8 +66,9 @@ class Gravity:
         step.launch(self._kernels.tangent, gravity=gravity_dot, acceleration_in=before, acceleration=after)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
-        total = self._sum(acceleration_bar)
-        step.launch(self._kernels.adjoint, *bar.named, total=total, threads=self._members)
+        with step.aside():
+            total = self._sum(acceleration_bar)
+            step.launch(self._kernels.adjoint, *bar.named, total=total, threads=self._members)
 
 
 def force(setting: Setting) -> Gravity:

@@ -70,15 +70,25 @@ class Mixture:
             self.chi.append(self.fractions())
             self.w.append(self.numbers())
 
-    def diffuse(self, step: StepContext, mass_fractions: wp.array) -> None:
-        """From ``mass_fractions`` in the scene's order, and write rest densities and viscosities."""
+    def sort(self, step: StepContext, mass_fractions: wp.array) -> None:
+        """From ``mass_fractions`` in the scene's order; without diffusion that is all."""
         if self.phases.count > 1:
             step.launch(self.kernels.order.sort, a_scene=mass_fractions, a=self.c[0])
+        if not self.substeps:
+            self._blend(step)
+
+    def diffuse(self, step: StepContext) -> None:
+        """Take the substeps of diffusion, once there are densities."""
         for k in range(self.substeps):
             assert self.diffusion is not None
             now = {"c": self.c[k], "chi": self.chi[k], "w": self.w[k]}
             step.launch(self.diffusion.potential.forward, strength=self.phases.strength, **now)
             step.launch(self.diffusion.flux.forward, substeps=self.substeps, c_new=self.c[k + 1], **now)
+        if self.substeps:
+            self._blend(step)
+
+    def _blend(self, step: StepContext) -> None:
+        """Rest densities and viscosities."""
         step.launch(self.kernels.blend.forward, c=self.c[self.substeps])
 
     def result(self, step: StepContext, mass_fractions: wp.array) -> None:

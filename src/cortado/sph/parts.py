@@ -4,6 +4,7 @@ A part reads the sorted particles and the parameters, and adds to adjoints: noth
 """
 
 from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -46,6 +47,14 @@ class StepContext:
         into ranges of particles; ``threads`` is for kernels without it.
         """
         self.launcher(kernel, *groups, *self._known, threads=threads, **arguments)
+
+    def aside(self) -> AbstractContextManager[None]:
+        """What is launched within needs nothing of what comes after it until `join`, nor that of this."""
+        return self.launcher.aside()
+
+    def join(self) -> None:
+        """Let what comes wait for all that went `aside`; a step ends with it."""
+        self.launcher.join()
 
 
 @dataclass(frozen=True)

@@ -77,6 +77,7 @@ class PcisphAdjoint(ParticleAdjoint):
         b = self.bar.fields
         unsorted = {"x_scene": self._push_bar, "v_scene": state_bar.velocities}
         context.launch(self._solver.integration.unsort, x=b["x"], v=b["v"], **unsorted)
+        context.join()
         if free_bar is not state_bar:
             wp.copy(state_bar.positions, free_bar.positions)
 

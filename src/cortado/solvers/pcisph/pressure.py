@@ -61,17 +61,22 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         member = i // s.particles
         if k >= rounds[member]:
             return
+        m_i = m[i]  # all that is needed is loaded before the sum, so that the loads do not wait for it
+        n_i = n[i]
+        rho_0_i = rho_0[i]
+        p_i = p_in[i]
+        own = real(1 - s.filling[i]) * s.self_weight
+        delta = y[i] * stiffness / (time_step[member] * time_step[member])
         total = weights(i, x_star, s)
         if lane() > 0:
             return
-        excess = m[i] * s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - rho_0[i]
-        delta = y[i] * stiffness / (time_step[member] * time_step[member])
-        p_i = p_in[i] + delta * excess
+        excess = m_i * s.volume * (own + total) - rho_0_i
+        p_i = p_i + delta * excess
         if p_i < real(0.0):  # not wp.max, which would turn NaN into 0 and hide it
             p_i = real(0.0)
-        compression = wp.max(excess / rho_0[i], real(0.0))
+        compression = wp.max(excess / rho_0_i, real(0.0))
         p_out[i] = p_i
-        c[i] = p_i / (n[i] * n[i])
+        c[i] = p_i / (n_i * n_i)
         error[i] = pair_of(compression, compression)
 
     @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)

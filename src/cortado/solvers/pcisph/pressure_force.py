@@ -90,14 +90,17 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
                 x_star[i] = x_before[i]
                 v_star[i] = v_before[i]
             return
+        dt = time_step[member]  # all that is needed is loaded before the sum, so that the loads do not wait for it
+        x_i = x[i]
+        v_i = v[i]
+        a_i = acceleration[i]
+        scale = -s.volume / m[i]
         total = force_sum(i, x, c, s)
         if lane() > 0:
             return
-        dt = time_step[member]
-        push = (-s.volume / m[i]) * total
-        velocity = v[i] + dt * (acceleration[i] + push)
+        velocity = v_i + dt * (a_i + scale * total)
         v_star[i] = velocity
-        x_star[i] = x[i] + dt * velocity
+        x_star[i] = x_i + dt * velocity
 
     @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
     def pressure_force_tangent(

@@ -50,7 +50,17 @@ class PcisphSteps(ParticleSolver):
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
         """Everything but the pressure, and the first prediction."""
-        it, kernels, context = self.iterates, self.kernels, self.sort(state, parameters)
+        it, context = self.iterates, self.sort(state, parameters)
+        with context.aside():
+            self._relax(context)
+        first = {"x_star": it.x_star[0], "v_star": it.v_star[0]}
+        context.launch(self.integration.predict, acceleration=self.accelerate(context), **first)
+        context.join()
+        return context
+
+    def _relax(self, context: StepContext) -> None:
+        """The pressure relaxation."""
+        kernels = self.kernels
         context.launch(kernels.wall_relaxation.forward, y=self.wall_relaxation)
         if kernels.density_ratio:
             context.launch(
@@ -59,9 +69,6 @@ class PcisphSteps(ParticleSolver):
                 t=self.density_ratio,
                 y=self.pressure_relaxation,
             )
-        first = {"x_star": it.x_star[0], "v_star": it.v_star[0]}
-        context.launch(self.integration.predict, acceleration=self.accelerate(context), **first)
-        return context
 
     def iterate(self, k: int, slot: int, context: StepContext) -> None:
         """Iteration k, from the predicted state of the slot before to that of ``slot`` (0: the only one)."""

@@ -1,0 +1,21 @@
+"""What the host looks at often: copied into memory that a GPU writes to by itself."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+
+class HostCopy:
+    """A small array of a device as the host reads it, without allocating anything each time."""
+
+    def __init__(self, array: wp.array):
+        self._array = array
+        self._copy: Any = array if array.device.is_cpu else wp.empty_like(array, device="cpu", pinned=True)
+
+    def read(self) -> np.ndarray:
+        """What the array holds when all work that was given to the device is done; the next call overwrites it."""
+        if self._copy is not self._array:
+            wp.copy(self._copy, self._array)
+            wp.synchronize_stream(self._array.device)
+        return self._copy.numpy()
