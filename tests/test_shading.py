@@ -22,6 +22,7 @@ from cortado.shading.stage import Stage, screen_axes, upright
 from cortado.shading.surface import spheres
 
 SMALL = {"width": 96, "height": 64}
+FILLED = np.array([[0.05, 0.05, 0.05], [0.25, 0.25, 0.25]])
 RED, BLUE = (0.8, 0.1, 0.05), (0.05, 0.1, 0.8)
 
 
@@ -130,7 +131,7 @@ GRAVITIES = ([0.0, -9.81, 0.0], [0.0, 0.0, -9.81], [9.81, 0.0, 0.0], [0.0, 0.0, 
 @pytest.mark.parametrize("size", [(1280, 720), (300, 700)])
 def test_the_camera_sees_the_whole_container_and_comes_near(gravity, size):
     scene = scene_of(forces={"gravity": gravity}, picture={"width": size[0], "height": size[1]})
-    stage = Stage.of(scene, np.zeros(3), np.ones(3) * 0.3)
+    stage = Stage.of(scene, FILLED)
     box = stage.placed(corners(*scene.container.extent()))
     forward = stage.look_at - stage.eye
     forward /= np.linalg.norm(forward)
@@ -155,7 +156,7 @@ def test_up_is_against_gravity(gravity):
 
 def test_the_camera_goes_where_the_scene_says():
     scene = scene_of(picture={"camera": [0.3, 0.2, 3.0], "look_at": [0.3, 0.2, 0.2]})
-    stage = Stage.of(scene, np.zeros(3), np.ones(3) * 0.3)
+    stage = Stage.of(scene, FILLED)
     np.testing.assert_allclose(stage.placed(np.array([[0.3, 0.2, 3.0], [0.3, 0.2, 0.2]])), [stage.eye, stage.look_at])
     image = drawn(scene)
     _, columns = np.nonzero(image[..., 2] > 1.3 * image[..., 0])
@@ -163,7 +164,7 @@ def test_the_camera_goes_where_the_scene_says():
 
 
 def test_fluid_goes_on_beyond_the_walls_that_it_touches():
-    stage = Stage.of(scene_of(), np.zeros(3), np.ones(3) * 0.3)
+    stage = Stage.of(scene_of(), FILLED)
     touching, inside = np.array([[0.05, 0.25, 0.2]]), np.array([[0.3, 0.25, 0.2]])
     wet, of = stage.wetting(stage.placed(touching))
     np.testing.assert_allclose(wet, stage.placed(np.array([[0.05, 0.25, 0.2], [-0.05, 0.25, 0.2]])), atol=1e-12)
@@ -171,8 +172,14 @@ def test_fluid_goes_on_beyond_the_walls_that_it_touches():
     assert len(stage.wetting(stage.placed(inside))[0]) == 1
 
 
+@pytest.mark.parametrize(("lid", "x", "cut"), [(True, 0.2, True), (False, 0.2, True), (False, 0.5, False)])
+def test_fluid_is_cut_at_the_wall_of_a_cup_unless_some_came_over_its_rim(lid, x, cut):
+    cup = {"shape": "cylinder", "base": [0.15, 0.0, 0.15], "radius": 0.25, "height": 0.5, "lid": lid}
+    assert Stage.of(scene_of(container=cup), np.array([[0.15, 0.1, 0.15], [x, 0.1, 0.15]])).cuts == cut
+
+
 def test_fluid_casts_a_shadow_on_the_floor():
-    stage = Stage.of(scene_of(), np.zeros(3), np.ones(3) * 0.3)
+    stage = Stage.of(scene_of(), FILLED)
     x, c = first_state(scene_of())
     light, corner, cell = floor_shadow(stage, stage.placed(x), c)
     assert light.shape[2] == 3 and light.max() <= 1.0 and 0.1 < light.min() < 0.7

@@ -8,7 +8,7 @@ from cortado.lattice.shapes import Points
 from cortado.scene.scene import Scene
 from cortado.shading.plane import PlanePainter
 from cortado.shading.space import SpacePainter
-from cortado.shading.stage import Stage
+from cortado.shading.stage import Stage, extent_of
 
 
 class Painter(Protocol):
@@ -21,10 +21,9 @@ class Painter(Protocol):
 def painter(scene: Scene, positions: Points, device: Any = "cpu") -> Painter:
     """The painter of a scene, whose fluid will be at positions (frames, n, d) [m]; ``device``: that of the rays."""
     particles = np.asarray(positions).reshape(-1, scene.dimension)
-    lower, upper = np.quantile(particles, 0.002, axis=0), np.quantile(particles, 0.998, axis=0)
     if scene.dimension == 2:
-        return PlanePainter.of(scene, lower, upper)
-    return SpacePainter(Stage.of(scene, lower, upper), device)
+        return PlanePainter.of(scene, *extent_of(particles))
+    return SpacePainter(Stage.of(scene, particles), device)
 
 
 def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:

@@ -23,9 +23,9 @@ def floor_shadow(stage: Stage, positions: Points, colours: Points) -> tuple[Poin
     height = positions[:, 1:2] - stage.lower[1]
     cast = positions[:, ::2] - height * stage.sun[::2] / stage.sun[1]
     volume = stage.spacing**3
-    key = _thickness(cast, colours, corner, cell, volume, 0.022 * stage.size)
-    near = np.exp(-height[:, 0] / (0.15 * stage.size))
-    around = _thickness(positions[:, ::2], colours, corner, cell, volume * near, 0.05 * stage.size)
+    near, least = np.exp(-height[:, 0] / (0.15 * stage.size)), 0.8 * stage.spacing
+    key = _thickness(cast, colours, corner, cell, volume, max(0.022 * stage.size, least))
+    around = _thickness(positions[:, ::2], colours, corner, cell, volume * near, max(0.05 * stage.size, least))
     light = 1.0 - 0.48 * _hidden(stage, *key) - 0.32 * _hidden(stage, *around)
     return light, corner, cell
 

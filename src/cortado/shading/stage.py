@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cortado.lattice.shapes import Points, corners
-from cortado.scene.containers import BoxContainer, CylinderContainer
+from cortado.scene.containers import BoxContainer, Container, CylinderContainer
 from cortado.scene.fluids import INDEX_OF_AXIS
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
@@ -47,10 +47,13 @@ class Stage:
     """[m]"""
     transparency: float
     """From 0 to 1."""
+    cuts: bool
+    """Whether fluid is shown within the container only."""
 
     @classmethod
-    def of(cls, scene: Scene, lower: Points, upper: Points) -> "Stage":
-        """That of a scene in 3-D, the fluid of which is between lower and upper (3,) [m]."""
+    def of(cls, scene: Scene, positions: Points) -> "Stage":
+        """That of a scene in 3-D, whose fluid will be at positions (n, 3) [m]."""
+        lower, upper = extent_of(positions)
         picture = scene.picture or Picture()
         ends = scene.container.extent()
         frame = upright(np.asarray(scene.forces.gravity))
@@ -74,7 +77,8 @@ class Stage:
         if transparency is None:
             transparency = 0.0 if several else 0.9
         spacing = scene.discretisation.spacing
-        return cls(frame, origin, low, high, eye, look_at, picture, scene.container, spacing, transparency)
+        cuts = ends is not None and not spilled(scene.container, positions, spacing)
+        return cls(frame, origin, low, high, eye, look_at, picture, scene.container, spacing, transparency, cuts)
 
     @property
     def size(self) -> float:
@@ -148,11 +152,6 @@ class Stage:
         return points.min(axis=0), points.max(axis=0)
 
     @property
-    def cuts(self) -> bool:
-        """Whether fluid is shown within the container only: not where it may come over a rim."""
-        return self.container.extent() is not None and getattr(self.container, "lid", True)
-
-    @property
     def room(self) -> tuple[Points, Points]:
         """Where fluid is shown, (3,) each [m], in the frame of the glass; infinite upwards, where an emitter may be,
         and along an axis that is periodic."""
@@ -189,6 +188,19 @@ class Stage:
         """(3,) unit vector; the azimuth [degrees] counts from the camera, to the right."""
         back = self.eye - self.look_at
         return _towards(np.degrees(np.arctan2(back[0], back[2])) + azimuth, elevation)
+
+
+def extent_of(positions: Points) -> tuple[Points, Points]:
+    """Lower and upper ends (d,) [m] of nearly all positions (n, d) [m]: a few drops may be further away."""
+    return np.quantile(positions, 0.002, axis=0), np.quantile(positions, 0.998, axis=0)
+
+
+def spilled(container: Container, positions: Points, spacing: float) -> bool:
+    """Whether fluid at positions (n, 3) [m] came over the rim of a cup."""
+    if not isinstance(container, CylinderContainer) or container.lid:
+        return False
+    off = np.delete(positions - np.asarray(container.base), INDEX_OF_AXIS[container.axis], axis=1)
+    return bool((np.linalg.norm(off, axis=1) > container.radius + 0.5 * spacing).any())
 
 
 def upright(gravity: Points) -> Points:

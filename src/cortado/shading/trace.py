@@ -141,12 +141,13 @@ def leave(s: Surroundings, surface: FluidSurface, o: wp.vec3, d: wp.vec3):
     hit = wp.mesh_query_ray(surface.mesh, o, d, FAR)
     if hit.result and (hit.t <= part[1] or part[1] <= 0.0):
         return at_surface(surface, hit.t, d, hit.face, hit.u, hit.v)
-    if hit.result:
-        return at_wall(s, surface, o, d, part[1])
-    none = Meeting()
-    none.found = False
-    none.t = 0.0
-    return none
+    met = Meeting()
+    met.found = hit.result
+    met.t = 0.0
+    if hit.result:  # the wall comes first; what colour fluid has there does not matter
+        met.t = part[1]
+        met.normal = -wall_normal(s, o + part[1] * d)
+    return met
 
 
 @wp.func
