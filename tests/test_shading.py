@@ -263,7 +263,7 @@ def test_pictures_change_neither_results_nor_whether_a_search_goes_on(tmp_path):
     [
         (3, {"width": 10}, "picture.width is 10, but must be"),
         (3, {"camera": [0.0, 1.0]}, "picture.camera is .*3 components"),
-        (2, {"camera": [0.0, 1.0]}, "picture.camera is .*left out, as the scene has 2 dimensions"),
+        (2, {"camera": [0.0, 1.0, 2.0]}, "picture.camera is .*left out, as the scene has 2 dimensions"),
         (3, {"camera": [0.0, 1.0, 2.0], "look_at": [0.0, 1.0, 2.0]}, "picture.look_at is .*another place than camera"),
         (3, {"surface": "foam"}, 'picture.surface is \'foam\', but must be "liquid" or "spheres"'),
         (3, {"widht": 100}, "picture.widht is not a key.*did you mean width"),

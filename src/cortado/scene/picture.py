@@ -4,8 +4,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ValidationInfo, field_validator
 
-from cortado.scene.fields import Colour, FieldPath, Flag, Length, Vector, count, field_error, quantity
+from cortado.scene.fields import Colour, FieldPath, Flag, Length, components, count, field_error, quantity
 from cortado.scene.tables import Table
+
+Place = Annotated[tuple[Length, ...], components("x", "y", "z")]
 
 
 class Picture(Table):
@@ -17,10 +19,10 @@ class Picture(Table):
     height: Annotated[int, count(64, 4320)] = 720
     """Rows of pixels."""
     surface: Literal["liquid", "spheres"] = "liquid"
-    """"liquid": the surface of the fluid; "spheres": a sphere for each particle, quicker."""
-    camera: Vector[Length] | None = None
+    """"liquid": the surface of the fluid; "spheres": a sphere for each particle, in 3-D."""
+    camera: Place | None = None
     """(3,) where the camera is [m], in 3-D; left out, it sees all of the container."""
-    look_at: Vector[Length] | None = None
+    look_at: Place | None = None
     """(3,) the middle of the picture [m], in 3-D; that of the container if left out."""
     field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=120.0)] = 28.0
     """The angle that the width of the picture spans [degrees], in 3-D."""
@@ -47,6 +49,4 @@ class Picture(Table):
             value = getattr(self, name)
             if value is not None and dimension == 2:
                 raise field_error((*path, name), value, "left out, as the scene has 2 dimensions")
-            if value is not None and len(value) != 3:
-                raise field_error((*path, name), value, "a list of 3 components: x, y and z")
         return self

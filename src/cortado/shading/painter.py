@@ -10,6 +10,9 @@ from cortado.shading.plane import PlanePainter
 from cortado.shading.space import SpacePainter
 from cortado.shading.stage import Stage, extent_of
 
+ENOUGH = 1_000_000
+"""Positions, of all particles in all frames, that tell where the fluid comes to."""
+
 
 class Painter(Protocol):
     """Draws states of one scene."""
@@ -21,6 +24,7 @@ class Painter(Protocol):
 def painter(scene: Scene, positions: Points, device: Any = "cpu") -> Painter:
     """The painter of a scene, whose fluid will be at positions (frames, n, d) [m]; ``device``: that of the rays."""
     particles = np.asarray(positions).reshape(-1, scene.dimension)
+    particles = particles[:: max(len(particles) // ENOUGH, 1)]
     if scene.dimension == 2:
         return PlanePainter.of(scene, *extent_of(particles))
     return SpacePainter(Stage.of(scene, particles), device)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cortado.device.cores import usable_cores
 from cortado.lattice.shapes import Points
 from cortado.scene.containers import BoxContainer
 from cortado.scene.picture import Picture
@@ -175,7 +176,7 @@ class PlanePainter:
 
 def _distances(tree: object, points: Points, reach: float) -> Points:
     """(p, k) [m] to the nearest particles; infinite where there are fewer within reach."""
-    distances, _ = tree.query(points, k=24, distance_upper_bound=reach, workers=-1)  # type: ignore[attr-defined]
+    distances, _ = tree.query(points, k=24, distance_upper_bound=reach, workers=usable_cores())  # type: ignore[attr-defined]
     return distances
 
 

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 
+from cortado.device.cores import usable_cores
 from cortado.errors import ComputationError, InputError
 from cortado.lattice.shapes import Points
 
@@ -75,7 +76,7 @@ def nearest_colours(points: Points, positions: Points, colours: Points, spacing:
     nearest by count most."""
     from scipy.spatial import cKDTree
 
-    distances, which = cKDTree(positions).query(points, k=min(NEIGHBOURS, len(positions)), workers=-1)
+    distances, which = cKDTree(positions).query(points, k=min(NEIGHBOURS, len(positions)), workers=usable_cores())
     distances, which = distances.reshape(len(points), -1), which.reshape(len(points), -1)
     weights = np.exp((distances[:, :1] ** 2 - distances**2) / (0.95 * spacing) ** 2)
     return np.einsum("pk,pkc->pc", weights, colours[which]) / weights.sum(axis=1)[:, None]
