@@ -236,7 +236,7 @@ def test_wrong_arguments_of_run_are_refused(cortado_command, folder, arguments, 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "a command is missing, one of gradients, run, optimise, sweep, bench; see cortado --help."),
+        ([], "a command is missing, one of gradients, run, optimise, picture, sweep, bench; see cortado --help."),
         (["walk"], "walk is unknown, but must be one of gradients, run, "),
         (["run"], "SCENE.toml is missing; see cortado run --help."),
         (["gradients"], "a command is missing, one of check, figure, study; see cortado gradients --help."),

@@ -123,7 +123,7 @@ def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], 
     figures: Figures = [("The same, rendered.", path)]
     if len(trajectory.times) > 1 and find_spec("av"):
         frames = range(0, len(trajectory.times), -(-len(trajectory.times) // MOST_FRAMES))
-        figures.append(("The run.", write_video(folder / "run.mp4", map(image, frames), 20)))
+        figures.append(("The same, in motion.", write_video(folder / "run.mp4", map(image, frames), 20)))
     return figures
 
 
