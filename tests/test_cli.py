@@ -38,6 +38,8 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     (tmp_path / "task.toml").write_text(GOOD_TASK)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("cortado.commands.run.run_pictures", lambda *_: [])  # tests/test_shading.py draws them
+    monkeypatch.setattr("cortado.commands.optimise.shaded_figures", lambda *_: [])
     return tmp_path
 
 

@@ -22,7 +22,7 @@ LAYERS = """
     parameters parameters.reference_density parameters.registry parameters.table parameters.tilt parameters.values
     scene scene.fields scene.sentences scene.point_reader scene.points scene.tables
     scene.schedule scene.fluids scene.emitter
-    scene.mixture scene.render scene.toml
+    scene.mixture scene.picture scene.render scene.toml
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights
     scene.containers scene.model scene.stability
@@ -56,6 +56,8 @@ LAYERS = """
     io.pictures
     figures.canvas figures.particle_sets figures.side_by_side
     io.trajectory io.trajectory_batch
+    shading shading.surface shading.stage shading.shadow shading.optics shading.trace shading.space shading.plane
+    shading.painter shading.labels shading.film
     simulation
     problem
     figures.curves figures
@@ -64,7 +66,7 @@ LAYERS = """
     optimisation optimisation.evaluate optimisation.differentiable optimisation.replay_log optimisation.optimisers
     optimisation.named_optimisers optimisation.result optimisation.optimise optimisation.transforms
     io.run_folder io.report
-    inverse inverse.tables inverse.file_schema inverse.task inverse.setup inverse.figures
+    inverse inverse.tables inverse.file_schema inverse.task inverse.setup inverse.figures inverse.shaded
     study study.canvas study.comparison study.estimates study.lyapunov_spectrum study.one_kernel_loops
     study.reference_losses study.scenes study.palette study.sources study.gravity_tangents study.spatial_scales
     study.ensembles study.tables study.experiment study.forces study.gravity_and_precision study.image_horizon
@@ -75,7 +77,7 @@ LAYERS = """
     bench.reference_engine bench.text
     sweep sweep.combinations sweep.table
     commands commands.executor commands.bench commands.check commands.compare commands.describe commands.examples
-    commands.figure commands.new commands.optimise commands.overview commands.run_summary commands.run
+    commands.figure commands.new commands.optimise commands.overview commands.picture commands.run_summary commands.run
     commands.schema commands.study
     commands.sweep
     cli

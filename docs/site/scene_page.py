@@ -51,6 +51,7 @@ LINKS = {
     "schedule": ("[table](#changes-over-time-schedule)", "What changes while the scene runs."),
     "solver": ("[table](#time-steps-solver)", "How a step is solved."),
     "render": ("[table](#pictures-render)", "How pictures are taken."),
+    "picture": ("[table](#shaded-pictures-picture)", "How shaded pictures and films are made."),
 }
 """Of keys that are tables what they are, with the heading that describes them, and their meaning."""
 
@@ -223,6 +224,19 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "",
                 '[render]\nview = "volume"\nposition = [1.5, 1.2, 2.0]\nlook_at = [0.5, 0.3, 0.25]\n'
                 "field_of_view = 40.0\nresolution = [256, 192]",
+            ),
+        ),
+    ),
+    (
+        "## Shaded pictures: `[picture]`",
+        "The pictures and films that `cortado run`, `optimise` and `picture` write to be looked at "
+        "([pictures](pictures.md)).",
+        (
+            (
+                "Picture",
+                "",
+                "[picture]\nwidth = 1920\nheight = 1080\ncamera = [2.0, 1.4, 2.6]\nlook_at = [0.5, 0.3, 0.25]\n"
+                'surface = "spheres"',
             ),
         ),
     ),

@@ -136,6 +136,7 @@ def run(
     precision: str = "float32",
     record_every: int = 1,
     overwrite: bool = False,
+    pictures: bool = True,
 ) -> Work:
     """Run a scene forward and write its trajectory.
 
@@ -148,12 +149,13 @@ def run(
         precision: "float32" or "float64".
         record_every: Steps from one frame of the trajectory to the next.
         overwrite: Replace an earlier run in the same folder.
+        pictures: Draw shaded pictures and a film; --no-pictures leaves them out.
     """
     _require_at_least(1, record_every, "--record-every")
     from cortado.commands.run import run_scene
 
-    words = _words(overrides)
-    return partial(run_scene, scene, steps, out, words, device, precision, record_every, overwrite, _command_line())
+    words, told = _words(overrides), _command_line()
+    return partial(run_scene, scene, steps, out, words, device, precision, record_every, overwrite, told, pictures)
 
 
 @_command(app, answers=True)
@@ -185,6 +187,7 @@ def optimise(
     overwrite: bool = False,
     scheduler: str | None = None,
     workers: int | None = None,
+    pictures: bool = True,
 ) -> Work:
     """Optimise what a task file names, and check the result as the file asks.
 
@@ -198,14 +201,39 @@ def optimise(
         overwrite: Replace an earlier run in the same folder.
         scheduler: Address of a scheduler of Dask's, whose workers compute the samples of an ensemble.
         workers: Number of worker processes on this machine that do; on a GPU each has one of its own.
+        pictures: Draw shaded pictures and films; --no-pictures leaves them out.
     """
     if resume and overwrite:
         raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
     from cortado.commands.executor import Where
     from cortado.commands.optimise import optimise_task
 
-    where, words = Where(scheduler, workers), _words(overrides)
-    return partial(optimise_task, task, out, words, device, precision, resume, overwrite, _command_line(), where)
+    where, words, told = Where(scheduler, workers), _words(overrides), _command_line()
+    return partial(optimise_task, task, out, words, device, precision, resume, overwrite, told, where, pictures)
+
+
+@_command(app)
+def picture(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    frame: int = -1,
+    film: bool = False,
+    out: Path | None = None,
+    overrides: Overrides = (),
+    device: str = "cpu",
+) -> Work:
+    """Draw a shaded picture, or a film, of a run that `cortado run` wrote.
+
+    Args:
+        run: The folder of the run.
+        frame: Number of a recorded frame, counted from the end where it is negative.
+        film: A film of all frames in its place.
+        out: Where to write it; into the run's figures if left out.
+        overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
+        device: "cpu", or "cuda:0" for the first GPU.
+    """
+    from cortado.commands.picture import draw_run
+
+    return partial(draw_run, run, frame, film, out, _words(overrides), device)
 
 
 @_command(app)

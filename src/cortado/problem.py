@@ -224,7 +224,7 @@ class Problem:
         only its type is known."""
         simulation, energy = self.simulation, self.simulation.free_energy
         parts = {
-            "scene": simulation.scene.to_json().encode(),
+            "scene": simulation.scene.computed_json().encode(),
             "first positions": simulation.positions.tobytes(),
             "target and loss": fingerprint(self.loss).encode(),
         }

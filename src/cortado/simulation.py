@@ -22,7 +22,7 @@ from cortado.device.state import State
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.discretise.discrete_scene import DiscreteScene, discretise
 from cortado.errors import CortadoWarning, DivergedError, InputError, shown
-from cortado.io.trajectory import Trajectory
+from cortado.io.trajectory import Frame, Trajectory
 from cortado.io.trajectory_batch import TrajectoryBatch
 from cortado.lattice.calibration import diffusion_limit
 from cortado.parameters.checks import check_sizes
@@ -34,7 +34,9 @@ from cortado.render.scene_renderer import scene_renderer
 from cortado.restart import RestartState
 from cortado.rollout import Rollout
 from cortado.scene.model import SOLVERS
+from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene, as_scene
+from cortado.shading.painter import colours_of, painter
 from cortado.solvers.build import first_capacity
 from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
@@ -278,6 +280,20 @@ class Simulation:
         look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for settings that do not fit.
         """
         return scene_renderer(self, **settings)
+
+    def picture(self, frame: Frame, **settings: Any) -> np.ndarray:
+        """A shaded picture of a frame, (rows, columns, 3), linear from 0 to 1, as the table ``[picture]`` of the scene
+        says; ``settings`` replace keys of it: ``width=640, height=360``.
+
+        Raises:
+            SceneError: settings that do not fit.
+            InputError: pysplashsurf is missing, for the surface of a liquid in 3-D.
+        """
+        given = {} if self.scene.picture is None else self.scene.picture.model_dump()
+        table = Picture(**{**given, **settings}).in_dimension(self.dimension, ("picture",))
+        scene = self.scene.model_copy(update={"picture": table})
+        colours = colours_of(scene, frame.mass_fractions, self.particles)
+        return painter(scene, frame.positions, self.device).image(frame.positions, colours)
 
     def parameters(self) -> dict[str, np.ndarray]:
         """Every parameter of `Problem` as the scene has it, without what its schedule changes."""

@@ -15,14 +15,17 @@ from cortado.executors import Executor
 from cortado.gradients import GradientEstimator, tuned
 from cortado.inverse.figures import task_figures
 from cortado.inverse.setup import Setup, setup
+from cortado.inverse.shaded import shaded_figures
 from cortado.inverse.task import Task, load_task
 from cortado.io.folder_lock import locked
 from cortado.io.interruption import keeping
 from cortado.io.progress import track
-from cortado.io.report import write_report
+from cortado.io.report import Figures, write_report
 from cortado.io.run_folder import RunFolder
+from cortado.io.terminal import say
 from cortado.losses.image_losses import psnr
 from cortado.optimisation.optimise import Record, Result, optimise
+from cortado.shading.film import lacking
 
 Rows = list[tuple[str, object]]
 MOST_NUMBERS = 1000
@@ -55,9 +58,10 @@ def optimise_task(
     overwrite: bool,
     command: list[str],
     where: Where = HERE,
+    pictures: bool = False,
 ) -> str:
-    """Optimise, write the run folder, and return a sentence that says where the results are. The samples of an ensemble
-    are computed ``where`` is asked for."""
+    """Optimise, write the run folder, shaded ``pictures`` too if wished, and return a sentence that says where the
+    results are. The samples of an ensemble are computed ``where`` is asked for."""
     task = load_task(task_file, overrides)
     if where.option and task.optimise.gradient.samples == 1:
         raise InputError(f"{where.option} is given, but must be left out, as optimise.gradient.samples is 1.")
@@ -67,7 +71,7 @@ def optimise_task(
     with where.executor(device) as executor, locked(out):
         folder = _run_folder(made, out, resume, overwrite, command)
         with keeping(lambda: f"{_kept(folder)}; --resume goes on with them" if _kept(folder) else ""):
-            return _solved(made, folder, resume, executor)
+            return _solved(made, folder, resume, executor, pictures)
 
 
 def _run_folder(made: Setup, out: Path, resume: bool, overwrite: bool, command: list[str]) -> RunFolder:
@@ -94,7 +98,7 @@ def _kept(folder: RunFolder) -> str:
     return f"the evaluations so far are in {folder.checkpoint}" if folder.read_metrics() else ""
 
 
-def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> str:
+def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pictures: bool) -> str:
     """Search, judge, and write what came out; returns the sentence about it."""
     try:
         result, estimator = _search(made, folder, resume, executor)
@@ -113,12 +117,20 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
         noise = psnr(made.image(made.problem.states(estimate, [last])[last]), target)
     first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
     verdict = judge(made.task, result, estimate, noise, first)
-    figures = task_figures(made, result, folder.figures)
+    figures = [*_shaded(made, result, folder.figures, pictures), *task_figures(made, result, folder.figures)]
     write_report(folder, made.task.scene.name, _rows(made, estimate, result, verdict, estimator), figures)
     folder.write_result(**_for_machines(result, estimate, verdict))
     if verdict.failures:
         raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
     return f"{_summary(made, result, verdict)} The results are in {folder.path}; open report.html."
+
+
+def _shaded(made: Setup, result: Result, folder: Path, wished: bool) -> Figures:
+    """Shaded pictures and films, where they are wished; none, and a sentence, where a package is missing."""
+    missing = lacking(made.task.scene) if wished else None
+    if missing:
+        say(missing)
+    return shaded_figures(made, result, folder) if wished and not missing else []
 
 
 def judge(

@@ -7,6 +7,7 @@ _GROUPS = {
         ("cortado new dam.toml", "write a commented scene that runs at once"),
         ("cortado describe dam.toml", "particles, memory, time, what limits its time step"),
         ("cortado run dam.toml --out runs/dam", "run it; open runs/dam/report.html"),
+        ("cortado picture runs/dam", "a shaded picture of it; --film for a film"),
         ("cortado examples", "list the examples; --copy NAME brings one here"),
     ),
     "Go on": (

@@ -19,10 +19,12 @@ from cortado.io.interruption import keeping
 from cortado.io.progress import track
 from cortado.io.report import Figures, write_report
 from cortado.io.run_folder import RunFolder
+from cortado.io.terminal import say
 from cortado.io.trajectory import Trajectory, append_frame, frame_writer
 from cortado.io.video import MOST_FRAMES, write_video
 from cortado.rollout import Rollout
 from cortado.scene.scene import load_scene
+from cortado.shading.film import lacking, run_pictures
 from cortado.simulation import Simulation, check_steps, not_converged_sentence
 
 Rows = list[tuple[str, object]]
@@ -39,8 +41,10 @@ def run_scene(
     record_every: int,
     overwrite: bool,
     command: list[str],
+    pictures: bool = False,
 ) -> str:
-    """Run a scene, write its folder, and return a sentence that says where the results are."""
+    """Run a scene, write its folder, shaded ``pictures`` too if wished, and return a sentence that says where the
+    results are."""
     scene = load_scene(scene_file, overrides)
     simulation = Simulation(scene, device, precision)
     rollout = simulation.rollout(check_steps(steps))
@@ -51,7 +55,7 @@ def run_scene(
     with locked(out):
         folder = RunFolder.create(out, scene.to_json(), command, overwrite=overwrite, **noted)
         with keeping(lambda: f"the frames so far are in {folder.trajectory}" if folder.trajectory.exists() else ""):
-            summary = _compute(simulation, rollout, folder, record_every)
+            summary = _compute(simulation, rollout, folder, record_every, pictures)
     converged = rollout.diagnostics["converged"]
     if not converged.all():
         warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=2)
@@ -63,19 +67,21 @@ def run_settings(steps: int, precision: str, record_every: int) -> dict[str, Any
     return {"steps": steps, "precision": precision, "record_every": record_every}
 
 
-def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int) -> RunSummary:
+def _compute(
+    simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int, pictures: bool
+) -> RunSummary:
     """Run, and fill the folder, also where the run diverges."""
     compile_ahead(rollout.solver, simulation.device)
     begun = time.perf_counter()
     try:
         last = _write_trajectory(simulation, rollout, folder, record_every)
     except DivergedError as error:
-        _write_pictures(simulation, rollout.substeps, folder, [("ended early", error)])
+        _write_pictures(simulation, rollout.substeps, folder, [("ended early", error)], pictures)
         told = error.with_advice(f"{error.advice}; the frames so far are in {folder.path}")
         folder.write_result(**_for_machines(simulation, rollout), failures=[str(told)])
         raise told from error
     summary = RunSummary.of(simulation, rollout, last, time.perf_counter() - begun)
-    _write_pictures(simulation, rollout.substeps, folder, [("in short", summary)])
+    _write_pictures(simulation, rollout.substeps, folder, [("in short", summary)], pictures)
     folder.write_result(**_for_machines(simulation, rollout), **summary.for_machines(), failures=[])
     return summary
 
@@ -129,17 +135,27 @@ def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], 
     figures: Figures = [("The same, rendered.", path)]
     if len(trajectory.times) > 1 and find_spec("av"):
         frames = range(0, len(trajectory.times), -(-len(trajectory.times) // MOST_FRAMES))
-        figures.append(("The run.", write_video(folder / "run.mp4", map(image, frames), 20)))
+        figures.append(("The same, in motion.", write_video(folder / "run.mp4", map(image, frames), 20)))
     return figures
 
 
-def _write_pictures(simulation: Simulation, substeps: int, folder: RunFolder, remarks: Rows) -> None:
-    """The report with its pictures; ``remarks`` are its first rows."""
+def _shaded(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Figures:
+    """Shaded pictures and a film; none, and a sentence, where a package is missing."""
+    missing = lacking(simulation.scene)
+    if missing:
+        say(missing)
+        return []
+    return run_pictures(simulation.scene, trajectory, folder, simulation.device)
+
+
+def _write_pictures(simulation: Simulation, substeps: int, folder: RunFolder, remarks: Rows, pictures: bool) -> None:
+    """The report with its figures, shaded ``pictures`` among them if wished; ``remarks`` are its first rows."""
     scene = simulation.scene
     trajectory = Trajectory.load(folder.trajectory)
     shown = sorted({0, len(trajectory.times) // 2, len(trajectory.times) - 1})
     speeds = [np.linalg.norm(trajectory.velocities[frame], axis=1) for frame in shown]
-    figures: Figures = [
+    figures: Figures = _shaded(simulation, trajectory, folder.figures) if pictures else []
+    figures += [
         (
             f"The fluid at the start, half-way and at the end{', seen along the third axis' * (scene.dimension == 3)}.",
             particles(

@@ -25,7 +25,9 @@ _LARGEST = 2**31
 _FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "result.json")
 _FOLDERS = ("checkpoint", "figures")
 _PICTURES = ("particles", "rendered", "density_errors", "loss", "images", "progress", *NAMES)
-FIGURES = (*(f"{name}.png" for name in _PICTURES), "run.mp4", "estimate.mp4")
+_SHADED = ("first", "last", "picture", "found", "search")
+_FILMS = ("run", "estimate", "film", "found", "search")
+FIGURES = (*(f"{name}.png" for name in (*_PICTURES, *_SHADED)), *(f"{name}.mp4" for name in _FILMS))
 """Every file that a run may have in its figures; whatever else is there is the user's."""
 
 
@@ -125,7 +127,7 @@ class RunFolder:
                 f"another --out, or replace it with --overwrite."
             )
         if self.scene.exists():
-            require_same(_read_json(self.scene), json.loads(scene_json), self.path)
+            require_same(_computed(_read_json(self.scene)), _computed(json.loads(scene_json)), self.path)
         if "settings" in noted:
             require_same(noted["settings"], as_json(settings or {}), self.path)
 
@@ -241,6 +243,11 @@ class RunFolder:
     def _checkpoints(self) -> list[Path]:
         """The folders with the logs of one search after the other, that of the first one last, as it holds the rest."""
         return [*self.checkpoint.glob("[0-9]*/"), self.checkpoint]
+
+
+def _computed(scene: Any) -> Any:
+    """A scene without what changes only how it is shown."""
+    return {name: table for name, table in scene.items() if name != "picture"} if isinstance(scene, dict) else scene
 
 
 def _finite(value: Any) -> Any:

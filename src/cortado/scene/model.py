@@ -13,6 +13,7 @@ from cortado.scene.emitter import Emitter
 from cortado.scene.fields import Colour, Flag, OneOf, Several, Text, Vector, count, field_error, quantity
 from cortado.scene.fluids import AnyFluid
 from cortado.scene.mixture import Mixture
+from cortado.scene.picture import Picture
 from cortado.scene.render import Render
 from cortado.scene.schedule import Schedule
 from cortado.scene.tables import Table
@@ -126,8 +127,10 @@ class SceneTables(Table):
     """What changes while the scene runs."""
     render: Render | None = None
     """How pictures are taken."""
+    picture: Picture | None = None
+    """How shaded pictures and films are made."""
 
-    @field_validator("emitter", "container", "forces", "schedule", "render")
+    @field_validator("emitter", "container", "forces", "schedule", "render", "picture")
     @classmethod
     def _resolve(cls, table: Any, info: ValidationInfo) -> Any:
         given = table is not None and "dimension" in info.data

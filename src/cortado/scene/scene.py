@@ -17,7 +17,7 @@ from cortado.scene.checks import check_scene
 from cortado.scene.model import OTHER_TABLES, SceneTables
 from cortado.scene.sentences import sentences
 from cortado.scene.stability import stability_limit
-from cortado.scene.toml import read_toml
+from cortado.scene.toml import put_in, read_toml
 
 
 class Scene(SceneTables):
@@ -36,13 +36,19 @@ class Scene(SceneTables):
         """The scene with all defaults filled in, to be read by `from_json`."""
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
+    def computed_json(self) -> str:
+        """The same without [picture]: what results depend on."""
+        return json.dumps(self.model_dump(mode="json", exclude={"picture"}), indent=2)
+
     @classmethod
-    def from_json(cls, text: str) -> "Scene":
-        """The scene that `to_json` wrote."""
+    def from_json(cls, text: str, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":
+        """The scene that `to_json` wrote to a file, with replacements as for `load_scene`."""
         try:
             data = json.loads(text)
         except (ValueError, RecursionError) as problem:
             raise SceneError(None, "", sentence=f"is not valid JSON: {problem}.") from None
+        if overrides and isinstance(data, dict):
+            data = put_in({name: table for name, table in data.items() if table is not None}, overrides, file)
         return scene_from_dict(data)
 
 

@@ -42,6 +42,11 @@ def read_toml(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> di
         raise _unreadable(file, f"is not valid TOML: {reason(problem)}.") from None
     except OSError as problem:
         raise _unreadable(file, f"cannot be read: {reason(problem)}.") from None
+    return put_in(data, overrides, file)
+
+
+def put_in(data: dict[str, Any], overrides: Sequence[str], file: str) -> dict[str, Any]:
+    """The contents of a file with overrides put in. Raises `SceneError`."""
     for override in overrides:
         _apply(data, override, file)
     return data

@@ -84,7 +84,7 @@ def measure(settings: LyapunovSettings, progress: Progress) -> Table:
     keys = []
     for variant in settings.variants:
         scene = varied(settings.scene, **variant.scene) if variant.scene else settings.scene
-        keys.append(scene.to_json() + " ".join(variant.without))
+        keys.append(scene.computed_json() + " ".join(variant.without))
         cases[keys[-1]] = scene, variant.without
     tasks = [
         partial(_exponents, settings, scene, without, settings.vectors, seed)

@@ -44,7 +44,7 @@ class TaskSettings(DeviceSettings):
 
     def identity(self) -> dict[str, Any]:
         made = load_task(self.task, self.overrides)
-        return {**super().identity(), "task": f"{made.scene.to_json()} {made.problem} {made.optimise}"}
+        return {**super().identity(), "task": f"{made.scene.computed_json()} {made.problem} {made.optimise}"}
 
 
 def measure(settings: TaskSettings, progress: Progress) -> Table:

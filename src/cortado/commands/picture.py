@@ -1,0 +1,35 @@
+"""``cortado picture``: a shaded picture, or a film, of a run that is there."""
+
+from pathlib import Path
+
+from cortado.errors import InputError
+from cortado.io.pictures import write_picture
+from cortado.io.run_folder import RunFolder
+from cortado.io.trajectory import Trajectory
+from cortado.scene.picture import Picture
+from cortado.scene.scene import Scene
+from cortado.shading.film import film, lacking, state_images
+
+
+def draw_run(run: Path, frame: int, as_film: bool, out: Path | None, overrides: list[str], device: str) -> str:
+    """Draw one recorded frame of a run, counted from the end where it is negative, or a film of all; returns a sentence
+    that says where it is."""
+    folder = RunFolder.open(run)
+    for override in overrides:
+        if not override.startswith("picture."):
+            raise InputError(f"--set is {override}, but must begin with picture., as the run is there already.")
+    scene = Scene.from_json(folder.scene.read_text(encoding="utf-8"), overrides)
+    trajectory = Trajectory.load(folder.trajectory)
+    missing = lacking(scene)
+    if missing:
+        raise InputError(missing)
+    image = state_images(scene, trajectory, device)
+    if as_film:
+        path = out or folder.figures / "film.mp4"
+        film(path, image, range(len(trajectory)), (scene.picture or Picture()).film_frames or len(trajectory))
+        return f"The film is in {path}."
+    if frame not in range(-len(trajectory), len(trajectory)):
+        raise InputError(f"--frame is {frame}, but the run has {len(trajectory)} frames, from 0.")
+    path = out or folder.figures / "picture.png"
+    write_picture(path, image(frame))
+    return f"The picture is in {path}."

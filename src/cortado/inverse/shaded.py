@@ -1,0 +1,82 @@
+"""Shaded pictures of a solved task: before, after, target and the search in motion."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cortado.inverse.setup import Setup
+from cortado.io.pictures import write_picture
+from cortado.io.report import Figures
+from cortado.lattice.shapes import Points
+from cortado.losses import Snapshot
+from cortado.optimisation.optimise import Result
+from cortado.scene.picture import Picture
+from cortado.shading.film import film
+from cortado.shading.labels import labelled, side_by_side
+from cortado.shading.painter import Painter, colours_of, painter
+
+ITERATIONS = (1, 5, 20, 100)
+"""Whose runs are shown, as far as the search went; 0 is the first guess."""
+Run = Mapping[int, Snapshot]
+"""States by the number of steps before them."""
+
+
+def shaded_figures(made: Setup, result: Result, folder: Path) -> Figures:
+    """Draw them into a folder; (caption, path) of each."""
+    picture, device = made.task.scene.picture or Picture(), made.problem.simulation.device
+    steps = np.unique(np.linspace(0, made.problem.steps, max(picture.film_frames, 2)).astype(int)).tolist()
+
+    def run(parameters: Mapping[str, Any]) -> Run:
+        return made.problem.states(dict(parameters), steps)
+
+    def found(u: dict[str, np.ndarray]) -> Run:
+        return run(made.search.parameters(u))
+
+    before, after = found(made.start), found(result.parameters)
+    runs = {"first guess": before, "found": after}
+    if made.task.problem.picture is None:  # else there is a picture to aim at, and no run
+        runs["target"] = run(made.task.true_parameters)
+    page = partial(_pages, made, device=device)
+    three = page(list(runs), list(runs.values()))
+    path = folder / "found.png"
+    write_picture(path, three(steps[-1]))
+    figures: Figures = [(f"The end of the run: {', '.join(runs)}.", path)]
+    shown = [k for k in ITERATIONS if k < len(result.history)] or [0]
+    searched = page([f"iteration {k}" for k in shown], [found(result.history[k].parameters) for k in shown])
+    path = folder / "search.png"
+    write_picture(path, searched(steps[-1]))
+    figures.append(("The end of the run as the search went on.", path))
+    if not picture.film_frames or len(steps) < 2:
+        return figures
+    pair = {name: runs[name] for name in (("found", "target") if "target" in runs else ("first guess", "found"))}
+    two = page(list(pair), list(pair.values()))
+    films: Figures = [
+        (f"The run: {' and '.join(pair)}.", film(folder / "found.mp4", two, steps, picture.film_frames)),
+        ("The search in motion.", film(folder / "search.mp4", searched, steps, picture.film_frames)),
+    ]
+    return [films[0], figures[0], films[1], figures[1]]
+
+
+def _pages(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -> Any:
+    """A function from a number of steps to a picture of the runs then, side by side, each with its name."""
+    scene, across = made.task.scene, len(runs) if len(runs) < 4 else 2
+    picture, half = scene.picture or Picture(), len(runs) > 1
+    size = {"width": picture.width // (1 + half), "height": picture.height // (1 + (len(runs) > across))}
+    panel = picture.model_copy(update=size)
+    places = np.stack([run[step].positions for run in runs for step in run])
+    artist = painter(scene.model_copy(update={"picture": panel}), places, device)
+
+    def page(step: int) -> Points:
+        return side_by_side(
+            [labelled(_image(made, artist, run[step]), name) for run, name in zip(runs, names, strict=True)], across
+        )
+
+    return page
+
+
+def _image(made: Setup, artist: Painter, state: Snapshot) -> Points:
+    colours = colours_of(made.task.scene, state.mass_fractions, len(state.positions), state.colours)
+    return artist.image(state.positions, colours)

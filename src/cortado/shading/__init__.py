@@ -1,0 +1,1 @@
+"""Pictures to show: shaded fluid on a floor, in its container of glass. `cortado.render` has those with derivatives."""

@@ -1,0 +1,351 @@
+"""Shaded pictures: what they show, that they show it whatever the order of particles, and that they change nothing."""
+
+import json
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado.cli import main
+from cortado.errors import InputError, SceneError
+from cortado.io.run_folder import RunFolder
+from cortado.io.srgb import to_srgb
+from cortado.lattice.shapes import corners
+from cortado.losses import FinalPositions
+from cortado.scene.picture import Picture
+from cortado.shading import film as shading_film
+from cortado.shading.film import film, lacking
+from cortado.shading.labels import labelled, side_by_side
+from cortado.shading.painter import colours_of, painter
+from cortado.shading.shadow import floor_shadow
+from cortado.shading.stage import Stage, screen_axes, upright
+from cortado.shading.surface import spheres
+
+SMALL = {"width": 96, "height": 64}
+FILLED = np.array([[0.05, 0.05, 0.05], [0.25, 0.25, 0.25]])
+RED, BLUE = (0.8, 0.1, 0.05), (0.05, 0.1, 0.8)
+
+
+def scene_of(dimension=3, fluids=1, picture=None, **tables):
+    """A box with a box of fluid in it, or two of two fluids side by side; 27 particles each in 3-D."""
+    names = ["one", "two"][:fluids]
+    phases = [
+        {"name": name, "rest_density": 1000.0, "viscosity": 0.05, "colour": colour}
+        for name, colour in zip(names, (BLUE, RED), strict=False)
+    ]
+    bodies = [
+        {"lower": [0.3 * k, 0.0, 0.0][:dimension], "upper": [0.3 * (k + 1), 0.3, 0.3][:dimension], "phase": name}
+        for k, name in enumerate(names)
+    ]
+    given = {
+        "dimension": dimension,
+        "discretisation": {"spacing": 0.1},
+        "phase": phases,
+        "fluid": [{"shape": "box", **body} for body in bodies],
+        "container": {"shape": "box", "lower": [0.0] * dimension, "upper": [0.6, 0.5, 0.4][:dimension]},
+        "solver": {"time_step": 0.002},
+        "picture": {**SMALL, **(picture or {})},
+    }
+    return cortado.Scene(**{**given, **tables})
+
+
+def first_state(scene):
+    """Positions and colours of the first particles."""
+    simulation = cortado.Simulation(scene)
+    fractions = simulation.parameters().get("mass_fractions")
+    return simulation.positions, colours_of(scene, fractions, simulation.particles)
+
+
+def drawn(scene, positions=None, colours=None):
+    x, c = first_state(scene)
+    x, c = x if positions is None else positions, c if colours is None else colours
+    return painter(scene, x).image(x, c)
+
+
+@pytest.mark.parametrize("surface", ["liquid", "spheres"])
+@pytest.mark.parametrize("shape", ["box", "cylinder", "none"])
+def test_27_particles_are_seen(surface, shape):
+    cup = {"shape": "cylinder", "base": [0.15, 0.0, 0.15], "radius": 0.25, "height": 0.5}
+    containers = {"box": {}, "none": {"container": {"shape": "none"}}, "cylinder": {"container": cup}}
+    scene = scene_of(picture={"surface": surface}, **containers[shape])
+    image = drawn(scene)
+    assert image.shape == (64, 96, 3) and image.min() >= 0.0 and image.max() <= 1.0
+    blue = (image[..., 2] > 1.3 * image[..., 0]).mean()
+    assert 0.01 < blue < 0.65
+
+
+def test_what_is_above_is_above_and_what_is_right_is_right():
+    """The fluid, in the left lower part of its box, is there in the picture too."""
+    image = drawn(scene_of())
+    rows, columns = np.nonzero(image[..., 2] > 1.3 * image[..., 0])
+    assert rows.mean() > 36 and columns.mean() < 46
+
+
+def test_two_fluids_have_their_colours():
+    image = drawn(scene_of(fluids=2))
+    assert (image[..., 2] > 3.0 * image[..., 0]).mean() > 0.02
+    assert (image[..., 0] > 3.0 * image[..., 2]).mean() > 0.02
+
+
+def test_the_plane_shows_pure_colours_and_mixtures():
+    scene = scene_of(2, fluids=2, picture={"width": 300, "height": 200})
+    x, colours = first_state(scene)
+    seen = {tuple(pixel) for pixel in to_srgb(drawn(scene)).reshape(-1, 3)}
+    for colour in (BLUE, RED):
+        wanted = to_srgb(np.array(colour).reshape(1, 1, 3))[0, 0]
+        assert min(np.abs(np.subtract(pixel, wanted, dtype=int)).max() for pixel in seen) <= 2
+    half = np.full_like(colours, 0.0) + 0.5 * np.add(BLUE, RED)
+    mixed = drawn(scene, x, half)[170, 150]
+    assert mixed == pytest.approx(0.5 * np.add(BLUE, RED), abs=0.02)
+
+
+def test_a_drop_in_the_plane_is_as_large_as_a_spacing():
+    scene = scene_of(2, picture={"width": 300, "height": 200})
+    alone = drawn(scene, np.array([[0.3, 0.25]]), np.array([[0.0, 0.0, 0.0]]))
+    pixel = painter(scene, np.zeros((1, 2))).pixel
+    dark = (alone.max(axis=2) < 0.4).sum() * pixel**2
+    assert 0.3 * 0.1**2 < dark < 1.5 * 0.1**2
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_order_of_particles_does_not_matter(dimension):
+    scene = scene_of(dimension, fluids=2)
+    x, c = first_state(scene)
+    x = x + 0.02 * np.random.default_rng(0).standard_normal(x.shape)
+    other = np.random.default_rng(1).permutation(len(x))
+    artist = painter(scene, x)
+    np.testing.assert_allclose(artist.image(x, c), artist.image(x[other], c[other]), atol=0.01)
+
+
+def test_mixtures_are_blended_by_mass_fractions():
+    scene = scene_of(fluids=2)
+    fractions = np.array([[1.0, 0.0], [0.25, 0.75]])
+    np.testing.assert_allclose(colours_of(scene, fractions, 2), [BLUE, 0.25 * np.array(BLUE) + 0.75 * np.array(RED)])
+    np.testing.assert_allclose(colours_of(scene_of(), None, 3), [BLUE] * 3)
+
+
+GRAVITIES = ([0.0, -9.81, 0.0], [0.0, 0.0, -9.81], [9.81, 0.0, 0.0], [0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("gravity", GRAVITIES)
+@pytest.mark.parametrize("size", [(1280, 720), (300, 700)])
+def test_the_camera_sees_the_whole_container_and_comes_near(gravity, size):
+    scene = scene_of(forces={"gravity": gravity}, picture={"width": size[0], "height": size[1]})
+    stage = Stage.of(scene, FILLED)
+    box = stage.placed(corners(*scene.container.extent()))
+    forward = stage.look_at - stage.eye
+    forward /= np.linalg.norm(forward)
+    right, up = screen_axes(forward)
+    half = np.tan(0.5 * np.radians(stage.picture.field_of_view))
+    depth = (box - stage.eye) @ forward
+    across = (box - stage.eye) @ right / depth / half
+    upwards = (box - stage.eye) @ up / depth / half * size[0] / size[1]
+    assert depth.min() > 0.0
+    widest = max(np.abs(across).max(), np.abs(upwards).max())
+    assert 0.8 < widest < 1.0
+
+
+@pytest.mark.parametrize("gravity", GRAVITIES)
+def test_up_is_against_gravity(gravity):
+    frame = upright(np.array(gravity))
+    np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-15)
+    assert np.linalg.det(frame) == pytest.approx(1.0)
+    wanted = -np.array(gravity) / 9.81 if any(gravity) else (0.0, 1.0, 0.0)
+    np.testing.assert_allclose(frame[1], wanted)
+
+
+def test_the_camera_goes_where_the_scene_says():
+    scene = scene_of(picture={"camera": [0.3, 0.2, 3.0], "look_at": [0.3, 0.2, 0.2]})
+    stage = Stage.of(scene, FILLED)
+    np.testing.assert_allclose(stage.placed(np.array([[0.3, 0.2, 3.0], [0.3, 0.2, 0.2]])), [stage.eye, stage.look_at])
+    image = drawn(scene)
+    _, columns = np.nonzero(image[..., 2] > 1.3 * image[..., 0])
+    assert columns.max() < 52  # the fluid is on the left of x = 0.3
+
+
+def test_fluid_goes_on_beyond_the_walls_that_it_touches():
+    stage = Stage.of(scene_of(), FILLED)
+    touching, inside = np.array([[0.05, 0.25, 0.2]]), np.array([[0.3, 0.25, 0.2]])
+    wet, of = stage.wetting(stage.placed(touching))
+    np.testing.assert_allclose(wet, stage.placed(np.array([[0.05, 0.25, 0.2], [-0.05, 0.25, 0.2]])), atol=1e-12)
+    assert of.tolist() == [0, 0]
+    assert len(stage.wetting(stage.placed(inside))[0]) == 1
+
+
+@pytest.mark.parametrize(("lid", "x", "cut"), [(True, 0.2, True), (False, 0.2, True), (False, 0.5, False)])
+def test_fluid_is_cut_at_the_wall_of_a_cup_unless_some_came_over_its_rim(lid, x, cut):
+    cup = {"shape": "cylinder", "base": [0.15, 0.0, 0.15], "radius": 0.25, "height": 0.5, "lid": lid}
+    assert Stage.of(scene_of(container=cup), np.array([[0.15, 0.1, 0.15], [x, 0.1, 0.15]])).cuts == cut
+
+
+def test_fluid_casts_a_shadow_on_the_floor():
+    stage = Stage.of(scene_of(), FILLED)
+    x, c = first_state(scene_of())
+    light, corner, cell = floor_shadow(stage, stage.placed(x), c)
+    assert light.shape[2] == 3 and light.max() <= 1.0 and 0.1 < light.min() < 0.7
+    i, j = np.rint((stage.placed(x).mean(axis=0) - corner)[[0, 2]] / cell).astype(int)
+    assert light[i, j].max() < 0.95 and light[0, 0].min() > 0.999
+
+
+def test_spheres_have_their_size_and_look_outwards():
+    surface = spheres(np.array([[1.0, 2.0, 3.0]]), np.array([RED]), 0.5)
+    off = surface.points - (1.0, 2.0, 3.0)
+    np.testing.assert_allclose(np.linalg.norm(off, axis=1), 0.25)
+    a, b, c = (surface.points[surface.triangles[:, k]] for k in range(3))
+    outwards = np.einsum("tk,tk->t", np.cross(b - a, c - a), (a + b + c) / 3.0 - (1.0, 2.0, 3.0))
+    assert (outwards > 0.0).all() and len(surface.triangles) == 128
+
+
+def test_a_film_has_its_size_and_its_frames(tmp_path):
+    av = pytest.importorskip("av")
+    shades = [np.full((34, 64, 3), k / 10.0) for k in range(11)]
+    path = film(tmp_path / "film.mp4", shades.__getitem__, range(11), 6)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        frames = [frame.to_ndarray(format="rgb24").mean() for frame in container.decode(stream)]
+        assert (stream.width, stream.height, stream.codec_context.pix_fmt) == (64, 34, "yuv420p")
+    assert len(frames) == 6 and np.all(np.diff(frames) > 0.0) and frames[0] < 5.0 and frames[-1] > 250.0
+
+
+def test_a_film_takes_no_longer_than_it_may(tmp_path, monkeypatch):
+    av = pytest.importorskip("av")
+    monkeypatch.setattr(shading_film, "SECONDS", 0.0)
+    path = film(tmp_path / "film.mp4", lambda k: np.zeros((32, 32, 3)), range(100), 90)
+    with av.open(str(path)) as container:
+        assert sum(1 for _ in container.decode(video=0)) == shading_film.LEAST_FRAMES
+
+
+def test_a_package_that_is_missing_is_named(monkeypatch):
+    assert lacking(scene_of()) is None
+    monkeypatch.setattr(shading_film, "find_spec", lambda name: None)
+    advice = r"pip install 'cortado-sph\[pictures\]'\."
+    with pytest.raises(
+        AssertionError, match="Shaded pictures need PyAV and pysplashsurf, which are not installed: " + advice
+    ):
+        raise AssertionError(lacking(scene_of()))
+    assert (
+        lacking(scene_of(2))
+        == "Shaded pictures need PyAV, which is not installed: pip install 'cortado-sph[pictures]'."
+    )
+    assert lacking(scene_of(2, picture={"film_frames": 0})) is None
+    monkeypatch.setitem(__import__("sys").modules, "pysplashsurf", None)
+    with pytest.raises(InputError, match="Shaded pictures need pysplashsurf, which is not installed: " + advice):
+        drawn(scene_of())
+
+
+def test_words_and_panels():
+    image = np.full((40, 60, 3), 0.8)
+    word = labelled(image, "found")
+    changed = np.nonzero((word != image).any(axis=2))
+    assert changed[0].size and changed[0].max() < 30 and changed[1].min() > 5
+    page = side_by_side([image * k / 3 for k in (1, 2, 3)], 2)
+    assert page.shape == (80, 120, 3)
+    np.testing.assert_allclose(page[[20, 20, 60, 60], [30, 90, 30, 90], 0], [0.8 / 3, 1.6 / 3, 0.8, 1.0])
+
+
+def test_pictures_change_neither_results_nor_whether_a_search_goes_on(tmp_path):
+    plain, other = scene_of(), scene_of(picture={"width": 128, "floor": False})
+    prints = [
+        cortado.Problem(cortado.Simulation(scene), steps=2, loss=FinalPositions(np.zeros((27, 3)))).fingerprint
+        for scene in (plain, other)
+    ]
+    assert prints[0] == prints[1]
+    folder = RunFolder.create(tmp_path / "run", plain.to_json(), [], kind="optimise")
+    folder.require(other.to_json(), "optimise")
+    former = {name: table for name, table in json.loads(plain.to_json()).items() if name != "picture"}
+    assert json.loads(plain.computed_json()) == former
+    with pytest.raises(InputError, match=r"was begun with solver\.time_step"):
+        folder.require(scene_of(solver={"time_step": 0.001}).to_json(), "optimise")
+
+
+@pytest.mark.parametrize(
+    ("dimension", "table", "sentence"),
+    [
+        (3, {"width": 10}, "picture.width is 10, but must be"),
+        (3, {"camera": [0.0, 1.0]}, "picture.camera is .*3 components"),
+        (2, {"camera": [0.0, 1.0, 2.0]}, "picture.camera is .*left out, as the scene has 2 dimensions"),
+        (3, {"camera": [0.0, 1.0, 2.0], "look_at": [0.0, 1.0, 2.0]}, "picture.look_at is .*another place than camera"),
+        (3, {"surface": "foam"}, 'picture.surface is \'foam\', but must be "liquid" or "spheres"'),
+        (3, {"widht": 100}, "picture.widht is not a key.*did you mean width"),
+    ],
+)
+def test_a_wrong_table_is_a_sentence(dimension, table, sentence):
+    with pytest.raises(SceneError, match=sentence):
+        scene_of(dimension, picture=table)
+
+
+def test_a_simulation_draws_its_frames():
+    simulation = cortado.Simulation(scene_of(2))
+    trajectory = simulation.run(steps=2)
+    assert simulation.picture(trajectory[-1]).shape == (64, 96, 3)
+    assert simulation.picture(trajectory[-1], width=128, height=72).shape == (72, 128, 3)
+    with pytest.raises(SceneError, match="height"):
+        simulation.picture(trajectory[-1], height=1)
+
+
+TASK = """
+[problem]
+steps = 4
+target.gravity = [0.5, -9.0]
+[optimise]
+start.gravity = [0.0, -9.81]
+optimiser = "lbfgs"
+learning_rate = 0.5
+iterations = 6
+"""
+
+
+def test_commands_write_pictures_and_films(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "task.toml").write_text(SCENE + TASK)
+    main(["run", "scene.toml", "--steps", "3", "--out", "a"])
+    written = {path.name for path in (tmp_path / "a" / "figures").iterdir()}
+    assert {"first.png", "last.png", "film.mp4"} <= written
+    assert (tmp_path / "a" / "report.html").read_text().count("data:video/mp4") == 1
+    main(["picture", "a", "--frame", "1", "--set", "picture.width=128", "--out", "one.png"])
+    assert cortado.pictures.read_picture("one.png").shape == (64, 128, 3)
+    main(["picture", "a", "--film"])
+    main(["optimise", "task.toml", "--out", "b"])
+    written = {path.name for path in (tmp_path / "b" / "figures").iterdir()}
+    assert {"found.png", "search.png", "found.mp4", "search.mp4"} <= written
+    assert cortado.pictures.read_picture(tmp_path / "b" / "figures" / "found.png").shape == (64, 3 * 48, 3)
+    main(["run", "scene.toml", "--steps", "1", "--out", "c", "--no-pictures"])
+    assert not (tmp_path / "c" / "figures" / "film.mp4").exists()
+    for arguments, sentence in (
+        (["--frame", "9"], "--frame is 9, but the run has 4 frames"),
+        (["--set", "solver.time_step=1"], "must begin with picture."),
+    ):
+        with pytest.raises(SystemExit) as end:
+            main(["picture", "a", *arguments])
+        assert end.value.code == 2 and sentence in capsys.readouterr().err
+
+
+SCENE = """
+name = "tiny"
+dimension = 2
+[discretisation]
+spacing = 0.1
+[[phase]]
+name = "water"
+rest_density = 1000.0
+viscosity = 0.05
+[[fluid]]
+shape = "box"
+lower = [0.0, 0.0]
+upper = [0.3, 0.3]
+phase = "water"
+[container]
+shape = "box"
+lower = [0.0, 0.0]
+upper = [0.6, 0.5]
+[solver]
+time_step = 0.002
+[picture]
+width = 96
+height = 64
+"""
+
+
+def test_defaults_are_large_enough_to_share():
+    assert Picture().width >= 1280 and Picture().height >= 720
