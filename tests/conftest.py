@@ -63,6 +63,7 @@ SLOW_TESTS = {
         "test_one_phase_loads_what_it_needs_and_no_more",
         "test_two_processes_start_cold_at_once",
     },
+    "test_driver": {"test_an_old_driver_is_told"},
     "test_estimators": {
         "test_a_mistake_is_a_sentence",
         "test_an_average_finds_its_strength_once",
@@ -75,6 +76,11 @@ SLOW_TESTS = {
     "test_executors": {"test_each_process_has_one_gpu_also_when_it_is_started_again"},
     "test_extinction_schedule": {
         "test_thin_fluid_first_gathers_what_thick_fluid_leaves_behind",
+    },
+    "test_first_commands": {
+        "test_a_new_scene_runs_at_once",
+        "test_quiet_says_nothing_but_what_was_asked_for",
+        "test_so_it_does_with_all_that_is_switched_off",
     },
     "test_fuzz": {
         "test_one_case_by_its_command",

@@ -13,13 +13,23 @@ from cortado import Trajectory
 from cortado.cli import main
 
 
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    """A run of a scene, and the scene."""
+    folder = tmp_path_factory.mktemp("first")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        Path("scene.toml").write_text(TINY_SCENE)
+        run("one")
+    return folder
+
+
 @pytest.fixture(autouse=True)
-def runs(tmp_path, monkeypatch):
+def runs(first, tmp_path, monkeypatch):
     """Two runs of one scene that are equal."""
+    shutil.copytree(first, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(first / "one", tmp_path / "other")
     monkeypatch.chdir(tmp_path)
-    Path("scene.toml").write_text(TINY_SCENE)
-    run("one")
-    shutil.copytree("one", "other")
 
 
 def run(out, *options):

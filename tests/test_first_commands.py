@@ -25,6 +25,7 @@ from cortado.io.usage import usage_sentence
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted(examples_folder().glob("*.toml"))
+VALIDATOR = jsonschema.Draft202012Validator(json.loads(SCHEMA.read_text("utf-8")))
 
 
 @pytest.fixture(autouse=True)
@@ -107,7 +108,7 @@ def test_so_it_does_with_all_that_is_switched_off(command, folder, dimension):
     Path("dam.toml").write_text(re.sub(r"^#(?=[a-z\[])", "", text, flags=re.MULTILINE))
     scene = cortado.load_scene("dam.toml")
     assert len(scene.phase) == len(scene.fluid) == 2 and scene.render is not None and scene.forces.surface_tension
-    jsonschema.validate(tomllib.loads(Path("dam.toml").read_text()), file_schema())
+    VALIDATOR.validate(tomllib.loads(Path("dam.toml").read_text()))
     assert command("run", "dam.toml", "--steps", 2)[0] == 0
 
 
@@ -126,6 +127,17 @@ def test_what_is_no_name_of_a_file_is_refused(command, name):
     assert_refused(command("new", name), "NAME" if len(name) < 3 else "cannot be written")
     assert_refused(command("new", "x", "--dimension", 4), "--dimension is 4")
     assert os.listdir() == ["dam.toml"]
+
+
+def test_names_that_are_too_long_are_sentences(command):
+    long = "a" * 300
+    assert_refused(command("new", long), "cannot be written: File name too long")
+    assert_refused(command("examples", "--copy", "pour", "--to", long), "cannot be written: File name too long")
+    assert_refused(command("describe", long), "cannot be read: File name too long")
+    Path("scene.toml").write_text(TINY_SCENE)
+    assert_refused(command("describe", "scene.toml", "--picture", f"{long}.png"), "cannot be written")
+    assert_refused(command("compare", long, long), "There is no run in ")
+    assert_refused(command("run", "scene.toml", "--out", long), "cannot be written")
 
 
 def test_a_name_may_hold_anything_that_a_file_may(command):
@@ -173,8 +185,8 @@ def test_the_schema_that_is_shipped_is_that_of_the_tables(command):
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_it_bears_the_examples(path):
-    jsonschema.Draft202012Validator.check_schema(file_schema())
-    jsonschema.validate(tomllib.loads(path.read_text("utf-8")), file_schema())
+    VALIDATOR.check_schema(VALIDATOR.schema)
+    VALIDATOR.validate(tomllib.loads(path.read_text("utf-8")))
 
 
 @pytest.mark.parametrize(
@@ -189,10 +201,10 @@ def test_it_bears_the_examples(path):
 )
 def test_it_refuses_what_cortado_refuses(old, new):
     assert old in TINY_SCENE
-    jsonschema.validate(tomllib.loads(TINY_SCENE), file_schema())
+    VALIDATOR.validate(tomllib.loads(TINY_SCENE))
     wrong = tomllib.loads(TINY_SCENE.replace(old, new, 1))
     with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate(wrong, file_schema())
+        VALIDATOR.validate(wrong)
     with pytest.raises(cortado.SceneError):
         cortado.Scene(**wrong)
 

@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 
 from cortado.errors import InputError, shown
-from cortado.io.files import sentences, write_atomically
+from cortado.io.files import is_taken, sentences, write_atomically
 from cortado.io.shipped import examples_folder
 from cortado.io.terminal import is_quiet
 
@@ -35,7 +35,7 @@ def _copied(sources: list[Path], folder: Path) -> str:
     """Nothing is copied unless all of it can be: a file that is there is kept."""
     targets = [folder / source.name for source in sources]
     for target in targets:
-        if target.exists() or target.is_symlink():
+        if is_taken(target):
             raise InputError(f"{target} is already there; choose another folder with --to, or remove it.")
     with sentences(folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -4,7 +4,7 @@ from pathlib import Path
 from string import Template
 
 from cortado.errors import InputError
-from cortado.io.files import sentences, write_atomically
+from cortado.io.files import is_taken, sentences, write_atomically
 from cortado.io.shipped import SCHEMA
 
 _SCENE = Template("""\
@@ -123,13 +123,13 @@ def new_scene(path: Path, dimension: int) -> str:
     if path.name in ("", ".."):
         raise InputError("NAME must be the name of a file, such as dam.toml.")
     file = path if path.suffix == ".toml" else path.with_name(f"{path.name}.toml")
-    if file.exists() or file.is_symlink():
+    if is_taken(file):
         raise InputError(f"{file} is already there; choose another NAME, or remove it.")
     schema = file.with_name(SCHEMA.name)
     with sentences(file.parent):
         file.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(file, scene_text(file, dimension))
-    if not schema.exists():
+    if not is_taken(schema):
         write_atomically(schema, SCHEMA.read_bytes())
     return f"The scene is {file}; {schema} tells editors what may stand in it. Run it: cortado run {file}"
 

@@ -43,6 +43,17 @@ def write_atomically(path: Path, content: str | bytes) -> None:
             temporary.unlink(missing_ok=True)
 
 
+def is_taken(path: Path) -> bool:
+    """Whether something of that name is there, also a link that leads nowhere. Raises `InputError` where nothing can be
+    looked for, as with a name that is too long."""
+    with sentences(path):
+        try:
+            path.lstat()
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        return True
+
+
 def write_fully(file: Any, content: bytes) -> None:
     """Writes to a file without a buffer, which may take a part at a time."""
     rest = memoryview(content)

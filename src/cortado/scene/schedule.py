@@ -17,7 +17,7 @@ class Course(Table):
     """One parameter over time: linear between the times, constant before the first and after the last."""
 
     times: Several[Annotated[float, quantity("s", ge=0.0)]]
-    """(k,) [s] from the first state of the run on, each greater than the one before"""
+    """(k,) counted from the first state of the run, each greater than the one before [s]"""
     values: Any
     """(k, components) in the parameter's unit"""
 
@@ -49,8 +49,9 @@ def _course(parameter: Parameter) -> type[Course]:
     """The table of one parameter, whose values have its unit."""
     unit = parameter.unit.replace("²", "2").replace("°", "degrees")
     row = Annotated[tuple[Annotated[float, quantity(unit)], ...], Field(min_length=1, max_length=3, fail_fast=True)]
-    values: Any = (Several[row], Field(description=f"{parameter.meaning}, at each of the times"))
-    return create_model(f"Course_{parameter.name}", __base__=Course, __module__=__name__, values=values)
+    values: Any = (Several[row], Field(description="(k, components) one row for each of the times"))
+    words = f"The parameter `{parameter.name}` over time: {parameter.meaning}."
+    return create_model(f"Course_{parameter.name}", __base__=Course, __module__=__name__, __doc__=words, values=values)
 
 
 _OVER_TIME = [p for p in PARAMETERS if p.axis is Axis.STEP]
