@@ -23,6 +23,7 @@ from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE
 from compiling_notice import without_compiling
 from cortado import Problem, Scene, Trajectory
 from cortado.cli import main
+from cortado.inverse.chapters import Chapters
 from cortado.io.folder_lock import locked
 from cortado.io.pictures import heart, rosetta, write_picture
 from cortado.io.run_folder import FIGURES, RunFolder
@@ -39,7 +40,7 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "task.toml").write_text(GOOD_TASK)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("cortado.commands.run.run_pictures", lambda *_: [])  # tests/test_shading.py draws them
-    monkeypatch.setattr("cortado.commands.optimise.shaded_figures", lambda *_: [])
+    monkeypatch.setattr("cortado.commands.optimise.shaded_figures", lambda *_: Chapters())
     return tmp_path
 
 
@@ -164,7 +165,7 @@ def test_a_run_that_diverges_says_where_and_keeps_its_frames(cortado_command):
     assert f"diverged in step {lost}: particle " in sentence and "left the container and was at (" in sentence
     assert "try a smaller time step" in sentence and sentence.endswith("dam.")
     assert {path.name for path in Path("dam").iterdir()} == RUN_FILES and len(metrics("dam")) == lost
-    assert f"<td>The simulation diverged in step {lost}" in Path("dam/report.html").read_text()
+    assert f'<p class="failed">The simulation diverged in step {lost}' in Path("dam/report.html").read_text()
 
 
 def interrupting(after):
@@ -544,7 +545,7 @@ def test_places_are_found_for_a_picture(cortado_command):
     assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
     assert figures("found") == {"loss.png", "images.png", "progress.png"}
     page = Path("found/report.html").read_text()
-    assert page.count("<img") == 3 and "image, PSNR [dB]" in page and "<video" not in page
+    assert page.count("<img") == 3 and "image, PSNR</th>" in page and "<video" not in page
     losses = [row["loss"] for row in metrics("found")]
     assert len(losses) == 5 and losses[-1] < losses[0]
 

@@ -17,7 +17,7 @@ LAYERS = """
     arrays
     restart
     io io.files io.folder_lock io.input_files io.interruption io.notebook io.terminal io.progress io.run_environment
-    io.shipped io.srgb io.usage io.video io.vtkhdf_layout io.vtkhdf
+    io.shipped io.srgb io.particle_view io.usage io.video io.vtkhdf_layout io.vtkhdf
     lattice lattice.shapes lattice.pairs lattice.region lattice.smoothing lattice.calibration
     parameters parameters.reference_density parameters.registry parameters.table parameters.tilt parameters.values
     scene scene.fields scene.sentences scene.point_reader scene.points scene.tables
@@ -31,7 +31,7 @@ LAYERS = """
     device.smoothing
     device.neighbourhood device.arrays device.fields device.launching device.state device.cells
     device.candidates device.neighbours
-    scene.checks scene.scene
+    scene.checks scene.scene scene.in_words
     parameters.checks
     discretise.sampling discretise.discrete_scene
     sph sph.density sph.free_energy sph.integration sph.order sph.materials sph.emitter_kernels sph.pair_forces
@@ -54,10 +54,10 @@ LAYERS = """
     render.cameras render.colour_field render.interpolation render.phase_colours render.fields render.rays
     render.absorption render.views render.marching render.renderer render.scene_renderer render
     io.pictures
-    figures.canvas figures.particle_sets figures.side_by_side
+    figures.canvas figures.panels figures.particle_sets figures.side_by_side
     io.trajectory io.trajectory_batch
     shading shading.surface shading.stage shading.shadow shading.optics shading.trace shading.space shading.plane
-    shading.painter shading.labels shading.film
+    shading.painter shading.labels shading.film shading.scene_view
     simulation
     problem
     figures.curves figures
@@ -66,7 +66,8 @@ LAYERS = """
     optimisation optimisation.evaluate optimisation.differentiable optimisation.replay_log optimisation.optimisers
     optimisation.named_optimisers optimisation.result optimisation.optimise optimisation.transforms
     io.run_folder io.report
-    inverse inverse.tables inverse.file_schema inverse.task inverse.setup inverse.figures inverse.shaded
+    inverse inverse.tables inverse.file_schema inverse.task inverse.in_words inverse.setup inverse.chapters
+    inverse.figures inverse.shaded
     study study.canvas study.comparison study.estimates study.lyapunov_spectrum study.one_kernel_loops
     study.reference_losses study.scenes study.palette study.sources study.gravity_tangents study.spatial_scales
     study.ensembles study.tables study.experiment study.forces study.gravity_and_precision study.image_horizon

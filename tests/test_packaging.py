@@ -16,7 +16,12 @@ import cortado
 
 ROOT = Path(__file__).parent.parent
 
-PACKAGE = ("src/cortado/__init__.py", "src/cortado/py.typed", "src/cortado/scene.schema.json")
+PACKAGE = (
+    "src/cortado/__init__.py",
+    "src/cortado/py.typed",
+    "src/cortado/scene.schema.json",
+    "src/cortado/io/particle_view.js",
+)
 EXAMPLE = "examples/pour.toml"
 needs_cmake = pytest.mark.skipif(shutil.which("cmake") is None, reason="CMake is not installed")
 
@@ -33,7 +38,7 @@ def build(hook: str, source: Path, out: Path, **environment: str) -> subprocess.
 def small(tmp_path):
     """A project of one module, with a marker that it has types, a schema and an example, built as Cortado is."""
     source = tmp_path / "source"
-    (source / "src/cortado").mkdir(parents=True)
+    (source / "src/cortado/io").mkdir(parents=True)
     (source / "cpp").mkdir()
     (source / "examples").mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE", "cpp/CMakeLists.txt", *PACKAGE, EXAMPLE):

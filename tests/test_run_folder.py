@@ -1,5 +1,6 @@
 """Run folders, their reports, and the progress lines that go with them."""
 
+import base64
 import io
 import itertools
 import json
@@ -13,8 +14,9 @@ import pytest
 import cortado.io.run_folder
 from cortado.errors import InputError
 from cortado.io.files import unfinished
+from cortado.io.particle_view import Cloud, particle_view
 from cortado.io.progress import track
-from cortado.io.report import write_report
+from cortado.io.report import Section, write_report, written
 from cortado.io.run_folder import RunFolder
 
 SCENE = '{"name": "drop", "dimension": 2}'
@@ -203,17 +205,55 @@ def test_report_is_one_self_contained_escaped_page(tmp_path):
     folder = new_run(tmp_path / "a")
     picture = folder.figures / "loss.png"
     picture.write_bytes(b"\x89PNG pixels")
-    rows = [("loss & more", 0.25), ("x", "<script>")]
-    path = write_report(folder, "a < b", rows, [("the <loss>", picture)])
+    table = Section("Numbers", head=("", "value"), rows=[("loss & more", 0.25), ("x", "<script>")])
+    path = write_report(folder, "a < b", [table, Section("P", figures=[("the <loss>", picture)]), Section("Nothing")])
     page = path.read_text()
-    assert path == folder.report
-    assert "<h1>a &lt; b</h1>" in page and "<th>loss &amp; more</th><td>0.25</td>" in page
+    assert path == folder.report and "Nothing" not in page
+    assert "<h1>a &lt; b</h1>" in page and '<th scope="row">loss &amp; more</th><td>0.25</td>' in page
+    assert "<pre>cortado run drop.toml</pre>" in page
     assert "<script" not in page and "http" not in page
     assert "data:image/png;base64,iVBORyBwaXhlbHM=" in page and "the &lt;loss&gt;" in page
     assert "&quot;drop&quot;" in page
     for bad in (folder.figures / "absent.png", folder.scene):
         with pytest.raises(InputError, match=bad.name):
-            write_report(folder, "t", [], [("c", bad)])
+            write_report(folder, "t", [Section("P", figures=[("c", bad)])])
+
+
+def test_a_view_in_a_report_holds_its_particles_and_no_network(tmp_path):
+    random = np.random.default_rng(0)
+    positions = random.uniform(size=(300, 200, 3))
+    speeds = random.uniform(size=(300, 200))
+    clouds = [Cloud("found", positions, speeds), Cloud("</script>", positions, speeds)]
+    view = particle_view(clouds, np.arange(300) * 0.01, 0.1, lines=[[[0, 0, 0], [2, 1, 1]]], most_bytes=100_000)
+    assert len(view) < 150_000 and view.count("</script>") == 1
+    data = json.loads(view.partition('"application/json">')[2].partition("</script>")[0])
+    assert data["particles"] == 200 and data["times"][-1] == 2.99 and data["half"] == [1.0, 0.5, 0.5]
+    frames = len(data["times"])
+    stored = np.frombuffer(base64.b64decode(data["clouds"][0]["positions"]), "<i2").reshape(frames, 200, 3)
+    np.testing.assert_allclose(stored[-1] / 32767 * data["half"] + [1.0, 0.5, 0.5], positions[-1], atol=1e-4)
+    page = write_report(new_run(tmp_path / "a"), "t", [Section("V", view=view)]).read_text()
+    assert "http" not in page and page.count("function show(element)") == 1
+
+
+def test_a_view_of_very_many_particles_leaves_some_out():
+    positions = np.zeros((30, 5000, 2))
+    view = particle_view([Cloud("a", positions, positions[..., 0])], np.arange(30), 0.1, most_bytes=100_000)
+    assert len(view) < 160_000 and "One particle in 6 is shown." in view
+
+
+@pytest.mark.parametrize(
+    "value, text",
+    [
+        (0.123456789, "0.123457"),
+        (7, "7"),
+        ("word", "word"),
+        ([1.5, -9.81], "(1.5, -9.81)"),
+        ([[1.0, 2.0], [3.0, 4.0]], "(1, 2); (3, 4)"),
+        (np.linspace(0.0, 1.0, 400).reshape(200, 2), "200 × 2 numbers from 0 to 1, in result.json"),
+    ],
+)
+def test_numbers_are_written_out_or_counted(value, text):
+    assert written(value) == text
 
 
 def test_progress_on_a_file_is_a_line_now_and_then():

@@ -13,23 +13,31 @@ from cortado.commands.executor import HERE, Where
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
 from cortado.gradients import GradientEstimator, tuned
-from cortado.inverse.figures import task_figures
+from cortado.inverse.chapters import Chapters
+from cortado.inverse.figures import component_names, task_figures
+from cortado.inverse.in_words import task_in_words
 from cortado.inverse.setup import Setup, setup
 from cortado.inverse.shaded import shaded_figures
 from cortado.inverse.task import Task, load_task
 from cortado.io.folder_lock import locked
 from cortado.io.interruption import keeping
 from cortado.io.progress import track
-from cortado.io.report import Figures, write_report
+from cortado.io.report import MOST_NUMBERS as MOST_WRITTEN
+from cortado.io.report import Section, write_report
 from cortado.io.run_folder import RunFolder
 from cortado.io.terminal import say
 from cortado.losses.image_losses import psnr
 from cortado.optimisation.optimise import Record, Result, optimise
+from cortado.parameters.values import UNITS
+from cortado.scene.in_words import scene_in_words
 from cortado.shading.film import lacking
+from cortado.shading.scene_view import scene_view
 
-Rows = list[tuple[str, object]]
+Rows = list[tuple[object, ...]]
 MOST_NUMBERS = 1000
 """Of a parameter whose estimate is in result.json; larger ones are in the checkpoint."""
+VIEWED = 60
+"""States of a run that the view in the report shows at most."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +112,8 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
         result, estimator = _search(made, folder, resume, executor)
     except DivergedError as error:
         evaluations = len(folder.read_metrics())
-        write_report(folder, made.task.scene.name, [("ended early", error), ("evaluations", evaluations)], [])
+        ended = Section("What came out", [f"The search ended early, in evaluation {evaluations}."], [error])
+        write_report(folder, made.task.scene.name, [_asked(made), ended])
         advice = f"{error.advice}, a smaller learning rate, or bounds on the parameters"
         advice = "; ".join(filter(None, [advice, _kept(folder)]))
         told = error.with_advice(advice)
@@ -117,20 +126,20 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
         noise = psnr(made.image(made.problem.states(estimate, [last])[last]), target)
     first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
     verdict = judge(made.task, result, estimate, noise, first)
-    figures = [*_shaded(made, result, folder.figures, pictures), *task_figures(made, result, folder.figures)]
-    write_report(folder, made.task.scene.name, _rows(made, estimate, result, verdict, estimator), figures)
+    figures = _shaded(made, result, folder.figures, pictures) + task_figures(made, result, folder.figures)
+    write_report(folder, made.task.scene.name, _sections(made, estimate, result, verdict, estimator, figures))
     folder.write_result(**_for_machines(result, estimate, verdict))
     if verdict.failures:
         raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
     return f"{_summary(made, result, verdict)} The results are in {folder.path}; open report.html."
 
 
-def _shaded(made: Setup, result: Result, folder: Path, wished: bool) -> Figures:
+def _shaded(made: Setup, result: Result, folder: Path, wished: bool) -> Chapters:
     """Shaded pictures and films, where they are wished; none, and a sentence, where a package is missing."""
     missing = lacking(made.task.scene) if wished else None
     if missing:
         say(missing)
-    return shaded_figures(made, result, folder) if wished and not missing else []
+    return shaded_figures(made, result, folder) if wished and not missing else Chapters()
 
 
 def judge(
@@ -226,24 +235,72 @@ def _summary(made: Setup, result: Result, verdict: Verdict) -> str:
     return f"{'; '.join([text, ', '.join(reached)]) if reached else text}."
 
 
-def _rows(
-    made: Setup, estimate: dict[str, np.ndarray], result: Result, verdict: Verdict, estimator: GradientEstimator
-) -> Rows:
+def _asked(made: Setup) -> Section:
+    scene = scene_in_words(made.task.scene, made.problem.simulation.particles)
+    return Section("What was asked", [*task_in_words(made.task), f"The scene: {scene}"])
+
+
+def _sections(
+    made: Setup,
+    estimate: dict[str, np.ndarray],
+    result: Result,
+    verdict: Verdict,
+    estimator: GradientEstimator,
+    figures: Chapters,
+) -> list[Section]:
+    """The report, in the order in which one would tell it."""
+    head = ("", "unit", "first guess", "found", "hidden", "error")
+    return [
+        _asked(made),
+        Section("What was found", [_summary(made, result, verdict)], verdict.failures, figures.found),
+        Section("In numbers", head=head, rows=_found_rows(made, estimate, verdict)),
+        Section("To turn and to play", view=_view(made, estimate)),
+        Section("Before, found and target", figures=figures.compared),
+        Section("Found against hidden", figures=figures.parameters),
+        Section("The search", [result.message], figures=figures.search, rows=_rows(made, result, verdict, estimator)),
+    ]
+
+
+def _view(made: Setup, estimate: dict[str, np.ndarray]) -> str:
+    """What was found, and the target where it is a run, in motion."""
+    steps = np.unique(np.linspace(0, made.problem.steps, VIEWED).astype(int)).tolist()
+    runs = {"found": estimate}
+    if made.task.problem.picture is None:
+        runs["target"] = made.task.true_parameters
+    states = {name: made.problem.states(parameters, steps) for name, parameters in runs.items()}
+    shown = {name: [found[step] for step in steps] for name, found in states.items()}
+    return scene_view(made.task.scene, shown, np.array(steps) * made.task.scene.solver.time_step)
+
+
+def _found_rows(made: Setup, estimate: dict[str, np.ndarray], verdict: Verdict) -> Rows:
+    """Of each number that was searched, and of those with very many numbers one row."""
+    rows: Rows = []
+    start = made.search.parameters(made.start)
+    for name, value in estimate.items():
+        unit, true = UNITS[name], made.true_parameter(name)
+        known = [np.asarray(start[name]), np.asarray(value), *([] if true is None else [true])]
+        error = f"{verdict.errors[name]:.3%}" if name in verdict.errors else ""
+        columns = np.broadcast_arrays(*known)
+        names = component_names(made.task.scene, name, columns[0])
+        if len(names) != columns[0].size or len(names) > MOST_WRITTEN:
+            rows.append((name.replace("_", " "), unit, *known[:2], "" if true is None else true, error))
+            continue
+        for k, label in enumerate(names):
+            numbers = [column.ravel()[k] for column in columns]
+            rows.append((label, unit, *numbers, *([] if true is not None else [""]), error if k == 0 else ""))
+    return rows
+
+
+def _rows(made: Setup, result: Result, verdict: Verdict, estimator: GradientEstimator) -> Rows:
     rows: Rows = [
-        ("particles", made.problem.simulation.particles),
-        ("steps", made.problem.steps),
-        ("gradients", repr(estimator)),
-        ("evaluations", len(result.history)),
-        ("first loss", f"{verdict.first:.4g}"),
-        ("best loss", f"{result.loss:.4g}"),
-        ("loss reduction", f"{verdict.reduction:.4g}"),
+        ("particles", made.problem.simulation.particles, ""),
+        ("steps", made.problem.steps, ""),
+        ("gradients", repr(estimator), ""),
+        ("evaluations", len(result.history), ""),
+        ("first loss", f"{verdict.first:.4g}", "" if made.renderer else "m²"),
+        ("best loss", f"{result.loss:.4g}", "" if made.renderer else "m²"),
+        ("loss reduction", f"{verdict.reduction:.4g}", "times"),
     ]
     if verdict.psnr is not None:
-        rows.append(("image, PSNR [dB]", f"{verdict.psnr:.4g}"))
-    for name, value in estimate.items():
-        rows.append((f"{name}, estimate", np.array2string(np.asarray(value), precision=6, threshold=20)))
-        true = made.true_parameter(name)
-        if true is not None:
-            rows.append((f"{name}, true", np.array2string(true, precision=6, threshold=20)))
-            rows.append((f"{name}, relative error", f"{verdict.errors[name]:.3%}"))
+        rows.append(("image, PSNR", f"{verdict.psnr:.4g}", "dB"))
     return rows

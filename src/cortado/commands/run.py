@@ -17,18 +17,17 @@ from cortado.figures import density_errors, images, particles
 from cortado.io.folder_lock import locked
 from cortado.io.interruption import keeping
 from cortado.io.progress import track
-from cortado.io.report import Figures, write_report
+from cortado.io.report import Figures, Section, write_report
 from cortado.io.run_folder import RunFolder
 from cortado.io.terminal import say
 from cortado.io.trajectory import Trajectory, append_frame, frame_writer
 from cortado.io.video import MOST_FRAMES, write_video
 from cortado.rollout import Rollout
+from cortado.scene.in_words import scene_in_words
 from cortado.scene.scene import load_scene
 from cortado.shading.film import lacking, run_pictures
+from cortado.shading.scene_view import trajectory_view
 from cortado.simulation import Simulation, check_steps, not_converged_sentence
-
-Rows = list[tuple[str, object]]
-"""(label, value) of each row of a report"""
 
 
 def run_scene(
@@ -76,12 +75,13 @@ def _compute(
     try:
         last = _write_trajectory(simulation, rollout, folder, record_every)
     except DivergedError as error:
-        _write_pictures(simulation, rollout.substeps, folder, [("ended early", error)], pictures)
+        _write_report(simulation, rollout, folder, Section("What came out", failures=[error]), pictures)
         told = error.with_advice(f"{error.advice}; the frames so far are in {folder.path}")
         folder.write_result(**_for_machines(simulation, rollout), failures=[str(told)])
         raise told from error
     summary = RunSummary.of(simulation, rollout, last, time.perf_counter() - begun)
-    _write_pictures(simulation, rollout.substeps, folder, [("in short", summary)], pictures)
+    numbers = Section("In numbers", head=("", "value", "unit"), rows=summary.rows())
+    _write_report(simulation, rollout, folder, numbers, pictures)
     folder.write_result(**_for_machines(simulation, rollout), **summary.for_machines(), failures=[])
     return summary
 
@@ -148,14 +148,14 @@ def _shaded(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Fig
     return run_pictures(simulation.scene, trajectory, folder, simulation.device)
 
 
-def _write_pictures(simulation: Simulation, substeps: int, folder: RunFolder, remarks: Rows, pictures: bool) -> None:
-    """The report with its figures, shaded ``pictures`` among them if wished; ``remarks`` are its first rows."""
+def _write_report(simulation: Simulation, rollout: Rollout, folder: RunFolder, told: Section, pictures: bool) -> None:
+    """The report with its figures, shaded ``pictures`` among them if wished; ``told``: what came out."""
     scene = simulation.scene
     trajectory = Trajectory.load(folder.trajectory)
     shown = sorted({0, len(trajectory.times) // 2, len(trajectory.times) - 1})
     speeds = [np.linalg.norm(trajectory.velocities[frame], axis=1) for frame in shown]
-    figures: Figures = _shaded(simulation, trajectory, folder.figures) if pictures else []
-    figures += [
+    shaded = _shaded(simulation, trajectory, folder.figures) if pictures else []
+    figures: Figures = [
         (
             f"The fluid at the start, half-way and at the end{', seen along the third axis' * (scene.dimension == 3)}.",
             particles(
@@ -170,17 +170,39 @@ def _write_pictures(simulation: Simulation, substeps: int, folder: RunFolder, re
     ]
     if scene.render is not None:
         figures += _rendered(simulation, trajectory, shown, folder.figures)
+    solver: Figures = []
     if len(trajectory.converged) and "density_errors" in trajectory.diagnostics and scene.forces.pressure:
         path = folder.figures / "density_errors.png"
         density_errors(trajectory, path, tolerance=scene.solver.density_tolerance)
-        figures.append(("Average density error of each step, and the tolerance asked.", path))
-    rows = [
-        *remarks,
-        ("particles", simulation.particles),
-        *([("substeps of diffusion in each step", substeps)] if substeps else []),
-        ("wall particles", len(simulation.walls)),
-        ("steps", len(trajectory.converged)),
-        ("simulated time [s]", f"{trajectory.times[-1]:.4g}"),
-        ("precision", simulation.precision.name),
+        solver.append(("Average density error of each step, and the tolerance asked.", path))
+    films = [(caption, path) for caption, path in shaded if Path(path).suffix == ".mp4"]
+    sections = [
+        Section("What was asked", _asked(simulation, rollout)),
+        Section("What it looks like", figures=films),
+        Section("To turn and to play", view=trajectory_view(scene, trajectory)),
+        told,
+        Section("Pictures", figures=[*(pair for pair in shaded if pair not in films), *figures]),
+        Section("The solver", _converged(rollout), figures=solver),
     ]
-    write_report(folder, scene.name, rows, figures)
+    write_report(folder, scene.name, sections)
+
+
+def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:
+    """The run in words."""
+    scene, step = simulation.scene, float(rollout.time_steps[0])
+    length = f"{rollout.steps} steps of {step:g} s, {rollout.steps * step:.4g} s of fluid"
+    wall = f" Walls are made of {len(simulation.walls)} particles." if len(simulation.walls) else ""
+    substeps = f" Each step has {rollout.substeps} substeps of diffusion." if rollout.substeps else ""
+    where = f"{simulation.precision.name} on {simulation.device}"
+    question = f"How do they move: {scene_in_words(scene, simulation.particles)}"
+    return [question, f"{length}, in {where}.{wall}{substeps}"]
+
+
+def _converged(rollout: Rollout) -> list[str]:
+    """Whether steps did."""
+    converged = rollout.diagnostics["converged"]
+    if not len(converged):
+        return []
+    if converged.all():
+        return ["The pressure converged in every step."]
+    return [not_converged_sentence(converged)]

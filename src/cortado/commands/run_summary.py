@@ -82,6 +82,23 @@ class RunSummary:
         least, greatest = self.densities or (None, None)
         return {"energy": energies, "density": {"least": least, "greatest": greatest}}
 
+    def rows(self) -> list[tuple[object, ...]]:
+        """(what, value, unit) of each row of a table."""
+        energies = [
+            (f"{kind} energy, {when}", f"{getattr(energy, kind):.4g}", "J")
+            for when, energy in (("at the start", self.first), ("at the end", self.last))
+            for kind in ("kinetic", "potential", "total")
+        ]
+        densities = zip(("least", "greatest"), self.densities or (), strict=False)
+        return [
+            ("steps", self.steps, ""),
+            ("simulated time", f"{self.steps * self.time_step:.4g}", "s"),
+            ("time that a step took", f"{self.milliseconds:.3g}", "ms"),
+            ("time that all steps took", f"{self.seconds:.3g}", "s"),
+            *energies,
+            *((f"{which} density at the end", f"{density:.4g}", "kg/m³") for which, density in densities),
+        ]
+
     def __str__(self) -> str:
         last = self.last
         text = (

@@ -1,11 +1,12 @@
-"""The pictures of a solved task: the loss, parameters, particles or images on the way, and a video."""
+"""The pictures of a solved task: particles or images, parameters against those that were hidden, the loss, a video."""
 
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
-from cortado.figures import curve, images, loss_curve, parameters, particles
+from cortado.figures import images, loss_curve, panels, particles
+from cortado.inverse.chapters import Chapters
 from cortado.inverse.setup import Setup
 from cortado.io.report import Figures
 from cortado.io.video import MOST_FRAMES, write_video
@@ -13,6 +14,7 @@ from cortado.optimisation.optimise import Result
 from cortado.parameters.registry import BY_NAME, Axis
 from cortado.parameters.tilt import Tilt
 from cortado.parameters.values import OVER_TIME, UNITS
+from cortado.scene.scene import Scene
 
 MOST_CURVES = 12
 """Parameters with more components get no picture of their own."""
@@ -20,17 +22,17 @@ IMAGES = 6
 """Images that show the course of the optimisation."""
 
 
-def task_figures(made: Setup, result: Result, folder: Path) -> Figures:
-    """Draw them into a folder; (caption, path) of each."""
+def task_figures(made: Setup, result: Result, folder: Path) -> Chapters:
+    """Draw them into a folder."""
     losses = [record.loss for record in result.history]
     label = "loss [m²]" if made.renderer is None else "loss"
-    figures: Figures = [("The loss.", loss_curve(losses, folder / "loss.png", label=label))]
+    figures = Chapters(search=[("The loss.", loss_curve(losses, folder / "loss.png", label=label))])
     if made.renderer is None:
-        figures.append(_particles(made, result, folder))
+        figures += Chapters(compared=[_particles(made, result, folder)])
     else:
         figures += _images(made, result, folder)
     for name in result.parameters:
-        figures += _parameter(made, result, name, folder)
+        figures += Chapters(parameters=_parameter(made, result, name, folder))
     return figures
 
 
@@ -41,7 +43,7 @@ def _particles(made: Setup, result: Result, folder: Path) -> tuple[str, Path]:
     return "Where the fluid ends: with the first guess, with the estimate, and the target.", path
 
 
-def _images(made: Setup, result: Result, folder: Path) -> Figures:
+def _images(made: Setup, result: Result, folder: Path) -> Chapters:
     last, target = max(made.targets.items())
 
     def image(u: dict[str, np.ndarray]) -> np.ndarray:
@@ -50,38 +52,55 @@ def _images(made: Setup, result: Result, folder: Path) -> Figures:
     path = images(
         [image(made.start), image(result.parameters), target], ["start", "estimate", "target"], folder / "images.png"
     )
-    figures: Figures = [("The last image: with the first guess, with the estimate, and the target.", path)]
+    compared: Figures = [("The last image: with the first guess, with the estimate, and the target.", path)]
     iterations = np.unique(np.linspace(0, len(result.history) - 1, IMAGES).astype(int))
     shown = [image(result.history[k].parameters) for k in iterations]
     path = images(shown, [f"iteration {k}" for k in iterations], folder / "progress.png")
-    figures.append(("The last image during the optimisation.", path))
+    search: Figures = [("The last image during the optimisation.", path)]
     steps = made.problem.steps
     if steps > 0 and find_spec("av"):
         numbers = np.unique(np.linspace(0, steps, MOST_FRAMES).astype(int))
         states = made.problem.states(made.search.parameters(result.parameters), numbers.tolist())
         path = write_video(folder / "estimate.mp4", (made.image(states[k]) for k in numbers.tolist()), 20)
-        figures.append(("The run with the estimated parameters.", path))
-    return figures
+        compared.append(("The run with the estimated parameters.", path))
+    return Chapters(compared=compared, search=search)
 
 
 def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
     """The estimate of a parameter over the iterations; of one that changes over time, the last estimate over time."""
     estimate, true = made.search.parameters(result.parameters)[name], made.true_parameter(name)
+    path, first = folder / f"{name}.png", np.asarray(made.search.parameters(made.start)[name])
+    names = component_names(made.task.scene, name, estimate)
     if name in OVER_TIME and np.ndim(estimate) == 2:
-        axes = Tilt(made.task.scene.forces.gravity).towards if name == "tilt" else "xyz"
-        series = {f"{axis}, estimate": column for axis, column in zip(axes, estimate.T, strict=False)}
-        truth = () if true is None else tuple(np.broadcast_to(true, estimate.shape).T)
-        path = folder / f"{name}.png"
-        label = f"{name} [{UNITS[name]}]"
-        curve(np.arange(len(estimate)), series, path, title=name, x_label="step", y_label=label, true=truth)
-        return [(f"The parameter {name} over time.", path)]
-    if true is None or max(np.size(estimate), true.size) > MOST_CURVES:
+        x, found, x_label, words = np.arange(len(estimate)), np.asarray(estimate), "step", "over time"
+    elif true is None or max(np.size(estimate), true.size) > MOST_CURVES:
         return []
-    values = [made.search.parameters(record.parameters)[name] for record in result.history]
-    history = [np.broadcast_arrays(value, true)[0] for value in values]
-    true = np.broadcast_to(true, history[0].shape)
-    phases = [phase.name for phase in made.task.scene.phase]
-    is_material = BY_NAME[name].axis is Axis.PHASE and BY_NAME[name].components is None
-    names = phases if is_material and len(phases) > 1 else None
-    path = parameters(history, true, folder / f"{name}.png", names=names, title=name, unit=UNITS[name])
-    return [(f"The parameter {name} during the optimisation, and its true value.", path)]
+    else:
+        shape = np.broadcast_shapes(np.shape(estimate), true.shape)
+        values = [made.search.parameters(record.parameters)[name] for record in result.history]
+        found = np.array([np.broadcast_to(value, shape).ravel() for value in values])
+        true, first = (np.broadcast_to(value, shape).ravel() for value in (true, first))
+        x, x_label, words = np.arange(len(found)), "iteration", "during the optimisation"
+        names = names if len(names) == found.shape[1] else [str(k) for k in range(found.shape[1])]
+    label = name.replace("_", " ")
+    panels(x, found, path, names=names, title=label, x_label=x_label, unit=UNITS[name], true=true, start=first)
+    hidden = "" if true is None else ", and its hidden value"
+    return [(f"The parameter {label} {words}{hidden}.", path)]
+
+
+def component_names(scene: Scene, name: str, value: np.ndarray) -> list[str]:
+    """Of the numbers of a parameter, of one over time those of a row: its axes, its phases, or else counted."""
+    parameter, last = BY_NAME[name], np.shape(value)[-1:]
+    count = int(np.prod(np.shape(value))) if parameter.axis is not Axis.STEP else int(np.prod(last))
+    label = name.replace("_", " ")
+    if count == 1:
+        return [label]
+    if name == "tilt":
+        return [f"{label} towards {axis}" for axis in Tilt(scene.forces.gravity).towards]
+    if parameter.axis is Axis.STEP:
+        return [f"{label} {axis}" for axis in "xyz"[:count]]
+    if parameter.axis is Axis.PHASE and count == len(scene.phase):
+        return [f"{label} of {phase.name}" for phase in scene.phase]
+    if name == "colours":
+        return [f"{hue} of {phase.name}" for phase in scene.phase for hue in ("red", "green", "blue")]
+    return [f"{label} {k}" for k in range(count)]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cortado.inverse.chapters import Chapters
 from cortado.inverse.setup import Setup
 from cortado.io.pictures import write_picture
 from cortado.io.report import Figures
@@ -24,8 +25,8 @@ Run = Mapping[int, Snapshot]
 """States by the number of steps before them."""
 
 
-def shaded_figures(made: Setup, result: Result, folder: Path) -> Figures:
-    """Draw them into a folder; (caption, path) of each."""
+def shaded_figures(made: Setup, result: Result, folder: Path) -> Chapters:
+    """Draw them into a folder."""
     picture, device = made.task.scene.picture or Picture(), made.problem.simulation.device
     steps = np.unique(np.linspace(0, made.problem.steps, max(picture.film_frames, 2)).astype(int)).tolist()
 
@@ -43,21 +44,19 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> Figures:
     three = page(list(runs), list(runs.values()))
     path = folder / "found.png"
     write_picture(path, three(steps[-1]))
-    figures: Figures = [(f"The end of the run: {', '.join(runs)}.", path)]
+    compared: Figures = [(f"The end of the run: {', '.join(runs)}.", path)]
     shown = [k for k in ITERATIONS if k < len(result.history)] or [0]
     searched = page([f"iteration {k}" for k in shown], [found(result.history[k].parameters) for k in shown])
     path = folder / "search.png"
     write_picture(path, searched(steps[-1]))
-    figures.append(("The end of the run as the search went on.", path))
+    search: Figures = [("The end of the run as the search went on.", path)]
     if not picture.film_frames or len(steps) < 2:
-        return figures
+        return Chapters(compared=compared, search=search)
     pair = {name: runs[name] for name in (("found", "target") if "target" in runs else ("first guess", "found"))}
     two = page(list(pair), list(pair.values()))
-    films: Figures = [
-        (f"The run: {' and '.join(pair)}.", film(folder / "found.mp4", two, steps, picture.film_frames)),
-        ("The search in motion.", film(folder / "search.mp4", searched, steps, picture.film_frames)),
-    ]
-    return [films[0], figures[0], films[1], figures[1]]
+    motion = film(folder / "found.mp4", two, steps, picture.film_frames)
+    search.insert(0, ("The search in motion.", film(folder / "search.mp4", searched, steps, picture.film_frames)))
+    return Chapters(found=[(f"The run: {' and '.join(pair)}.", motion)], compared=compared, search=search)
 
 
 def _pages(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -> Any:

@@ -1,0 +1,82 @@
+"""The particles of runs of a scene in motion, as a piece of a page, in the scene's colours and its container."""
+
+from collections.abc import Iterable, Mapping
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cortado.io.particle_view import Cloud, particle_view
+from cortado.io.trajectory import Trajectory
+from cortado.lattice.shapes import Points, corners
+from cortado.scene.containers import CylinderContainer
+from cortado.scene.fluids import INDEX_OF_AXIS
+from cortado.scene.scene import Scene
+from cortado.shading.painter import colours_of
+from cortado.shading.stage import upright
+
+ROUND = 48
+"""Sides of the polygon that stands for a circle."""
+
+
+class MovingState(Protocol):
+    """A state of a run; n particles in d dimensions."""
+
+    @property
+    def positions(self) -> Points:
+        """(n, d) [m]"""
+
+    @property
+    def velocities(self) -> Points:
+        """(n, d) [m/s]"""
+
+    @property
+    def mass_fractions(self) -> Points | None:
+        """(n, phases) [-]; None with one phase"""
+
+
+def trajectory_view(scene: Scene, trajectory: Trajectory) -> str:
+    """HTML that shows a run; see `scene_view`."""
+    return scene_view(scene, {scene.name: list(trajectory)}, trajectory.times)
+
+
+def scene_view(scene: Scene, runs: Mapping[str, Iterable[MovingState]], times: ArrayLike) -> str:
+    """HTML that shows runs of a scene side by side, each by its name with a state for each of the times (frames,) [s];
+    see `particle_view`."""
+    turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
+    clouds = [_cloud(scene, name, list(states), turn) for name, states in runs.items()]
+    return particle_view(clouds, times, scene.discretisation.spacing, lines=outline(scene) @ turn.T)
+
+
+def outline(scene: Scene) -> Points:
+    """(k, 2, d) ends of the lines that draw the container of a scene [m]; none without a container."""
+    container, ends = scene.container, scene.container.extent()
+    if ends is None:
+        return np.zeros((0, 2, scene.dimension))
+    if isinstance(container, CylinderContainer):
+        return _cup(container)
+    places = corners(*ends)
+    pairs = [(a, b) for a in range(len(places)) for b in range(a) if np.count_nonzero(places[a] != places[b]) == 1]
+    return places[np.array(pairs)]
+
+
+def _cup(container: CylinderContainer) -> Points:
+    """Two circles, and four lines between them."""
+    angles = np.linspace(0.0, 2.0 * np.pi, ROUND, endpoint=False)
+    axis = INDEX_OF_AXIS[container.axis]
+    circle = np.insert(container.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1), axis, 0.0, axis=1)
+    low = circle + np.asarray(container.base)
+    high = low + container.height * np.eye(3)[axis]
+    rims = [np.stack([rim, np.roll(rim, -1, axis=0)], axis=1) for rim in (low, high)]
+    sides = np.stack([low, high], axis=1)[:: ROUND // 4]
+    return np.concatenate([*rims, sides])
+
+
+def _cloud(scene: Scene, name: str, states: list[MovingState], turn: Points) -> Cloud:
+    positions = np.stack([state.positions for state in states]) @ turn.T
+    speeds = np.stack([np.linalg.norm(state.velocities, axis=1) for state in states])
+    particles = positions.shape[1]
+    if len(scene.phase) == 1:
+        return Cloud(name, positions, speeds, colours_of(scene, None, particles))
+    colours = [colours_of(scene, state.mass_fractions, particles) for state in states]
+    return Cloud(name, positions, speeds, np.stack(colours))
