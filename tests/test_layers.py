@@ -16,8 +16,8 @@ LAYERS = """
     words
     arrays
     restart
-    io io.files io.folder_lock io.input_files io.interruption io.notebook io.terminal io.progress io.run_environment
-    io.shipped io.srgb io.particle_view io.usage io.video io.vtkhdf_layout io.vtkhdf
+    io io.files io.folder_lock io.input_files io.interruption io.terminal io.progress io.run_environment
+    io.shipped io.srgb io.particle_view io.notebook io.usage io.video io.vtkhdf_layout io.vtkhdf
     lattice lattice.shapes lattice.pairs lattice.region lattice.smoothing lattice.calibration
     parameters parameters.reference_density parameters.registry parameters.table parameters.tilt parameters.values
     scene scene.fields scene.sentences scene.point_reader scene.points scene.tables
@@ -80,7 +80,7 @@ LAYERS = """
     commands commands.executor commands.bench commands.check commands.compare commands.describe commands.examples
     commands.figure commands.new commands.optimise commands.overview commands.picture commands.run_summary commands.run
     commands.schema commands.study
-    commands.sweep
+    commands.sweep commands.view_window commands.view_recorded commands.view_live commands.view
     cli
     __main__
 """

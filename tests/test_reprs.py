@@ -1,7 +1,9 @@
 """What is shown of results: a few words, never the numbers of an array; in notebooks a picture or a table too."""
 
+import json
 import re
 from base64 import b64decode
+from html import unescape
 from io import BytesIO
 
 import numpy as np
@@ -90,7 +92,7 @@ def test_a_certificate_is_the_same_text_in_a_notebook(certificate, monkeypatch):
     assert str(certificate) == text and "adjoint" in text.splitlines()[2]
 
 
-@pytest.mark.parametrize("name", ["trajectory", "result"])
+@pytest.mark.parametrize("name", ["simulation", "trajectory", "result"])
 def test_a_notebook_shows_a_picture(name, request):
     found = request.getfixturevalue(name)
     html = found._repr_html_()
@@ -98,6 +100,13 @@ def test_a_notebook_shows_a_picture(name, request):
     pixels = np.asarray(Image.open(BytesIO(b64decode(picture))).convert("L"))
     assert pixels.shape[1] >= 1000 and 0.001 < np.mean(pixels < 200) < 0.9
     assert html.startswith(f"<p>{repr(found)[:10]}")
+
+
+def test_a_notebook_plays_a_trajectory(trajectory):
+    (page,) = re.findall(r'<iframe srcdoc="([^"]*)"', trajectory._repr_html_())
+    data = json.loads(unescape(page).partition('"application/json">')[2].partition("</script>")[0])
+    assert len(data["times"]) == len(trajectory) and data["particles"] == 64
+    assert data["radius"] == pytest.approx(0.56 * 0.05, rel=0.3)
 
 
 def test_a_trajectory_of_nothing_has_no_picture(trajectory):

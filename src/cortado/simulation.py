@@ -22,6 +22,8 @@ from cortado.device.state import State
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.discretise.discrete_scene import DiscreteScene, discretise
 from cortado.errors import CortadoWarning, DivergedError, InputError, shown
+from cortado.figures.particle_sets import particles
+from cortado.io.notebook import with_picture
 from cortado.io.trajectory import Frame, Trajectory
 from cortado.io.trajectory_batch import TrajectoryBatch
 from cortado.lattice.calibration import diffusion_limit
@@ -129,6 +131,11 @@ class Simulation:
         sizes = f"{counted(self.particles, 'particle')}, {counted(len(self.scene.phase), 'phase')}"
         batch = "" if self.batch is None else f"batch of {self.batch}, "
         return f"Simulation({batch}{sizes}, {self.device.alias}, {self.precision.name})"
+
+    def _repr_html_(self) -> str:
+        """With a picture of its first particles."""
+        shown, extent = self.positions[: self.free_particles or None], self.scene.container.extent()
+        return with_picture(self, lambda path: particles([shown], ["t = 0 s"], path, container=extent))
 
     @property
     def dimension(self) -> int:

@@ -13,9 +13,15 @@ from numpy.typing import NDArray
 
 from cortado.errors import InputError, shown
 from cortado.io import vtkhdf
-from cortado.io.notebook import as_text, with_picture
+from cortado.io.notebook import as_text, with_view
+from cortado.io.particle_view import Cloud, particle_view
 from cortado.restart import Clock, RestartState
 from cortado.words import counted
+
+IN_A_NOTEBOOK = 1_000_000
+"""Bytes of what a notebook shows in motion."""
+MANY = 2000
+"""Particles of which the nearest others are looked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +90,7 @@ class Trajectory:
         return f"Trajectory({counted(len(self), 'frame')} of {counted(self.particles, 'particle')}{times})"
 
     def _repr_html_(self) -> str:
-        """Its first, middle and last frame, coloured by speed."""
+        """In motion, with y up; and its first, middle and last frame, coloured by speed."""
         from cortado.figures.particle_sets import particles
 
         if not len(self):
@@ -93,7 +99,9 @@ class Trajectory:
         titles = [f"t = {frame.time:.4g} s" for frame in shown]
         speeds = [np.linalg.norm(frame.velocities, axis=1) for frame in shown]
         sets, label = [frame.positions for frame in shown], "speed [m/s]"
-        return with_picture(self, lambda path: particles(sets, titles, path, colours=speeds, colour_label=label))
+        cloud = Cloud("run", self.positions, np.linalg.norm(self.velocities, axis=2))
+        view = particle_view([cloud], self.times, _spacing(self.positions[0]), most_bytes=IN_A_NOTEBOOK)
+        return with_view(self, view, lambda path: particles(sets, titles, path, colours=speeds, colour_label=label))
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -215,6 +223,15 @@ class Trajectory:
         phases = sum(name.startswith(FRACTION) for name in arrays)
         fractions = np.stack([arrays[name] for name in _fraction_names(phases)], axis=-1) if phases else None
         return cls(**{name: arrays[name] for name in names}, mass_fractions=fractions)
+
+
+def _spacing(positions: NDArray[Any]) -> float:
+    """The usual distance [m] from a particle at one of positions (n, d) to the nearest other; 1 of a single one."""
+    from scipy.spatial import KDTree
+
+    if len(positions) < 2:
+        return 1.0
+    return float(np.median(KDTree(positions).query(positions[:MANY], k=2)[0][:, 1])) or 1.0
 
 
 def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
