@@ -84,6 +84,8 @@ def test_a_nozzle_follows_its_sliders(scene):
 
 def test_particles_are_coloured_by_what_is_asked(live):
     live.tick()
+    live.window.colour.value = "phase"
+    live.window._draw()
     phase = np.array(live.window._cloud.colors)
     live.window.colour.value = "density"
     live.window._draw()

@@ -41,7 +41,8 @@ class Window:
         self._cloud: Any = None
         self._shown: tuple[Points, Points, Mapping[str, Quantity]] | None = None
         self.server.scene.set_up_direction("+y")
-        self.colour = self.server.gui.add_dropdown("Colour", ["phase", *units])
+        first = "phase" if len(scene.phase) > 1 else next(iter(units))  # one colour would show no depth
+        self.colour = self.server.gui.add_dropdown("Colour", ["phase", *units], initial_value=first)
         self.legend = self.server.gui.add_markdown("")
         self.colour.on_update(lambda _: self._draw())
         self._frame_container()
