@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from cortado.errors import LONGEST
 
 _COMMAND = re.compile(
-    r"(new|examples|describe|run|compare|optimise|sweep|bench|schema|completion"
+    r"(new|examples|describe|run|compare|optimise|picture|sweep|bench|schema|completion"
     r"|gradients( (check|figure|study))?)(?= |$)"
 )
 _EDGES = "│|╭╮╰╯─-+ "
