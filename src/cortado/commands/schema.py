@@ -1,8 +1,8 @@
 """``cortado schema``: the JSON schema of scenes and tasks, with which editors complete and check them."""
 
-from cortado.io.shipped import SCHEMA
+from cortado.inverse.file_schema import file_schema_text
 
 
 def print_schema() -> str:
     """As JSON."""
-    return SCHEMA.read_text("utf-8").rstrip("\n")
+    return file_schema_text().rstrip("\n")
