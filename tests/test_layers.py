@@ -56,7 +56,8 @@ LAYERS = """
     io.pictures
     figures.canvas figures.particle_sets figures.side_by_side
     io.trajectory io.trajectory_batch
-    shading shading.surface shading.stage shading.shadow shading.optics shading.trace shading.space shading.plane
+    shading shading.surface shading.stage shading.shadow shading.surroundings shading.glass shading.meeting
+    shading.trace shading.space shading.plane
     shading.painter shading.labels shading.film
     simulation
     problem
