@@ -16,6 +16,7 @@ from cortado.io.folder_lock import LOCK, locked
 
 HOLDER = """
 import sys, time
+from pathlib import Path
 from cortado.io.folder_lock import locked
 
 with locked(Path(sys.argv[1])):
