@@ -170,7 +170,7 @@ def _write(folder: Path, kind: str) -> None:
 
 def shell_script(environment: Environment, kind: str, cache: Path) -> str:
     """What bash is given to run one command; ``cache`` is where compiled kernels are."""
-    options = "--steps 5" if kind == "run" else ""
+    options = "--no-pictures --steps 5" if kind == "run" else "--no-pictures"
     command = f'{shlex.join(console())} {kind} "${{1:-$file}}" {options} --out "${{2:-out}}"'
     return (
         f"file=file.toml; cache={shlex.quote(str(cache))}; run() {{ exec $through {command}; }}; {environment.script}"

@@ -41,8 +41,8 @@ def prepare(folder: Path) -> list[Outcome]:
     scene = bases.ROOT / "experiments" / "scenes" / "splash.toml"
     (folder / "experiment.toml").write_text(experiment.replace("scenes/splash.toml", str(scene)))
     outcomes = [
-        by_fork(["run", "scene.toml", "--steps", "6", "--out", "run"], folder),
-        by_fork(["optimise", "task.toml", "--out", SEARCH], folder),
+        by_fork(["run", "scene.toml", "--no-pictures", "--steps", "6", "--out", "run"], folder),
+        by_fork(["optimise", "task.toml", "--no-pictures", "--out", SEARCH], folder),
         call(lambda: _write_points(folder), ("points",), folder),
     ]
     for outcome in outcomes:
@@ -83,12 +83,12 @@ def read_hostile(case: Case) -> None:
 
 
 def _run(case: Case) -> None:
-    outcome = case.cortado("run", "scene.toml", "--steps", "2", "--out", "out")
+    outcome = case.cortado("run", "scene.toml", "--no-pictures", "--steps", "2", "--out", "out")
     case.complaints += run_complaints(case.folder / "out", outcome.code == 0, 2)
 
 
 def _search(case: Case) -> None:
-    outcome = case.cortado("optimise", "task.toml", "--out", "out")
+    outcome = case.cortado("optimise", "task.toml", "--no-pictures", "--out", "out")
     case.complaints += search_complaints(case.folder / "out", outcome.code == 0)
 
 
@@ -118,7 +118,7 @@ def _resume(case: Case, good: Path, name: str) -> None:
     content = (out / name).read_bytes()
     (out / name).unlink()
     case.notes += [name, make_hostile(out / name, content, others, case.random)]
-    outcome = case.cortado("optimise", "task.toml", "--out", "out", "--resume")
+    outcome = case.cortado("optimise", "task.toml", "--no-pictures", "--out", "out", "--resume")
     if outcome.code == 0 and _content(out / "checkpoint" / "replay.log") != wanted:
         case.complaints.append("a search with a damaged folder went on with other bits")
 

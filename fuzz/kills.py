@@ -97,11 +97,11 @@ def _choose(case: Case, choices: Sequence[tuple[str, str]]) -> tuple[str, str, P
 
 
 def _run_words(precision: str, steps: int) -> list[str]:
-    return ["run", "file.toml", "--out", "out", "--steps", str(steps), "--precision", precision]
+    return ["run", "file.toml", "--no-pictures", "--out", "out", "--steps", str(steps), "--precision", precision]
 
 
 def _search_words(precision: str) -> list[str]:
-    return ["optimise", "file.toml", "--out", "out", "--precision", precision]
+    return ["optimise", "file.toml", "--no-pictures", "--out", "out", "--precision", precision]
 
 
 def _longer(tables: bases.Tables) -> bases.Tables:

@@ -19,7 +19,7 @@ def run_scene(case: Case) -> None:
     if case.random.random() < 0.2:
         words += ["--precision", "float64"]
     overrides, odd = _write(case, "scene.toml", bases.scenes())
-    outcome = case.cortado("run", "scene.toml", "--out", "out", *words, *overrides, *odd)
+    outcome = case.cortado("run", "scene.toml", "--no-pictures", "--out", "out", *words, *overrides, *odd)
     if outcome.hung or outcome.swollen:
         _forgive_if_large(case, "scene.toml", overrides[1::2], steps)
     asked = None if odd else steps
@@ -30,7 +30,7 @@ def search_task(case: Case) -> None:
     """A task with one to three things changed is searched for a few iterations."""
     overrides, odd = _write(case, "task.toml", bases.tasks())
     precision = ["--precision", "float64"] if case.random.random() < 0.2 else []
-    outcome = case.cortado("optimise", "task.toml", "--out", "out", *precision, *overrides, *odd)
+    outcome = case.cortado("optimise", "task.toml", "--no-pictures", "--out", "out", *precision, *overrides, *odd)
     if outcome.hung or outcome.swollen:
         _forgive_if_large(case, "task.toml", overrides[1::2], 0)
     case.complaints += search_complaints(case.folder / "out", outcome.code == 0)

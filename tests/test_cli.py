@@ -691,7 +691,7 @@ def test_a_planted_error_fails_the_check(cortado_command, monkeypatch, json_opti
 
 
 def test_bench_speaks_json_and_words(cortado_command):
-    code, out, err = cortado_command("bench", "--particles", 8, 100, "--steps", 2, "--repeats", 1, "--json")
+    code, out, err = cortado_command("bench", "--particles", 8, 100, "--steps", 2, "--repeats", 5, "--json")
     found = json.loads(out)
     assert (code, err) == (0, "") and [row["particles"] for row in found["sizes"]] == [8, 125]
     assert all(row["steps"] == 2 and row["gradient"]["ms"] > row["rollout"]["ms"] > 0.0 for row in found["sizes"])

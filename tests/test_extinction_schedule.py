@@ -88,7 +88,7 @@ def test_positions_have_no_extinction(tmp_path):
 
 
 def test_each_search_begins_where_the_last_one_ended(file):
-    main(["optimise", "task.toml", "--set", STAGED, "--out", "run"])
+    main(["optimise", "task.toml", "--no-pictures", "--set", STAGED, "--out", "run"])
     metrics = [json.loads(line) for line in Path("run/metrics.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in metrics] == list(range(10))  # 4 updates and the last iterate, twice
     made = setup(load_task(file, [STAGED]), "cpu", "float32")
@@ -99,16 +99,27 @@ def test_each_search_begins_where_the_last_one_ended(file):
 
 def test_searches_resume_bit_for_bit(file):
     """Even when interrupted in the second one; and with another schedule they are refused."""
-    main(["optimise", "task.toml", "--set", STAGED, "--out", "whole"])
-    main(["optimise", "task.toml", "--set", STAGED, "--out", "cut"])
+    main(["optimise", "task.toml", "--no-pictures", "--set", STAGED, "--out", "whole"])
+    main(["optimise", "task.toml", "--no-pictures", "--set", STAGED, "--out", "cut"])
     log, metrics = Path("cut/checkpoint/1/replay.log"), Path("cut/metrics.jsonl")
     log.write_bytes(log.read_bytes()[: int(0.6 * log.stat().st_size)])
     metrics.write_text("".join(metrics.read_text().splitlines(keepends=True)[:7]))
-    main(["optimise", "task.toml", "--set", STAGED, "--out", "cut", "--resume"])
+    main(["optimise", "task.toml", "--no-pictures", "--set", STAGED, "--out", "cut", "--resume"])
     for name in ("metrics.jsonl", "checkpoint/replay.log", "checkpoint/1/replay.log"):
         assert (Path("cut") / name).read_bytes() == (Path("whole") / name).read_bytes()
     with pytest.raises(SystemExit) as end:
-        main(["optimise", "task.toml", "--set", "optimise.extinction_schedule=[0.5, 1.0]", "--out", "cut", "--resume"])
+        main(
+            [
+                "optimise",
+                "task.toml",
+                "--no-pictures",
+                "--set",
+                "optimise.extinction_schedule=[0.5, 1.0]",
+                "--out",
+                "cut",
+                "--resume",
+            ]
+        )
     assert end.value.code == 2
 
 

@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import runpy
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import sys
 import pytest
 
 from cortado.errors import InputError
+from cortado.io import file_lock
 from cortado.io.folder_lock import LOCK, locked
 
 HOLDER = """
@@ -77,3 +79,26 @@ def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path):
     with pytest.raises(InputError, match="cannot be written"), locked(tmp_path):
         pass
     assert (tmp_path / "precious").read_text() == "mine"
+
+
+def test_a_lock_on_windows_is_one_byte_that_others_need_not_read(tmp_path, monkeypatch):
+    """With what Windows has in the place of flock, as there is no Windows to run it on."""
+    asked = []
+
+    class Msvcrt:
+        LK_NBLCK = 2
+
+        @staticmethod
+        def locking(file, mode, size):
+            asked.append((os.lseek(file, 0, os.SEEK_CUR), mode, size))
+            if len(asked) > 1:
+                raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setitem(sys.modules, "msvcrt", Msvcrt)
+    monkeypatch.setattr(sys, "platform", "win32")
+    found = runpy.run_path(file_lock.__file__)
+    with open(tmp_path / LOCK, "w+b") as file:
+        found["lock"](file.fileno())
+        assert asked == [(found["BEYOND"], 2, 1)] and file.tell() == 0
+        with pytest.raises(BlockingIOError):
+            found["lock"](file.fileno())

@@ -16,8 +16,8 @@ LAYERS = """
     words
     arrays
     restart
-    io io.files io.folder_lock io.input_files io.interruption io.notebook io.terminal io.progress io.run_environment
-    io.shipped io.srgb io.usage io.video io.vtkhdf_layout io.vtkhdf
+    io io.file_lock io.files io.folder_lock io.input_files io.interruption io.notebook io.terminal io.progress
+    io.run_environment io.shipped io.srgb io.usage io.video io.vtkhdf_layout io.vtkhdf
     lattice lattice.shapes lattice.pairs lattice.region lattice.smoothing lattice.calibration
     parameters parameters.reference_density parameters.registry parameters.table parameters.tilt parameters.values
     scene scene.fields scene.sentences scene.point_reader scene.points scene.tables
@@ -56,7 +56,8 @@ LAYERS = """
     io.pictures
     figures.canvas figures.particle_sets figures.side_by_side
     io.trajectory io.trajectory_batch
-    shading shading.surface shading.stage shading.shadow shading.optics shading.trace shading.space shading.plane
+    shading shading.surface shading.stage shading.shadow shading.surroundings shading.glass shading.meeting
+    shading.trace shading.space shading.plane
     shading.painter shading.labels shading.film
     simulation
     problem

@@ -143,7 +143,19 @@ def test_a_task_is_optimised_with_every_combination(alone, folder):
     ]
     assert {row["status"] for row in found} == {"done"} and all(float(row["loss"]) < 1e-7 for row in found)
 
-    main(["optimise", "task.toml", "--set", "optimise.learning_rate=0.5", "--set", "problem.steps=4", "--out", "one"])
+    main(
+        [
+            "optimise",
+            "task.toml",
+            "--no-pictures",
+            "--set",
+            "optimise.learning_rate=0.5",
+            "--set",
+            "problem.steps=4",
+            "--out",
+            "one",
+        ]
+    )
     member = alone / found[0]["folder"]
     for name in ("metrics.jsonl", "result.json", "checkpoint/replay.log"):
         assert (member / name).read_bytes() == (folder / "one" / name).read_bytes(), name
@@ -262,12 +274,12 @@ def test_a_worker_that_is_killed_half_way_changes_nothing(alone, sweep, folder):
 def test_a_search_with_an_ensemble_has_the_same_bits_on_workers(folder, capfd):
     options = ("--set", "optimise.iterations=2", "--set", "optimise.gradient.samples=4")
     options += ("--set", "optimise.gradient.spread.gravity=0.1")
-    main(["optimise", "task.toml", *options, "--out", "alone"])
-    main(["optimise", "task.toml", *options, "--out", "many", "--workers", "2"])
+    main(["optimise", "task.toml", "--no-pictures", *options, "--out", "alone"])
+    main(["optimise", "task.toml", "--no-pictures", *options, "--out", "many", "--workers", "2"])
     logs = [(folder / out / "checkpoint" / "replay.log").read_bytes() for out in ("alone", "many")]
     assert logs[0] == logs[1] and len(logs[0]) > 100
     with pytest.raises(SystemExit) as end:
-        main(["optimise", "task.toml", "--out", "more", "--workers", "2"])
+        main(["optimise", "task.toml", "--no-pictures", "--out", "more", "--workers", "2"])
     assert end.value.code == 2 and not Path("more").exists()
     wanted = "--workers is given, but must be left out, as optimise.gradient.samples is 1.\n"
     assert without_compiling(capfd.readouterr().err) == wanted

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import socket
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from cortado.errors import InputError
+from cortado.io.file_lock import lock
 from cortado.io.files import sentences
 
 LOCK = ".lock"
@@ -36,14 +36,15 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        path.unlink(missing_ok=True)
+        with suppress(PermissionError):  # on Windows no open file can be removed: it stays, unlocked
+            path.unlink(missing_ok=True)
         os.close(file)
 
 
 def _open_locked(path: Path) -> int:
     """The file descriptor of the locked file, which names this process."""
     while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
         try:
             _lock(file, path.parent)
             if _is_at(path, file):
@@ -59,7 +60,7 @@ def _open_locked(path: Path) -> int:
 
 def _lock(file: int, folder: Path) -> None:
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock(file)
     except BlockingIOError:
         owner = os.read(file, 200).decode(errors="replace") or "another process"
         raise InputError(

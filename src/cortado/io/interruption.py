@@ -80,5 +80,7 @@ def _try_again(dropped: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(dropped)
     else:
         number = dropped.exc_value.args[0]
+        if not hasattr(signal, "setitimer"):  # on Windows
+            _leave(number, None)
         signal.signal(signal.SIGALRM, lambda *_: _raise(number, None))
         signal.setitimer(signal.ITIMER_REAL, AGAIN)

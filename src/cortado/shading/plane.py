@@ -1,6 +1,7 @@
 """Pictures of fluid in 2-D: a body with a smooth edge and a little gloss, in its container, on paper."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -55,16 +56,18 @@ class PlanePainter:
 
     def image(self, positions: Points, colours: Points) -> Points:
         """A picture (rows, columns, 3), linear from 0 to 1: particles at positions (n, 2) [m] with colours (n, 3)."""
-        x, y = self._pixels()
-        paper = self._paper(x, y)
         cover, colour = self._fluid(np.asarray(positions, dtype=np.float64), np.asarray(colours, dtype=np.float64))
-        room = np.zeros_like(cover) if self.container is None else self._room(x, y)
-        fluid = self._glossy(cover if self.container is None else np.where(room > 0.5, cover, 1.0), colour)
-        alpha = (cover if self.container is None else cover * room)[..., None]
-        outside = paper * (1.0 - self._shadow(x, y) * (1.0 - room))[..., None]
-        inside = outside + (1.0 - paper) * (0.40 * room)[..., None]
-        return np.clip(self._outlined(x, y, inside * (1.0 - alpha) + fluid * alpha), 0.0, 1.0)
+        if self.container is None:
+            fluid, alpha = self._glossy(cover, colour), cover[..., None]
+        else:
+            fluid, alpha = self._glossy(np.where(self._room > 0.5, cover, 1.0), colour), (cover * self._room)[..., None]
+        image = self._behind * (1.0 - alpha) + fluid * alpha
+        if self.container is not None:
+            opacity, glass = self._glass
+            image = image * (1.0 - opacity) + glass
+        return np.clip(image, 0.0, 1.0)
 
+    @cached_property
     def _pixels(self) -> tuple[Points, Points]:
         """(rows, columns) where the middle of each pixel is [m]: x, and y."""
         columns, rows, middle = self.picture.width, self.picture.height, 0.5 * (self.lower + self.upper)
@@ -72,14 +75,26 @@ class PlanePainter:
         y = middle[1] - (np.arange(rows) - 0.5 * (rows - 1)) * self.pixel
         return np.meshgrid(x, y)
 
-    def _paper(self, x: Points, y: Points) -> Points:
+    @cached_property
+    def _behind(self) -> Points:
+        """(rows, columns, 3) what is behind the fluid: the paper, the container's shadow on it, and its inside."""
+        if self.container is None:
+            return self._paper()
+        room, paper = self._room, self._paper()
+        outside = paper * (1.0 - self._shadow() * (1.0 - room))[..., None]
+        return outside + (1.0 - paper) * (0.40 * room)[..., None]
+
+    def _paper(self) -> Points:
         """The background, a little brighter in the middle and darker in the corners."""
+        x, y = self._pixels
         middle, half = 0.5 * (self.lower + self.upper), 0.5 * self.pixel * self.picture.width
         away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
         return np.asarray(self.picture.background) * (1.12 - 0.20 * away)[..., None]
 
-    def _room(self, x: Points, y: Points) -> Points:
+    @cached_property
+    def _room(self) -> Points:
         """(rows, columns) the part of each pixel that is within the container."""
+        x, y = self._pixels
         off = np.minimum.reduce([x - self.lower[0], self.upper[0] - x, y - self.lower[1], self.upper[1] - y])
         return np.clip(off / self.pixel + 0.5, 0.0, 1.0)
 
@@ -88,10 +103,9 @@ class PlanePainter:
         """How thick the walls are drawn [m]."""
         return 0.010 * float((self.upper - self.lower).max())
 
-    def _shadow(self, x: Points, y: Points) -> Points:
+    def _shadow(self) -> Points:
         """(rows, columns) how much darker the paper is behind the container."""
-        if self.container is None:
-            return np.zeros_like(x)
+        x, y = self._pixels
         size = float((self.upper - self.lower).max())
         blur, drop = 0.022 * size, 0.020 * size
 
@@ -116,11 +130,13 @@ class PlanePainter:
         corner = wet.min(axis=0) - reach
         counts = np.ceil((wet.max(axis=0) + reach - corner) / cell).astype(int) + 1
         field, tinted = _splat(wet, strength, colours[of], corner, cell, counts, reach)
-        x, y = self._pixels()
+        x, y = self._pixels
         at = [(x - corner[0]) / cell, (y - corner[1]) / cell]
         level = map_coordinates(field, at, order=3, mode="constant", cval=0.0)
         slope = np.hypot(*np.gradient(level))
         cover = np.clip(0.5 + (level - 0.5) / np.maximum(slope, 1e-3), 0.0, 1.0)
+        if (colours == colours[0]).all():
+            return cover, np.broadcast_to(colours[0], (*cover.shape, 3))
         colour = np.stack([map_coordinates(tinted[k], at, order=1, mode="nearest") for k in range(3)], axis=-1)
         return cover, np.clip(colour, 0.0, 1.0)
 
@@ -156,10 +172,12 @@ class PlanePainter:
         deep = 0.80 + 0.20 * height
         return colour * (np.minimum(diffuse, 1.12) * deep)[..., None] + 0.55 * np.clip(gleam, 0.0, 1.0)[..., None]
 
-    def _outlined(self, x: Points, y: Points, image: Points) -> Points:
-        """With the walls of the container."""
-        if self.container is None:
-            return image
+    @cached_property
+    def _glass(self) -> tuple[Points, Points]:
+        """The walls of the container: how much they hide of what is behind them (rows, columns, 1), and what they add
+        (rows, columns, 3)."""
+        assert self.container is not None
+        x, y = self._pixels
         wall, half = self._wall, 0.5 * (self.upper - self.lower)
         off = np.stack([x, y]) - (0.5 * (self.lower + self.upper))[:, None, None]
         beyond = np.abs(off) - half[:, None, None]
@@ -170,8 +188,8 @@ class PlanePainter:
             if self.container.periodic[axis]:
                 band = band * (beyond[axis] < 0.0)
         shine = 1.0 - 0.35 * np.clip(distance / wall, 0.0, 1.0)
-        glass = np.array([0.40, 0.50, 0.55]) * shine[..., None]
-        return image * (1.0 - 0.85 * band)[..., None] + 0.85 * band[..., None] * glass
+        opacity = 0.85 * band[..., None]
+        return opacity, opacity * np.array([0.40, 0.50, 0.55]) * shine[..., None]
 
 
 def _distances(tree: object, points: Points, reach: float) -> Points:

@@ -12,11 +12,12 @@ from cortado.device.cores import usable_cores
 from cortado.device.launching import launch
 from cortado.device.threads import MOST_CORES, WARP, helpers
 from cortado.lattice.shapes import Points
-from cortado.shading import optics
+from cortado.shading.meeting import FluidSurface
 from cortado.shading.shadow import floor_shadow
 from cortado.shading.stage import Stage, screen_axes
 from cortado.shading.surface import Surface, liquid, spheres
-from cortado.shading.trace import Eye, FluidSurface, illuminate, trace
+from cortado.shading.surroundings import GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Surroundings
+from cortado.shading.trace import Eye, illuminate, trace
 
 ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 """Where in a pixel four more rays go, in pixels from its middle."""
@@ -149,7 +150,7 @@ def _directions(count: int) -> Points:
 
 
 def _surroundings(stage: Stage) -> Any:
-    picture, s = stage.picture, optics.Surroundings()
+    picture, s = stage.picture, Surroundings()
     horizon = np.asarray(picture.background)
     s.size, s.nearest = stage.size, 1e-4 * stage.size
     s.sun, s.fill = wp.vec3(*stage.sun), wp.vec3(*stage.fill)
@@ -158,10 +159,10 @@ def _surroundings(stage: Stage) -> Any:
     s.floor_colour = wp.vec3(*(0.93 * horizon))
     s.floor_centre = wp.vec3(*(0.5 * (stage.lower + stage.upper)))
     s.grid = _round_length(stage.size / 6.0)
-    s.glass = optics.NO_GLASS
+    s.glass = NO_GLASS
     if stage.container.extent() is not None:
         lower, upper = stage.glass_ends
-        s.glass = optics.GLASS_BOX if stage.container.shape == "box" else optics.GLASS_CYLINDER
+        s.glass = GLASS_BOX if stage.container.shape == "box" else GLASS_CYLINDER
         s.glass_frame = wp.mat33(*stage.glass_frame.ravel())
         s.glass_lower, s.glass_upper = wp.vec3(*lower), wp.vec3(*upper)
         lower, upper = (np.clip(end, -1e8, 1e8) for end in stage.room)
