@@ -98,7 +98,7 @@ def test_a_new_scene_runs_at_once(command, dimension):
     text = Path("dam.toml").read_text()
     particles = int(re.search(r"(\d+) particles in", text)[1])
     assert cortado.Simulation("dam.toml").particles == particles
-    code, out, err = command("run", "dam.toml", "--steps", 3)
+    code, out, err = command("run", "dam.toml", "--steps", 3, "--quiet")
     assert (code, err) == (0, "")
 
 

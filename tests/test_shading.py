@@ -306,7 +306,9 @@ def test_commands_write_pictures_and_films(tmp_path, monkeypatch, capsys):
     main(["picture", "a", "--frame", "1", "--set", "picture.width=128", "--out", "one.png"])
     assert cortado.pictures.read_picture("one.png").shape == (64, 128, 3)
     main(["picture", "a", "--film"])
+    capsys.readouterr()
     main(["optimise", "task.toml", "--out", "b"])
+    assert capsys.readouterr().out.splitlines()[-1].endswith("; open figures/found.mp4, or report.html.")
     written = {path.name for path in (tmp_path / "b" / "figures").iterdir()}
     assert {"found.png", "search.png", "found.mp4", "search.mp4"} <= written
     assert cortado.pictures.read_picture(tmp_path / "b" / "figures" / "found.png").shape == (64, 3 * 48, 3)

@@ -278,6 +278,7 @@ def test_a_search_with_an_ensemble_has_the_same_bits_on_workers(folder, capfd):
     main(["optimise", "task.toml", "--no-pictures", *options, "--out", "many", "--workers", "2"])
     logs = [(folder / out / "checkpoint" / "replay.log").read_bytes() for out in ("alone", "many")]
     assert logs[0] == logs[1] and len(logs[0]) > 100
+    capfd.readouterr()  # progress, where a search takes long
     with pytest.raises(SystemExit) as end:
         main(["optimise", "task.toml", "--no-pictures", "--out", "more", "--workers", "2"])
     assert end.value.code == 2 and not Path("more").exists()

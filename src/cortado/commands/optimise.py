@@ -126,12 +126,15 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
         noise = psnr(made.image(made.problem.states(estimate, [last])[last]), target)
     first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
     verdict = judge(made.task, result, estimate, noise, first)
-    figures = _shaded(made, result, folder.figures, pictures) + task_figures(made, result, folder.figures)
+    shaded = _shaded(made, result, folder.figures, pictures)
+    figures = shaded + task_figures(made, result, folder.figures)
     write_report(folder, made.task.scene.name, _sections(made, estimate, result, verdict, estimator, figures))
     folder.write_result(**_for_machines(result, estimate, verdict))
     if verdict.failures:
         raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
-    return f"{_summary(made, result, verdict)} The results are in {folder.path}; open report.html."
+    films = [f"figures/{Path(path).name}" for _, path in shaded.found if Path(path).suffix == ".mp4"]
+    to_open = ", or ".join([*films[:1], "report.html"])
+    return f"{_summary(made, result, verdict)} The results are in {folder.path}; open {to_open}."
 
 
 def _shaded(made: Setup, result: Result, folder: Path, wished: bool) -> Chapters:
@@ -227,12 +230,12 @@ def _for_machines(result: Result, estimate: Mapping[str, np.ndarray], verdict: V
 
 
 def _summary(made: Setup, result: Result, verdict: Verdict) -> str:
-    reached = [f"{name} within {100 * error:.3g}% of its true value" for name, error in verdict.errors.items()]
+    reached = [f"{name} is found with an error of {100 * error:.2g}%" for name, error in verdict.errors.items()]
     if verdict.psnr is not None:
-        reached.insert(0, f"the image is matched to {verdict.psnr:.3g} dB")
+        reached.append(f"the image is matched to {verdict.psnr:.3g} dB")
     fell = f"fell {verdict.reduction:.3g} times" if result.loss > 0.0 else f"went from {verdict.first:.3g} to 0"
     text = f"The loss {fell} in {len(result.history)} evaluations"
-    return f"{'; '.join([text, ', '.join(reached)]) if reached else text}."
+    return f"{'; '.join([text, *reached])}."
 
 
 def _asked(made: Setup) -> Section:
