@@ -13,6 +13,7 @@ ROOT = Path(__file__).parent.parent
 FOLDERS = ("examples", "docs/figures", "experiments/scenes", "fuzz/scenes")
 SPACINGS = {
     "dam_break": 0.16,
+    "drop": 0.012,
     "identify": 0.01,
     "latte_art": 0.006,
     "latte_art_heart": 0.006,
