@@ -329,14 +329,14 @@ def test_the_predicted_horizon():
 def test_the_advice():
     far = horizon((1.0, 9.0, 9.0), (1.0, 1.0, 1.0))
     found = replace(long(), horizons=(far,))
-    judged = [Judged("Exact()", 0.99, 9.0), Judged("AdjointViscosity(strength=0.1)", 0.8, 1.0)]
+    judged = [Judged("Exact()", 0.99, 9.0), Judged("AdjointViscosity()", 0.8, 1.0)]
     for (cosine, size), wanted in {
         (0.9, 1.0): "FrozenGeometry()",
-        (0.9, 3.0): "AdjointViscosity(strength=0.1)",
-        (0.7, 1.0): "AdjointViscosity(strength=0.1)",
+        (0.9, 3.0): "AdjointViscosity()",
+        (0.7, 1.0): "AdjointViscosity()",
     }.items():
         both = (*judged, Judged("FrozenGeometry()", cosine, size))
         assert replace(found, alignment=Alignment(0.1, both)).estimator == wanted
-    lost = (judged[0], Judged("AdjointViscosity(strength=0.1)", 0.1, 1.0), Judged("FrozenGeometry()", 0.2, 1.0))
+    lost = (judged[0], Judged("AdjointViscosity()", 0.1, 1.0), Judged("FrozenGeometry()", 0.2, 1.0))
     assert replace(found, alignment=Alignment(0.1, lost)).estimator == "RandomizedSmoothing()"
     assert replace(found, alignment=None).estimator == "AdjointViscosity()"

@@ -40,9 +40,8 @@ ESTIMATORS: dict[str, gradients.GradientEstimator] = {
     "exact": gradients.Exact(),
     "velocity only": gradients.FrozenGeometry(),
     "damped 20/s": gradients.Damped(20.0),
-    "smoothing 0.1": gradients.AdjointViscosity(0.1),
+    "smoothing 0.1": gradients.AdjointViscosity(1.0),
     "smoothing": gradients.AdjointViscosity(),
-    "smoothing, extrapolated": gradients.AdjointViscosity(order=2),
     "averaged over 8": gradients.EnsembleMean(SPREAD, 8, POSITION_NOISE),
 }
 DRAWN = ("exact", "velocity only", "smoothing", "averaged over 8")
@@ -143,7 +142,7 @@ class One:
     def __init__(self, case: Case, name: str):
         self._case, self._name = case, name
         self._problem = Problem(case.simulation, case.steps, case.losses[name])
-        self.simulation = SimpleNamespace(positions=case.start, scene=case.simulation.scene)
+        self.simulation = SimpleNamespace(positions=case.start, scene=case.simulation.scene, batch=None)
 
     def value(self, values: dict[str, np.ndarray]) -> float:
         return self._case.values(values)[self._name]
