@@ -13,6 +13,7 @@ import cortado
 from cortado import InputError, Problem, Simulation, losses
 from cortado.certificate import Consistency, certify
 from cortado.certificate.alignment import Alignment, Judged
+from cortado.certificate.growth import growth
 from cortado.certificate.horizon import Horizon
 from cortado.certificate.twin import in_float64
 from cortado.problem import ForwardPass
@@ -340,3 +341,13 @@ def test_the_advice():
     lost = (judged[0], Judged("AdjointViscosity()", 0.1, 1.0), Judged("FrozenGeometry()", 0.2, 1.0))
     assert replace(found, alignment=Alignment(0.1, lost)).estimator == "RandomizedSmoothing()"
     assert replace(found, alignment=None).estimator == "AdjointViscosity()"
+
+
+def test_growth_is_in_e_folds():
+    steps, dt = 100, 0.01
+    back = steps - np.arange(steps + 1)
+    assert growth(np.stack([np.exp(0.05 * back), 0 * back], axis=1), dt) == pytest.approx(5.0)
+    flight = np.stack([np.ones(steps + 1), back * dt], axis=1)
+    assert 0.0 < growth(flight, dt) < 0.5
+    assert growth(np.zeros((steps + 1, 2)), dt) == 0.0
+    assert growth(np.full((steps + 1, 2), np.inf), dt) == np.inf
