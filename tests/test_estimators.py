@@ -574,6 +574,51 @@ def test_before_chaos_an_average_and_the_exact_gradient_agree():
     assert np.linalg.norm(found.gradient["gravity"] - exact["gravity"]) < 0.02 * np.linalg.norm(exact["gravity"])
 
 
+def test_guided_differences_mend_the_sizes_of_a_surrogate():
+    """Its directions are right, and its sizes and signs wrong, in each row of gravity and of the viscosity."""
+    stub = Stub(quadratic, simulation_of("2-D"))
+    wrong = Slopes(lambda g, mu: [[1.8, -0.15], [-10.0, -7.0]], lambda g, mu: 1e6)
+    estimator = gradients.Guided({"gravity": 0.5, "viscosity": 0.1}, parts=2, surrogate=wrong)
+    found = estimator.estimate(stub, POINT)
+    assert found.loss == quadratic(POINT)
+    np.testing.assert_allclose(found.gradient["gravity"], [[6.0, -0.5], [2.0, 1.4]], rtol=1e-12)
+    np.testing.assert_allclose(found.gradient["viscosity"], 7.4, rtol=1e-12)
+    assert (len(wrong.asked), len(stub.calls)) == (4, 1 + 2 * 3 * 2)
+
+
+def test_guided_differences_are_a_projection():
+    """The gradient (6, -1/2, 2, 1.4) of gravity on (1, 0, 1, 0)."""
+    stub = Stub(quadratic, simulation_of("2-D"))
+    surrogate = Slopes(lambda g, mu: [[1.0, 0.0], [1.0, 0.0]], lambda g, mu: 0.0)
+    found = gradients.Guided(0.5, parts=1, surrogate=surrogate).estimate(stub, POINT)
+    np.testing.assert_allclose(found.gradient["gravity"], [[4.0, 0.0], [4.0, 0.0]], rtol=1e-12)
+    assert found.gradient["viscosity"] == 0.0
+
+
+def test_standard_errors_of_guided_differences_tell_how_they_scatter():
+    first = simulation_of("2-D").positions
+
+    def noisy(p):
+        x = p.get("initial_positions", first)
+        return quadratic(p) + 1e4 * p["gravity"][0, 0] * (x[3, 0] - first[3, 0])
+
+    stub = Stub(noisy, simulation_of("2-D"))
+    made = [gradients.Guided(0.5, differences=20, seed=seed, surrogate=slopes_of_quadratic()) for seed in range(40)]
+    runs = [one.estimate(stub, POINT) for one in made]
+    scatter = np.std([run.gradient["gravity"][0] for run in runs], axis=0, ddof=1)
+    believed = np.sqrt(np.mean([run.standard_error["gravity"][0] ** 2 for run in runs], axis=0))
+    np.testing.assert_allclose(believed, scatter, rtol=0.4)
+
+
+def test_before_chaos_guided_differences_and_the_exact_gradient_agree():
+    simulation = Simulation(splash())
+    problem = Problem(simulation, 60, losses.CentreOfMass([0.1, 0.1, 0.1]))
+    point = {"gravity": np.tile([0.5, -9.81, 0.0], (60, 1))}
+    _, exact = problem.value_and_gradient(point)
+    found = problem.estimate(point, gradients.Guided(0.1, position_noise=0.001, surrogate=gradients.Exact()))
+    assert np.linalg.norm(found.gradient["gravity"] - exact["gravity"]) < 0.02 * np.linalg.norm(exact["gravity"])
+
+
 # ---- centre of mass -------------------------------------------------------------------------------------------------
 
 
@@ -688,6 +733,9 @@ MISTAKES = {
     "one sample": lambda p: gradients.RandomizedSmoothing(samples=1),
     "an average of one": lambda p: gradients.EnsembleMean(samples=1),
     "an average over no spread": lambda p: p.estimate({"viscosity": 1.0}, gradients.EnsembleMean(0.0)),
+    "differences of no parts": lambda p: gradients.Guided(parts=0),
+    "one difference": lambda p: gradients.Guided(differences=1),
+    "guided by no estimator": lambda p: gradients.Guided(surrogate=gradients.Exact),
     "an average of no estimator": lambda p: gradients.EnsembleMean(estimator=gradients.Exact),
     "position noise below 0": lambda p: gradients.RandomizedSmoothing(position_noise=-0.1),
     "spread 0": lambda p: p.estimate({"viscosity": 1.0}, gradients.RandomizedSmoothing(0.0)),

@@ -20,6 +20,7 @@ from cortado.gradients.estimator import (
 )
 from cortado.gradients.exact import Exact, FrozenGeometry, Tape
 from cortado.gradients.filters import AdjointViscosity, Damped
+from cortado.gradients.guided import Guided
 from cortado.parameters.values import Values
 from cortado.rollout import Observer
 
@@ -36,6 +37,7 @@ __all__ = [
     "ForwardPass",
     "FrozenGeometry",
     "GradientEstimator",
+    "Guided",
     "RandomizedSmoothing",
     "Tape",
     "estimate",

@@ -59,7 +59,7 @@ class RandomizedSmoothing(Ensemble):
         found = np.zeros((self.samples, numbers))
         for k, q in enumerate(directions):
             found[k // numbers] += (losses[2 * k] - losses[2 * k + 1]) / (2.0 * r) * q
-        gradient, error = (ensemble.named(one / ensemble.spreads) for one in _mean_and_error(found))
+        gradient, error = (ensemble.named(one / ensemble.spreads) for one in mean_and_error(found))
         return Estimate(loss, gradient, standard_error=error)
 
 
@@ -99,17 +99,17 @@ class EnsembleMean(Ensemble):
                 yield ensemble.sample(-u, -displacement, self.estimator)
 
         at_them, *samples = self.evaluated(problem, points(), observe)
-        numbers = [_numbers(one.gradient, ensemble.values) for one in samples]
+        numbers = [joined(one.gradient, ensemble.values) for one in samples]
         means = [np.mean(pair, axis=0) for pair in zip(numbers[::2], numbers[1::2], strict=True)]
-        gradient, error = (ensemble.named(one) for one in _mean_and_error(np.array(means)))
+        gradient, error = (ensemble.named(one) for one in mean_and_error(np.array(means)))
         return Estimate(at_them.loss, gradient, error)
 
 
-def _mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mean of the rows and its standard error."""
     return samples.mean(axis=0), samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
 
 
-def _numbers(gradient: Arrays, names: Iterable[str]) -> np.ndarray:
+def joined(gradient: Arrays, names: Iterable[str]) -> np.ndarray:
     """The gradient with respect to these parameters as one vector."""
     return np.concatenate([gradient[name].ravel() for name in names])
