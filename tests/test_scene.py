@@ -293,6 +293,49 @@ def test_a_large_time_step_is_a_warning():
         Scene(**plane(solver={"time_step": 1.01 * limit}))
 
 
+def lock_exchange(time_step):
+    """Heavy fluid beside light fluid, 40 spacings deep."""
+    phases = [{"name": name, "rest_density": density} for name, density in (("salt", 1200.0), ("fresh", 1000.0))]
+    ends = {"salt": ([0.0, 0.0], [0.2, 0.4]), "fresh": ([0.2, 0.0], [0.4, 0.4])}
+    return Scene(
+        dimension=2,
+        discretisation={"spacing": 0.01},
+        phase=[phase | {"viscosity": 0.001} for phase in phases],
+        fluid=[{"shape": "box", "lower": a, "upper": b, "phase": name} for name, (a, b) in ends.items()],
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4]},
+        forces={"gravity": [0.0, -9.81]},
+        solver={"time_step": time_step},
+    )
+
+
+def test_a_step_too_long_for_deep_fluid_is_warned_of():
+    with pytest.warns(CortadoWarning, match=r"limit of stability is about 0\.00144 s, which comes from depth"):
+        scene = lock_exchange(0.002)
+    with pytest.raises(DivergedError, match=r"depth limits the time step to about 0\.0014 s, but it is 0\.002 s"):
+        Simulation(scene).run(60)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        shorter = lock_exchange(0.0014)
+    assert Simulation(shorter).run(60).positions[-1].max() < 0.42
+
+
+def test_the_depth_is_that_of_the_fluid():
+    def depth(fluids, **tables):
+        box = {"shape": "box", "lower": [0, 0], "upper": [1, 4]}
+        given = {"fluid": fluids, "container": box, "solver": {"time_step": 1e-5}, **tables}
+        return 1.8 * 0.1**1.5 / sqrt(9.81) / stability_limits(Scene(**plane(**given)))["depth"]
+
+    def slab(lower, upper):
+        return {"shape": "box", "lower": [0, lower], "upper": [1, upper], "phase": "water"}
+
+    gravity = {"gravity": [0, -9.81]}
+    assert depth([slab(0, 1)], forces=gravity) == pytest.approx(1.0)
+    assert depth([slab(1, 2), slab(0, 1)], forces=gravity) == pytest.approx(2.0)
+    assert depth([slab(0, 1), slab(3, 3.5)], forces=gravity) == pytest.approx(1.5)
+    assert depth([slab(0, 1)], forces={"gravity": [0, 0]}) == 0.0
+    assert depth([slab(0, 1)], forces=gravity | {"pressure": False}) == 0.0
+
+
 @pytest.mark.parametrize("form", ["pairwise", "laminar"])
 @pytest.mark.parametrize("kernel, support", [("cubic_spline", 2.0), ("wendland_c4", 3.0)])
 def test_the_viscous_limit_is_where_steps_begin_to_fail(kernel, support, form):
