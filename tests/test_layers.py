@@ -81,7 +81,8 @@ LAYERS = """
     commands commands.executor commands.bench commands.check commands.compare commands.describe commands.examples
     commands.figure commands.new commands.optimise commands.overview commands.picture commands.run_summary commands.run
     commands.schema commands.study
-    commands.sweep commands.view_window commands.view_recorded commands.view_live commands.view
+    commands.sweep commands.view_window commands.view_quantities commands.view_recorded commands.view_live
+    commands.view_task commands.view
     cli
     __main__
 """
