@@ -9,7 +9,8 @@ import numpy as np
 from cortado.commands.view_window import PULL, Quantity
 from cortado.errors import InputError
 from cortado.gradients import Exact
-from cortado.losses import CentreOfMassAlong, Snapshot
+from cortado.losses import CentreOfMassAlong, Loss, Snapshot
+from cortado.losses.loss import by_field
 from cortado.restart import RestartState
 from cortado.rollout import Rollout
 from cortado.scene.scene import Scene
@@ -69,13 +70,12 @@ def pull_on_height(
     return pull
 
 
-def pull_of(simulation: Simulation, rollout: Rollout, loss: CentreOfMassAlong) -> np.ndarray:
+def pull_of(simulation: Simulation, rollout: Rollout, loss: Loss) -> np.ndarray:
     """(n, d) minus the exact derivative of a loss of a rollout's last state with respect to its first positions."""
     colours = np.array([phase.colour for phase in simulation.scene.phase])
     end = Snapshot(rollout.forward().copy(), simulation.dimension, colours)
-    _, (positions_bar, _) = loss.value_and_adjoint(end)
     bar = simulation.solver.new_state()
-    bar.set({"positions": positions_bar})
+    bar.set(by_field(loss.value_and_adjoint(end)[1], simulation.dimension))
     first = rollout.backward(Exact().derivative(rollout), {rollout.steps: bar})
     return -first.numpy(simulation.dimension, only=["positions"])["positions"].astype(np.float64)
 

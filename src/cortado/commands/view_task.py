@@ -1,7 +1,6 @@
 """The run of a task in a window, where its loss pulls the particles, and a button for the next step of its search."""
 
 import time
-from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -10,19 +9,20 @@ import numpy as np
 
 from cortado.commands.view_quantities import UNITS
 from cortado.commands.view_recorded import RecordedView
-from cortado.commands.view_window import PULL
+from cortado.commands.view_window import PULL, in_words
 from cortado.device.state import State
 from cortado.errors import CortadoError
 from cortado.gradients import tuned
 from cortado.inverse.figures import component_names
 from cortado.inverse.setup import Setup
+from cortado.io.notebook import table
 from cortado.io.srgb import to_srgb
 from cortado.io.trajectory import Trajectory
 from cortado.optimisation.optimise import optimise
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.parameters.registry import Role, names
-from cortado.parameters.values import Arrays
 from cortado.parameters.values import UNITS as PARAMETER_UNITS
+from cortado.parameters.values import Arrays
 
 FRAMES = 60
 """Of a run, at most about."""
@@ -90,7 +90,8 @@ class TaskView:
         self.played.replace(run, self._controls(), pulls)
         self._show_image()
         took = time.monotonic() - begun
-        sentence = f"Step {self.taken}: the loss went from {former:.4g} to {self.loss:.4g}{self._unit}, in {took:.2g} s."
+        change = f"from {former:.4g} to {self.loss:.4g}{self._unit}"
+        sentence = f"Step {self.taken}: the loss went {change}, in {took:.2g} s."
         self._tell(sentence, before)
 
     @property
@@ -145,10 +146,9 @@ class TaskView:
 
     def _tell(self, sentence: str, before: Arrays) -> None:
         """A sentence, and a table of the parameters before and now."""
-        rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in self._rows(before))
-        head = "".join(f'<th style="text-align: left">{word}</th>' for word in ("", "unit", "before", "now", "hidden"))
-        style = "width: 100%; font-size: .8em; padding: 0 .8em; font-variant-numeric: tabular-nums"
-        self.told.content = _paragraph(sentence) + f'<table style="{style}"><tr>{head}</tr>{rows}</table>'
+        rows = table(("", "unit", "before", "now", "hidden"), self._rows(before))
+        style = "font-size: .8em; padding: 0 .8em; font-variant-numeric: tabular-nums"
+        self.told.content = in_words(sentence) + f'<div style="{style}">{rows}</div>'
 
     def _rows(self, before: Arrays) -> list[tuple[str, ...]]:
         """Of each number that is searched, and of a parameter with very many of them one row."""
@@ -168,11 +168,13 @@ class TaskView:
                 continue
             labels = component_names(scene, name, now)
             labels = [f"{label}{knots} {k}" for k in range(len(now)) for label in labels] if knots else labels
-            known = np.full(now.size, np.nan) if hidden is None else np.broadcast_to(hidden, now.shape).ravel()
-            for label, a, b, c in zip(labels, was.ravel(), now.ravel(), known, strict=False):
-                rows.append((label, unit, f"{a:.4g}", f"{b:.4g}", "" if np.isnan(c) else f"{c:.4g}"))
+            columns = [was, now, np.nan if hidden is None else hidden]
+            written = [_written(np.broadcast_to(column, now.shape)) for column in columns]
+            rows += [(label, unit, *cells) for label, *cells in zip(labels, *written, strict=False)]
         return rows
 
 
-def _paragraph(words: str) -> str:
-    return f'<p style="padding: 0 .8em; margin: .3em 0; font-size: .85em">{escape(words)}</p>'
+def _written(values: np.ndarray) -> list[str]:
+    """Numbers in words, 0 for round-off; nothing for what is not a number."""
+    least = 1e-9 * np.abs(values).max()
+    return ["" if np.isnan(a) else f"{a if abs(a) > least else 0.0:.4g}" for a in values.ravel()]

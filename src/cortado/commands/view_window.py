@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
-from io import StringIO
 from dataclasses import dataclass
 from html import escape
+from io import StringIO
 from typing import Any
 
 import numpy as np
@@ -21,15 +21,16 @@ RADIUS = 0.4
 DISTANCE = 1.7
 """Of the camera at the start, in radii of what is shown."""
 PALETTE = "cividis"
-SHOWN_RANGE = (0.0, 99.5)
-"""Percentiles at the ends of the colours, so that a few particles do not darken all the others."""
+BRIGHTEST, BRIGHTEST_PULL = 99.5, 90.0
+"""Percentiles at the upper end of the colours, so that a few particles do not darken all the others; the pulls of a
+splash differ by orders of magnitude."""
 MOST_ARROWS = 1500
 """Of more particles, every k-th has an arrow."""
-LONGEST_ARROW, FULL_ARROWS = 2.5, 90.0
-"""In spacings, and the percentile of pulls from which on all arrows are as long as that."""
+LONGEST_ARROW = 2.5
+"""Of pulls that are as large as the colours go or larger, in spacings."""
 BESIDE_ARROWS = 0.4
 """Of the size of particles, where they would hide arrows."""
-ARROWS = (196, 60, 40)
+ARROWS = (170, 30, 15)
 """sRGB"""
 PULL = "pull of the loss"
 
@@ -98,7 +99,7 @@ class Window:
 
     def add_still(self, name: str, positions: Points) -> Any:
         """Grey points at positions (n, d) [m] that stay where they are, hidden at first."""
-        size = RADIUS * self.scene.discretisation.spacing
+        size = 0.6 * RADIUS * self.scene.discretisation.spacing
         style = {"point_size": size, "point_shape": "circle", "precision": "float32", "visible": False}
         return self.server.scene.add_point_cloud(name, self._space(positions), (150, 146, 140), **style)
 
@@ -149,11 +150,11 @@ class Window:
         try:
             values = np.linalg.norm(shown.pull(), axis=1) if name == PULL else np.asarray(shown.quantities[name]())
         except CortadoError as error:
-            self.legend.content = _sentence(str(error))
+            self.legend.content = in_words(str(error))
             return own
-        least, greatest = _range(values)
+        least, greatest = float(values.min()), _upper_end(values, BRIGHTEST_PULL if name == PULL else BRIGHTEST)
         self.legend.content = _scale(name, self._units[name], least, greatest, clips=values.max() > greatest)
-        share = (values - least) / (greatest - least or 1.0)
+        share = np.clip((values - least) / (greatest - least or 1.0), 0.0, 1.0)
         return (255.0 * colormaps[PALETTE](share)[:, :3]).astype(np.uint8)
 
     def _arrows_of(self, shown: Shown) -> np.ndarray | None:
@@ -161,16 +162,17 @@ class Window:
         try:
             pull = shown.pull()
         except CortadoError as error:
-            self.arrows_legend.content = _sentence(str(error))
+            self.arrows_legend.content = in_words(str(error))
             return None
         lengths = np.linalg.norm(pull, axis=1)
-        longest = float(np.percentile(lengths, FULL_ARROWS, method="higher"))
-        self.arrows_legend.content = _sentence(f"The longest arrows: {longest:.3g} {self._units[PULL]} or more.")
+        longest = _upper_end(lengths, BRIGHTEST_PULL)
+        self.arrows_legend.content = in_words(f"The longest arrows: {longest:.4g} {self._units[PULL]} or more.")
         reach = LONGEST_ARROW * self.scene.discretisation.spacing
         scaled = pull * (np.minimum(lengths / (longest or 1.0), 1.0) * reach / np.where(lengths, lengths, 1.0))[:, None]
         chosen = slice(None, None, -(-len(pull) // MOST_ARROWS))
         starts = shown.positions[chosen]
         return self._space(np.stack([starts, starts + scaled[chosen]], axis=1))
+
     def _space(self, points: Points) -> np.ndarray:
         """(..., 3) float32, of points (..., d), with y up."""
         turned = np.asarray(points, dtype=np.float32) @ self._turn.T.astype(np.float32)
@@ -194,10 +196,9 @@ class Window:
         camera.position = middle + DISTANCE * radius * away / np.linalg.norm(away)
 
 
-def _range(values: np.ndarray) -> tuple[float, float]:
-    """Both ends of the colours of (n,) values."""
-    least, greatest = np.percentile(values, SHOWN_RANGE, method="higher")
-    return float(least), float(greatest)
+def _upper_end(values: np.ndarray, percentile: float) -> float:
+    """A percentile of (n,) values that is one of them."""
+    return float(np.percentile(values, percentile, method="higher"))
 
 
 def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> str:
@@ -206,7 +207,7 @@ def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> 
     from matplotlib.colors import to_hex
 
     stops = ", ".join(to_hex(colormaps[PALETTE](share)) for share in np.linspace(0.0, 1.0, 9))
-    ends = f"<span>{least:.3g}</span><span>{'≥ ' if clips else ''}{greatest:.3g}</span>"
+    ends = f"<span>{least:.4g}</span><span>{'≥ ' if clips else ''}{greatest:.4g}</span>"
     return (
         f'<div style="padding: 0 .8em .4em; font-size: .85em">{escape(name)} [{escape(unit)}]'
         f'<div style="height: .8em; border-radius: 3px; background: linear-gradient(90deg, {stops})"></div>'
@@ -214,6 +215,6 @@ def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> 
     )
 
 
-def _sentence(words: str) -> str:
+def in_words(words: str) -> str:
     """HTML of plain words."""
     return f'<p style="padding: 0 .8em .4em; margin: 0; font-size: .85em">{escape(words)}</p>'
