@@ -121,7 +121,7 @@ def test_a_report_is_turned(page, tmp_path, monkeypatch):
     first, box = pixels(canvas), canvas.bounding_box()
     page.mouse.move(box["x"] + 200, box["y"] + 100)
     page.mouse.down()
-    page.mouse.move(box["x"] + 300, box["y"] + 130, steps=4)
+    page.mouse.move(box["x"] + 300, box["y"] + 100, steps=4)
     page.mouse.up()
     page.wait_for_timeout(100)
     turned = pixels(canvas)
