@@ -93,9 +93,7 @@ def coloured(shown, name: str) -> np.ndarray:
     return np.array(shown.window._cloud.colors)
 
 
-@pytest.mark.parametrize(
-    ("name", "unit"), [("speed", "m/s"), ("density", "kg/m³"), ("pressure", "Pa"), (PULL, "m/m")]
-)
+@pytest.mark.parametrize(("name", "unit"), [("speed", "m/s"), ("density", "kg/m³"), ("pressure", "Pa"), (PULL, "m/m")])
 def test_particles_are_coloured_by_what_is_asked(live, name, unit):
     for _ in range(12):  # until it has fallen onto the floor
         live.tick()

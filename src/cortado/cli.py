@@ -244,8 +244,8 @@ def view(
     precision: str = "float32",
     port: int = 8080,
 ) -> Work:
-    """Show a run in the browser, or a scene that runs meanwhile, with gravity on sliders, or a task, with a button for one
-    gradient step; Ctrl-C ends it.
+    """Show a run in the browser, or a scene that runs meanwhile, with gravity on sliders, or the search of a task, with
+    a button for its next step; Ctrl-C ends it.
 
     Args:
         path: The folder of a run, a scene file, or a task file.
