@@ -38,7 +38,9 @@ def opened(
     """The view of a run folder, of a task file, or of a scene file."""
     if not path.is_dir():
         if {"problem", "optimise"} & set(read_toml(path, overrides)):
-            return TaskView(setup(load_task(path, overrides), device, precision), port)
+            made = setup(load_task(path, overrides), device, precision)
+            say("The run with the first guess, and its gradient, are computed first.")
+            return TaskView(made, port)
         return LiveView(Simulation(load_scene(path, overrides), device, precision), port)
     if overrides:
         raise InputError("--set is given, but must be left out, as the run is there already.")
