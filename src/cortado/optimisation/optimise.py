@@ -86,6 +86,7 @@ def optimise(
         evaluations=len(evaluator.history),
         message=outcome.message,
         converged=outcome.converged,
+        problem=problem if hasattr(problem, "simulation") else None,
     )
 
 
