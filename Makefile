@@ -53,7 +53,6 @@ docs-links: $(VENV)/.docs
 	$(BIN)/sphinx-build --builder linkcheck --quiet docs build/docs-links
 
 docs-browser: docs
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check playwright
 	$(BIN)/python docs/site/look.py build/docs
 
 sanitize: setup

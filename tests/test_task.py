@@ -192,8 +192,8 @@ def test_a_missing_file_is_a_sentence(tmp_path):
 def result(parameters, losses):
     """What an optimisation with these losses would give back."""
     found = {name: np.asarray(value, dtype=float) for name, value in parameters.items()}
-    history = tuple(Record(k, loss, 0.0, found, replayed=False) for k, loss in enumerate(losses))
-    return Result(found, min(losses), found, history, len(losses), "done", converged=False)
+    history = tuple(Record(k, k, loss, 0.0, found, replayed=False) for k, loss in enumerate(losses))
+    return Result(found, min(losses), found, history, len(losses) - 1, len(losses), "done", converged=False)
 
 
 def test_what_is_reached_passes(task_file):

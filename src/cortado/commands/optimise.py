@@ -184,15 +184,21 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
     settings = made.task.optimise
     known = len(folder.read_metrics()) if resume else 0
     history: list[Record] = []
-    start = made.start
-    with track(len(made.searches) * (settings.iterations + 1), "optimise") as advance:
+    start, shown, updates = made.start, 0, 0
+    with track(len(made.searches) * settings.iterations, "optimise") as advance:
+
+        def show(made: int, **fields: Any) -> None:
+            """The progress after so many updates of this search; a search before it may have ended early."""
+            nonlocal shown
+            advance(k * settings.iterations + made - shown, **fields)
+            shown = k * settings.iterations + made
 
         def note(record: Record) -> None:
-            record = replace(record, iteration=len(history))
+            show(record.updates, loss=record.loss, evaluations=len(history) + 1)
+            record = replace(record, iteration=len(history), updates=updates + record.updates)
             if record.iteration >= known:
                 folder.append_metrics(iteration=record.iteration, loss=record.loss, gradient_norm=record.gradient_norm)
             history.append(record)
-            advance(loss=record.loss)
 
         for k, search in enumerate(made.searches):
             result = optimise(
@@ -206,8 +212,10 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
                 resume=resume,
                 on_iteration=note,
             )
-            start = result.last_parameters
-    return replace(result, history=tuple(history), evaluations=len(history))
+            if result.updates > result.history[-1].updates:
+                show(result.updates)
+            start, updates = result.last_parameters, updates + result.updates
+    return replace(result, history=tuple(history), updates=updates, evaluations=len(history))
 
 
 def _for_machines(result: Result, estimate: Mapping[str, np.ndarray], verdict: Verdict) -> dict[str, Any]:
