@@ -134,7 +134,7 @@ ESTIMATORS = {
     "exact": ([], gradients.Exact()),
     "velocity only": (['optimise.gradient.name="frozen_geometry"'], gradients.FrozenGeometry()),
     "smoothing": (SMOOTHING, gradients.AdjointViscosity()),
-    "with a strength": ([*SMOOTHING, "optimise.gradient.strength=0.3"], gradients.AdjointViscosity(0.3)),
+    "with a coefficient": ([*SMOOTHING, "optimise.gradient.coefficient=3.0"], gradients.AdjointViscosity(3.0)),
     "averaged": ([*SMOOTHING, *SEVERAL], gradients.EnsembleMean({"gravity": 0.5}, 4)),
     "averaged without position_noise": (
         [*SMOOTHING, *SEVERAL, "optimise.gradient.position_noise=0"],

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from cortado.commands.executor import HERE, Where
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
-from cortado.gradients import GradientEstimator, tuned
 from cortado.inverse.chapters import Chapters
 from cortado.inverse.figures import component_names, task_figures
 from cortado.inverse.in_words import task_in_words
@@ -111,7 +110,7 @@ def _kept(folder: RunFolder) -> str:
 def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pictures: bool) -> str:
     """Search, judge, and write what came out; returns the sentence about it."""
     try:
-        result, estimator = _search(made, folder, resume, executor)
+        result = _search(made, folder, resume, executor)
     except DivergedError as error:
         evaluations = len(folder.read_metrics())
         ended = Section("What came out", [f"The search ended early, in evaluation {evaluations}."], [error])
@@ -131,7 +130,7 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
     note(f"{_summary(made, result, verdict)} Now it is drawn.")
     shaded = _shaded(made, result, folder.figures, pictures)
     figures = shaded + task_figures(made, result, folder.figures)
-    write_report(folder, made.task.scene.name, _sections(made, estimate, result, verdict, estimator, figures))
+    write_report(folder, made.task.scene.name, _sections(made, estimate, result, verdict, figures))
     folder.write_result(**_for_machines(result, estimate, verdict))
     if verdict.failures:
         raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
@@ -184,8 +183,7 @@ def _distance(estimate: ArrayLike, true: ArrayLike) -> float:
     return float(np.linalg.norm(estimate - true) / (np.linalg.norm(true) or 1.0))
 
 
-def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> tuple[Result, GradientEstimator]:
-    """What came out, and the estimator of the last search as it was tuned."""
+def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> Result:
     settings = made.task.optimise
     known = len(folder.read_metrics()) if resume else 0
     if known:
@@ -208,14 +206,13 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
             history.append(record)
 
         for k, search in enumerate(made.searches):
-            estimator = tuned(settings.gradient.estimator(executor), search, start)
             result = optimise(
                 search,
                 start,
                 settings.algorithm(),
                 settings.iterations,
                 bounds=made.bounds,
-                gradient=estimator,
+                gradient=settings.gradient.estimator(executor),
                 checkpoint=folder.checkpoint / str(k) if k else folder.checkpoint,
                 resume=resume,
                 on_iteration=keep,
@@ -223,7 +220,7 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
             if result.updates > result.history[-1].updates:
                 show(result.updates)
             start, updates = result.last_parameters, updates + result.updates
-    return replace(result, history=tuple(history), updates=updates, evaluations=len(history)), estimator
+    return replace(result, history=tuple(history), updates=updates, evaluations=len(history))
 
 
 def _for_machines(result: Result, estimate: Mapping[str, np.ndarray], verdict: Verdict) -> dict[str, Any]:
@@ -268,7 +265,6 @@ def _sections(
     estimate: dict[str, np.ndarray],
     result: Result,
     verdict: Verdict,
-    estimator: GradientEstimator,
     figures: Chapters,
 ) -> list[Section]:
     """The report, in the order in which one would tell it."""
@@ -280,7 +276,7 @@ def _sections(
         Section("To turn and to play", view=_view(made, estimate)),
         Section("Before, found and target", figures=figures.compared),
         Section("Found against hidden", figures=figures.parameters),
-        Section("The search", [result.message], figures=figures.search, rows=_rows(made, result, verdict, estimator)),
+        Section("The search", [result.message], figures=figures.search, rows=_rows(made, result, verdict)),
     ]
 
 
@@ -315,11 +311,11 @@ def _found_rows(made: Setup, estimate: dict[str, np.ndarray], verdict: Verdict) 
     return rows
 
 
-def _rows(made: Setup, result: Result, verdict: Verdict, estimator: GradientEstimator) -> Rows:
+def _rows(made: Setup, result: Result, verdict: Verdict) -> Rows:
     rows: Rows = [
         ("particles", made.problem.simulation.particles, ""),
         ("steps", made.problem.steps, ""),
-        ("gradients", repr(estimator), ""),
+        ("gradients", repr(made.task.optimise.gradient.estimator()), ""),
         ("evaluations", len(result.history), ""),
         ("first loss", f"{verdict.first:.4g}", "" if made.renderer else "m²"),
         ("best loss", f"{result.loss:.4g}", "" if made.renderer else "m²"),

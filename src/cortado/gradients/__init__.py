@@ -17,7 +17,6 @@ from cortado.gradients.estimator import (
     GradientEstimator,
     checked_estimate,
     checked_estimator,
-    tuned,
 )
 from cortado.gradients.exact import Exact, FrozenGeometry, Tape
 from cortado.gradients.filters import AdjointViscosity, Damped
@@ -40,7 +39,6 @@ __all__ = [
     "RandomizedSmoothing",
     "Tape",
     "estimate",
-    "tuned",
 ]
 
 
