@@ -18,6 +18,7 @@ VALIDATION = {
 }
 """Files: physics against published data and closed forms, studies, walls that hold, and every plant."""
 SLOW = {
+    "test_browser",
     "test_docs",
     "test_examples",
     "test_kernel_cache",
@@ -26,7 +27,7 @@ SLOW = {
     "test_silence",
     "test_terminal",
 }
-"""Files: processes that compile kernels, examples, documents' code."""
+"""Files: pages in a browser, processes that compile kernels, examples, documents' code."""
 SLOW_TESTS = {
     "test_certificate": {
         "test_a_sign_flipped_is_found_in_float32",

@@ -1,6 +1,6 @@
 """Estimators: each does to the adjoint what its formula says, and nothing else."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -140,6 +140,13 @@ class Twin:
 
     def adjoint(self, bar, estimator):
         """The gradient with respect to the first state, for the adjoint of the last."""
+        if getattr(estimator, "order", 1) == 1:
+            return self.back(bar, estimator)
+        twice = replace(estimator, coefficient=2 * estimator.coefficient)
+        return 2 * self.back(bar, estimator) - self.back(bar, twice)
+
+    def back(self, bar, estimator):
+        """Without an extrapolation."""
         chain = [estimator]
         while hasattr(chain[0], "base"):
             chain.insert(0, chain[0].base)
@@ -175,6 +182,7 @@ ESTIMATORS = (
     gradients.AdjointViscosity(5.0),
     gradients.AdjointViscosity(1000.0, limit=np.inf),
     gradients.AdjointViscosity(5.0, limit=1.1),
+    gradients.AdjointViscosity(5.0, limit=1.1, order=2),
     gradients.AdjointViscosity(5.0, base=gradients.FrozenGeometry()),
     gradients.AdjointViscosity(5.0, base=gradients.Tape()),
     gradients.Damped(100.0),
@@ -714,6 +722,10 @@ def test_an_estimate_comes_in_float64():
 # ---- mistakes -------------------------------------------------------------------------------------------------------
 
 MISTAKES = {
+    "order 0": lambda p: gradients.AdjointViscosity(order=0),
+    "order in words": lambda p: gradients.AdjointViscosity(order="two"),
+    "order with a point": lambda p: gradients.AdjointViscosity(order=2.0),
+    "order 3": lambda p: gradients.AdjointViscosity(order=3),
     "samples in words": lambda p: gradients.EnsembleMean(samples="4"),
     "odd samples": lambda p: gradients.EnsembleMean(samples=5),
     "half a sample": lambda p: gradients.RandomizedSmoothing(samples=2.5),

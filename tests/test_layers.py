@@ -66,7 +66,8 @@ LAYERS = """
     certificate.horizon
     certificate.consistency certificate.text certificate.certificate certificate certificate.figure
     optimisation optimisation.evaluate optimisation.differentiable optimisation.replay_log optimisation.optimisers
-    optimisation.named_optimisers optimisation.result optimisation.optimise optimisation.transforms
+    optimisation.named_optimisers optimisation.result_page optimisation.result optimisation.optimise
+    optimisation.transforms
     io.run_folder io.report
     inverse inverse.tables inverse.file_schema inverse.task inverse.in_words inverse.setup inverse.chapters
     inverse.figures inverse.shaded
@@ -82,7 +83,8 @@ LAYERS = """
     commands commands.executor commands.bench commands.check commands.compare commands.describe commands.examples
     commands.figure commands.new commands.optimise commands.overview commands.picture commands.run_summary commands.run
     commands.schema commands.study
-    commands.sweep commands.view_window commands.view_recorded commands.view_live commands.view
+    commands.sweep commands.view_window commands.view_quantities commands.view_recorded commands.view_live
+    commands.view_task commands.view
     cli
     __main__
 """

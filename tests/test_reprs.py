@@ -1,7 +1,9 @@
 """What is shown of results: a few words, never the numbers of an array; in notebooks a picture or a table too."""
 
 import json
+import pickle
 import re
+import sys
 from base64 import b64decode
 from html import unescape
 from io import BytesIO
@@ -92,14 +94,68 @@ def test_a_certificate_is_the_same_text_in_a_notebook(certificate, monkeypatch):
     assert str(certificate) == text and "adjoint" in text.splitlines()[2]
 
 
-@pytest.mark.parametrize("name", ["simulation", "trajectory", "result"])
+def pictures(html: str) -> list[np.ndarray]:
+    """(rows, columns) greys of every picture in a page."""
+    found = re.findall(r'src="data:image/png;base64,([^"]*)"', html)
+    return [np.asarray(Image.open(BytesIO(b64decode(one))).convert("L")) for one in found]
+
+
+def cells(html: str) -> list[list[str]]:
+    """The rows of the table in a page, below its head."""
+    rows = re.findall("<tr>(.*?)</tr>", html)[1:]
+    return [[unescape(cell) for cell in re.findall("<td[^>]*>(.*?)</td>", row)] for row in rows]
+
+
+@pytest.mark.parametrize("name", ["simulation", "trajectory"])
 def test_a_notebook_shows_a_picture(name, request):
     found = request.getfixturevalue(name)
     html = found._repr_html_()
-    (picture,) = re.findall(r'src="data:image/png;base64,([^"]*)"', html)
-    pixels = np.asarray(Image.open(BytesIO(b64decode(picture))).convert("L"))
+    (pixels,) = pictures(html)
     assert pixels.shape[1] >= 1000 and 0.001 < np.mean(pixels < 200) < 0.9
     assert html.startswith(f"<p>{repr(found)[:10]}")
+
+
+def test_a_notebook_shows_what_a_search_found(result, problem, simulation):
+    before = problem.value({})
+    html = result._repr_html_()
+    ends, losses = pictures(html)
+    assert min(ends.shape[1], losses.shape[1]) >= 1000
+    thirds = np.array_split(ends < 200, 3, axis=1)
+    assert all(0.02 < np.mean(one) < 0.5 for one in thirds)  # first, found and target
+    (name, unit, first, found), (_, other_unit, _, number) = cells(html)
+    assert (name, unit, first, other_unit) == ("gravity", "m/s²", "0, -9", "Pa s")
+    assert found == ", ".join(f"{g:.4g}" for g in result.parameters["gravity"]) and float(number) > 0.0
+    assert problem.value({}) == before and pickle.loads(pickle.dumps(result)).problem is None
+
+
+def test_a_search_of_images_shows_images(simulation):
+    renderer = simulation.renderer(resolution=(30, 20))
+    loss = losses.Image(renderer, np.ones(renderer.shape))
+    problem = Problem(simulation, 3, losses.Frames({1: loss, 3: loss}))
+    start = {"initial_positions": simulation.positions}
+    html = cortado.optimise(problem, start, "adam", learning_rate=1e-3, iterations=1)._repr_html_()
+    assert len(pictures(html)) == 2
+    ((name, unit, first, _),) = cells(html)
+    assert (name, unit) == ("initial positions", "m") and first.startswith("(64, 2) numbers, ")
+
+
+def test_a_search_of_a_function_shows_its_losses(monkeypatch):
+    def square(parameters):
+        return float(parameters["gravity"] ** 2), {"gravity": 2.0 * parameters["gravity"]}
+
+    result = cortado.optimise(square, {"gravity": 3.0}, "adam", learning_rate=0.1, iterations=2)
+    html = result._repr_html_()
+    assert len(pictures(html)) == 1 and cells(html) == [["gravity", "-", "3", f"{result.parameters['gravity']:.4g}"]]
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert pictures(result._repr_html_()) == [] and "Result(gravity" in result._repr_html_()
+
+
+def test_a_first_guess_that_diverges_has_no_picture(result, monkeypatch):
+    def lost(*_):
+        raise cortado.DivergedError(1, 2, "try less")
+
+    monkeypatch.setattr(Problem, "states", lost)
+    assert len(pictures(result._repr_html_())) == 1
 
 
 def test_a_notebook_plays_a_trajectory(trajectory):

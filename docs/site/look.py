@@ -6,13 +6,12 @@ Playwright's own is taken.
 """
 
 import argparse
-import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from playwright.sync_api import sync_playwright
+from chromium import chromium, listened
 
 WIDTHS = (400, 1280)
 """Of a telephone, and of a laptop [pixels]."""
@@ -33,10 +32,7 @@ LOOK = """() => {
 def complaints(browser: Any, page_file: Path, width: int, picture: Path | None) -> Iterator[str]:
     """What is wrong with a page in a window of a width."""
     page = browser.new_page(viewport={"width": width, "height": 800})
-    found: list[str] = []
-    page.on("console", lambda message: found.append(message.text) if message.type == "error" else None)
-    page.on("pageerror", lambda error: found.append(str(error)))
-    page.on("requestfailed", lambda request: found.append(f"does not get {request.url}"))
+    found = listened(page)
     page.goto(page_file.resolve().as_uri(), wait_until="load")
     for image in page.query_selector_all("article img"):  # those further down are loaded when they are looked at
         image.scroll_into_view_if_needed()
@@ -57,15 +53,13 @@ def main() -> None:
     if not pages:
         sys.exit(f"{options.site} holds no pages: build them with make docs.")
     found: list[str] = []
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+    with chromium() as browser:
         for page in pages:
             name = page.relative_to(options.site).with_suffix("").as_posix()
             for width in WIDTHS:
                 pictured = options.pictures and name in PICTURED
                 picture = options.pictures / f"{name.replace('/', '-')}-{width}.png" if pictured else None
                 found += complaints(browser, page, width, picture)
-        browser.close()
     print(*found, sep="\n")
     print(f"{len(pages)} pages at widths of {WIDTHS}: {len(found)} complaints")
     sys.exit(bool(found))

@@ -238,19 +238,20 @@ def picture(
 
 @_command(app)
 def view(
-    path: Annotated[Positional[Path], arg(metavar="RUN|SCENE.toml")],
+    path: Annotated[Positional[Path], arg(metavar="RUN|SCENE.toml|TASK.toml")],
     overrides: Overrides = (),
     device: str = "cpu",
     precision: str = "float32",
     port: int = 8080,
 ) -> Work:
-    """Show a run in the browser, or a scene that runs meanwhile, with gravity on sliders; Ctrl-C ends it.
+    """Show a run in the browser, or a scene that runs meanwhile, with gravity on sliders, or the search of a task, with
+    a button for its next step; Ctrl-C ends it.
 
     Args:
-        path: The folder of a run, or a scene file.
+        path: The folder of a run, a scene file, or a task file.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
         device: "cpu", or "cuda:0" for the first GPU.
-        precision: "float32" or "float64", of a scene that runs.
+        precision: "float32" or "float64", of a scene or a task that runs.
         port: Of the page on this machine; the next one that is free if it is taken.
     """
     from cortado.commands.view import view as show

@@ -1,20 +1,25 @@
-"""``cortado view``: a run, or a scene that runs meanwhile, in the browser."""
+"""``cortado view``: a run, a task, or a scene that runs meanwhile, in the browser."""
 
+from functools import cache
 from pathlib import Path
 
 from cortado.commands.view_live import LiveView
 from cortado.commands.view_recorded import RecordedView
+from cortado.commands.view_task import TaskView
 from cortado.errors import InputError
+from cortado.inverse.setup import setup
+from cortado.inverse.task import load_task
 from cortado.io.interruption import keeping
 from cortado.io.run_folder import RunFolder
 from cortado.io.terminal import say
 from cortado.io.trajectory import Trajectory
 from cortado.scene.scene import Scene, load_scene
+from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 
 
 def view(path: Path, overrides: list[str], device: str, precision: str, port: int) -> str:
-    """Show a run folder, or run a scene, until Ctrl-C ends it."""
+    """Show a run folder, or run a task or a scene, until Ctrl-C ends it."""
     shown = opened(path, overrides, device, precision, port)
     say(f"{shown.window.address} shows it; Ctrl-C ends it.")
     try:
@@ -27,9 +32,15 @@ def view(path: Path, overrides: list[str], device: str, precision: str, port: in
         shown.window.close()
 
 
-def opened(path: Path, overrides: list[str], device: str, precision: str, port: int) -> LiveView | RecordedView:
-    """The view of a run folder, or of a scene file."""
+def opened(
+    path: Path, overrides: list[str], device: str, precision: str, port: int
+) -> LiveView | RecordedView | TaskView:
+    """The view of a run folder, of a task file, or of a scene file."""
     if not path.is_dir():
+        if {"problem", "optimise"} & set(read_toml(path, overrides)):
+            made = setup(load_task(path, overrides), device, precision)
+            say("The run with the first guess, and its gradient, are computed first.")
+            return TaskView(made, port)
         return LiveView(Simulation(load_scene(path, overrides), device, precision), port)
     if overrides:
         raise InputError("--set is given, but must be left out, as the run is there already.")
@@ -37,4 +48,5 @@ def opened(path: Path, overrides: list[str], device: str, precision: str, port: 
     if not folder.trajectory.exists():
         raise InputError(f"{path} has no trajectory, but must be the folder of `cortado run`, or a scene file.")
     scene = Scene.from_json(folder.scene.read_text(encoding="utf-8"))
-    return RecordedView(scene, Trajectory.load(folder.trajectory), device, port)
+    simulation = cache(lambda: Simulation(scene, device))
+    return RecordedView(scene, Trajectory.load(folder.trajectory), simulation, port)

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from cortado.commands.view_recorded import UNITS, densities, quantities_of
-from cortado.commands.view_window import Window
+from cortado.commands.view_quantities import HEIGHT_UNITS, pull_on_height, quantities_of
+from cortado.commands.view_window import Shown, Window
 from cortado.errors import CortadoWarning, DivergedError
 from cortado.restart import RestartState
 from cortado.shading.painter import colours_of
@@ -29,7 +29,7 @@ class LiveView:
         scene, self.simulation = simulation.scene, simulation
         self.steps = max(round(SHOWN / scene.solver.time_step), 1)
         """Between two pictures."""
-        self.window = Window(scene, port, UNITS)
+        self.window = Window(scene, port, HEIGHT_UNITS)
         gui = self.window.server.gui
         self.running = gui.add_checkbox("Run", True)
         reset = gui.add_button("Begin again")
@@ -47,6 +47,7 @@ class LiveView:
         if self._wish_to_begin:
             self._begin()
         if not self.running.value:
+            self.window.refresh()
             time.sleep(SHORTEST)
             return
         begun = time.monotonic()
@@ -76,12 +77,20 @@ class LiveView:
         self._state = state
         self._told.content = f"t = {state.clock.time:.4g} s"
         colours = colours_of(self.simulation.scene, state.fields.get("mass_fractions"), self.simulation.particles)
-        quantities = quantities_of(state["velocities"], lambda: densities(self.simulation.rollout(1, state=state)))
-        self.window.show(state["positions"], colours, quantities)
+        controls = {"gravity": self._gravity()}
+        if self._nozzle is not None:
+            controls["nozzle_path"] = self._nozzle
+        quantities = quantities_of(state["velocities"], lambda: self.simulation, state, controls)
+        pull = pull_on_height(lambda: self.simulation, state, controls)
+        self.window.show(Shown(state["positions"], colours, quantities, pull))
+
+    def _gravity(self) -> np.ndarray:
+        """(d,) as the sliders are."""
+        return np.array([slider.value for slider in self.gravity])
 
     def _controls(self) -> dict[str, np.ndarray]:
         """Gravity, and a path of the nozzle from where it is to where it shall be."""
-        controls = {"gravity": np.array([slider.value for slider in self.gravity])}
+        controls = {"gravity": self._gravity()}
         if self._nozzle is not None:
             wished = np.array([slider.value for slider in self.nozzle])
             share = np.arange(1, self.steps + 1)[:, None] / self.steps

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
+from dataclasses import dataclass
+from html import escape
 from io import StringIO
 from typing import Any
 
 import numpy as np
 
-from cortado.errors import InputError
+from cortado.errors import CortadoError, InputError
 from cortado.io.srgb import to_srgb
 from cortado.lattice.shapes import Points
 from cortado.scene.scene import Scene
@@ -16,19 +18,46 @@ from cortado.shading.stage import upright
 
 RADIUS = 0.4
 """Of a particle that is drawn, in spacings."""
-DISTANCE = 2.0
+DISTANCE = 1.7
 """Of the camera at the start, in radii of what is shown."""
 PALETTE = "cividis"
+BRIGHTEST, BRIGHTEST_PULL = 99.5, 90.0
+"""Percentiles at the upper end of the colours, so that a few particles do not darken all the others; the pulls of a
+splash differ by orders of magnitude."""
+MOST_ARROWS = 1500
+"""Of more particles, every k-th has an arrow."""
+LONGEST_ARROW = 2.5
+"""Of pulls that are as large as the colours go or larger, in spacings."""
+BESIDE_ARROWS = 0.4
+"""Of the size of particles, where they would hide arrows."""
+ARROWS = (170, 30, 15)
+"""sRGB"""
+PULL = "pull of the loss"
 
 Quantity = Callable[[], np.ndarray]
-"""(n,) of the particles that are shown, computed when it is asked for."""
+"""Something of the particles that are shown, computed when it is asked for; may raise a `CortadoError`."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Particles at a moment."""
+
+    positions: Points
+    """(n, d) [m]"""
+    colours: Points
+    """(n, 3) their own, linear."""
+    quantities: Mapping[str, Quantity]
+    """(n,) by name."""
+    pull: Quantity
+    """(n, d) where the loss pulls them: minus its derivative with respect to their positions."""
 
 
 class Window:
     """A page of viser's; y is up, whatever the axes of the scene."""
 
     def __init__(self, scene: Scene, port: int, units: Mapping[str, str]):
-        """``units``: of the quantities that colours may show, by their names; "phase" is there without."""
+        """``units``: of the quantities that colours may show, by their names, `PULL` among them; "phase" is there
+        without."""
         try:
             import viser
         except ImportError:
@@ -39,12 +68,18 @@ class Window:
         self._turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
         self._units = units
         self._cloud: Any = None
-        self._shown: tuple[Points, Points, Mapping[str, Quantity]] | None = None
+        self._arrows: Any = None
+        self._shown: Shown | None = None
+        self._stale = False
+        """Whether the user wants to see something else of what is shown; `refresh` draws it."""
         self.server.scene.set_up_direction("+y")
-        first = "phase" if len(scene.phase) > 1 else next(iter(units))  # one colour would show no depth
-        self.colour = self.server.gui.add_dropdown("Colour", ["phase", *units], initial_value=first)
-        self.legend = self.server.gui.add_markdown("")
-        self.colour.on_update(lambda _: self._draw())
+        gui, first = self.server.gui, "phase" if len(scene.phase) > 1 else next(iter(units))  # one colour has no depth
+        self.colour = gui.add_dropdown("Colour", ["phase", *units], initial_value=first)
+        self.legend = gui.add_html("")
+        self.arrows = gui.add_checkbox("Arrows: where the loss pulls", False)
+        self.arrows_legend = gui.add_html("")
+        for choice in (self.colour, self.arrows):
+            choice.on_update(lambda _: setattr(self, "_stale", True))  # in a thread of viser's, which computes nothing
         self._frame_container()
 
     @property
@@ -57,37 +92,86 @@ class Window:
         with redirect_stdout(StringIO()):
             self.server.stop()
 
-    def show(self, positions: Points, colours: Points, quantities: Mapping[str, Quantity]) -> None:
-        """Particles at positions (n, d) [m] with linear colours (n, 3), or coloured by one of the quantities."""
-        self._shown = positions, colours, quantities
+    def show(self, shown: Shown) -> None:
+        """Draw particles in the place of those before."""
+        self._shown = shown
         self._draw()
 
+    def add_still(self, name: str, positions: Points) -> Any:
+        """Grey points at positions (n, d) [m] that stay where they are, hidden at first."""
+        size = 0.6 * RADIUS * self.scene.discretisation.spacing
+        style = {"point_size": size, "point_shape": "circle", "precision": "float32", "visible": False}
+        return self.server.scene.add_point_cloud(name, self._space(positions), (150, 146, 140), **style)
+
+    def refresh(self) -> None:
+        """Draw again where the user has chosen other colours or arrows."""
+        if self._stale and self._shown is not None:
+            self._draw()
+
     def _draw(self) -> None:
-        if self._shown is None:
-            return
-        positions, own, quantities = self._shown
-        points, colours = self._space(positions), self._colours(own, quantities)
+        assert self._shown is not None
+        self._stale = False
+        points, colours = self._space(self._shown.positions), self._colours(self._shown)
+        arrows = self._arrows_of(self._shown) if self.arrows.value else None
+        with self.server.atomic():
+            self._draw_particles(points, colours)
+            self._draw_arrows(arrows)
+
+    def _draw_particles(self, points: np.ndarray, colours: np.ndarray) -> None:
+        size = 2.0 * RADIUS * self.scene.discretisation.spacing * (BESIDE_ARROWS if self.arrows.value else 1.0)
         if self._cloud is None:
-            size = 2.0 * RADIUS * self.scene.discretisation.spacing
             style = {"point_size": size, "point_shape": "circle", "precision": "float32"}
             self._cloud = self.server.scene.add_point_cloud("/particles", points, colours, **style)
             return
-        with self.server.atomic():
-            self._cloud.points, self._cloud.colors = points, colours
+        self._cloud.points, self._cloud.colors, self._cloud.point_size = points, colours, size
 
-    def _colours(self, own: Points, quantities: Mapping[str, Quantity]) -> np.ndarray:
-        """(n, 3) sRGB; the legend says from where to where they go."""
+    def _draw_arrows(self, ends: np.ndarray | None) -> None:
+        """From (k, 2, 3) ends; none without."""
+        if ends is None:
+            self.arrows_legend.content = "" if not self.arrows.value else self.arrows_legend.content
+            if self._arrows is not None:
+                self._arrows.visible = False
+            return
+        if self._arrows is None or len(self._arrows.points) != len(ends):
+            spacing = self.scene.discretisation.spacing
+            style = {"shaft_radius": 0.06 * spacing, "head_radius": 0.18 * spacing, "head_length": 0.4 * spacing}
+            self._arrows = self.server.scene.add_arrows("/pull", ends, ARROWS, **style)
+            return
+        self._arrows.points, self._arrows.visible = ends, True
+
+    def _colours(self, shown: Shown) -> np.ndarray:
+        """(n, 3) sRGB; the legend says from where to where they go, or why there are none."""
         from matplotlib import colormaps
 
-        name = self.colour.value
-        if name not in quantities:
+        name, own = self.colour.value, to_srgb(shown.colours[None])[0]
+        if name == "phase":
             self.legend.content = ""
-            return to_srgb(own[None])[0]
-        values = np.asarray(quantities[name](), dtype=float)
-        least, greatest = float(values.min()), float(values.max())
-        self.legend.content = f"{name}: {least:.4g} (dark) to {greatest:.4g} {self._units[name]} (bright)"
-        share = (values - least) / (greatest - least or 1.0)
+            return own
+        try:
+            values = np.linalg.norm(shown.pull(), axis=1) if name == PULL else np.asarray(shown.quantities[name]())
+        except CortadoError as error:
+            self.legend.content = in_words(str(error))
+            return own
+        least, greatest = float(values.min()), _upper_end(values, BRIGHTEST_PULL if name == PULL else BRIGHTEST)
+        self.legend.content = _scale(name, self._units[name], least, greatest, clips=values.max() > greatest)
+        share = np.clip((values - least) / (greatest - least or 1.0), 0.0, 1.0)
         return (255.0 * colormaps[PALETTE](share)[:, :3]).astype(np.uint8)
+
+    def _arrows_of(self, shown: Shown) -> np.ndarray | None:
+        """(k, 2, 3) ends of arrows from particles; None, with the reason in the legend, where there is no pull."""
+        try:
+            pull = shown.pull()
+        except CortadoError as error:
+            self.arrows_legend.content = in_words(str(error))
+            return None
+        lengths = np.linalg.norm(pull, axis=1)
+        longest = _upper_end(lengths, BRIGHTEST_PULL)
+        self.arrows_legend.content = in_words(f"The longest arrows: {longest:.4g} {self._units[PULL]} or more.")
+        reach = LONGEST_ARROW * self.scene.discretisation.spacing
+        scaled = pull * (np.minimum(lengths / (longest or 1.0), 1.0) * reach / np.where(lengths, lengths, 1.0))[:, None]
+        chosen = slice(None, None, -(-len(pull) // MOST_ARROWS))
+        starts = shown.positions[chosen]
+        return self._space(np.stack([starts, starts + scaled[chosen]], axis=1))
 
     def _space(self, points: Points) -> np.ndarray:
         """(..., 3) float32, of points (..., d), with y up."""
@@ -110,3 +194,27 @@ class Window:
         camera = self.server.initial_camera
         camera.look_at = middle
         camera.position = middle + DISTANCE * radius * away / np.linalg.norm(away)
+
+
+def _upper_end(values: np.ndarray, percentile: float) -> float:
+    """A percentile of (n,) values that is one of them."""
+    return float(np.percentile(values, percentile, method="higher"))
+
+
+def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> str:
+    """HTML of a bar with the colours, and the numbers at its ends."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    stops = ", ".join(to_hex(colormaps[PALETTE](share)) for share in np.linspace(0.0, 1.0, 9))
+    ends = f"<span>{least:.4g}</span><span>{'≥ ' if clips else ''}{greatest:.4g}</span>"
+    return (
+        f'<div style="padding: 0 .8em .4em; font-size: .85em">{escape(name)} [{escape(unit)}]'
+        f'<div style="height: .8em; border-radius: 3px; background: linear-gradient(90deg, {stops})"></div>'
+        f'<div style="display: flex; justify-content: space-between">{ends}</div></div>'
+    )
+
+
+def in_words(words: str) -> str:
+    """HTML of plain words."""
+    return f'<p style="padding: 0 .8em .4em; margin: 0; font-size: .85em">{escape(words)}</p>'

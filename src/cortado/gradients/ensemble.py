@@ -14,7 +14,7 @@ from cortado.gradients.points import Point
 from cortado.parameters.values import Arrays, Values
 from cortado.rollout import Observer
 
-SMOOTHING = AdjointViscosity()
+SMOOTHING = AdjointViscosity(order=2)
 MOST_NUMBERS = 64
 """Components that differences are taken along at most: each costs two runs a sample."""
 

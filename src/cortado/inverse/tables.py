@@ -200,8 +200,9 @@ class GradientTable(Table):
     def estimator(self, executor: Executor | None = None) -> GradientEstimator:
         """As an object; ``executor`` computes the samples of an ensemble."""
         one = ESTIMATORS[self.name]
-        if self.coefficient is not None:
-            one = AdjointViscosity(self.coefficient)
+        if isinstance(one, AdjointViscosity):
+            coefficient = one.coefficient if self.coefficient is None else self.coefficient
+            one = AdjointViscosity(coefficient, order=2 if self.samples > 1 else 1)
         if self.spread is None:
             return one
         spread = {name: float(number) for name, number in self.spread.items()}

@@ -1,10 +1,9 @@
 """The result of an optimisation: its best parameters, and every evaluation on the way."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-from cortado.io.notebook import with_picture
 from cortado.words import counted, sized
 
 Parameters = dict[str, Any]
@@ -17,6 +16,8 @@ class Record:
 
     iteration: int
     """Index of the evaluation, from 0; with Adam and gradient descent also the number of updates before it."""
+    updates: int
+    """Made before it; fewer than the evaluations before it where a line search evaluates several times an update."""
     loss: float
     gradient_norm: float
     """Euclidean, over all the parameters."""
@@ -41,12 +42,20 @@ class Result:
     """The optimiser's last iterate."""
     history: tuple[Record, ...]
     """One per evaluation, in order."""
+    updates: int
+    """That the optimiser made, with those replayed from the checkpoint."""
     evaluations: int
     """How many the optimiser asked for, with those replayed from the checkpoint."""
     message: str
     """How it ended, a sentence."""
     converged: bool
     """Whether the optimiser's own test was met; Adam and gradient descent have none."""
+    problem: Any = field(default=None, repr=False)
+    """The `Problem` that was solved, or one in other coordinates, whose runs a notebook shows; None for other problems,
+    and in a result that was pickled."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "problem": None}
 
     def __repr__(self) -> str:
         found = f"loss {self.loss:.6g} after {counted(self.evaluations, 'evaluation')}"
@@ -54,7 +63,8 @@ class Result:
         return f"Result({sized(self.parameters)}: {found}; {end})"
 
     def _repr_html_(self) -> str:
-        """With the losses of all evaluations."""
-        from cortado.figures.curves import loss_curve
+        """With the ends of runs, first and found, beside the target; the parameters; the losses of all evaluations."""
+        from cortado.optimisation.result_page import result_page
 
-        return with_picture(self, lambda path: loss_curve([record.loss for record in self.history], path))
+        losses = [record.loss for record in self.history]
+        return result_page(self, self.problem, self.history[0].parameters, self.parameters, losses)

@@ -218,8 +218,12 @@ class ParticleSolver:
         self.sort(state, parameters)
         while self.make_room():
             self.sort(state, parameters)
+        return self.in_scene_order(self.fields["m"].numpy() * self.fields["n"].numpy())
+
+    def in_scene_order(self, values: NDArray) -> NDArray:
+        """(n,) numbers of sorted particles in the scene's order, of a batch one scene behind the other."""
         found = np.empty(self.layout.all_particles)
-        found[self.search.order.numpy()[: len(found)]] = self.fields["m"].numpy() * self.fields["n"].numpy()
+        found[self.search.order.numpy()[: len(found)]] = values
         return found
 
     # ---- derivatives ---------------------------------------------------------------------------------------------

@@ -4,6 +4,8 @@
 iterations and keeps every intermediate value, for `cortado.solvers.pcisph.derivatives`.
 """
 
+from numpy.typing import NDArray
+
 from cortado.device.state import Parameters, State
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
@@ -47,6 +49,11 @@ class PcisphSteps(ParticleSolver):
         (iterations,) = counts
         it = self.iterates
         self.unsort(self.context(parameters), it.x_star[iterations], it.v_star[iterations], new_state)
+
+    def pressures(self) -> NDArray:
+        """(n,) of the last `step`, in the scene's order, of a batch one scene behind the other [Pa]; 0 without limits,
+        as nothing is iterated then."""
+        return self.in_scene_order(self.iterates.p[1].numpy())
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
         """Everything but the pressure, and the first prediction."""
