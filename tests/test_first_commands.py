@@ -16,7 +16,9 @@ import cortado
 from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_SCENE
 from compiling_notice import without_compiling
-from cortado.cli import app, gradients, main
+from cortado.cli import main
+from cortado.cli.commands import app
+from cortado.cli.gradient_commands import gradients
 from cortado.commands.new import scene_text
 from cortado.commands.overview import COMMANDS
 from cortado.inverse.file_schema import file_schema, file_schema_text
@@ -75,7 +77,7 @@ def test_cortado_alone_shows_every_command(command):
 
 @pytest.mark.parametrize("example", COMMANDS)
 def test_what_it_shows_can_be_typed(example, command, monkeypatch):
-    monkeypatch.setattr("cortado.cli.start_warp", lambda: pytest.fail("the command was understood"))
+    monkeypatch.setattr("cortado.cli.process.start_warp", lambda: pytest.fail("the command was understood"))
     words = shlex.split(example)[1:]
     with pytest.raises(pytest.fail.Exception, match="understood"):
         main(words)
