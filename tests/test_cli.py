@@ -392,7 +392,7 @@ def test_a_killed_optimisation_resumes_bit_for_bit(cortado_command):
     assert len(json.loads(Path("killed/environment.json").read_text())["resumed"]) == 1
 
 
-SMOOTHED = ["name=adjoint_viscosity", "strength=0.2", "samples=4", "spread.gravity=0.1", "position_noise=0.001"]
+SMOOTHED = ["name=adjoint_viscosity", "coefficient=3.0", "samples=4", "spread.gravity=0.1", "position_noise=0.001"]
 
 
 @pytest.mark.parametrize(
