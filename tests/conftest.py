@@ -4,6 +4,8 @@ A whole file is named, or tests of a file by their names. A test is slow if all 
 where a core was shared by about three processes; a few are left in the unit tier as nothing else there guards the same.
 """
 
+import math
+
 import pytest
 
 from compiling_notice import without_compiling
@@ -181,8 +183,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture
-def cortado_command(capfd):
-    """Runs a command in this process: (exit code, stdout, stderr), with what C code writes."""
+def cortado_command(capfd, monkeypatch):
+    """Runs a command in this process: (exit code, stdout, stderr), with what C code writes. There are no lines of
+    progress, however slow the machine is."""
+    monkeypatch.setattr("cortado.io.progress.LINE_INTERVAL", math.inf)
 
     def run(*arguments):
         capfd.readouterr()

@@ -50,7 +50,8 @@ LAYERS = """
     losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
     losses.positions losses.recorded losses losses.checked
     gradients.estimator gradients.points gradients.ensemble_members gradients.exact
-    gradients.filter_kernels gradients.adjoint_filters gradients.filters gradients.ensemble gradients
+    gradients.filter_kernels gradients.adjoint_filters gradients.filters gradients.ensemble gradients.guided
+    gradients
     render.cameras render.colour_field render.interpolation render.phase_colours render.fields render.rays
     render.absorption render.views render.marching render.renderer render.scene_renderer render
     io.pictures
