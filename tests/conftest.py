@@ -1,10 +1,15 @@
-"""Which tier a test belongs to: validation, slow, or else the unit tier, which is neither.
+"""Which tier a test belongs to, validation, slow, or else the unit tier, which is neither; and how tests run commands.
 
 A whole file is named, or tests of a file by their names. A test is slow if all of its cases together took at least 3 s
 where a core was shared by about three processes; a few are left in the unit tier as nothing else there guards the same.
 """
 
+import math
+
 import pytest
+
+from compiling_notice import without_compiling
+from cortado.cli import main
 
 VALIDATION = {
     "test_containment",
@@ -175,3 +180,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         found = tier(item.path.stem, getattr(item, "originalname", item.name))
         if found != "unit":
             item.add_marker(getattr(pytest.mark, found))
+
+
+@pytest.fixture
+def cortado_command(capfd, monkeypatch):
+    """Runs a command in this process: (exit code, stdout, stderr), with what C code writes. There are no lines of
+    progress, however slow the machine is."""
+    monkeypatch.setattr("cortado.io.progress.LINE_INTERVAL", math.inf)
+
+    def run(*arguments):
+        capfd.readouterr()
+        try:
+            main([str(argument) for argument in arguments])
+            code = 0
+        except SystemExit as end:
+            code = end.code or 0
+        out, err = capfd.readouterr()
+        return code, out, without_compiling(err)
+
+    return run

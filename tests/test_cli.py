@@ -20,9 +20,7 @@ import cortado.commands.run
 import cortado.io.vtkhdf
 from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
-from compiling_notice import without_compiling
 from cortado import Problem, Scene, Trajectory
-from cortado.cli import main
 from cortado.inverse.chapters import Chapters
 from cortado.io.folder_lock import locked
 from cortado.io.pictures import heart, rosetta, write_picture
@@ -42,23 +40,6 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr("cortado.commands.run.run_pictures", lambda *_: [])  # tests/test_shading.py draws them
     monkeypatch.setattr("cortado.commands.optimise.shaded_figures", lambda *_: Chapters())
     return tmp_path
-
-
-@pytest.fixture
-def cortado_command(capfd):
-    """Runs a command in this process: (exit code, stdout, stderr), with what C code writes."""
-
-    def run(*arguments):
-        capfd.readouterr()
-        try:
-            main([str(argument) for argument in arguments])
-            code = 0
-        except SystemExit as end:
-            code = end.code
-        out, err = capfd.readouterr()
-        return code, out, without_compiling(err)
-
-    return run
 
 
 def start(*arguments):

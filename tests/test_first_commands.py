@@ -15,8 +15,9 @@ import pytest
 import cortado
 from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_SCENE
-from compiling_notice import without_compiling
-from cortado.cli import app, gradients, main
+from cortado.cli import main
+from cortado.cli.commands import app
+from cortado.cli.gradient_commands import gradients
 from cortado.commands.new import scene_text
 from cortado.commands.overview import COMMANDS
 from cortado.inverse.file_schema import file_schema, file_schema_text
@@ -34,23 +35,6 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.fixture
-def command(capfd):
-    """Runs a command in this process: (exit code, stdout, stderr)."""
-
-    def run(*arguments):
-        capfd.readouterr()
-        try:
-            main([str(argument) for argument in arguments])
-            code = 0
-        except SystemExit as end:
-            code = end.code or 0
-        out, err = capfd.readouterr()
-        return code, out, without_compiling(err)
-
-    return run
-
-
 def assert_refused(result, *words):
     code, out, err = result
     assert (code, out) == (2, ""), err
@@ -66,25 +50,25 @@ def commands():
     return {*app._subcommands, *(f"gradients {name}" for name in gradients._subcommands)} - {"gradients"}
 
 
-def test_cortado_alone_shows_every_command(command):
-    code, out, err = command()
+def test_cortado_alone_shows_every_command(cortado_command):
+    code, out, err = cortado_command()
     assert (code, err) == (0, "") and cortado.__version__ in out
     assert all(f"  cortado {name} " in out for name in commands())
     assert all(len(line) <= 100 for line in out.splitlines())
 
 
 @pytest.mark.parametrize("example", COMMANDS)
-def test_what_it_shows_can_be_typed(example, command, monkeypatch):
-    monkeypatch.setattr("cortado.cli.start_warp", lambda: pytest.fail("the command was understood"))
+def test_what_it_shows_can_be_typed(example, cortado_command, monkeypatch):
+    monkeypatch.setattr("cortado.cli.process.start_warp", lambda: pytest.fail("the command was understood"))
     words = shlex.split(example)[1:]
     with pytest.raises(pytest.fail.Exception, match="understood"):
         main(words)
 
 
 @pytest.mark.parametrize("name", sorted(commands()))
-def test_the_help_of_each_is_named_where_it_is_misused(name, command):
+def test_the_help_of_each_is_named_where_it_is_misused(name, cortado_command):
     words = name.split()
-    assert command(*words, "--help")[1].count("--quiet") >= 1
+    assert cortado_command(*words, "--help")[1].count("--quiet") >= 1
     assert usage_sentence("", [*words, "x"]).endswith(f"see cortado {name} --help.")
 
 
@@ -92,94 +76,99 @@ def test_the_help_of_each_is_named_where_it_is_misused(name, command):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_new_scene_runs_at_once(command, dimension):
-    code, out, err = command("new", "dam", "--dimension", dimension)
+def test_a_new_scene_runs_at_once(cortado_command, dimension):
+    code, out, err = cortado_command("new", "dam", "--dimension", dimension)
     assert (code, err) == (0, "") and "cortado run dam.toml" in out
     text = Path("dam.toml").read_text()
     particles = int(re.search(r"(\d+) particles in", text)[1])
     assert cortado.Simulation("dam.toml").particles == particles
-    code, out, err = command("run", "dam.toml", "--steps", 3, "--quiet")
+    code, out, err = cortado_command("run", "dam.toml", "--steps", 3, "--quiet")
     assert (code, err) == (0, "")
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_so_it_does_with_all_that_is_switched_off(command, folder, dimension):
+def test_so_it_does_with_all_that_is_switched_off(cortado_command, folder, dimension):
     text = scene_text(Path("dam.toml"), dimension)
     Path("dam.toml").write_text(re.sub(r"^#(?=[a-z\[])", "", text, flags=re.MULTILINE))
     scene = cortado.load_scene("dam.toml")
     assert len(scene.phase) == len(scene.fluid) == 2 and scene.render is not None and scene.forces.surface_tension
     VALIDATOR.validate(tomllib.loads(Path("dam.toml").read_text()))
-    assert command("run", "dam.toml", "--steps", 2)[0] == 0
+    assert cortado_command("run", "dam.toml", "--steps", 2)[0] == 0
 
 
-def test_nothing_is_replaced(command):
+def test_nothing_is_replaced(cortado_command):
     Path("scene.schema.json").write_text("{}")
-    assert command("new", "a/b/dam.toml")[0] == 0 and Path("a/b/scene.schema.json").read_bytes() == SCHEMA.read_bytes()
-    assert_refused(command("new", "a/b/dam"), "already there", "NAME")
-    assert command("new", "dam")[0] == 0 and Path("scene.schema.json").read_text() == "{}"
+    assert (
+        cortado_command("new", "a/b/dam.toml")[0] == 0
+        and Path("a/b/scene.schema.json").read_bytes() == SCHEMA.read_bytes()
+    )
+    assert_refused(cortado_command("new", "a/b/dam"), "already there", "NAME")
+    assert cortado_command("new", "dam")[0] == 0 and Path("scene.schema.json").read_text() == "{}"
     Path("gone.toml").symlink_to("nowhere")
-    assert_refused(command("new", "gone"), "already there")
+    assert_refused(cortado_command("new", "gone"), "already there")
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "dam.toml/under"])
-def test_what_is_no_name_of_a_file_is_refused(command, name):
+def test_what_is_no_name_of_a_file_is_refused(cortado_command, name):
     Path("dam.toml").write_text("")
-    assert_refused(command("new", name), "NAME" if len(name) < 3 else "cannot be written")
-    assert_refused(command("new", "x", "--dimension", 4), "--dimension is 4")
+    assert_refused(cortado_command("new", name), "NAME" if len(name) < 3 else "cannot be written")
+    assert_refused(cortado_command("new", "x", "--dimension", 4), "--dimension is 4")
     assert os.listdir() == ["dam.toml"]
 
 
-def test_names_that_are_too_long_are_sentences(command):
+def test_names_that_are_too_long_are_sentences(cortado_command):
     long = "a" * 300
-    assert_refused(command("new", long), "cannot be written: File name too long")
-    assert_refused(command("examples", "--copy", "pour", "--to", long), "cannot be written: File name too long")
-    assert_refused(command("describe", long), "cannot be read: File name too long")
+    assert_refused(cortado_command("new", long), "cannot be written: File name too long")
+    assert_refused(cortado_command("examples", "--copy", "pour", "--to", long), "cannot be written: File name too long")
+    assert_refused(cortado_command("describe", long), "cannot be read: File name too long")
     Path("scene.toml").write_text(TINY_SCENE)
-    assert_refused(command("describe", "scene.toml", "--picture", f"{long}.png"), "cannot be written")
-    assert_refused(command("compare", long, long), "There is no run in ")
-    assert_refused(command("run", "scene.toml", "--out", long), "cannot be written")
+    assert_refused(cortado_command("describe", "scene.toml", "--picture", f"{long}.png"), "cannot be written")
+    assert_refused(cortado_command("compare", long, long), "There is no run in ")
+    assert_refused(cortado_command("run", "scene.toml", "--out", long), "cannot be written")
 
 
-def test_a_name_may_hold_anything_that_a_file_may(command):
+def test_a_name_may_hold_anything_that_a_file_may(cortado_command):
     name = 'a "b" \\ c\n'
-    assert command("new", name)[0] == 0
+    assert cortado_command("new", name)[0] == 0
     assert cortado.load_scene(f"{name}.toml").dimension == 2
 
 
 @pytest.mark.skipif(os.geteuid() == 0 if hasattr(os, "geteuid") else True, reason="root may write anywhere")
-def test_a_folder_that_may_not_be_written(command):
+def test_a_folder_that_may_not_be_written(cortado_command):
     Path("closed").mkdir(mode=0o500)
-    assert_refused(command("new", "closed/dam"), "cannot be written")
+    assert_refused(cortado_command("new", "closed/dam"), "cannot be written")
 
 
 # ---- examples ----------------------------------------------------------------------------------------------------
 
 
-def test_examples_are_listed_and_copied(command):
-    code, out, err = command("examples")
+def test_examples_are_listed_and_copied(cortado_command):
+    code, out, err = cortado_command("examples")
     assert (code, err) == (0, "") and all(path.name in out for path in (ROOT / "examples").iterdir() if path.is_file())
-    code, out, _ = command("examples", "--copy", "pour", "--copy", "first_gradient.py", "--to", "a/b")
+    code, out, _ = cortado_command("examples", "--copy", "pour", "--copy", "first_gradient.py", "--to", "a/b")
     assert (code, sorted(os.listdir("a/b"))) == (0, ["first_gradient.py", "pour.toml"])
     assert "cortado optimise a/b/pour.toml" in out and "python a/b/first_gradient.py" in out
     assert Path("a/b/pour.toml").read_bytes() == (ROOT / "examples/pour.toml").read_bytes()
 
 
-def test_all_of_them_or_none(command):
+def test_all_of_them_or_none(cortado_command):
     Path("pour.toml").write_text("mine")
-    assert_refused(command("examples", "--copy", "all"), "pour.toml is already there", "--to")
+    assert_refused(cortado_command("examples", "--copy", "all"), "pour.toml is already there", "--to")
     assert os.listdir() == ["pour.toml"]
-    assert command("examples", "--copy", "all", "--to", "all")[0] == 0
+    assert cortado_command("examples", "--copy", "all", "--to", "all")[0] == 0
     assert len(os.listdir("all")) == len([path for path in (ROOT / "examples").iterdir() if path.is_file()])
-    assert_refused(command("examples", "--copy", "por"), "--copy is 'por', but must be all or one of custom_loss, ")
-    assert_refused(command("examples", "--copy", "pour", "--to", "pour.toml"), "pour.toml")
+    assert_refused(
+        cortado_command("examples", "--copy", "por"), "--copy is 'por', but must be all or one of custom_loss, "
+    )
+    assert_refused(cortado_command("examples", "--copy", "pour", "--to", "pour.toml"), "pour.toml")
 
 
 # ---- schema ------------------------------------------------------------------------------------------------------
 
 
-def test_the_schema_that_is_shipped_is_that_of_the_tables(command):
+def test_the_schema_that_is_shipped_is_that_of_the_tables(cortado_command):
     assert SCHEMA.read_text("utf-8") == file_schema_text(), "renew it: cortado schema > src/cortado/scene.schema.json"
-    assert json.loads(command("schema")[1]) == file_schema()
+    assert json.loads(cortado_command("schema")[1]) == file_schema()
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
@@ -216,8 +205,8 @@ def test_it_refuses_what_cortado_refuses(old, new):
     ("typed", "found"),
     [("cortado optim", "optimise"), ("cortado run --rec", "--record-every"), ("cortado gradients f", "figure")],
 )
-def test_bash_completes(command, typed, found):
-    code, script, err = command("completion", "bash")
+def test_bash_completes(cortado_command, typed, found):
+    code, script, err = cortado_command("completion", "bash")
     assert (code, err) == (0, "")
     words = typed.split()
     ask = f"COMP_WORDS=({typed}); COMP_CWORD={len(words) - 1}; _tyro_cortado; echo ${{COMPREPLY[@]}}"
@@ -225,20 +214,22 @@ def test_bash_completes(command, typed, found):
     assert done.stdout.strip() == found, done.stderr
 
 
-def test_zsh_has_a_script(command):
-    code, script, _ = command("completion", "zsh")
+def test_zsh_has_a_script(cortado_command):
+    code, script, _ = cortado_command("completion", "zsh")
     assert code == 0 and script.startswith("#compdef cortado")
-    assert_refused(command("completion", "fish"), "'fish', but must be one of 'bash', 'zsh'")
+    assert_refused(cortado_command("completion", "fish"), "'fish', but must be one of 'bash', 'zsh'")
 
 
-def test_quiet_says_nothing_but_what_was_asked_for(command, monkeypatch):
+def test_quiet_says_nothing_but_what_was_asked_for(cortado_command, monkeypatch):
     monkeypatch.setattr("cortado.io.progress.LINE_INTERVAL", 0.0)
     Path("scene.toml").write_text(TINY_SCENE)
-    assert command("run", "scene.toml", "--steps", 2, "--quiet") == (0, "", "")
+    assert cortado_command("run", "scene.toml", "--steps", 2, "--quiet") == (0, "", "")
     assert Path("runs/run/report.html").exists()
-    assert command("new", "dam", "--quiet") == (0, "", "")
-    assert command("examples", "--quiet")[1] == command("examples")[1] != ""
-    assert_refused(command("run", "scene.toml", "--quiet"), "already holds a run")
-    _, _, err = command("run", "scene.toml", "--quiet", "--overwrite", "--set", "solver.time_step=0.02", "--steps", 1)
+    assert cortado_command("new", "dam", "--quiet") == (0, "", "")
+    assert cortado_command("examples", "--quiet")[1] == cortado_command("examples")[1] != ""
+    assert_refused(cortado_command("run", "scene.toml", "--quiet"), "already holds a run")
+    _, _, err = cortado_command(
+        "run", "scene.toml", "--quiet", "--overwrite", "--set", "solver.time_step=0.02", "--steps", 1
+    )
     assert "limit of stability" in err
-    assert "The results are in" in command("run", "scene.toml", "--steps", 2, "--out", "a")[1]
+    assert "The results are in" in cortado_command("run", "scene.toml", "--steps", 2, "--out", "a")[1]

@@ -50,7 +50,8 @@ LAYERS = """
     losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
     losses.positions losses.recorded losses losses.checked
     gradients.estimator gradients.points gradients.ensemble_members gradients.exact
-    gradients.filter_kernels gradients.adjoint_filters gradients.filters gradients.ensemble gradients.guided gradients
+    gradients.filter_kernels gradients.adjoint_filters gradients.filters gradients.ensemble gradients.guided
+    gradients
     render.cameras render.colour_field render.interpolation render.phase_colours render.fields render.rays
     render.absorption render.views render.marching render.renderer render.scene_renderer render
     io.pictures
@@ -85,7 +86,7 @@ LAYERS = """
     commands.schema commands.study
     commands.sweep commands.view_window commands.view_quantities commands.view_recorded commands.view_live
     commands.view_task commands.view
-    cli
+    cli.command cli.arguments cli.parsing cli.gradient_commands cli.commands cli.process cli
     __main__
 """
 """From the foundations to the command line; ``package.*`` stands for modules that do not import one another.

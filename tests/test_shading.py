@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import cortado
+from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.cli import main
 from cortado.errors import InputError, SceneError
 from cortado.io.run_folder import RunFolder
@@ -283,22 +284,17 @@ def test_a_simulation_draws_its_frames():
         simulation.picture(trajectory[-1], height=1)
 
 
-TASK = """
-[problem]
-steps = 4
-target.gravity = [0.5, -9.0]
-[optimise]
-start.gravity = [0.0, -9.81]
-optimiser = "lbfgs"
-learning_rate = 0.5
-iterations = 6
+PICTURE = """
+[picture]
+width = 96
+height = 64
 """
 
 
 def test_commands_write_pictures_and_films(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene.toml").write_text(SCENE)
-    (tmp_path / "task.toml").write_text(SCENE + TASK)
+    (tmp_path / "scene.toml").write_text(TINY_SCENE + PICTURE)
+    (tmp_path / "task.toml").write_text(GOOD_TASK + PICTURE)
     main(["run", "scene.toml", "--steps", "3", "--out", "a"])
     written = {path.name for path in (tmp_path / "a" / "figures").iterdir()}
     assert {"first.png", "last.png", "film.mp4"} <= written
@@ -321,32 +317,6 @@ def test_commands_write_pictures_and_films(tmp_path, monkeypatch, capsys):
         with pytest.raises(SystemExit) as end:
             main(["picture", "a", *arguments])
         assert end.value.code == 2 and sentence in capsys.readouterr().err
-
-
-SCENE = """
-name = "tiny"
-dimension = 2
-[discretisation]
-spacing = 0.1
-[[phase]]
-name = "water"
-rest_density = 1000.0
-viscosity = 0.05
-[[fluid]]
-shape = "box"
-lower = [0.0, 0.0]
-upper = [0.3, 0.3]
-phase = "water"
-[container]
-shape = "box"
-lower = [0.0, 0.0]
-upper = [0.6, 0.5]
-[solver]
-time_step = 0.002
-[picture]
-width = 96
-height = 64
-"""
 
 
 def test_defaults_are_large_enough_to_share():

@@ -3,6 +3,7 @@
 import json
 import shutil
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,6 @@ from PIL import Image
 
 from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_LATTE
-from compiling_notice import without_compiling
 from cortado.cli import main
 from cortado.gradients import Exact, FrozenGeometry
 from cortado.inverse.setup import setup
@@ -35,20 +35,9 @@ FIGURES = ["figure_1", "figure_2_small", "figure_3_small", "figure_4", "figure_5
 
 
 @pytest.fixture
-def command(capfd):
+def gradients(cortado_command):
     """Runs ``cortado gradients ...`` in this process: (exit code, stdout, stderr)."""
-
-    def run(*arguments):
-        capfd.readouterr()
-        try:
-            main(["gradients", *map(str, arguments)])
-            code = 0
-        except SystemExit as end:
-            code = end.code
-        out, err = capfd.readouterr()
-        return code, out, without_compiling(err)
-
-    return run
+    return partial(cortado_command, "gradients")
 
 
 @pytest.fixture(scope="module")
@@ -193,11 +182,11 @@ GOOD = (EXPERIMENTS / "figure_6.toml").read_text().replace("scenes/", f"{EXPERIM
         ("scene = ", "scene = { dimension = 2 } #", ["experiment.toml: discretisation is missing"]),
     ],
 )
-def test_a_bad_experiment_is_refused_in_a_sentence(tmp_path, monkeypatch, command, old, new, words):
+def test_a_bad_experiment_is_refused_in_a_sentence(tmp_path, monkeypatch, gradients, old, new, words):
     monkeypatch.chdir(tmp_path)
     assert old in GOOD
     Path("experiment.toml").write_text(GOOD.replace(old, new, 1))
-    code, out, err = command("figure", "experiment.toml")
+    code, out, err = gradients("figure", "experiment.toml")
     assert (code, out) == (2, "")
     assert_one_sentence(err.removesuffix("\n"))
     assert all(word in err for word in words), err
@@ -215,17 +204,17 @@ def test_a_scene_is_changed_in_the_file(tmp_path):
 # ---- commands ----------------------------------------------------------------------------------------------------
 
 
-def test_a_figure_is_drawn_again_from_its_numbers(measured, tmp_path, command):
+def test_a_figure_is_drawn_again_from_its_numbers(measured, tmp_path, gradients):
     _, done = measured("figure_6")
     out = tmp_path / "again"
     shutil.copytree(done, out)
     table = Table.read_csv(out / "data.csv")
     Table({**table.columns, "norm": 2.0 * table["norm"]}).write_csv(out / "data.csv")
     file = EXPERIMENTS / "figure_6.toml"
-    code, printed, _ = command("figure", file, "--reduced", "--redraw", "--out", out)
+    code, printed, _ = gradients("figure", file, "--reduced", "--redraw", "--out", out)
     assert code == 0 and printed.splitlines()[-1] == f"The results are in {out}; open figure.png."
     assert (out / "figure.png").read_bytes() != (done / "figure.png").read_bytes()
-    code, _, err = command("figure", file, "--redraw", "--out", tmp_path / "absent")
+    code, _, err = gradients("figure", file, "--redraw", "--out", tmp_path / "absent")
     assert code == 2 and "cannot be read" in err
 
 
@@ -240,35 +229,35 @@ def folder(tmp_path):
     return made
 
 
-def test_a_study_resumes_and_leaves_out_what_needs_a_gpu(folder, tmp_path, command, monkeypatch):
+def test_a_study_resumes_and_leaves_out_what_needs_a_gpu(folder, tmp_path, gradients, monkeypatch):
     monkeypatch.setattr("cortado.commands.study._has_gpu", lambda: False)
     out = tmp_path / "study"
-    code, printed, err = command("study", folder, "--out", out)
+    code, printed, err = gradients("study", folder, "--out", out)
     assert code == 0 and err == "quick ...\n"
     assert "Left out: it needs a GPU" in printed and printed.splitlines()[-1].startswith(f"The results are in {out}")
     data = out / "quick" / "data.csv"
     data.write_text("kept")
-    code, again, err = command("study", folder, "--out", out)
+    code, again, err = gradients("study", folder, "--out", out)
     assert (code, again, err) == (0, printed, "") and data.read_text() == "kept"
     (folder / "quick.toml").write_text((folder / "quick.toml").read_text().replace("steps = 20", "steps = 21"))
-    code, _, err = command("study", folder, "--out", out, "--only", "quick")
+    code, _, err = gradients("study", folder, "--out", out, "--only", "quick")
     assert (code, err) == (0, "quick ...\n") and data.read_text() != "kept"
 
 
-def test_an_experiment_that_fails_does_not_stop_the_study(folder, tmp_path, command, monkeypatch):
+def test_an_experiment_that_fails_does_not_stop_the_study(folder, tmp_path, gradients, monkeypatch):
     monkeypatch.setattr("cortado.commands.study._has_gpu", lambda: True)
-    code, printed, err = command("study", folder, "--out", tmp_path / "study")
+    code, printed, err = gradients("study", folder, "--out", tmp_path / "study")
     assert code == 1 and "These experiments failed: remote." in err
     assert "Failed: device is 'cuda:99'" in printed and "Analytic, all forces" in printed
 
 
 @pytest.mark.parametrize(("arguments", "words"), [(["."], "no experiments"), ([".", "--only", "a"], "no experiments")])
-def test_a_study_of_nothing_is_refused(tmp_path, monkeypatch, command, arguments, words):
+def test_a_study_of_nothing_is_refused(tmp_path, monkeypatch, gradients, arguments, words):
     monkeypatch.chdir(tmp_path)
-    code, out, err = command("study", *arguments)
+    code, out, err = gradients("study", *arguments)
     assert (code, out) == (2, "") and words in err
 
 
-def test_an_unknown_name_is_refused(folder, command):
-    code, _, err = command("study", folder, "--only", "figure_9")
+def test_an_unknown_name_is_refused(folder, gradients):
+    code, _, err = gradients("study", folder, "--only", "figure_9")
     assert code == 2 and "--only is 'figure_9', but must be one of quick, remote." in err

@@ -5,6 +5,7 @@ import csv
 import json
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -46,20 +47,9 @@ def alone(tmp_path_factory):
 
 
 @pytest.fixture
-def sweep(capfd):
-    """Runs `cortado sweep` in this process: (exit code, stdout, stderr)."""
-
-    def run(*arguments):
-        capfd.readouterr()
-        try:
-            main(["sweep", *map(str, arguments)])
-            code = 0
-        except SystemExit as end:
-            code = end.code
-        out, err = capfd.readouterr()
-        return code, out, without_compiling(err)
-
-    return run
+def sweep(cortado_command):
+    """Runs ``cortado sweep ...`` in this process: (exit code, stdout, stderr)."""
+    return partial(cortado_command, "sweep")
 
 
 def rows(out):

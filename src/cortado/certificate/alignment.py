@@ -8,7 +8,6 @@ from cortado.errors import DivergedError
 from cortado.gradients import (
     AdjointViscosity,
     EnsembleMean,
-    Exact,
     FrozenGeometry,
     GradientEstimator,
     Guided,

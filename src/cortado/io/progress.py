@@ -36,9 +36,10 @@ def untracked() -> Iterator[None]:
 
 @contextmanager
 def track(
-    total: int, description: str, *, stream: TextIO | None = None, interval: float = LINE_INTERVAL
+    total: int, description: str, *, stream: TextIO | None = None, interval: float | None = None
 ) -> Iterator[Advance]:
-    """Shows the progress of `total` steps on a stream, stderr when none is given.
+    """Shows the progress of `total` steps on a stream, stderr when none is given; where that is no terminal, by a line
+    every `interval` seconds, `LINE_INTERVAL` when none is given.
 
     Use:
         with track(120, "optimise") as advance:
@@ -52,7 +53,7 @@ def track(
         with _bar(total, description, stream) as advance:
             yield advance
     else:
-        yield _Lines(total, description, stream, interval)
+        yield _Lines(total, description, stream, LINE_INTERVAL if interval is None else interval)
 
 
 @contextmanager

@@ -1,0 +1,34 @@
+"""Arguments that several commands have, and what is asked of their values before a command begins."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from cortado.errors import InputError
+
+Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
+Overrides = Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")]
+
+
+def require_at_least(least: int, value: int, option: str) -> None:
+    """Raises `InputError` for a value that is smaller, with the option's name in the sentence."""
+    if value < least:
+        raise InputError(f"{option} is {value}, but must be at least {least}.")
+
+
+def as_text(options: Sequence[str]) -> list[str]:
+    """What was given to --set or --only; raises `InputError` for bytes that are no text."""
+    for option in options:
+        try:
+            option.encode()
+        except UnicodeEncodeError:
+            raise InputError(f"{option!r} is among the options, but must be text in UTF-8.") from None
+    return list(options)
+
+
+def command_line() -> list[str]:
+    """The command as it was typed, which a run writes into its folder."""
+    return ["cortado", *sys.argv[1:]]
