@@ -1,0 +1,192 @@
+"""A task as a search sees it: a function of numbers from -1 to 1, that counts the steps it simulates."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cortado import DivergedError, Problem
+from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator
+from cortado.optimisation.transforms import Transformed
+from cortado.parameters.values import Arrays, Values
+from task import Task
+
+BACKWARD = 3.0
+"""Forward steps that a step back costs: it computes the step once more, and its adjoint (README.md)."""
+POSITION_NOISE = 0.01
+"""Of the first positions of a seed [spacings]."""
+BAD = 10.0
+"""A run that diverged counts as so many times the loss of the baseline."""
+
+
+class BudgetSpent(Exception):
+    """A search has simulated as many steps as it may."""
+
+
+@dataclass
+class Meter:
+    """Counts simulated steps."""
+
+    forward: int = 0
+    backward: int = 0
+
+    @property
+    def steps(self) -> float:
+        """All of them, in forward steps."""
+        return self.forward + BACKWARD * self.backward
+
+
+class Objective:
+    """The loss of a task from first positions of a seed's own, as a function of the numbers of its controls."""
+
+    def __init__(self, task: Task, problem: Problem, seed: int, budget: float):
+        """``budget``: simulated steps after which no further run begins."""
+        self.task, self.budget, self.meter = task, budget, Meter()
+        self.metered = Metered(problem, _first_positions(problem, seed), self.meter)
+        self._name = task.controls.parameter
+        self.problem = Transformed(self.metered, {self._name: task.controls.mapping})  # type: ignore[arg-type]
+        self.curve: list[tuple[float, float]] = []
+        """Simulated steps, and the loss of the run that they end with; infinite for one that diverged."""
+        self.best, self.best_loss = task.baseline, math.inf
+        self._bad = BAD * abs(problem.value(task.controls.parameters(task.baseline)))
+
+    @property
+    def start(self) -> np.ndarray:
+        """(numbers,) where searches begin."""
+        return self.task.baseline
+
+    def named(self, u: np.ndarray) -> Arrays:
+        """The numbers as what `problem` is given."""
+        return {self._name: u}
+
+    def values(self, points: Sequence[np.ndarray]) -> np.ndarray:
+        """(points,) the losses, as many at a time in one launch as the device takes; of those that diverged a bad one.
+        Raises `BudgetSpent`."""
+        found: list[float] = []
+        room = max(self.problem.room(), 1)
+        while len(found) < len(points):
+            self._require_budget()
+            part = [self.named(u) for u in points[len(found) : len(found) + room]]
+            before = self.meter.steps
+            if room > 1:
+                losses = [_loss(one) for one in self.problem.together(part)]
+            else:
+                losses = [self._value(one) for one in part]
+            each = (self.meter.steps - before) / len(part)
+            for k, (u, loss) in enumerate(zip(part, losses, strict=True), 1):
+                found.append(self._noted(u[self._name], loss, before + k * each))
+        return np.array(found)
+
+    def value_and_gradient(self, u: Arrays, gradient: GradientEstimator) -> tuple[float, Arrays]:
+        """As `cortado.optimise` asks. Where the run diverged, or the gradient overflowed, it is 0 in those numbers."""
+        self._require_budget()
+        try:
+            found = self.problem.estimate(u, gradient)
+        except DivergedError:
+            return self._noted(u[self._name], math.inf, self.meter.steps), self.named(np.zeros_like(u[self._name]))
+        loss = self._noted(u[self._name], found.loss, self.meter.steps)
+        with np.errstate(over="ignore"):
+            slopes = np.nan_to_num(found.gradient[self._name], nan=0.0, posinf=0.0, neginf=0.0)
+        return loss, self.named(np.clip(slopes, -1e100, 1e100))
+
+    def _value(self, u: Arrays) -> float:
+        try:
+            return self.problem.value(u)
+        except DivergedError:
+            return math.inf
+
+    def _noted(self, u: np.ndarray, loss: float, steps: float) -> float:
+        """The loss as a search is told it, which is entered into the curve."""
+        loss = loss if math.isfinite(loss) else math.inf
+        self.curve.append((steps, loss))
+        if loss < self.best_loss:
+            self.best, self.best_loss = u.copy(), loss
+        return min(loss, self._bad)
+
+    def _require_budget(self) -> None:
+        if self.meter.steps >= self.budget:
+            raise BudgetSpent
+
+
+class Metered:
+    """A problem whose steps are counted, forward and back, also those of several runs in one launch; if it has first
+    positions of its own, they replace those of the scene."""
+
+    def __init__(self, problem: Problem, first_positions: np.ndarray | None, meter: Meter):
+        self._problem, self._meter, self._first = problem, meter, first_positions
+        self.simulation = problem.simulation if first_positions is None else _Simulation(problem, first_positions)
+
+    def value(self, parameters: Values) -> Any:
+        self._meter.forward += self._steps
+        return self._problem.value(self._all(parameters))
+
+    def forward_pass(self, parameters: Values) -> "_MeteredPass":
+        self._meter.forward += self._steps
+        return _MeteredPass(self._problem.forward_pass(self._all(parameters)), self._steps, self._meter)
+
+    def room(self, estimator: AdjointEstimator | None = None) -> int:
+        """See `Batchable.room`."""
+        return self._problem.room(estimator)
+
+    def together(
+        self, points: Sequence[Values], estimator: AdjointEstimator | None = None
+    ) -> list[Estimate | DivergedError]:
+        """See `Batchable.together`."""
+        if estimator is None:
+            self._meter.forward += self._steps * len(points)
+        inner: Any = None if estimator is None else _MeteredEstimator(estimator, self._meter)
+        return self._problem.together([self._all(point) for point in points], inner)
+
+    @property
+    def _steps(self) -> int:
+        """In one evaluation, of all scenes of a batch."""
+        return self._problem.steps * (self._problem.simulation.batch or 1)
+
+    def _all(self, parameters: Values) -> Values:
+        return parameters if self._first is None else {"initial_positions": self._first, **parameters}
+
+
+class _MeteredPass:
+    """A forward run whose reverse passes are counted."""
+
+    def __init__(self, forward_pass: Any, steps: int, meter: Meter):
+        self._pass, self._steps, self._meter = forward_pass, steps, meter
+        self.loss, self.rollout, self.derivative = forward_pass.loss, forward_pass.rollout, forward_pass.derivative
+
+    def back(self, derivative: Any, observe: Any = None) -> Arrays:
+        self._meter.backward += self._steps
+        return self._pass.back(derivative, observe)
+
+
+@dataclass(frozen=True)
+class _MeteredEstimator:
+    """An estimator that counts what it does to a batch."""
+
+    estimator: AdjointEstimator
+    meter: Meter
+
+    def estimate(self, problem: Any, parameters: Values, observe: Any = None) -> Estimate:
+        return self.estimator.estimate(Metered(problem, None, self.meter), parameters, observe)
+
+
+class _Simulation:
+    """A simulation with other first positions, as ensembles look at it."""
+
+    batch = None
+
+    def __init__(self, problem: Problem, positions: np.ndarray):
+        self.scene, self.positions = problem.simulation.scene, positions
+
+
+def _first_positions(problem: Problem, seed: int) -> np.ndarray:
+    """(n, d) those of the scene, with a little noise but in a nozzle [m]."""
+    simulation = problem.simulation
+    noise = np.random.default_rng(seed).standard_normal(simulation.positions.shape)
+    noise[simulation.free_particles or len(noise) :] = 0.0
+    return simulation.positions + POSITION_NOISE * simulation.scene.discretisation.spacing * noise
+
+
+def _loss(found: Estimate | DivergedError) -> float:
+    return math.inf if isinstance(found, DivergedError) else float(found.loss)
