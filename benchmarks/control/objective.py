@@ -43,7 +43,7 @@ class Objective:
 
     def __init__(self, task: Task, problem: Problem, seed: int, budget: float):
         """``budget``: simulated steps after which no further run begins."""
-        self.task, self.budget, self.meter = task, budget, Meter()
+        self.task, self.budget, self.meter, self._problem = task, budget, Meter(), problem
         self.metered = Metered(problem, _first_positions(problem, seed), self.meter)
         self._name = task.controls.parameter
         self.problem = Transformed(self.metered, {self._name: task.controls.mapping})  # type: ignore[arg-type]
@@ -90,6 +90,13 @@ class Objective:
         with np.errstate(over="ignore"):
             slopes = np.nan_to_num(found.gradient[self._name], nan=0.0, posinf=0.0, neginf=0.0)
         return loss, self.named(np.clip(slopes, -1e100, 1e100))
+
+    def score(self) -> dict[str, float]:
+        """Of the best controls, from the first positions of the scene; empty where they diverge from there."""
+        try:
+            return self.task.score(self._problem, self.best)
+        except DivergedError:
+            return {}
 
     def _value(self, u: Arrays) -> float:
         try:
