@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from objective import BudgetSpent, Objective
 
 from cortado import InputError, gradients, optimise, optimisers
-from objective import BudgetSpent, Objective
 
 
 class Contender(Protocol):
@@ -21,7 +21,7 @@ class Descent:
     """Adam with the gradients of an estimator, whose automatic settings are chosen once, where the search begins."""
 
     estimator: gradients.GradientEstimator
-    learning_rate: float = 0.05
+    learning_rate: float = 0.1
     """Of controls, which go from -1 to 1."""
 
     def search(self, objective: Objective, seed: int) -> None:
@@ -29,7 +29,8 @@ class Descent:
         estimator = gradients.tuned(self.estimator, objective.problem, start)
         iterations = 1 + int(objective.budget)
         try:
-            optimise(objective, start, optimisers.Adam(self.learning_rate), iterations, _bounds(start), gradient=estimator)
+            adam = optimisers.Adam(self.learning_rate)
+            optimise(objective, start, adam, iterations, _bounds(start), gradient=estimator)
         except BudgetSpent:
             return
 
@@ -58,7 +59,7 @@ class CMAES:
 
 @dataclass(frozen=True)
 class RandomSearch:
-    """Normal changes of the best controls so far, of widths drawn between two bounds; the best one is kept."""
+    """Normal changes of the best controls so far, of many widths; the best one is kept."""
 
     widths: tuple[float, float] = (0.01, 0.5)
     population: int = 16
@@ -69,7 +70,7 @@ class RandomSearch:
         try:
             objective.values([objective.start])
             while True:
-                widths = np.exp(random.uniform(*np.log(self.widths), self.population))
+                widths = np.geomspace(*self.widths, self.population)
                 changes = random.standard_normal((self.population, objective.start.size))
                 objective.values(list(np.clip(objective.best + widths[:, None] * changes, -1.0, 1.0)))
         except BudgetSpent:

@@ -3,14 +3,14 @@
 from pathlib import Path
 
 import numpy as np
-
 from catalogue import task
 from contenders import CONTENDERS
+from records import Record
+
 from cortado import InputError, Problem
 from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE, drawing
-from cortado.losses import Image
 from cortado.io.srgb import to_srgb
-from records import Record
+from cortado.losses import Image
 
 POINTS = 400
 """Of a curve."""
@@ -91,7 +91,8 @@ def picture(problem: Problem, parameters: dict[str, np.ndarray]) -> np.ndarray:
 def medians(records: list[Record]) -> str:
     """A table for a document: for each task and contender the median of the least loss, with its quartiles, and the
     medians of the score."""
-    lines = ["| task | contender | runs | least loss, median (quartiles) | diverged | score |", "|---|---|---|---|---|---|"]
+    lines = ["| task | contender | runs | least loss, median (quartiles) | diverged | score |",
+             "|---|---|---|---|---|---|"]
     for name in dict.fromkeys(one.run.task for one in records):
         for who, runs in by_contender([one for one in records if one.run.task == name]).items():
             low, middle, high = np.percentile([one.so_far[-1] for one in runs], QUARTILES)

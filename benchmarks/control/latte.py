@@ -5,18 +5,19 @@ for a while. `latte` compares the last pictures; `latte_dense` has FluidLab's lo
 particle of milk from where it is under the hidden path, at many times.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
+from task import COFFEE, MILK, Controls, NoLoss, Score, Task, scene_of
 
 from cortado import Problem, Scene, Simulation, image_losses
 from cortado.losses import Frames, Image, Loss
 from cortado.losses.loss import Adjoint, Snapshot
 from cortado.optimisation.transforms import Affine
-from task import COFFEE, MILK, Controls, NoLoss, Score, Task, scene_of
 
 LAG = 0.08
 """Of the pouring: in so long the nozzle comes nearer to where it is sent, by a factor of e."""
@@ -53,7 +54,7 @@ class Latte(Task):
 
     @classmethod
     def large(cls) -> Self:
-        return cls(3, 16, 8, 2, 75, 0.0021, 0.0012, actions=250, repeats=4, standing=320)
+        return cls(3, 16, 9, 2, 75, 0.0021, 0.0012, actions=250, repeats=4, standing=320)
 
     @property
     def steps(self) -> int:
@@ -78,6 +79,8 @@ class Latte(Task):
     def scene(self) -> Scene:
         coffee, height = self.layers * self.spacing, 2.5 * self.layers * self.spacing
         radius, area = self.opening * self.spacing, self.spacing ** (self.dimension - 1)
+        cup: dict[str, Any]
+        pool: dict[str, Any]
         if self.dimension == 2:
             cup = {"shape": "box", "lower": [-self.cup, 0.0], "upper": [self.cup, height]}
             pool = {"shape": "box", "lower": [-self.cup, 0.0], "upper": [self.cup, coffee]}
@@ -122,7 +125,7 @@ class Latte(Task):
     def known(self) -> np.ndarray:
         """The hidden path: the outline of a heart, in the plane its breadth alone."""
         angle = 2.0 * np.pi * np.arange(self.actions) / self.actions
-        height = (13 * np.cos(angle) - 5 * np.cos(2 * angle) - 2 * np.cos(3 * angle) - np.cos(4 * angle)) / 16
+        height = (13 * np.cos(angle) - 5 * np.cos(2 * angle) - 2 * np.cos(3 * angle) - np.cos(4 * angle)) / 17
         return np.stack([np.sin(angle) ** 3, -height][: self.dimension - 1], axis=1).ravel()
 
     def loss(self, simulation: Simulation) -> Loss | Frames:
@@ -143,23 +146,23 @@ class Latte(Task):
 
     def milk_distances(self, simulation: Simulation) -> dict[int, "MilkDistance"]:
         """FluidLab's loss at some steps, by their number."""
-        steps = np.linspace(0, self.steps, FRAMES + 1).astype(int)[1:]
+        steps = np.linspace(0, self.steps, FRAMES + 1).astype(int)[1:].tolist()
         states = self._hidden(simulation, steps)
         emitter = simulation.scene.emitter
         assert emitter is not None
         upstream, n = emitter.sample(self.spacing).upstream, simulation.particles
         return {
-            int(step): MilkDistance(
+            step: MilkDistance(
                 np.arange(n - len(upstream), n)[upstream < self.speed * step * self.time_step],
-                states[int(step)].positions,
+                states[step].positions,
             )
             for step in steps
         }
 
-    def _hidden(self, simulation: Simulation, steps: object) -> dict[int, Snapshot]:
+    def _hidden(self, simulation: Simulation, steps: Iterable[int]) -> dict[int, Snapshot]:
         """States under the hidden path."""
         problem = Problem(simulation, self.steps, NoLoss())
-        return problem.states(self.controls.parameters(self.known), [int(step) for step in np.atleast_1d(steps)])
+        return problem.states(self.controls.parameters(self.known), steps)
 
 
 @dataclass(frozen=True)

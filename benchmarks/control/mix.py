@@ -6,14 +6,14 @@ component by component, and stirs where here the cup is shaken.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
+from task import COFFEE, GRAVITY, MILK, Controls, Score, Task, scene_of, shaken
 
 from cortado import Problem, Scene, Simulation
 from cortado.losses import Frames
 from cortado.losses.loss import Adjoint, Snapshot
-from task import COFFEE, GRAVITY, MILK, Controls, Score, Task, scene_of, shaken
 
 STRENGTH = 6.0
 """Greatest acceleration of the cup along an axis [m/s2]."""
@@ -33,16 +33,22 @@ class Mix(Task):
     width: float
     """[m]"""
     time_step: float
-    steps: int
     blocks: int
+    """Of time, in each of which the controls are constant."""
+    repeats: int
+    """Steps in a block."""
 
     @classmethod
     def small(cls) -> Self:
-        return cls((16, 9), 4, 0.08, 0.002, steps=200, blocks=25)
+        return cls((16, 9), 4, 0.08, 0.002, blocks=25, repeats=8)
 
     @classmethod
     def large(cls) -> Self:
-        return cls((20, 20, 20), 8, 0.08, 0.001, steps=1200, blocks=60)
+        return cls((20, 20, 20), 8, 0.08, 0.001, blocks=60, repeats=20)
+
+    @property
+    def steps(self) -> int:
+        return self.blocks * self.repeats
 
     @property
     def spacing(self) -> float:
@@ -54,7 +60,7 @@ class Mix(Task):
         upper = self.spacing * np.array(self.cells)
         border, half = upper[1] - self.milk * self.spacing, upper[0] / 2
 
-        def box(phase: str, lower: list[float], *cut: tuple[int, float]) -> dict[str, object]:
+        def box(phase: str, lower: list[float], *cut: tuple[int, float]) -> dict[str, Any]:
             corner = upper.copy()
             for axis, at in cut:
                 corner[axis] = at
@@ -63,7 +69,7 @@ class Mix(Task):
 
         roof = upper.copy()
         roof[1] *= 1.8
-        view = {"view": "plane", "resolution": [64, 65]}
+        view: dict[str, Any] = {"view": "plane", "resolution": [64, 65]}
         if len(upper) == 3:
             middle = [upper[0] / 2, 0.45 * roof[1], upper[2] / 2]
             camera = [upper[0] / 2, 0.45 * roof[1], 5.0 * upper[0]]

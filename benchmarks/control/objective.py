@@ -6,23 +6,25 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from task import Task
 
 from cortado import DivergedError, Problem
 from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator
 from cortado.optimisation.transforms import Transformed
 from cortado.parameters.values import Arrays, Values
-from task import Task
 
 BACKWARD = 3.0
 """Forward steps that a step back costs: it computes the step once more, and its adjoint (README.md)."""
 POSITION_NOISE = 0.01
 """Of the first positions of a seed [spacings]."""
+GREATEST = 1e100
+"""Components of a gradient are limited to it, so that Adam can square them."""
 BAD = 10.0
 """A run that diverged counts as so many times the loss of the baseline."""
 
 
 class BudgetSpent(Exception):
-    """A search has simulated as many steps as it may."""
+    """A search has simulated as many steps as it may; what it has evaluated beyond them does not count."""
 
 
 @dataclass
@@ -79,17 +81,16 @@ class Objective:
                 found.append(self._noted(u[self._name], loss, before + k * each))
         return np.array(found)
 
-    def value_and_gradient(self, u: Arrays, gradient: GradientEstimator) -> tuple[float, Arrays]:
+    def value_and_gradient(self, parameters: Arrays, gradient: GradientEstimator | None = None) -> tuple[float, Arrays]:
         """As `cortado.optimise` asks. Where the run diverged, or the gradient overflowed, it is 0 in those numbers."""
         self._require_budget()
+        u = parameters[self._name]
         try:
-            found = self.problem.estimate(u, gradient)
+            found = self.problem.estimate(parameters, gradient)
         except DivergedError:
-            return self._noted(u[self._name], math.inf, self.meter.steps), self.named(np.zeros_like(u[self._name]))
-        loss = self._noted(u[self._name], found.loss, self.meter.steps)
-        with np.errstate(over="ignore"):
-            slopes = np.nan_to_num(found.gradient[self._name], nan=0.0, posinf=0.0, neginf=0.0)
-        return loss, self.named(np.clip(slopes, -1e100, 1e100))
+            return self._noted(u, math.inf, self.meter.steps), self.named(np.zeros_like(u))
+        slopes = np.nan_to_num(found.gradient[self._name], nan=0.0, posinf=0.0, neginf=0.0)
+        return self._noted(u, found.loss, self.meter.steps), self.named(np.clip(slopes, -GREATEST, GREATEST))
 
     def score(self) -> dict[str, float]:
         """Of the best controls, from the first positions of the scene; empty where they diverge from there."""
@@ -105,7 +106,10 @@ class Objective:
             return math.inf
 
     def _noted(self, u: np.ndarray, loss: float, steps: float) -> float:
-        """The loss as a search is told it, which is entered into the curve."""
+        """The loss as a search is told it, which is entered into the curve. Raises `BudgetSpent` for a run that ended
+        after the budget was spent."""
+        if steps > self.budget:
+            raise BudgetSpent
         loss = loss if math.isfinite(loss) else math.inf
         self.curve.append((steps, loss))
         if loss < self.best_loss:

@@ -6,12 +6,12 @@ from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 
 import numpy as np
-
 from catalogue import task
 from contenders import contender
+from objective import Objective
+
 from cortado import InputError, __version__
 from cortado.io.files import write_atomically
-from objective import Objective
 
 
 @dataclass(frozen=True)

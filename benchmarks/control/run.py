@@ -14,10 +14,11 @@ from pathlib import Path
 
 from catalogue import SIZES, TASKS, task
 from contenders import CONTENDERS, contender
-from cortado.errors import CortadoError, CortadoWarning, InputError
-from cortado.io.progress import track
 from curves import draw, medians
 from records import Record, Records, Run, carried_out
+
+from cortado.errors import CortadoError, CortadoWarning, InputError
+from cortado.io.progress import track
 
 BUDGETS = {"small": 20_000.0, "large": 200_000.0}
 """Simulated steps of a search, by size."""

@@ -5,10 +5,10 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
+from task import WATER, Controls, NoLoss, Score, Task, scene_of, shaken
 
 from cortado import Problem, Scene, Simulation, image_losses
 from cortado.losses import Image
-from task import WATER, Controls, NoLoss, Score, Task, scene_of, shaken
 
 STRENGTH = 12.0
 """Greatest acceleration of the box along an axis [m/s2]."""
@@ -25,16 +25,22 @@ class Splash(Task):
     width: float
     """Of the box [m]."""
     time_step: float
-    steps: int
     blocks: int
+    """Of time, in each of which the controls are constant."""
+    repeats: int
+    """Steps in a block."""
 
     @classmethod
     def small(cls) -> Self:
-        return cls(12, 0, 0.6, 0.003, steps=200, blocks=25)
+        return cls(12, 0, 0.6, 0.003, blocks=25, repeats=8)
 
     @classmethod
     def large(cls) -> Self:
-        return cls(32, 8, 0.6, 0.001, steps=1000, blocks=50)
+        return cls(32, 8, 0.6, 0.001, blocks=50, repeats=20)
+
+    @property
+    def steps(self) -> int:
+        return self.blocks * self.repeats
 
     @property
     def dimension(self) -> int:

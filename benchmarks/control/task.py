@@ -46,8 +46,6 @@ class Task(ABC):
     """A fluid to be moved, and how well that was done."""
 
     name: ClassVar[str]
-    steps: int
-    """Of time, in one run."""
 
     @classmethod
     @abstractmethod
@@ -58,6 +56,11 @@ class Task(ABC):
     @abstractmethod
     def large(cls) -> Self:
         """For a GPU, 1,000 steps or more."""
+
+    @property
+    @abstractmethod
+    def steps(self) -> int:
+        """Of time, in one run."""
 
     @property
     @abstractmethod
@@ -106,15 +109,13 @@ class NoLoss:
 def scene_of(name: str, spacing: float, time_step: float, container: Mapping[str, Any], **tables: Any) -> Scene:
     """A scene with what all tasks have in common; lengths in m, times in s."""
     dimension = len(container["lower" if "lower" in container else "base"])
-    return Scene(
-        name=name,
-        dimension=dimension,
-        discretisation={"spacing": spacing, "support": 2.0, "kernel": "cubic_spline"},
-        container=container,
-        forces={"gravity": [0.0, -GRAVITY, 0.0][:dimension], "viscosity": "pairwise"},
-        solver={"time_step": time_step, "minimum_iterations": 4, "maximum_iterations": 4},
-        **tables,
-    )
+    common: dict[str, Any] = {
+        "discretisation": {"spacing": spacing, "support": 2.0, "kernel": "cubic_spline"},
+        "container": container,
+        "forces": {"gravity": [0.0, -GRAVITY, 0.0][:dimension], "viscosity": "pairwise"},
+        "solver": {"time_step": time_step, "minimum_iterations": 4, "maximum_iterations": 4},
+    }
+    return Scene(name=name, dimension=dimension, **common, **tables)
 
 
 def blocks_of(steps: int, blocks: int) -> np.ndarray:
