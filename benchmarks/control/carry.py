@@ -85,8 +85,8 @@ class Carry(Task):
 
     @cached_property
     def _full_throttle(self) -> np.ndarray:
-        """(blocks,) [m/s2]: one acceleration for the first half of the way, its opposite for the second."""
-        signs = np.where(np.arange(self.blocks) < self.blocks // 2, 1.0, -1.0)
+        """(blocks,) [m/s2]: one acceleration for the first half of the time, its opposite for the second."""
+        signs = np.sign(0.5 * (self.blocks - 1) - np.arange(self.blocks))
         return self.distance / (self._arrival[1] @ signs) * signs
 
     @cached_property

@@ -91,8 +91,10 @@ def picture(problem: Problem, parameters: dict[str, np.ndarray]) -> np.ndarray:
 def medians(records: list[Record]) -> str:
     """A table for a document: for each task and contender the median of the least loss, with its quartiles, and the
     medians of the score."""
-    lines = ["| task | contender | runs | least loss, median (quartiles) | diverged | score |",
-             "|---|---|---|---|---|---|"]
+    lines = [
+        "| task | contender | runs | least loss, median (quartiles) | diverged | score |",
+        "|---|---|---|---|---|---|",
+    ]
     for name in dict.fromkeys(one.run.task for one in records):
         for who, runs in by_contender([one for one in records if one.run.task == name]).items():
             low, middle, high = np.percentile([one.so_far[-1] for one in runs], QUARTILES)
