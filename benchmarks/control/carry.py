@@ -15,6 +15,7 @@ from cortado import Problem, Scene, Simulation
 from cortado.losses import Frames
 from cortado.losses.loss import Adjoint, Snapshot
 from cortado.optimisation.transforms import Affine
+from cortado.parameters.values import Arrays
 
 FRAMES = 20
 """States on the way at which water above the rim is counted, and as many after the arrival."""
@@ -124,8 +125,7 @@ class Carry(Task):
     def loss(self, simulation: Simulation) -> Frames:
         return Frames(self.frames)
 
-    def score(self, problem: Problem, u: np.ndarray) -> Score:
-        parameters = self.controls.parameters(u)
+    def score(self, problem: Problem, parameters: Arrays) -> Score:
         states, frames = problem.states(parameters, self.frames), self.frames
         accelerations = -parameters["gravity"][: self.moving, 0]
         velocities = self.time_step * np.cumsum(accelerations)

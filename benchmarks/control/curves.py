@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from catalogue import task
 from contenders import CONTENDERS
+from objective import first_positions
 from records import Record
 
 from cortado import InputError, Problem
@@ -60,10 +61,13 @@ def _draw_curves(name: str, size: str, problem: Problem, records: list[Record], 
 
 def _draw_pictures(name: str, size: str, problem: Problem, records: list[Record], path: Path) -> None:
     chosen = task(name, size)
-    controls = {"no search": chosen.baseline, "known solution": chosen.known}
+    parameters = {"no search": chosen.controls.parameters(chosen.baseline)}
+    parameters["known solution"] = chosen.controls.parameters(chosen.known)
     for who, runs in by_contender(records).items():
-        controls[who] = np.array(sorted(runs, key=lambda one: one.so_far[-1])[len(runs) // 2].best)
-    pictures = {who: picture(problem, chosen.controls.parameters(u)) for who, u in controls.items()}
+        median = sorted(runs, key=lambda one: one.so_far[-1])[len(runs) // 2]
+        first = first_positions(problem, median.run.seed)
+        parameters[who] = chosen.controls.parameters(np.array(median.best)) | first
+    pictures = {who: picture(problem, one) for who, one in parameters.items()}
     if isinstance(problem.loss, Image):
         pictures = {"target": problem.loss.target, **pictures}
     columns = 5

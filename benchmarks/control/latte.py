@@ -18,6 +18,7 @@ from cortado import Problem, Scene, Simulation, image_losses
 from cortado.losses import Frames, Image, Loss
 from cortado.losses.loss import Adjoint, Snapshot
 from cortado.optimisation.transforms import Affine
+from cortado.parameters.values import Arrays
 
 LAG = 0.08
 """Of the pouring: in so long the nozzle comes nearer to where it is sent, by a factor of e."""
@@ -134,8 +135,8 @@ class Latte(Task):
         target = renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
         return Image(renderer, target, image_losses.Pyramid())
 
-    def score(self, problem: Problem, u: np.ndarray) -> Score:
-        end = problem.end(self.controls.parameters(u))
+    def score(self, problem: Problem, parameters: Arrays) -> Score:
+        end = problem.end(parameters)
         image = Latte.loss(self, problem.simulation)
         assert isinstance(image, Image)
         milk = self.milk_distances(problem.simulation)[self.steps]

@@ -14,6 +14,7 @@ from task import COFFEE, GRAVITY, MILK, Controls, Score, Task, scene_of, shaken
 from cortado import Problem, Scene, Simulation
 from cortado.losses import Frames
 from cortado.losses.loss import Adjoint, Snapshot
+from cortado.parameters.values import Arrays
 
 STRENGTH = 6.0
 """Greatest acceleration of the cup along an axis [m/s2]."""
@@ -109,8 +110,8 @@ class Mix(Task):
         steps = np.linspace(0.75 * self.steps, self.steps, FRAMES).astype(int)
         return Frames({int(step): Unmixed(milk, everywhere, 1.0 / FRAMES) for step in steps})
 
-    def score(self, problem: Problem, u: np.ndarray) -> Score:
-        end, simulation = problem.end(self.controls.parameters(u)), problem.simulation
+    def score(self, problem: Problem, parameters: Arrays) -> Score:
+        end, simulation = problem.end(parameters), problem.simulation
         milk = np.flatnonzero(simulation.mass_fractions[:, 1])
         return {
             "unmixed at the end": Unmixed(milk, spread(simulation.positions), 1.0).value(end),

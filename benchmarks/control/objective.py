@@ -46,7 +46,8 @@ class Objective:
     def __init__(self, task: Task, problem: Problem, seed: int, budget: float):
         """``budget``: simulated steps after which no further run begins."""
         self.task, self.budget, self.meter, self._problem = task, budget, Meter(), problem
-        self.metered = Metered(problem, _first_positions(problem, seed), self.meter)
+        self._first = first_positions(problem, seed)
+        self.metered = Metered(problem, self._first, self.meter)
         self._name = task.controls.parameter
         self.problem = Transformed(self.metered, {self._name: task.controls.mapping})  # type: ignore[arg-type]
         self.curve: list[tuple[float, float]] = []
@@ -82,22 +83,25 @@ class Objective:
         return np.array(found)
 
     def value_and_gradient(self, parameters: Arrays, gradient: GradientEstimator | None = None) -> tuple[float, Arrays]:
-        """As `cortado.optimise` asks. Where the run diverged, or the gradient overflowed, it is 0 in those numbers."""
+        """As `cortado.optimise` asks. Where the run diverged, the gradient leads back to the best controls so far; numbers
+        of it that overflowed are 0."""
         self._require_budget()
         u = parameters[self._name]
         try:
             found = self.problem.estimate(parameters, gradient)
         except DivergedError:
-            return self._noted(u, math.inf, self.meter.steps), self.named(np.zeros_like(u))
+            return self._noted(u, math.inf, self.meter.steps), self.named(self._away_from_best(u))
         slopes = np.nan_to_num(found.gradient[self._name], nan=0.0, posinf=0.0, neginf=0.0)
         return self._noted(u, found.loss, self.meter.steps), self.named(np.clip(slopes, -GREATEST, GREATEST))
 
     def score(self) -> dict[str, float]:
-        """Of the best controls, from the first positions of the scene; empty where they diverge from there."""
-        try:
-            return self.task.score(self._problem, self.best)
-        except DivergedError:
-            return {}
+        """Of the best controls."""
+        return self.task.score(self._problem, {**self.task.controls.parameters(self.best), **self._first})
+
+    def _away_from_best(self, u: np.ndarray) -> np.ndarray:
+        """(numbers,) the gradient of a loss that rises evenly from the best controls to these, which are bad."""
+        away = u - self.best
+        return (self._bad - min(self.best_loss, self._bad)) * away / max(float(away @ away), 1e-12)
 
     def _value(self, u: Arrays) -> float:
         try:
@@ -125,9 +129,10 @@ class Metered:
     """A problem whose steps are counted, forward and back, also those of several runs in one launch; if it has first
     positions of its own, they replace those of the scene."""
 
-    def __init__(self, problem: Problem, first_positions: np.ndarray | None, meter: Meter):
-        self._problem, self._meter, self._first = problem, meter, first_positions
-        self.simulation = problem.simulation if first_positions is None else _Simulation(problem, first_positions)
+    def __init__(self, problem: Problem, first: Arrays, meter: Meter):
+        """``first``: first positions by their name, or nothing for those of the scene."""
+        self._problem, self._meter, self._first = problem, meter, first
+        self.simulation = _Simulation(problem, **first) if first else problem.simulation
 
     def value(self, parameters: Values) -> Any:
         self._meter.forward += self._steps
@@ -156,7 +161,7 @@ class Metered:
         return self._problem.steps * (self._problem.simulation.batch or 1)
 
     def _all(self, parameters: Values) -> Values:
-        return parameters if self._first is None else {"initial_positions": self._first, **parameters}
+        return {**self._first, **parameters}
 
 
 class _MeteredPass:
@@ -179,7 +184,7 @@ class _MeteredEstimator:
     meter: Meter
 
     def estimate(self, problem: Any, parameters: Values, observe: Any = None) -> Estimate:
-        return self.estimator.estimate(Metered(problem, None, self.meter), parameters, observe)
+        return self.estimator.estimate(Metered(problem, {}, self.meter), parameters, observe)
 
 
 class _Simulation:
@@ -187,16 +192,17 @@ class _Simulation:
 
     batch = None
 
-    def __init__(self, problem: Problem, positions: np.ndarray):
-        self.scene, self.positions = problem.simulation.scene, positions
+    def __init__(self, problem: Problem, initial_positions: np.ndarray):
+        self.scene, self.positions = problem.simulation.scene, initial_positions
 
 
-def _first_positions(problem: Problem, seed: int) -> np.ndarray:
-    """(n, d) those of the scene, with a little noise but in a nozzle [m]."""
+def first_positions(problem: Problem, seed: int) -> Arrays:
+    """The parameter of the first positions (n, d) [m]: those of the scene, with a little noise but in a nozzle."""
     simulation = problem.simulation
     noise = np.random.default_rng(seed).standard_normal(simulation.positions.shape)
     noise[simulation.free_particles or len(noise) :] = 0.0
-    return simulation.positions + POSITION_NOISE * simulation.scene.discretisation.spacing * noise
+    noise *= POSITION_NOISE * simulation.scene.discretisation.spacing
+    return {"initial_positions": simulation.positions + noise}
 
 
 def _loss(found: Estimate | DivergedError) -> float:

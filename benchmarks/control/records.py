@@ -38,9 +38,9 @@ class Record:
     losses: list[float | None]
     """(evaluations,), None of a run that diverged"""
     best: list[float]
-    """(numbers,) the controls with the least loss, from the first positions of the seed"""
+    """(numbers,) the controls with the least loss"""
     score: dict[str, float]
-    """Of these, from the first positions of the scene; empty where they diverge from there."""
+    """Of these."""
     forward_steps: int
     backward_steps: int
     seconds: float

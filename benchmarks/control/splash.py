@@ -9,6 +9,7 @@ from task import WATER, Controls, NoLoss, Score, Task, scene_of, shaken
 
 from cortado import Problem, Scene, Simulation, image_losses
 from cortado.losses import Image
+from cortado.parameters.values import Arrays
 
 STRENGTH = 12.0
 """Greatest acceleration of the box along an axis [m/s2]."""
@@ -104,7 +105,7 @@ class Splash(Task):
         target = written.renderer().render(end.state.positions, end.state.mass_fractions, end.colours)
         return Image(simulation.renderer(), target, image_losses.Pyramid())
 
-    def score(self, problem: Problem, u: np.ndarray) -> Score:
-        end = problem.end(self.controls.parameters(u))
+    def score(self, problem: Problem, parameters: Arrays) -> Score:
+        end = problem.end(parameters)
         assert isinstance(problem.loss, Image)
         return {"-PSNR [dB]": -image_losses.psnr(problem.loss.image(end), problem.loss.target)}

@@ -77,8 +77,8 @@ class Task(ABC):
         """What a search lowers."""
 
     @abstractmethod
-    def score(self, problem: Problem, u: np.ndarray) -> Score:
-        """How well some controls do, in numbers with a meaning; each is better the smaller it is."""
+    def score(self, problem: Problem, parameters: Arrays) -> Score:
+        """How well some parameters do, in numbers with a meaning; each is better the smaller it is."""
 
     @property
     @abstractmethod
