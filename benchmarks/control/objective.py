@@ -83,8 +83,8 @@ class Objective:
         return np.array(found)
 
     def value_and_gradient(self, parameters: Arrays, gradient: GradientEstimator | None = None) -> tuple[float, Arrays]:
-        """As `cortado.optimise` asks. Where the run diverged, the gradient leads back to the best controls so far; numbers
-        of it that overflowed are 0."""
+        """As `cortado.optimise` asks. Where the run diverged, the gradient leads back to the best controls so far; its
+        numbers that overflowed are 0."""
         self._require_budget()
         u = parameters[self._name]
         try:
