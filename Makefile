@@ -12,13 +12,20 @@ BIN := $(VENV)/bin
 setup: $(VENV)/.ready
 
 $(VENV)/.ready: pyproject.toml $(shell find cpp -type f)
+	@echo 'Installing Cortado and what its tests need in $(VENV), once: some minutes.'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
 	@$(BIN)/python -c 'import cortado.reference._engine' 2>/dev/null || \
 		echo 'Installed without the reference engine (C++): CONTRIBUTING.md says how to see why.'
 	touch $@
 
-demo: setup
+$(VENV)/.demo: pyproject.toml $(shell find cpp -type f)
+	@test -e $(VENV)/.ready || echo 'Installing Cortado and its pictures in $(VENV), once: a minute or two.'
+	@test -e $(VENV)/.ready || $(PYTHON) -m venv $(VENV)
+	@test -e $(VENV)/.ready || $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[pictures]'
+	touch $@
+
+demo: $(VENV)/.demo
 	$(BIN)/cortado optimise examples/latte_art_small.toml --out runs/demo --overwrite
 
 test: lint types tests

@@ -6,9 +6,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent
 VENV = ROOT / ".venv"
-READY = VENV / ".ready"
+STAMPS = {"test": VENV / ".ready", "pictures": VENV / ".demo"}
+"""What says that an extra is installed."""
 BIN = VENV / ("Scripts" if sys.platform == "win32" else "bin")
-INSTALL = ("python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--editable", ".[test]")
+INSTALL = ("python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--editable")
 COMMANDS: dict[str, tuple[str, ...]] = {
     "demo": ("cortado", "optimise", "examples/latte_art_small.toml", "--out", "runs/demo", "--overwrite"),
     "lint": ("ruff", "check", "."),
@@ -29,7 +30,7 @@ def main(arguments: list[str]) -> int:
     if name not in SEVERAL:
         print(f"python -m tasks TASK, one of: {', '.join(SEVERAL)}", file=sys.stderr)
         return 2
-    set_up()
+    set_up("pictures" if name == "demo" else "test")
     steps = [COMMANDS[part] for part in SEVERAL[name]]
     for number, step in enumerate(steps, 1):
         code = run((*step, *options) if number == len(steps) else step)
@@ -38,18 +39,21 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def set_up() -> None:
-    """Make the virtual environment, and install Cortado in it, unless nothing has changed since."""
+def set_up(extra: str) -> None:
+    """Make the virtual environment, and install Cortado in it with what an extra has, unless nothing has changed since
+    that, or since all that tests need was installed."""
     sources = [ROOT / "pyproject.toml", *(path for path in (ROOT / "cpp").rglob("*") if path.is_file())]
-    if READY.exists() and READY.stat().st_mtime >= max(path.stat().st_mtime for path in sources):
+    changed, stamp = max(path.stat().st_mtime for path in sources), STAMPS[extra]
+    if any(done.exists() and done.stat().st_mtime >= changed for done in {stamp, STAMPS["test"]}):
         return
+    print(f"Installing Cortado in {VENV.name}, once: some minutes.")
     if not BIN.exists():
         subprocess.run([sys.executable, "-m", "venv", str(VENV)], check=True)
-    if run(INSTALL):
+    if run((*INSTALL, f".[{extra}]")):
         sys.exit(1)
     if run(("python", "-c", "import cortado.reference._engine")):
         print("Installed without the reference engine (C++): CONTRIBUTING.md says how to see why.", file=sys.stderr)
-    READY.touch()
+    stamp.touch()
 
 
 def run(command: tuple[str, ...]) -> int:

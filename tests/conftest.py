@@ -73,8 +73,7 @@ SLOW_TESTS = {
     "test_driver": {"test_an_old_driver_is_told"},
     "test_estimators": {
         "test_a_mistake_is_a_sentence",
-        "test_an_average_finds_its_strength_once",
-        "test_auto_takes_so_many_times_the_smallest_sufficient_strength",
+        "test_a_viscosity_keeps_the_adjoint_of_a_long_run_from_growing",
         "test_gradients_equal_those_of_the_twin",
         "test_the_same_bits_twice_and_float32_is_near",
         "test_velocity_only_grows_at_most_linearly",

@@ -13,6 +13,7 @@ import cortado
 from cortado import InputError, Problem, Simulation, losses
 from cortado.certificate import Consistency, certify
 from cortado.certificate.alignment import Alignment, Judged
+from cortado.certificate.growth import growth
 from cortado.certificate.horizon import Horizon
 from cortado.certificate.twin import in_float64
 from cortado.problem import ForwardPass
@@ -329,14 +330,24 @@ def test_the_predicted_horizon():
 def test_the_advice():
     far = horizon((1.0, 9.0, 9.0), (1.0, 1.0, 1.0))
     found = replace(long(), horizons=(far,))
-    judged = [Judged("Exact()", 0.99, 9.0), Judged("AdjointViscosity(strength=0.1)", 0.8, 1.0)]
+    judged = [Judged("Exact()", 0.99, 9.0), Judged("AdjointViscosity()", 0.8, 1.0)]
     for (cosine, size), wanted in {
         (0.9, 1.0): "FrozenGeometry()",
-        (0.9, 3.0): "AdjointViscosity(strength=0.1)",
-        (0.7, 1.0): "AdjointViscosity(strength=0.1)",
+        (0.9, 3.0): "AdjointViscosity()",
+        (0.7, 1.0): "AdjointViscosity()",
     }.items():
         both = (*judged, Judged("FrozenGeometry()", cosine, size))
         assert replace(found, alignment=Alignment(0.1, both)).estimator == wanted
-    lost = (judged[0], Judged("AdjointViscosity(strength=0.1)", 0.1, 1.0), Judged("FrozenGeometry()", 0.2, 1.0))
+    lost = (judged[0], Judged("AdjointViscosity()", 0.1, 1.0), Judged("FrozenGeometry()", 0.2, 1.0))
     assert replace(found, alignment=Alignment(0.1, lost)).estimator == "RandomizedSmoothing()"
     assert replace(found, alignment=None).estimator == "AdjointViscosity()"
+
+
+def test_growth_is_in_e_folds():
+    steps, dt = 100, 0.01
+    back = steps - np.arange(steps + 1)
+    assert growth(np.stack([np.exp(0.05 * back), 0 * back], axis=1), dt) == pytest.approx(5.0)
+    flight = np.stack([np.ones(steps + 1), back * dt], axis=1)
+    assert 0.0 < growth(flight, dt) < 0.5
+    assert growth(np.zeros((steps + 1, 2)), dt) == 0.0
+    assert growth(np.full((steps + 1, 2), np.inf), dt) == np.inf

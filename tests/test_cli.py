@@ -304,6 +304,26 @@ def test_an_optimisation_that_diverges_says_so(cortado_command):
     assert len(metrics("found")) == 1
 
 
+@pytest.mark.parametrize("optimiser", ["lbfgs", "adam"])
+def test_progress_counts_updates_and_not_evaluations(cortado_command, monkeypatch, optimiser):
+    shown = []
+
+    @contextmanager
+    def track(total, description):
+        def advance(n=1, **fields):
+            shown.append((n, fields))
+
+        yield advance
+        assert total == 8
+
+    monkeypatch.setattr("cortado.commands.optimise.track", track)
+    overrides = ["--set", f"optimise.optimiser={optimiser}", "--set", "optimise.iterations=8"]
+    assert cortado_command("optimise", "task.toml", "--out", "found", *overrides)[0] == 0
+    assert all(n in (0, 1) for n, _ in shown) and sum(n for n, _ in shown) == 8
+    last = [fields["evaluations"] for _, fields in shown if fields][-1]
+    assert last == len(metrics("found")) and (last > 9 if optimiser == "lbfgs" else last == 9)
+
+
 def test_a_target_beyond_the_precision_is_named(cortado_command):
     far = ["--set", "problem.target.gravity=[0,-1e30]"]
     result = cortado_command("optimise", "task.toml", "--out", "found", *far)
@@ -391,7 +411,7 @@ def test_a_killed_optimisation_resumes_bit_for_bit(cortado_command):
     assert len(json.loads(Path("killed/environment.json").read_text())["resumed"]) == 1
 
 
-SMOOTHED = ["name=adjoint_viscosity", "strength=0.2", "samples=4", "spread.gravity=0.1", "position_noise=0.001"]
+SMOOTHED = ["name=adjoint_viscosity", "coefficient=3.0", "samples=4", "spread.gravity=0.1", "position_noise=0.001"]
 
 
 @pytest.mark.parametrize(

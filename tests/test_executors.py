@@ -52,7 +52,6 @@ def bits(estimate):
     errors = estimate.standard_error or {}
     return b"".join(np.asarray(value).tobytes() for one in (estimate.gradient, errors) for value in one.values()), (
         estimate.loss,
-        estimate.strength,
     )
 
 

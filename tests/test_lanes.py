@@ -63,7 +63,13 @@ def kernels_of(discretisation):
         *(kernels for mixture in mixtures for kernels in (mixture.potential, mixture.flux)),
     ]
     kernels = [kernel for family in families for kernel in (family.forward, family.tangent, family.adjoint)]
-    alone = [fill_kernel(discretisation), frozen_force_adjoint(discretisation), filters.crowd, filters.average]
+    alone = [
+        fill_kernel(discretisation),
+        frozen_force_adjoint(discretisation),
+        filters.crowd,
+        filters.strength,
+        filters.viscosity,
+    ]
     return [*alone, *kernels]
 
 

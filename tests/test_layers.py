@@ -50,7 +50,7 @@ LAYERS = """
     losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
     losses.positions losses.recorded losses losses.checked
     gradients.estimator gradients.points gradients.ensemble_members gradients.exact
-    gradients.filter_kernels gradients.adjoint_filters gradients.strength gradients.filters gradients.ensemble gradients
+    gradients.filter_kernels gradients.adjoint_filters gradients.filters gradients.ensemble gradients
     render.cameras render.colour_field render.interpolation render.phase_colours render.fields render.rays
     render.absorption render.views render.marching render.renderer render.scene_renderer render
     io.pictures
@@ -62,7 +62,8 @@ LAYERS = """
     simulation
     problem
     figures.curves figures
-    certificate.alignment certificate.perturbations certificate.twin certificate.loss_history certificate.horizon
+    certificate.growth certificate.alignment certificate.perturbations certificate.twin certificate.loss_history
+    certificate.horizon
     certificate.consistency certificate.text certificate.certificate certificate certificate.figure
     optimisation optimisation.evaluate optimisation.differentiable optimisation.replay_log optimisation.optimisers
     optimisation.named_optimisers optimisation.result_page optimisation.result optimisation.optimise

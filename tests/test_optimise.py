@@ -42,7 +42,7 @@ def bits(result: Result) -> list[bytes]:
     """Everything an optimisation computed, as bytes: equal only if equal bit for bit."""
     numbers = [result.loss, *result.parameters.values(), *result.last_parameters.values()]
     for record in result.history:
-        numbers += [record.iteration, record.loss, record.gradient_norm, *record.parameters.values()]
+        numbers += [record.iteration, record.updates, record.loss, record.gradient_norm, *record.parameters.values()]
     return [np.asarray(number).tobytes() for number in numbers]
 
 
@@ -104,6 +104,18 @@ def test_lbfgs_first_step_is_as_long_as_its_scale(stiffness):
     result = optimise(problem, {"viscosity": 0.05}, LBFGS(scale={"viscosity": 0.01}), 20)
     assert problem.seen[1]["viscosity"] == pytest.approx(0.06)
     assert result.parameters["viscosity"] == pytest.approx(0.08)
+
+
+@pytest.mark.parametrize("optimiser", OPTIMISERS)
+def test_updates_are_counted_beside_evaluations(optimiser):
+    result = rosenbrock(optimiser, 20)
+    updates = [record.updates for record in result.history]
+    assert result.updates == 20 and str(result.updates) in result.message
+    assert updates[0] == 0 and updates == sorted(updates) and set(range(20)) <= set(updates)
+    if isinstance(optimiser, LBFGS):
+        assert updates[-1] == 19 and result.evaluations > 21  # a line search takes several evaluations
+    else:
+        assert updates == list(range(21))
 
 
 def test_lbfgs_at_an_optimum_stops_at_once():
@@ -372,7 +384,7 @@ class Breaks:
 )
 def test_not_finite_stops_with_advice_and_keeps_the_rest(optimiser, problem, what, tmp_path):
     start = {"x": 1.0, "g": np.ones((2, 3))}
-    with pytest.raises(ComputationError, match=f"At iteration 2 the {what}.*smaller learning rate") as caught:
+    with pytest.raises(ComputationError, match=f"In evaluation 2 the {what}.*smaller learning rate") as caught:
         optimise(replace(problem), start, optimiser, 10, checkpoint=tmp_path)
     assert str(tmp_path) in str(caught.value)
     records: list[Record] = []
@@ -402,7 +414,7 @@ class Walled:
 
 
 def test_parameters_that_a_search_comes_to_are_no_mistake_of_the_user(tmp_path):
-    with pytest.raises(ComputationError, match=r"At iteration 3 the search came to .* x is 0.7") as caught:
+    with pytest.raises(ComputationError, match=r"In evaluation 3 the search came to .* x is 0.7") as caught:
         optimise(Walled(0.75), {"x": 1.0}, Adam(learning_rate=0.1), 10, checkpoint=tmp_path)
     assert str(tmp_path) in str(caught.value)
     with pytest.raises(InputError, match="x is 1, but"):

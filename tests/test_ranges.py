@@ -38,7 +38,7 @@ CASES = {
 }
 ESTIMATORS = {
     "exact": gradients.Exact(),
-    "adjoint viscosity": gradients.AdjointViscosity(strength=0.3),
+    "adjoint viscosity": gradients.AdjointViscosity(5.0),
     "frozen geometry": gradients.FrozenGeometry(),
 }
 CORES_AND_PARTS = ((2, 2), (2, 8), (5, 5))

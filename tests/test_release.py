@@ -57,7 +57,7 @@ def test_what_was_tested_is_pinned():
 
 def test_tasks_are_those_of_make():
     makefile = (ROOT / "Makefile").read_text("utf-8")
-    recipes = dict(re.findall(r"^(\w+): setup\n\t\$\(BIN\)/(.*)$", makefile, re.MULTILINE))
+    recipes = dict(re.findall(r"^(\w+): (?:setup|\$\(VENV\)/\.demo)\n\t\$\(BIN\)/(.*)$", makefile, re.MULTILINE))
     recipes["fuzz"] = recipes["fuzz"].partition(" $(if")[0]
     recipes.pop("sanitize")  # takes GCC or Clang
     assert recipes == {
@@ -65,12 +65,12 @@ def test_tasks_are_those_of_make():
     }
     (test,) = re.findall(r"^test: (.*)$", makefile, re.MULTILINE)
     assert tuple(test.split()) == tasks.SEVERAL["test"]
-    assert all(word in makefile for word in (" ".join(tasks.INSTALL[:-1]), tasks.INSTALL[-1]))
+    assert all(f"{' '.join(tasks.INSTALL)} '.[{extra}]'" in makefile for extra in tasks.STAMPS)
 
 
 def test_a_task_ends_with_the_first_failure(monkeypatch):
     ran = []
-    monkeypatch.setattr(tasks, "set_up", lambda: None)
+    monkeypatch.setattr(tasks, "set_up", lambda extra: None)
     monkeypatch.setattr(tasks, "run", lambda command: ran.append(command[0]) or (3 if command[0] == "mypy" else 0))
     assert tasks.main(["test"]) == 3 and ran == ["ruff", "mypy"]
     assert tasks.main(["lint", "--fix"]) == 0
@@ -89,13 +89,13 @@ def test_what_changed_is_installed_again(tmp_path, monkeypatch, newer):
         (tmp_path / name).touch()
     ready, ran = tmp_path / "ready", []
     monkeypatch.setattr(tasks, "ROOT", tmp_path)
-    monkeypatch.setattr(tasks, "READY", ready)
+    monkeypatch.setattr(tasks, "STAMPS", {"test": ready, "pictures": tmp_path / "demo"})
     monkeypatch.setattr(tasks, "BIN", tmp_path)
     monkeypatch.setattr(tasks, "run", lambda command: ran.append(command) or 0)
-    tasks.set_up()
-    tasks.set_up()
-    assert len(ran) == 2 and ran[0] == tasks.INSTALL and ready.exists()
+    tasks.set_up("test")
+    tasks.set_up("test")
+    assert len(ran) == 2 and ran[0] == (*tasks.INSTALL, ".[test]") and ready.exists()
     later = ready.stat().st_mtime + 10
     os.utime(tmp_path / newer, (later, later))
-    tasks.set_up()
+    tasks.set_up("test")
     assert len(ran) == 4

@@ -10,8 +10,9 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_SCENE
 from cortado import CortadoWarning, InputError, Problem, Scene, SceneError, Simulation, losses, reference
 from cortado.certificate import certify
-from cortado.commands.run_summary import Energy
+from cortado.commands.run_summary import Energy, RunSummary
 from cortado.parameters.tilt import Tilt
+from cortado.scene.in_words import scene_in_words
 from cortado.scene.schedule import Course
 from cortado.scene.stability import stability_limit
 from cortado.study.experiment_files import load_experiment
@@ -189,6 +190,20 @@ def test_scenes_of_a_batch_go_on_each_at_its_own_time():
     whole, states = one.run(STEPS), [one.run(3).last_state, one.run(6).last_state]
     for found, start in zip(batch.run(4, state=states), (3, 6), strict=True):
         assert found.positions.tobytes() == whole.positions[start : start + 5].tobytes()
+
+
+@pytest.mark.parametrize("last, turned", [(-9.81, False), (-5.0, True)])
+def test_a_run_says_whether_gravity_changed(last, turned):
+    course = {"times": [0.0, 0.01], "values": [[0.0, -9.81], [0.0, last]]}
+    simulation = Simulation(plane(schedule={"gravity": course}))
+    rollout = simulation.rollout(steps=10)
+    summary = RunSummary.of(simulation, rollout, rollout.forward(), 1.0)
+    assert ("in the gravity of that time" in str(summary)) is turned
+
+
+def test_a_schedule_is_told():
+    told = scene_in_words(plane(schedule={"tilt": {"times": [0.0, 0.5], "values": [[0.0], [20.0]]}}), 100)
+    assert told.endswith("under gravity (0, -9.81) m/s²; its tilt changes from 0 s to 0.5 s.")
 
 
 def test_energies_are_in_the_gravity_of_their_time():

@@ -9,7 +9,7 @@ import pytest
 from bad_scenes import assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK
 from cortado import gradients
-from cortado.commands.optimise import judge
+from cortado.commands.optimise import found_in_words, judge
 from cortado.errors import SceneError
 from cortado.inverse.task import load_task
 from cortado.optimisation.optimise import Record, Result
@@ -134,7 +134,7 @@ ESTIMATORS = {
     "exact": ([], gradients.Exact()),
     "velocity only": (['optimise.gradient.name="frozen_geometry"'], gradients.FrozenGeometry()),
     "smoothing": (SMOOTHING, gradients.AdjointViscosity()),
-    "with a strength": ([*SMOOTHING, "optimise.gradient.strength=0.3"], gradients.AdjointViscosity(0.3)),
+    "with a coefficient": ([*SMOOTHING, "optimise.gradient.coefficient=3.0"], gradients.AdjointViscosity(3.0)),
     "averaged": ([*SMOOTHING, *SEVERAL], gradients.EnsembleMean({"gravity": 0.5}, 4)),
     "averaged without position_noise": (
         [*SMOOTHING, *SEVERAL, "optimise.gradient.position_noise=0"],
@@ -192,8 +192,8 @@ def test_a_missing_file_is_a_sentence(tmp_path):
 def result(parameters, losses):
     """What an optimisation with these losses would give back."""
     found = {name: np.asarray(value, dtype=float) for name, value in parameters.items()}
-    history = tuple(Record(k, loss, 0.0, found, replayed=False) for k, loss in enumerate(losses))
-    return Result(found, min(losses), found, history, len(losses), "done", converged=False)
+    history = tuple(Record(k, k, loss, 0.0, found, replayed=False) for k, loss in enumerate(losses))
+    return Result(found, min(losses), found, history, len(losses) - 1, len(losses), "done", converged=False)
 
 
 def test_what_is_reached_passes(task_file):
@@ -257,3 +257,8 @@ def test_a_misspelt_table_of_a_task_is_recognised(task_file, table):
     task_file.write_text(GOOD_TASK.replace(f"[{table}", f"[{table}s"))
     with pytest.raises(SceneError, match=rf"{table}s is not a key of the scene; did you mean {table}\?"):
         load_task(task_file)
+
+
+@pytest.mark.parametrize("error, words", [(0.004, "found with an error of 0.4%"), (0.81, "not found, 81% off")])
+def test_what_is_far_off_is_not_called_found(error, words):
+    assert found_in_words(error).startswith(words)

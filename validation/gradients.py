@@ -1,19 +1,21 @@
 """Estimators against the gradient of a smoothed loss: ``python validation/gradients.py --out runs/gradients`` (1 h).
 
-A dam break of 144 particles in the plane, 12 x 12 with a spacing of 0.025 m, time step 1 ms, 4 pressure iterations a
-step, in float64. The parameter is gravity, constant or in equal blocks of time (``--blocks``). A seed moves the first
-positions by 1 % of the spacing, and draws the gravity of a run whose last state is the target of the losses: centre of
-mass, Gaussian density on a grid, picture with two distances, and positions particle by particle.
+Five flows of 144 to 176 particles in the plane, with a spacing of 0.025 m, time step 1 ms, 4 pressure iterations a
+step, in float64: see `SCENES`. The parameter is gravity, constant or in equal blocks of time (``--blocks``). A seed
+moves the first positions by 1 % of the spacing, and draws the gravity of a run whose last state is the target of the
+losses: centre of mass, Gaussian density on a grid, picture with two distances, and positions particle by particle.
 
 The reference is `gradients.RandomizedSmoothing` with a spread of 0.5 m/s2. For each estimator the script writes the
-cosine of its gradient to the reference, and its size over the reference's, into `gradients_1.csv` (for 1 block) with a
-picture, and prints the medians over seeds.
+cosine of its gradient to the reference, and its size over the reference's, into `gradients_4.csv` (for 4 blocks) with a
+picture, and prints the medians over seeds. ``--coefficients`` compares such of `gradients.AdjointViscosity` instead,
+also with another ``--kernel`` and ``--support``.
 """
 
 import argparse
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,29 +40,58 @@ TILT, TRUE_SPREAD = 3.0, 1.0
 LOSSES = ("centre of mass", "density grid", "picture, pyramid", "picture", "particles")
 ESTIMATORS: dict[str, gradients.GradientEstimator] = {
     "exact": gradients.Exact(),
-    "velocity only": gradients.FrozenGeometry(),
-    "damped 20/s": gradients.Damped(20.0),
-    "smoothing 0.1": gradients.AdjointViscosity(0.1),
-    "smoothing": gradients.AdjointViscosity(),
-    "smoothing, extrapolated": gradients.AdjointViscosity(order=2),
-    "averaged over 8": gradients.EnsembleMean(SPREAD, 8, POSITION_NOISE),
+    "frozen geometry": gradients.FrozenGeometry(),
+    "viscosity": gradients.AdjointViscosity(),
+    "mean over 8": gradients.EnsembleMean(SPREAD, 8, POSITION_NOISE, seed=77),
 }
-DRAWN = ("exact", "velocity only", "smoothing", "averaged over 8")
+WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.05, "colour": [0.1, 0.3, 0.8]}
+OIL = {"name": "oil", "rest_density": 1600.0, "viscosity": 0.4, "colour": [0.8, 0.6, 0.1]}
 
 
-def dam_break() -> Scene:
-    """A square column of water in a box twice as wide."""
-    return Scene(
-        name="dam break",
-        dimension=2,
-        discretisation={"spacing": SPACING, "support": 2.0, "kernel": "cubic_spline"},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.05, "colour": [0.1, 0.3, 0.8]}],
-        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.3, 0.3], "phase": "water"}],
-        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.9]},
-        forces={"gravity": [0.0, -9.81], "viscosity": "pairwise"},
-        solver={"time_step": 0.001, "minimum_iterations": 4, "maximum_iterations": 4},
-        render={"view": "plane", "resolution": [24, 36]},
-    )
+@dataclass(frozen=True)
+class Flow:
+    """A scene in a box of 0.6 m x 0.9 m."""
+
+    blocks: tuple[dict[str, Any], ...]
+    kernel: str = "cubic_spline"
+    support: float = 2.0
+    phases: tuple[dict[str, Any], ...] = (WATER,)
+    nozzle: dict[str, Any] | None = None
+
+    def scene(self) -> Scene:
+        """As a scene."""
+        return Scene(
+            dimension=2,
+            discretisation={"spacing": SPACING, "support": self.support, "kernel": self.kernel},
+            phase=self.phases,
+            fluid=self.blocks,
+            container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.9]},
+            forces={"gravity": [0.0, -9.81], "viscosity": "pairwise"},
+            solver={"time_step": 0.001, "minimum_iterations": 4, "maximum_iterations": 4},
+            render={"view": "plane", "resolution": [24, 36]},
+            **({} if self.nozzle is None else {"emitter": self.nozzle}),
+        )
+
+
+def block(lower: tuple[float, float], upper: tuple[float, float], phase: str = "water", speed: float = 0.0) -> Any:
+    """A box full of fluid that moves to the right."""
+    return {"shape": "box", "lower": lower, "upper": upper, "phase": phase, "velocity": (speed, 0.0)}
+
+
+NOZZLE = {"phase": "water", "outlet": [0.2, 0.35], "radius": 0.05, "length": 0.5, "flow_rate": 0.1}
+SCENES = {
+    "dam break": Flow((block((0.0, 0.0), (0.3, 0.3)),)),
+    "drop": Flow((block((0.0, 0.0), (0.6, 0.1)), block((0.1, 0.3), (0.25, 0.5)))),
+    "crash": Flow(
+        (block((0.0, 0.0), (0.2, 0.225), speed=1.0), block((0.4, 0.0), (0.6, 0.225), speed=-1.0)), "wendland_c2", 2.5
+    ),
+    "two fluids": Flow(
+        (block((0.0, 0.0), (0.2, 0.3)), block((0.2, 0.0), (0.4, 0.2), "oil")), "wendland_c4", 3.0, (WATER, OIL)
+    ),
+    "jet": Flow((block((0.0, 0.0), (0.6, 0.1)),), nozzle=NOZZLE),
+}
+"""A column of water that collapses, a drop that falls into a pool, two columns that run into each other, oil beside a
+higher column of water, and a jet into a pool; each with a kernel of its own."""
 
 
 class DensityGrid:
@@ -95,7 +126,8 @@ class DensityGrid:
 class Case:
     """One seed and horizon: the losses, and all of them after any run."""
 
-    def __init__(self, simulation: Simulation, seed: int, steps: int, blocks: int):
+    def __init__(self, flow: Flow, seed: int, steps: int, blocks: int):
+        simulation = Simulation(flow.scene(), precision="float64")
         random = np.random.default_rng(seed)
         self.simulation, self.steps, self.blocks = simulation, steps, blocks
         self.gravity = np.tile(GRAVITY, (blocks, 1))
@@ -143,7 +175,7 @@ class One:
     def __init__(self, case: Case, name: str):
         self._case, self._name = case, name
         self._problem = Problem(case.simulation, case.steps, case.losses[name])
-        self.simulation = SimpleNamespace(positions=case.start, scene=case.simulation.scene)
+        self.simulation = SimpleNamespace(positions=case.start, scene=case.simulation.scene, batch=None)
 
     def value(self, values: dict[str, np.ndarray]) -> float:
         return self._case.values(values)[self._name]
@@ -166,39 +198,63 @@ class InBlocks:
 
 Row = dict[str, Any]
 FIELDS = (
+    "scene",
     "seed",
     "steps",
     "loss",
     "estimator",
-    "strength",
     "cosine",
     "size",
     *(f"g{k}" for k in range(2 * MOST_BLOCKS)),
 )
 
 
-def references(seed: int, steps: int, blocks: int, samples: int) -> list[Row]:
+@dataclass(frozen=True)
+class Work:
+    """One seed and horizon of a scene."""
+
+    scene: str
+    flow: Flow
+    seed: int
+    steps: int
+    blocks: int
+
+    @property
+    def key(self) -> tuple[str, int, int]:
+        """As rows begin."""
+        return self.scene, self.seed, self.steps
+
+    def case(self) -> Case:
+        """Made in the process that works on it."""
+        return Case(self.flow, self.seed, self.steps, self.blocks)
+
+    def row(self, loss: str, estimator: str, gradient: np.ndarray) -> Row:
+        """One line of the file."""
+        numbers = {f"g{k}": float(value) for k, value in enumerate(gradient.ravel())}
+        named = {"scene": self.scene, "seed": self.seed, "steps": self.steps}
+        return {**named, "loss": loss, "estimator": estimator, **numbers}
+
+
+def references(work: Work, samples: int) -> list[Row]:
     """Two references of half the samples each, for every loss, from the same runs."""
-    case = Case(Simulation(dam_break(), precision="float64"), seed, steps, blocks)
-    rows = []
+    case, rows = work.case(), []
     for half in (1, 2):
-        reference = gradients.RandomizedSmoothing(SPREAD, samples // 2, POSITION_NOISE, 1000 * seed + half)
-        name = f"reference {half} of {samples}"
-        rows += [row(seed, steps, loss, name, case.estimate(loss, reference)) for loss in LOSSES]
+        reference = gradients.RandomizedSmoothing(SPREAD, samples // 2, POSITION_NOISE, 1000 * work.seed + half)
+        for loss in LOSSES:
+            gradient = case.estimate(loss, reference).gradient["gravity"]
+            rows.append(work.row(loss, f"reference {half} of {samples}", gradient))
     return rows
 
 
-def estimator_rows(seed: int, steps: int, blocks: int, loss: str) -> list[Row]:
+def estimator_rows(work: Work, loss: str, estimators: Mapping[str, gradients.GradientEstimator]) -> list[Row]:
     """The gradients of every estimator, for a loss."""
-    case = Case(Simulation(dam_break(), precision="float64"), seed, steps, blocks)
-    return [row(seed, steps, loss, name, case.estimate(loss, estimator)) for name, estimator in ESTIMATORS.items()]
+    case = work.case()
+    return [work.row(loss, name, case.estimate(loss, one).gradient["gravity"]) for name, one in estimators.items()]
 
 
-def row(seed: int, steps: int, loss: str, estimator: str, found: gradients.Estimate) -> Row:
-    """One line of the file."""
-    numbers = {f"g{k}": float(value) for k, value in enumerate(found.gradient["gravity"].ravel())}
-    strength = "" if found.strength is None else found.strength
-    return {"seed": seed, "steps": steps, "loss": loss, "estimator": estimator, "strength": strength, **numbers}
+def case_of(line: Row) -> tuple[str, int, int]:
+    """The scene, the seed and the number of steps."""
+    return line["scene"], int(line["seed"]), int(line["steps"])
 
 
 def gradient_of(line: Row) -> np.ndarray:
@@ -213,18 +269,18 @@ def cosine(a: np.ndarray, b: np.ndarray) -> float:
 
 def compared(rows: list[Row], halves: list[Row]) -> list[Row]:
     """The rows with cosine and size to their references; the references' are those of one half to the other."""
-    pairs: dict[tuple[int, int, str], list[np.ndarray]] = {}
+    pairs: dict[Any, list[Row]] = {}
     for line in halves:
-        pairs.setdefault((int(line["seed"]), int(line["steps"]), line["loss"]), []).append(gradient_of(line))
+        pairs.setdefault((case_of(line), line["loss"]), []).append(line)
     found = []
     for line in rows:
-        whole = np.mean(pairs[int(line["seed"]), int(line["steps"]), line["loss"]], axis=0)
+        whole = np.mean([gradient_of(half) for half in pairs[case_of(line), line["loss"]]], axis=0)
         g = gradient_of(line)
         found.append(line | {"cosine": cosine(g, whole), "size": float(np.linalg.norm(g) / np.linalg.norm(whole))})
-    for (seed, steps, loss), (a, b) in pairs.items():
-        mean = gradients.Estimate(0.0, {"gravity": (a + b) / 2})
-        whole = row(seed, steps, loss, "one half of the reference to the other", mean)
-        found.append(whole | {"cosine": cosine(a, b), "size": float(np.linalg.norm(a) / np.linalg.norm(b))})
+    for one, other in pairs.values():
+        a, b = gradient_of(one), gradient_of(other)
+        sizes = {"cosine": cosine(a, b), "size": float(np.linalg.norm(a) / np.linalg.norm(b))}
+        found.append(one | {"estimator": "one half of the reference to the other", **sizes})
     return found
 
 
@@ -245,34 +301,37 @@ def write(path: Path, rows: Iterable[Row]) -> None:
 
 
 def report(rows: list[Row]) -> None:
-    """Print medians over seeds: cosine [least over seeds], size."""
-    cases = sorted({int(line["steps"]) for line in rows})
+    """Print medians over seeds, and over all scenes: cosine [least], size."""
     names = list(dict.fromkeys(line["loss"] for line in rows))
-    for steps in cases:
+    scenes = list(dict.fromkeys(line["scene"] for line in rows))
+    for steps in sorted({int(line["steps"]) for line in rows}):
         print(f"\n{steps} steps: median cosine to the reference [least], median size over the reference's")
-        print(f"{'':40}" + "".join(f"{name:>28}" for name in names))
-        for estimator in dict.fromkeys(line["estimator"] for line in rows):
-            cells = []
-            for name in names:
-                of = [x for x in rows if (int(x["steps"]), x["loss"], x["estimator"]) == (steps, name, estimator)]
-                cosines, sizes = ([float(x[key]) for x in of] for key in ("cosine", "size"))
-                cells.append(f"{np.median(cosines):8.3f} [{min(cosines):6.3f}] {np.median(sizes):9.2g}")
-            print(f"{estimator:40}" + "".join(f"{cell:>28}" for cell in cells))
+        for scene in [*scenes, None] if len(scenes) > 1 else scenes:
+            chosen = [x for x in rows if int(x["steps"]) == steps and scene in (x["scene"], None)]
+            print(f"{scene or 'all':40}" + "".join(f"{name:>28}" for name in names))
+            for estimator in dict.fromkeys(line["estimator"] for line in rows):
+                cells = []
+                for name in names:
+                    of = [x for x in chosen if (x["loss"], x["estimator"]) == (name, estimator)]
+                    cosines, sizes = ([float(x[key]) for x in of] for key in ("cosine", "size"))
+                    cells.append(f"{np.median(cosines):8.3f} [{min(cosines):6.3f}] {np.median(sizes):9.2g}")
+                print(f"{estimator:40}" + "".join(f"{cell:>28}" for cell in cells))
 
 
 def draw(rows: list[Row], path: Path) -> None:
-    """Cosine and size of each estimator, a dot a seed and a line at the median."""
+    """Cosine and size of each estimator, a dot for each scene and seed, and a line at the median."""
+    drawn = [name for name in dict.fromkeys(line["estimator"] for line in rows) if "half" not in name]
     horizons = sorted({int(line["steps"]) for line in rows})
     with drawing(path, 6.5 * len(horizons), 7.0) as figure:
         panels = figure.subplots(2, len(horizons), sharex=True, sharey="row", squeeze=False)
         for k, steps in enumerate(horizons):
             for key, panel in zip(("cosine", "size"), panels[:, k], strict=True):
-                for number, estimator in enumerate(DRAWN):
+                for number, estimator in enumerate(drawn):
                     for at, loss in enumerate(LOSSES):
                         chosen = (steps, loss, estimator)
                         of = [x for x in rows if (int(x["steps"]), x["loss"], x["estimator"]) == chosen]
                         values = np.array([float(x[key]) for x in of])
-                        x = at + 0.15 * (number - (len(DRAWN) - 1) / 2)
+                        x = at + 0.15 * (number - (len(drawn) - 1) / 2)
                         label = estimator if at == 0 else None
                         panel.plot(np.full(len(values), x), values, ".", color=PALETTE[number], ms=5, alpha=0.7)
                         line = {"color": PALETTE[number], "lw": 2.5, "label": label}
@@ -283,45 +342,59 @@ def draw(rows: list[Row], path: Path) -> None:
             panels[1, k].set_xticks(range(len(LOSSES)), LOSSES, rotation=20, ha="right")
         panels[0, 0].set_ylabel("cosine to the smoothed gradient")
         panels[1, 0].set_ylabel("size over the smoothed gradient's")
-        figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=len(DRAWN))
+        figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=len(drawn))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """See the head of the file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("runs/estimators"))
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=["dam break", "crash", "two fluids", "jet"])
+    parser.add_argument("--kernel", help="another kernel than the scenes have")
+    parser.add_argument("--support", type=float, help="another support than the scenes have, in spacings")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--steps", type=int, nargs="+", default=[400, 800], help="multiples of the blocks")
-    parser.add_argument("--blocks", type=int, default=1, help="of time in which gravity is a parameter, at most 8")
-    parser.add_argument("--samples", type=int, default=32, help="of the reference, 4 runs a block; an even number")
+    parser.add_argument("--blocks", type=int, default=4, help="of time in which gravity is a parameter, at most 8")
+    parser.add_argument("--samples", type=int, default=8, help="of the reference, 4 runs a block; an even number")
+    parser.add_argument("--coefficients", type=float, nargs="+", help="compare these of the viscosity instead")
     parser.add_argument("--processes", type=int, default=2)
     given = parser.parse_args(arguments)
     given.out.mkdir(parents=True, exist_ok=True)
-    cases = [(seed, steps) for steps in given.steps for seed in given.seeds]
-    file = given.out / f"references_{given.blocks}_{given.samples}.csv"
+    changes = {name: getattr(given, name) for name in ("kernel", "support") if getattr(given, name) is not None}
+    kinds = "".join(f"_{value}" for value in changes.values())
+    works = [
+        Work(scene, replace(SCENES[scene], **changes), seed, steps, given.blocks)
+        for steps in given.steps
+        for scene in given.scenes
+        for seed in given.seeds
+    ]
+    estimators = ESTIMATORS
+    if given.coefficients:
+        estimators = {f"coefficient {c:g}": gradients.AdjointViscosity(c) for c in given.coefficients}
+    file = given.out / f"references_{given.blocks}_{given.samples}{kinds}.csv"
     kept = read(file)
-    known = {(int(line["seed"]), int(line["steps"])) for line in kept}
+    known = {case_of(line) for line in kept}
     rows: list[Row] = []
     with (
         ProcessPoolExecutor(given.processes, get_context("spawn")) as pool,
-        track(sum(len(LOSSES) + (case not in known) for case in cases), "cases") as advance,
+        track(sum(len(LOSSES) + (work.key not in known) for work in works), "cases") as advance,
     ):
-        wanted = {
-            pool.submit(references, *case, given.blocks, given.samples): kept for case in cases if case not in known
-        }
-        wanted |= {pool.submit(estimator_rows, *case, given.blocks, loss): rows for case in cases for loss in LOSSES}
+        wanted = {pool.submit(references, work, given.samples): kept for work in works if work.key not in known}
+        wanted |= {pool.submit(estimator_rows, work, loss, estimators): rows for work in works for loss in LOSSES}
         for done in as_completed(wanted):
             wanted[done].extend(done.result())
             write(file, kept)
             advance()
-    halves = [line for line in kept if (int(line["seed"]), int(line["steps"])) in cases]
-    order = {name: k for k, name in enumerate(ESTIMATORS)}
-    rows.sort(key=lambda line: (line["steps"], line["seed"], order[line["estimator"]], LOSSES.index(line["loss"])))
+    keys = [work.key for work in works]
+    halves = [line for line in kept if case_of(line) in keys]
+    order = list(estimators)
+    rows.sort(key=lambda x: (keys.index(case_of(x)), order.index(x["estimator"]), LOSSES.index(x["loss"])))
     found = compared(rows, halves)
-    write(given.out / f"gradients_{given.blocks}.csv", found)
+    name = f"coefficients_{given.blocks}{kinds}" if given.coefficients else f"gradients_{given.blocks}{kinds}"
+    write(given.out / f"{name}.csv", found)
     report(found)
-    draw(found, given.out / f"gradients_{given.blocks}.png")
-    print(f"\nwritten: {given.out / f'gradients_{given.blocks}.csv'}")
+    draw(found, given.out / f"{name}.png")
+    print(f"\nwritten: {given.out / name}.csv")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ class Contender(Protocol):
 
 @dataclass(frozen=True)
 class Descent:
-    """Adam with the gradients of an estimator, whose automatic settings are chosen once, where the search begins."""
+    """Adam with the gradients of an estimator."""
 
     estimator: gradients.GradientEstimator
     learning_rate: float = 0.1
@@ -26,11 +26,10 @@ class Descent:
 
     def search(self, objective: Objective, seed: int) -> None:
         start = objective.named(objective.start)
-        estimator = gradients.tuned(self.estimator, objective.problem, start)
         iterations = 1 + int(objective.budget)
         try:
             adam = optimisers.Adam(self.learning_rate)
-            optimise(objective, start, adam, iterations, _bounds(start), gradient=estimator)
+            optimise(objective, start, adam, iterations, _bounds(start), gradient=self.estimator)
         except BudgetSpent:
             return
 
@@ -83,6 +82,7 @@ CONTENDERS: dict[str, Contender] = {
     "damped": Descent(gradients.Damped(5.0)),
     "adjoint_viscosity": Descent(gradients.AdjointViscosity()),
     "ensemble_mean": Descent(gradients.EnsembleMean(0.05)),
+    "guided": Descent(gradients.Guided(0.05)),
     "randomized_smoothing": Descent(gradients.RandomizedSmoothing(0.05, samples=2)),
     "cma_es": CMAES(),
     "random_search": RandomSearch(),

@@ -61,7 +61,7 @@ PARTS = [
         "## Which gradient: `[optimise.gradient]`",
         "GradientTable",
         "In long runs exact gradients may be useless; [gradient estimators](gradients.md) says what to do then.",
-        '[optimise.gradient]\nname = "adjoint_viscosity"\nstrength = 0.2\nsamples = 4\n'
+        '[optimise.gradient]\nname = "adjoint_viscosity"\ncoefficient = 2.0\nsamples = 4\n'
         "spread.gravity = 0.5                # m/s2",
     ),
     (

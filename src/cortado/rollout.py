@@ -76,6 +76,8 @@ class Rollout:
         """Explicit steps of diffusion within each step."""
         self.time_steps = np.zeros(solver.layout.members)
         """(members,) [s], as they were given: the device rounds them."""
+        self.advice: Callable[[int], str] = lambda member: "try a smaller time step, or more pressure iterations"
+        """What to try where a member diverged, in words."""
         self.clocks = [Clock()] * solver.layout.members
         """Of the first state of each scene of a batch."""
         self.lost: dict[int, DivergedError] = {}
@@ -195,12 +197,11 @@ class Rollout:
     def _diverged(self, member: int, lost: Lost, state: State) -> DivergedError:
         containment, particle = self.solver.containment, member * self.solver.layout.particles + lost.particle
         position = state.positions.numpy()[particle][: containment.walled.dimension]
-        time_step = self.time_steps[member]
         imprecise = ", or float64 for fluid that flies that far" if containment.is_imprecise(position) else ""
         return DivergedError(
             step=lost.step + 1,
             particle=lost.particle,
-            advice=f"try a smaller time step than {time_step:g} s, or more pressure iterations{imprecise}",
+            advice=f"{self.advice(member)}{imprecise}",
             where=containment.where(position),
             others=lost.others,
         )

@@ -5,7 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from cortado.errors import DivergedError
-from cortado.gradients import AdjointViscosity, Estimate, Exact, FrozenGeometry, GradientEstimator, RandomizedSmoothing
+from cortado.gradients import (
+    AdjointViscosity,
+    EnsembleMean,
+    Exact,
+    FrozenGeometry,
+    GradientEstimator,
+    Guided,
+    RandomizedSmoothing,
+)
 from cortado.parameters.values import Arrays
 from cortado.problem import Problem
 
@@ -14,7 +22,8 @@ MOST_NUMBERS = 12
 SAMPLES = 2
 LEAST_COSINE = 0.5
 """An estimator is advised only where the cosine of its gradient with the smoothed one is greater."""
-ESTIMATORS: tuple[GradientEstimator, ...] = (Exact(), AdjointViscosity(), FrozenGeometry())
+OTHERS = 1
+"""Seed of the ensembles that are judged; the smoothed gradient has another."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +31,7 @@ class Judged:
     """An estimator's gradient beside the smoothed one, each component in units of its meaningful perturbation."""
 
     estimator: str
-    """As it is written in Python, after ``gradients.``"""
+    """As it is written in Python, after ``gradients.``; ``spread`` stands for the meaningful perturbations by name."""
     cosine: float
     size: float
     """Its norm over that of the smoothed gradient."""
@@ -69,18 +78,28 @@ def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) ->
     reference, error = numbers(smoothed.gradient), numbers(smoothed.standard_error or {})
     length = float(np.linalg.norm(reference))
 
-    def judged(estimator: GradientEstimator) -> Judged:
-        found = Estimate(0.0, exact) if estimator == Exact() else problem.estimate(values, estimator)
-        gradient = numbers(found.gradient)
+    def judged(name: str, gradient: np.ndarray) -> Judged:
         size = float(np.linalg.norm(gradient))
-        cosine = float(gradient @ reference) / (size * length) if 0.0 < size < np.inf else 0.0
-        return Judged(_written(estimator, found), cosine, size / length)
+        return Judged(
+            name, float(gradient @ reference) / (size * length) if 0.0 < size < np.inf else 0.0, size / length
+        )
 
     if not length > 0.0:
         return None
-    return Alignment(float(np.linalg.norm(error)) / length, tuple(map(judged, ESTIMATORS)))
+    found = [judged("Exact()", numbers(exact))]
+    for name, estimator in _others(spread).items():
+        try:
+            found.append(judged(name, numbers(problem.estimate(values, estimator).gradient)))
+        except DivergedError:  # in a sample of an ensemble
+            continue
+    return Alignment(float(np.linalg.norm(error)) / length, tuple(found))
 
 
-def _written(estimator: GradientEstimator, found: Estimate) -> str:
-    inside = f"strength={found.strength:g}" if found.strength is not None else ""
-    return f"{type(estimator).__name__}({inside})"
+def _others(spread: dict[str, float]) -> dict[str, GradientEstimator]:
+    """All that are judged beside `Exact`, as they are written."""
+    return {
+        "AdjointViscosity()": AdjointViscosity(),
+        "FrozenGeometry()": FrozenGeometry(),
+        "EnsembleMean(spread)": EnsembleMean(spread, seed=OTHERS),
+        "Guided(spread)": Guided(spread, seed=OTHERS),
+    }

@@ -9,6 +9,7 @@ import numpy as np
 
 from cortado.certificate.alignment import Alignment, alignment
 from cortado.certificate.consistency import Consistency, balanced, check_consistency
+from cortado.certificate.growth import growth
 from cortado.certificate.horizon import Horizon, horizon
 from cortado.certificate.loss_history import LossHistory
 from cortado.certificate.perturbations import (
@@ -23,7 +24,6 @@ from cortado.certificate.text import consistency_words, gradient_table, horizon_
 from cortado.certificate.twin import in_float64
 from cortado.errors import InputError, shown
 from cortado.gradients import AdjointNorms
-from cortado.gradients.strength import growth
 from cortado.io.notebook import as_text
 from cortado.losses import FinalPositions
 from cortado.parameters.values import Arrays, Values

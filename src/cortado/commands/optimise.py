@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from cortado.commands.executor import HERE, Where
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
-from cortado.gradients import GradientEstimator, tuned
 from cortado.inverse.chapters import Chapters
 from cortado.inverse.figures import component_names, task_figures
 from cortado.inverse.in_words import task_in_words
@@ -25,7 +24,7 @@ from cortado.io.progress import track
 from cortado.io.report import MOST_NUMBERS as MOST_WRITTEN
 from cortado.io.report import Section, write_report
 from cortado.io.run_folder import RunFolder
-from cortado.io.terminal import say
+from cortado.io.terminal import note, say
 from cortado.losses.image_losses import psnr
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.parameters.values import UNITS
@@ -36,6 +35,8 @@ from cortado.shading.scene_view import scene_view
 Rows = list[tuple[object, ...]]
 MOST_NUMBERS = 1000
 """Of a parameter whose estimate is in result.json; larger ones are in the checkpoint."""
+MOST_ERROR = 0.3
+"""Of a parameter, relative, up to which it counts as found."""
 VIEWED = 60
 """States of a run that the view in the report shows at most."""
 
@@ -109,7 +110,7 @@ def _kept(folder: RunFolder) -> str:
 def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pictures: bool) -> str:
     """Search, judge, and write what came out; returns the sentence about it."""
     try:
-        result, estimator = _search(made, folder, resume, executor)
+        result = _search(made, folder, resume, executor)
     except DivergedError as error:
         evaluations = len(folder.read_metrics())
         ended = Section("What came out", [f"The search ended early, in evaluation {evaluations}."], [error])
@@ -126,9 +127,10 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
         noise = psnr(made.image(made.problem.states(estimate, [last])[last]), target)
     first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
     verdict = judge(made.task, result, estimate, noise, first)
+    note(f"{_summary(made, result, verdict)} Now it is drawn.")
     shaded = _shaded(made, result, folder.figures, pictures)
     figures = shaded + task_figures(made, result, folder.figures)
-    write_report(folder, made.task.scene.name, _sections(made, estimate, result, verdict, estimator, figures))
+    write_report(folder, made.task.scene.name, _sections(made, estimate, result, verdict, figures))
     folder.write_result(**_for_machines(result, estimate, verdict))
     if verdict.failures:
         raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
@@ -181,36 +183,44 @@ def _distance(estimate: ArrayLike, true: ArrayLike) -> float:
     return float(np.linalg.norm(estimate - true) / (np.linalg.norm(true) or 1.0))
 
 
-def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> tuple[Result, GradientEstimator]:
-    """What came out, and the estimator of the last search as it was tuned."""
+def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> Result:
     settings = made.task.optimise
     known = len(folder.read_metrics()) if resume else 0
+    if known:
+        note(f"The search goes on after evaluation {known}.")
     history: list[Record] = []
-    start = made.start
-    with track(len(made.searches) * (settings.iterations + 1), "optimise") as advance:
+    start, shown, updates = made.start, 0, 0
+    with track(len(made.searches) * settings.iterations, "optimise") as advance:
 
-        def note(record: Record) -> None:
-            record = replace(record, iteration=len(history))
+        def show(made: int, **fields: Any) -> None:
+            """The progress after so many updates of this search; a search before it may have ended early."""
+            nonlocal shown
+            advance(k * settings.iterations + made - shown, **fields)
+            shown = k * settings.iterations + made
+
+        def keep(record: Record) -> None:
+            show(record.updates, loss=record.loss, evaluations=len(history) + 1)
+            record = replace(record, iteration=len(history), updates=updates + record.updates)
             if record.iteration >= known:
                 folder.append_metrics(iteration=record.iteration, loss=record.loss, gradient_norm=record.gradient_norm)
             history.append(record)
-            advance(loss=record.loss)
 
         for k, search in enumerate(made.searches):
-            estimator = tuned(settings.gradient.estimator(executor), search, start)
             result = optimise(
                 search,
                 start,
                 settings.algorithm(),
                 settings.iterations,
                 bounds=made.bounds,
-                gradient=estimator,
+                gradient=settings.gradient.estimator(executor),
                 checkpoint=folder.checkpoint / str(k) if k else folder.checkpoint,
                 resume=resume,
-                on_iteration=note,
+                on_iteration=keep,
             )
-            start = result.last_parameters
-    return replace(result, history=tuple(history), evaluations=len(history)), estimator
+            if result.updates > result.history[-1].updates:
+                show(result.updates)
+            start, updates = result.last_parameters, updates + result.updates
+    return replace(result, history=tuple(history), updates=updates, evaluations=len(history))
 
 
 def _for_machines(result: Result, estimate: Mapping[str, np.ndarray], verdict: Verdict) -> dict[str, Any]:
@@ -230,12 +240,19 @@ def _for_machines(result: Result, estimate: Mapping[str, np.ndarray], verdict: V
 
 
 def _summary(made: Setup, result: Result, verdict: Verdict) -> str:
-    reached = [f"{name} is found with an error of {100 * error:.2g}%" for name, error in verdict.errors.items()]
+    reached = [f"{name} is {found_in_words(error)}" for name, error in verdict.errors.items()]
     if verdict.psnr is not None:
         reached.append(f"the image is matched to {verdict.psnr:.3g} dB")
     fell = f"fell {verdict.reduction:.3g} times" if result.loss > 0.0 else f"went from {verdict.first:.3g} to 0"
     text = f"The loss {fell} in {len(result.history)} evaluations"
     return f"{'; '.join([text, *reached])}."
+
+
+def found_in_words(error: float) -> str:
+    """How well a parameter is found, by its distance from the true value relative to it."""
+    if error > MOST_ERROR:
+        return f"not found, {100 * error:.2g}% off: other values do as well, or the search is too short"
+    return f"found with an error of {100 * error:.2g}%"
 
 
 def _asked(made: Setup) -> Section:
@@ -248,7 +265,6 @@ def _sections(
     estimate: dict[str, np.ndarray],
     result: Result,
     verdict: Verdict,
-    estimator: GradientEstimator,
     figures: Chapters,
 ) -> list[Section]:
     """The report, in the order in which one would tell it."""
@@ -260,7 +276,7 @@ def _sections(
         Section("To turn and to play", view=_view(made, estimate)),
         Section("Before, found and target", figures=figures.compared),
         Section("Found against hidden", figures=figures.parameters),
-        Section("The search", [result.message], figures=figures.search, rows=_rows(made, result, verdict, estimator)),
+        Section("The search", [result.message], figures=figures.search, rows=_rows(made, result, verdict)),
     ]
 
 
@@ -290,15 +306,16 @@ def _found_rows(made: Setup, estimate: dict[str, np.ndarray], verdict: Verdict) 
             continue
         for k, label in enumerate(names):
             numbers = [column.ravel()[k] for column in columns]
-            rows.append((label, unit, *numbers, *([] if true is not None else [""]), error if k == 0 else ""))
+            off = [""] if true is None else [f"{_distance(*numbers[1:]):.3%}"]
+            rows.append((label, unit, *numbers, *([] if true is not None else [""]), *off))
     return rows
 
 
-def _rows(made: Setup, result: Result, verdict: Verdict, estimator: GradientEstimator) -> Rows:
+def _rows(made: Setup, result: Result, verdict: Verdict) -> Rows:
     rows: Rows = [
         ("particles", made.problem.simulation.particles, ""),
         ("steps", made.problem.steps, ""),
-        ("gradients", repr(estimator), ""),
+        ("gradients", repr(made.task.optimise.gradient.estimator()), ""),
         ("evaluations", len(result.history), ""),
         ("first loss", f"{verdict.first:.4g}", "" if made.renderer else "m²"),
         ("best loss", f"{result.loss:.4g}", "" if made.renderer else "m²"),

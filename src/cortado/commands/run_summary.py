@@ -52,6 +52,8 @@ class RunSummary:
     """That the steps took, with what was recorded of them."""
     first: Energy
     last: Energy
+    turned: bool
+    """Whether gravity changed during the run, and potential energies are those of other gravities."""
     densities: tuple[float, float] | None
     """The least and the greatest at the end [kg/m3]; None of a solver without particles."""
 
@@ -68,6 +70,7 @@ class RunSummary:
             seconds=seconds,
             first=Energy.of(simulation, rollout, rollout.initial, 0),
             last=Energy.of(simulation, rollout, last, rollout.steps - 1),
+            turned=bool(np.ptp(rollout.parameters["gravity"].numpy()[0], axis=0).any()),
             densities=found,
         )
 
@@ -106,6 +109,8 @@ class RunSummary:
             f"energy {last.total:.4g} J (kinetic {last.kinetic:.3g}, potential {last.potential:.3g}), at the start "
             f"{self.first.total:.4g} J"
         )
+        if self.turned:
+            text += " in the gravity of that time"
         if self.densities is None:
             return f"{text}."
         return f"{text}; density {self.densities[0]:.4g} to {self.densities[1]:.4g} kg/m3."

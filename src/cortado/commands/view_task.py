@@ -12,7 +12,6 @@ from cortado.commands.view_recorded import RecordedView
 from cortado.commands.view_window import PULL, in_words
 from cortado.device.state import State
 from cortado.errors import CortadoError
-from cortado.gradients import tuned
 from cortado.inverse.figures import component_names
 from cortado.inverse.setup import Setup
 from cortado.io.notebook import table
@@ -42,7 +41,7 @@ class TaskView:
         self._log = TemporaryDirectory()
         """Of the replay log, with which the search goes on."""
         self._coordinates: Arrays = made.start
-        self._estimator = tuned(made.task.optimise.gradient.estimator(), made.search, made.start)
+        self._estimator = made.task.optimise.gradient.estimator()
         self.taken = 0
         """Steps of the search."""
         self.loss, pulls = self._judged(made.start)

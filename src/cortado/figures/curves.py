@@ -15,18 +15,18 @@ from cortado.io.trajectory import Trajectory
 
 
 def loss_curve(losses: ArrayLike, path: str | Path, *, title: str = "Loss", label: str = "loss") -> Path:
-    """Losses (iterations,) over the iterations, on a logarithmic scale where any is positive."""
+    """Losses (evaluations,) over the evaluations, on a logarithmic scale where any is positive."""
     values = np.asarray(losses, dtype=float)
     with drawing(path) as figure:
         axes = figure.subplots()
-        iterations, values = _line(axes, np.arange(len(values)), values, _any_positive(values), color=PALETTE[0])
+        numbers, values = _line(axes, np.arange(len(values)), values, _any_positive(values), color=PALETTE[0])
         labels = {0: {"xytext": (0, 9), "ha": "center"}, len(values) - 1: {"xytext": (9, 0), "va": "center"}}
         for k, place in labels.items() if len(values) else ():
-            end = (iterations[k], values[k])
+            end = (numbers[k], values[k])
             axes.plot(*end, "o", color=PALETTE[0], markersize=7)
             axes.annotate(f"{values[k]:.3g}", end, textcoords="offset points", weight="bold", **place)
         axes.margins(x=0.06, y=0.14)
-        axes.set(title=title, xlabel="iteration", ylabel=label)
+        axes.set(title=title, xlabel="evaluation", ylabel=label)
         whole_numbers(axes.xaxis)
     return Path(path)
 
@@ -79,11 +79,11 @@ def parameters(
     unit: str = "",
     title: str = "Recovered parameters",
 ) -> Path:
-    """Every component of the parameters over the iterations (solid), against their true values (dashed).
+    """Every component of the parameters over the evaluations (solid), against their true values (dashed).
 
     Args:
-        history: (iterations, k), or (iterations, ...) with k components in all.
-        true: (k,) or the same shape as one iteration; None where they are not known.
+        history: (evaluations, k), or (evaluations, ...) with k components in all.
+        true: (k,) or the same shape as one evaluation; None where they are not known.
         names: k of them; by default x, y, z for up to three, numbers for more.
     """
     values = np.asarray(history, dtype=float)
@@ -98,7 +98,7 @@ def parameters(
             axes.plot(values[:, k], color=colour, alpha=faint, label=labels[k])
             if levels is not None:
                 axes.axhline(levels[k], **DASHED, color=colour, alpha=faint)
-        axes.set(title=title, xlabel="iteration", ylabel=f"value [{unit}]" if unit else "value")
+        axes.set(title=title, xlabel="evaluation", ylabel=f"value [{unit}]" if unit else "value")
         axes.margins(x=0.02, y=0.08)
         whole_numbers(axes.xaxis)
         if levels is not None:

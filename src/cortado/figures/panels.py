@@ -26,7 +26,7 @@ def panels(
     """Each component of what was found in a panel of its own, over whole numbers.
 
     Args:
-        x: (k,) iterations or steps.
+        x: (k,) evaluations or steps.
         found: (k, c).
         names: c of them.
         true: (c,) or (k, c), dashed; None where it is not known.

@@ -17,10 +17,10 @@ from cortado.gradients.estimator import (
     GradientEstimator,
     checked_estimate,
     checked_estimator,
-    tuned,
 )
 from cortado.gradients.exact import Exact, FrozenGeometry, Tape
 from cortado.gradients.filters import AdjointViscosity, Damped
+from cortado.gradients.guided import Guided
 from cortado.parameters.values import Values
 from cortado.rollout import Observer
 
@@ -37,10 +37,10 @@ __all__ = [
     "ForwardPass",
     "FrozenGeometry",
     "GradientEstimator",
+    "Guided",
     "RandomizedSmoothing",
     "Tape",
     "estimate",
-    "tuned",
 ]
 
 

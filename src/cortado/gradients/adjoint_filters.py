@@ -1,7 +1,5 @@
 """Filters that act on the adjoint of a state between two backward steps, and the norms of adjoints."""
 
-from collections.abc import Iterable
-
 import numpy as np
 import warp as wp
 
@@ -9,57 +7,47 @@ from cortado.device.state import Parameters, State
 from cortado.gradients.filter_kernels import adjoint_filter_kernels
 from cortado.solvers.solver import Solver
 
-FIELDS = ("positions", "velocities")
-"""Fields of a `State` that can be filtered."""
 
+class EddyViscosity:
+    """Blends the adjoints of positions and of velocities with their averages over the neighbours that the solver holds,
+    the more the faster the forward flow strains there."""
 
-class Average:
-    """Blends fields of an adjoint with their average over the neighbours that the solver holds."""
-
-    def __init__(self, solver: Solver, fields: Iterable[str]):
-        self._solver, self._fields = solver, tuple(fields)
+    def __init__(self, solver: Solver, coefficient: float):
+        self._solver, self._coefficient = solver, coefficient
         self._kernels = adjoint_filter_kernels(solver.discretisation)
-        self._before = solver.new_state()
-        real, device = solver.discretisation.precision.real, solver.device
-        self._strength = wp.zeros(1, dtype=real, device=device)
-        self._most = wp.zeros(solver.layout.all_particles, dtype=real, device=device)
-
-    def set_strength(self, strength: float) -> None:
-        """Set the strength of the following calls, from 0, which changes nothing, to 1."""
-        self._strength.fill_(strength)
+        precision, particles, device = solver.discretisation.precision, solver.layout.all_particles, solver.device
+        self._most, self.strengths = (wp.zeros(particles, dtype=precision.real, device=device) for _ in range(2))
+        a, b = (wp.zeros(particles, dtype=precision.vector, device=device) for _ in range(2))
+        self._sorted = {"a_sorted": a, "b_sorted": b}
 
     def __call__(self, bar: State, parameters: Parameters) -> None:
-        """Blend the adjoint of the state whose step the solver has replayed last."""
-        context = self._solver.context(parameters)
-        context.launch(self._kernels.crowd, most=self._most)
-        for name in self._fields:
-            wp.copy(self._before[name], bar[name])
-            arrays = {"a": self._before[name], "a_new": bar[name]}
-            context.launch(self._kernels.average, strength=self._strength, most=self._most, **arrays)
+        """Blend the adjoint of the state whose step the solver has replayed last. ``strengths`` are then those of its
+        particles, sorted."""
+        context, kernels = self._solver.context(parameters), self._kernels
+        fields = {"a": bar.positions, "b": bar.velocities, **self._sorted}
+        flow = {"most": self._most, "strengths": self.strengths}
+        context.launch(kernels.crowd, most=self._most)
+        context.launch(kernels.strength, coefficient=self._coefficient, **flow)
+        context.launch(kernels.sort, **fields)
+        context.launch(kernels.viscosity, **flow, **fields)
 
 
 class Limit:
     """Limits the vector of each particle in an adjoint to a number of times the root mean square over all particles."""
 
-    def __init__(self, solver: Solver, fields: Iterable[str]):
-        layout = solver.layout
-        self._launch, self._particles, self._fields = solver.launch, layout.particles, tuple(fields)
+    def __init__(self, solver: Solver, times: float):
+        layout, self._times = solver.layout, times
+        self._launch, self._particles = solver.launch, layout.particles
         self._kernels = adjoint_filter_kernels(solver.discretisation)
         self._squares = wp.zeros(layout.all_particles, dtype=wp.vec2d, device=layout.device)
-        self._sum = layout.sum_of(wp.vec2d)
-        self._times = wp.full(1, np.inf, dtype=wp.float64, device=layout.device)
+        self._sum, self._sum_of_strengths = layout.sum_of(wp.vec2d), layout.sum_of(layout.precision.real)
 
-    def set_times(self, times: float) -> None:
-        """Set the limit of the following calls, in root mean squares; an infinite one changes nothing."""
-        self._times.fill_(times)
-
-    def __call__(self, bar: State) -> None:
-        squares = self._squares
-        self._launch(self._kernels.squares, a=bar.positions, b=bar.velocities, found=squares)
-        known = {"times": self._times, "particles": self._particles, "squares": squares, "sums": self._sum(squares)}
-        for number, name in enumerate(FIELDS):
-            if name in self._fields:
-                self._launch(self._kernels.limit, known, field=number, a=bar[name])
+    def __call__(self, bar: State, strengths: wp.array) -> None:
+        """Limit the adjoint of a state; where the ``strengths`` of its `EddyViscosity` are all 0, nothing changes."""
+        squares, fields = self._squares, {"a": bar.positions, "b": bar.velocities}
+        self._launch(self._kernels.squares, **fields, found=squares)
+        sums = {"squares": squares, "sums": self._sum(squares), "strengths": self._sum_of_strengths(strengths)}
+        self._launch(self._kernels.limit, **sums, **fields, times=self._times, particles=self._particles)
 
 
 class Drag:

@@ -2,13 +2,13 @@
 gradients."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from cortado.errors import InputError, shown
 from cortado.gradients.ensemble_members import Ensemble
-from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator, checked_estimator, tuned
+from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator, checked_estimator
 from cortado.gradients.filters import AdjointViscosity
 from cortado.gradients.points import Point
 from cortado.parameters.values import Arrays, Values
@@ -59,7 +59,7 @@ class RandomizedSmoothing(Ensemble):
         found = np.zeros((self.samples, numbers))
         for k, q in enumerate(directions):
             found[k // numbers] += (losses[2 * k] - losses[2 * k + 1]) / (2.0 * r) * q
-        gradient, error = (ensemble.named(one / ensemble.spreads) for one in _mean_and_error(found))
+        gradient, error = (ensemble.named(one / ensemble.spreads) for one in mean_and_error(found))
         return Estimate(loss, gradient, standard_error=error)
 
 
@@ -79,7 +79,7 @@ class EnsembleMean(Ensemble):
     samples: int = 4
     """An even number, as samples are drawn in antithetic pairs."""
     estimator: GradientEstimator = SMOOTHING
-    """The estimator whose gradients are averaged. An automatic strength is found once, at the given parameters."""
+    """The estimator whose gradients are averaged."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -90,31 +90,26 @@ class EnsembleMean(Ensemble):
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         """``observe`` is called with the adjoints of one sample after the other."""
         ensemble = self.around(problem, parameters)
-        estimator = tuned(self.estimator, problem, ensemble.values)
 
         def points() -> Iterator[Point]:
             yield Point(ensemble.values)
             for _ in range(self.samples // 2):
                 u, displacement = ensemble.offset(), ensemble.displacement()
-                yield ensemble.sample(u, displacement, estimator)
-                yield ensemble.sample(-u, -displacement, estimator)
+                yield ensemble.sample(u, displacement, self.estimator)
+                yield ensemble.sample(-u, -displacement, self.estimator)
 
         at_them, *samples = self.evaluated(problem, points(), observe)
-        numbers = [_numbers(one.gradient, ensemble.values) for one in samples]
+        numbers = [joined(one.gradient, ensemble.values) for one in samples]
         means = [np.mean(pair, axis=0) for pair in zip(numbers[::2], numbers[1::2], strict=True)]
-        gradient, error = (ensemble.named(one) for one in _mean_and_error(np.array(means)))
-        return Estimate(at_them.loss, gradient, samples[-1].strength, error)
-
-    def tuned(self, problem: Differentiable, parameters: Values) -> "EnsembleMean":
-        """The same with its estimator tuned at these parameters."""
-        return replace(self, estimator=tuned(self.estimator, problem, parameters))
+        gradient, error = (ensemble.named(one) for one in mean_and_error(np.array(means)))
+        return Estimate(at_them.loss, gradient, error)
 
 
-def _mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mean of the rows and its standard error."""
     return samples.mean(axis=0), samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
 
 
-def _numbers(gradient: Arrays, names: Iterable[str]) -> np.ndarray:
+def joined(gradient: Arrays, names: Iterable[str]) -> np.ndarray:
     """The gradient with respect to these parameters as one vector."""
     return np.concatenate([gradient[name].ravel() for name in names])

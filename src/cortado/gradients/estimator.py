@@ -24,8 +24,6 @@ class Estimate:
     """A float, of a batch (batch,)."""
     gradient: Arrays
     """For each parameter given, an array of its shape (float64), of a batch with a first axis for the scenes."""
-    strength: float | None = None
-    """The strength of `AdjointViscosity`; where two were extrapolated, the smaller one."""
     standard_error: Arrays | None = None
     """Of every component of the gradient, where it is an average (`RandomizedSmoothing`, `EnsembleMean`)."""
 
@@ -35,10 +33,9 @@ class Estimate:
         return replace(self, loss=float(self.loss[number]), gradient=gradient)
 
     def __repr__(self) -> str:
-        strength = "" if self.strength is None else f", strength {self.strength:.4g}"
         error = "" if self.standard_error is None else ", with its standard error"
         loss = f"losses {self.loss.shape}" if np.ndim(self.loss) else f"loss {self.loss:.6g}"
-        return f"Estimate({loss}, gradient of {sized(self.gradient)}{strength}{error})"
+        return f"Estimate({loss}, gradient of {sized(self.gradient)}{error})"
 
 
 class ForwardPass(Protocol):
@@ -116,20 +113,6 @@ def checked_estimate(found: Any, parameters: Values, batch: int | None = None) -
         if gradient[name].shape != wanted:
             raise InputError(f"{what} has shape {gradient[name].shape}, but must be {wanted}, the parameter's.")
     return replace(found, loss=loss, gradient=gradient)
-
-
-@runtime_checkable
-class Tunable(Protocol):
-    """An estimator with a setting that it chooses by itself, such as an automatic strength."""
-
-    def tuned(self, problem: Differentiable, parameters: Values) -> GradientEstimator:
-        """The same with the setting chosen at these parameters, for use at others nearby."""
-
-
-def tuned(estimator: GradientEstimator, problem: Differentiable, parameters: Values) -> GradientEstimator:
-    """The estimator with its automatic settings chosen at these parameters, so that a search chooses them once."""
-    checked_estimator(estimator)
-    return estimator.tuned(problem, parameters) if isinstance(estimator, Tunable) else estimator
 
 
 class AdjointEstimator(ABC):

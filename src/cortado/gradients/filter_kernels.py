@@ -1,14 +1,18 @@
-"""Filters of the adjoint a of a state between two backward steps: an average over neighbours, a limit, a drag.
+"""Filters of the adjoint of a state between two backward steps: an eddy viscosity, a limit, a drag.
 
-    average:  a_i += strength sum_j w_ij (a_j - a_i),   w_ij = W_ij / max(s_i, s_j, W(h / 2)),   s_i = sum_j W_ij
-    limit:    a_i *= min(1, times r / |a_i|),   r^2 = sum_j |a_j|^2 / particles
-    drag:     a_i *= exp(-rate dt)
+    viscosity:  a_i += sum_j max(s_i, s_j) w_ij (a_j - a_i),    s_i = min(C dt gamma_i, 0.6),
+                gamma_i^2 = sum_j w_ij |v_i - v_j|^2 / (|x_i - x_j|^2 + 0.01 h^2),
+                w_ij = W_ij / max(S_i, S_j, W(h / 2)),          S_i = sum_j W_ij
+    limit:      a_i *= min(1, times r / |a_i|),                 r^2 = sum_j |a_j|^2 / particles
+    drag:       a_i *= exp(-rate dt)
 
-over fluid neighbours j of i. The weights of the average are symmetric, so that sum_i a_i is kept; and those of a
-particle add up to at most 1, so that for 0 <= strength <= 1 the square norm cannot grow. Long waves of a are hardly
-damped, those of a few spacings decay: the average is a viscosity of the adjoint. Owing to the division by s it acts at
-a surface, and in a drop of a few particles, as it does within the fluid; W(h / 2) limits it for particles that hardly
-touch.
+over fluid neighbours j of i, for each field a of the adjoint. x and v are those of the state that the adjoint belongs
+to: gamma is the strain rate of the forward flow.
+
+The weights of the viscosity are symmetric, so that sum_i a_i is kept; and those of a particle add up to at most 0.6,
+so that the square norm cannot grow. Long waves of a are hardly damped, those of a few spacings decay. Owing to the
+division by S it acts at a surface, and in a drop of a few particles, as it does within the fluid; W(h / 2) limits it
+for particles that hardly touch.
 """
 
 from dataclasses import dataclass
@@ -20,14 +24,20 @@ import warp as wp
 from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
+STRONGEST = 0.6
+"""Strength s of the viscosity at most: waves of two spacings are damped by a factor, and do not change their sign."""
+
 
 @dataclass(frozen=True)
 class FilterKernels:
-    """The kernels of filters; vectors (n,) that are filtered are in the scene's order."""
+    """The kernels of filters. Adjoints are in the scene's order, and are sorted for the viscosity."""
 
     crowd: Any
-    """Comes before ``average``."""
-    average: Any
+    """Comes before ``strength``."""
+    strength: Any
+    """Comes before ``viscosity``."""
+    sort: Any
+    viscosity: Any
     limit: Any
     drag: Any
     squares: Any
@@ -39,11 +49,13 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
-    separation, weight, vectors, numbers = pair.separation, pair.weight, pair.vectors, pair.numbers
+    separation, weight, per_size = pair.separation, pair.weight, pair.per_size
+    vectors, numbers = pair.vectors, pair.numbers
     LANES = discretisation.lanes
     lanes = lane_functions(discretisation.precision, LANES)
     lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
     module = discretisation.module(False, "adjoint_filters")
+    strongest = wp.constant(real(STRONGEST))
 
     @wp.kernel(module=module, enable_backward=False)
     def crowd(
@@ -52,7 +64,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
         # out
         most: wp.array(dtype=real),
     ):
-        """max(s_i, W(h / 2))"""
+        """max(S_i, W(h / 2))"""
         i = s.first + wp.tid() // LANES
         x_i = x[i]
         total = real(0.0)
@@ -68,36 +80,87 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
         most[i] = wp.max(total, weight(vector(real(0.5) * s.support, real(0.0), real(0.0)), s))
 
     @wp.kernel(module=module, enable_backward=False)
-    def average(
+    def strength(
+        s: neighbourhood,
+        coefficient: real,
+        time_step: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
+        most: wp.array(dtype=real),
+        # out
+        strengths: wp.array(dtype=real),
+    ):
+        """s_i, of sorted particles as all arguments"""
+        i = s.first + wp.tid() // LANES
+        x_i = x[i]
+        v_i = v[i]
+        most_i = most[i]
+        total = real(0.0)
+        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
+            x_j = vectors(x, k, i, s)
+            v_j = vectors(v, k, i, s)
+            most_j = numbers(most, k, i, s)
+            for u in range(UNROLL):
+                x_ij = separation(x_i, x_j[u], s)
+                v_ij = v_i - v_j[u]
+                total += weight(x_ij, s) / wp.max(most_i, most_j[u]) * wp.dot(v_ij, v_ij) * per_size(x_ij, s)
+        total = add_up(total)
+        if lane() > 0:
+            return
+        strengths[i] = wp.min(coefficient * time_step[i // s.particles] * wp.sqrt(total), strongest)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def sort(
+        order: wp.array(dtype=wp.int32),
+        a: wp.array(dtype=vector),
+        b: wp.array(dtype=vector),
+        # out
+        a_sorted: wp.array(dtype=vector),
+        b_sorted: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        a_sorted[i] = a[order[i]]
+        b_sorted[i] = b[order[i]]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def viscosity(
         s: neighbourhood,
         order: wp.array(dtype=wp.int32),
-        strength: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         most: wp.array(dtype=real),
-        a: wp.array(dtype=vector),
+        strengths: wp.array(dtype=real),
+        a_sorted: wp.array(dtype=vector),
+        b_sorted: wp.array(dtype=vector),
         # out
-        a_new: wp.array(dtype=vector),
+        a: wp.array(dtype=vector),
+        b: wp.array(dtype=vector),
     ):
-        """``x`` and ``most`` are sorted, ``a`` is in the scene's order. A strength of 0 copies bit for bit."""
+        """Two fields of an adjoint at once, which are written in the scene's order."""
         i = s.first + wp.tid() // LANES
         x_i = x[i]
         most_i = most[i]
-        a_i = a[order[i]]
-        if strength[0] == real(0.0):
-            if lane() == 0:
-                a_new[order[i]] = a_i
-            return
-        total = vector()
+        strength_i = strengths[i]
+        a_i = a_sorted[i]
+        b_i = b_sorted[i]
+        a_total = vector()
+        b_total = vector()
         for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             most_j = numbers(most, k, i, s)
+            strength_j = numbers(strengths, k, i, s)
+            a_j = vectors(a_sorted, k, i, s)
+            b_j = vectors(b_sorted, k, i, s)
             for u in range(UNROLL):
                 w_ij = weight(separation(x_i, x_j[u], s), s) / wp.max(most_i, most_j[u])
-                total += w_ij * (a[order[s.neighbours[k + u, i]]] - a_i)
-        total = add_up_vectors(total)
+                share = wp.max(strength_i, strength_j[u]) * w_ij
+                a_total += share * (a_j[u] - a_i)
+                b_total += share * (b_j[u] - b_i)
+        a_total = add_up_vectors(a_total)
+        b_total = add_up_vectors(b_total)
         if lane() > 0:
             return
-        a_new[order[i]] = a_i + strength[0] * total
+        a[order[i]] = a_i + a_total
+        b[order[i]] = b_i + b_total
 
     @wp.kernel(module=module, enable_backward=False)
     def drag(
@@ -125,19 +188,25 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
 
     @wp.kernel(module=module, enable_backward=False)
     def limit(
-        times: wp.array(dtype=wp.float64),
+        times: wp.float64,
         particles: int,
         squares: wp.array(dtype=wp.vec2d),
         sums: wp.array(dtype=wp.vec2d),
-        field: int,
+        strengths: wp.array(dtype=real),
         # in and out
         a: wp.array(dtype=vector),
+        b: wp.array(dtype=vector),
     ):
-        """``squares`` of every particle and their ``sums`` over each scene, of field 0 or 1, which is ``a``."""
+        """``squares`` of every particle, of a and of b; their ``sums`` over each scene, and that of all strengths of
+        the viscosity: a flow without strain is not limited."""
         i = wp.tid()
-        most = times[0] * times[0] * sums[i // particles][field] / wp.float64(particles)
-        own = squares[i][field]
-        if own > most:
-            a[i] = real(wp.sqrt(most / own)) * a[i]
+        if strengths[i // particles] == real(0.0):
+            return
+        most = (times * times / wp.float64(particles)) * sums[i // particles]
+        own = squares[i]
+        if own[0] > most[0]:
+            a[i] = real(wp.sqrt(most[0] / own[0])) * a[i]
+        if own[1] > most[1]:
+            b[i] = real(wp.sqrt(most[1] / own[1])) * b[i]
 
-    return FilterKernels(crowd, average, limit, drag, squares)
+    return FilterKernels(crowd, strength, sort, viscosity, limit, drag, squares)

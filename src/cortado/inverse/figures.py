@@ -14,6 +14,7 @@ from cortado.optimisation.optimise import Result
 from cortado.parameters.registry import BY_NAME, Axis
 from cortado.parameters.tilt import Tilt
 from cortado.parameters.values import OVER_TIME, UNITS
+from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
 
 MOST_CURVES = 12
@@ -53,12 +54,12 @@ def _images(made: Setup, result: Result, folder: Path) -> Chapters:
         [image(made.start), image(result.parameters), target], ["start", "estimate", "target"], folder / "images.png"
     )
     compared: Figures = [("The last image: with the first guess, with the estimate, and the target.", path)]
-    iterations = np.unique(np.linspace(0, len(result.history) - 1, IMAGES).astype(int))
-    shown = [image(result.history[k].parameters) for k in iterations]
-    path = images(shown, [f"iteration {k}" for k in iterations], folder / "progress.png")
+    evaluations = np.unique(np.linspace(0, len(result.history) - 1, IMAGES).astype(int))
+    shown = [image(result.history[k].parameters) for k in evaluations]
+    path = images(shown, [f"evaluation {k}" for k in evaluations], folder / "progress.png")
     search: Figures = [("The last image during the optimisation.", path)]
     steps = made.problem.steps
-    if steps > 0 and find_spec("av"):
+    if steps > 0 and (made.task.scene.picture or Picture()).film_frames and find_spec("av"):
         numbers = np.unique(np.linspace(0, steps, MOST_FRAMES).astype(int))
         states = made.problem.states(made.search.parameters(result.parameters), numbers.tolist())
         path = write_video(folder / "estimate.mp4", (made.image(states[k]) for k in numbers.tolist()), 20)
@@ -67,7 +68,7 @@ def _images(made: Setup, result: Result, folder: Path) -> Chapters:
 
 
 def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
-    """The estimate of a parameter over the iterations; of one that changes over time, the last estimate over time."""
+    """The estimate of a parameter over the evaluations; of one that changes over time, the last estimate over time."""
     estimate, true = made.search.parameters(result.parameters)[name], made.true_parameter(name)
     path, first = folder / f"{name}.png", np.asarray(made.search.parameters(made.start)[name])
     names = component_names(made.task.scene, name, estimate)
@@ -80,7 +81,7 @@ def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
         values = [made.search.parameters(record.parameters)[name] for record in result.history]
         found = np.array([np.broadcast_to(value, shape).ravel() for value in values])
         true, first = (np.broadcast_to(value, shape).ravel() for value in (true, first))
-        x, x_label, words = np.arange(len(found)), "iteration", "during the optimisation"
+        x, x_label, words = np.arange(len(found)), "evaluation", "during the optimisation"
         names = names if len(names) == found.shape[1] else [str(k) for k in range(found.shape[1])]
     label = name.replace("_", " ")
     panels(x, found, path, names=names, title=label, x_label=x_label, unit=UNITS[name], true=true, start=first)

@@ -19,7 +19,7 @@ from cortado.shading.film import film
 from cortado.shading.labels import labelled, side_by_side
 from cortado.shading.painter import Painter, colours_of, painter
 
-ITERATIONS = (1, 5, 20, 100)
+EVALUATIONS = (1, 5, 20, 100)
 """Whose runs are shown, as far as the search went; 0 is the first guess."""
 Run = Mapping[int, Snapshot]
 """States by the number of steps before them."""
@@ -45,8 +45,8 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> Chapters:
     path = folder / "found.png"
     write_picture(path, three(steps[-1]))
     compared: Figures = [(f"The end of the run: {', '.join(runs)}.", path)]
-    shown = [k for k in ITERATIONS if k < len(result.history)] or [0]
-    searched = page([f"iteration {k}" for k in shown], [found(result.history[k].parameters) for k in shown])
+    shown = [k for k in EVALUATIONS if k < len(result.history)] or [0]
+    searched = page([f"evaluation {k}" for k in shown], [found(result.history[k].parameters) for k in shown])
     path = folder / "search.png"
     write_picture(path, searched(steps[-1]))
     search: Figures = [("The end of the run as the search went on.", path)]

@@ -163,8 +163,8 @@ class GradientTable(Table):
 
     name: Annotated[str, OneOf(ESTIMATORS)] = "exact"
     """Name of the estimator; "adjoint_viscosity" is for long splashes."""
-    strength: Annotated[float, quantity(gt=0.0, le=1.0)] | None = None
-    """Strength of `AdjointViscosity`; if left out, chosen at the start of a search."""
+    coefficient: Annotated[float, quantity(ge=0.0)] | None = None
+    """C of `AdjointViscosity`, whose strength is C times what the fluid strains in a step; if left out, 2."""
     samples: Annotated[int, count(1, 10_000)] = 1
     """Runs of the ensemble over which the gradient is averaged: 1, or an even number of at least 4."""
     spread: Values | None = None
@@ -173,12 +173,18 @@ class GradientTable(Table):
     position_noise: Annotated[float, quantity("spacings", ge=0.0)] = EnsembleMean.position_noise
     """Standard deviation of the perturbations of first positions in the ensemble."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _has_no_strength(cls, given: Any) -> Any:
+        if isinstance(given, Mapping) and "strength" in given:
+            words = "left out, as the strength follows the flow now; coefficient is a factor on it"
+            raise field_error(("strength",), given["strength"], words)
+        return given
+
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.strength is not None and self.name != "adjoint_viscosity":
-            raise field_error(("strength",), self.strength, "left out, as nothing is smoothed")
-        if self.strength is not None and self.strength * self._order > 1.0:
-            raise field_error(("strength",), self.strength, f"at most {1.0 / self._order:g}, as means are extrapolated")
+        if self.coefficient is not None and self.name != "adjoint_viscosity":
+            raise field_error(("coefficient",), self.coefficient, "left out, as nothing is smoothed")
         if self.samples != 1 and (self.samples % 2 or self.samples < 4):
             raise field_error(("samples",), self.samples, "1, or an even number of at least 4")
         if self.samples > 1 and self.spread is None:
@@ -191,15 +197,12 @@ class GradientTable(Table):
                 raise field_error(("spread", name), number.tolist(), "a number greater than 0")
         return self
 
-    @property
-    def _order(self) -> int:
-        return 2 if self.samples > 1 else 1
-
     def estimator(self, executor: Executor | None = None) -> GradientEstimator:
         """As an object; ``executor`` computes the samples of an ensemble."""
         one = ESTIMATORS[self.name]
         if isinstance(one, AdjointViscosity):
-            one = AdjointViscosity("auto" if self.strength is None else self.strength, order=self._order)
+            coefficient = one.coefficient if self.coefficient is None else self.coefficient
+            one = AdjointViscosity(coefficient, order=2 if self.samples > 1 else 1)
         if self.spread is None:
             return one
         spread = {name: float(number) for name, number in self.spread.items()}

@@ -40,6 +40,8 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
     file = os.fspath(path)
     data = read_toml(path, overrides)
     scene = scene_from_dict(data, file)
+    if not any(key in data for key in TaskTables.model_fields):
+        raise SceneError(file, "problem", MISSING, "a table; a scene without one is run by cortado run")
     try:
         with sentences(TaskTables):
             tables = TaskTables.model_validate({key: data[key] for key in TaskTables.model_fields if key in data})

@@ -74,13 +74,15 @@ def optimise(
     }
     with closing(_open_log(checkpoint, resume, layout, identity)) as log:
         evaluator = _Evaluator(differentiable, gradient, layout, start, log, on_iteration)
-        outcome = algorithm.minimise(Search(evaluator, layout, vector, lower, upper, iterations))
+        search = Search(evaluator, layout, vector, lower, upper, iterations, evaluator.count_update)
+        outcome = algorithm.minimise(search)
     best = min(evaluator.history, key=lambda record: record.loss)
     return Result(
         parameters=_copied(best.parameters),
         loss=best.loss,
         last_parameters=_as_given(layout.unravel(outcome.last), start),
         history=tuple(evaluator.history),
+        updates=evaluator.updates,
         evaluations=len(evaluator.history),
         message=outcome.message,
         converged=outcome.converged,
@@ -103,6 +105,12 @@ class _Evaluator:
     log: Log
     on_iteration: Callable[[Record], None] | None
     history: list[Record] = field(default_factory=list)
+    updates: int = 0
+    """Made by the optimiser so far."""
+
+    def count_update(self) -> None:
+        """Called by the optimiser after each update."""
+        self.updates += 1
 
     def __call__(self, vector: Vector) -> tuple[float, Vector]:
         """The loss and its gradient (size,) at a vector (size,)."""
@@ -110,6 +118,7 @@ class _Evaluator:
         evaluation = self._replay(vector) if replayed else self._compute(vector)
         record = Record(
             iteration=len(self.history),
+            updates=self.updates,
             loss=evaluation.loss,
             gradient_norm=math.sqrt(np.sum(evaluation.gradient**2)),
             parameters=_as_given(self.layout.unravel(vector), self.start),
@@ -144,8 +153,8 @@ class _Evaluator:
             if not self.history:
                 raise
             raise ComputationError(
-                f"At iteration {len(self.history)} the search came to parameters that cannot be: {error} Try a smaller "
-                f"learning rate, or bounds on the parameters. The {len(self.history)} evaluations before "
+                f"In evaluation {len(self.history)} the search came to parameters that cannot be: {error} Try a "
+                f"smaller learning rate, or bounds on the parameters. The {len(self.history)} evaluations before "
                 f"{self.log.fate}."
             ) from error
         loss, gradients = loss_and_gradient(found)
@@ -178,7 +187,7 @@ class _Evaluator:
             names = self._names_of(np.ones_like(broken))
             what = f"the loss is {evaluation.loss} as a function of {names}"
         raise ComputationError(
-            f"At iteration {len(self.history)} {what}; try a smaller learning rate, bounds on the "
+            f"In evaluation {len(self.history)} {what}; try a smaller learning rate, bounds on the "
             f"parameters, or a shorter horizon. The {len(self.history)} evaluations before {self.log.fate}."
         )
 

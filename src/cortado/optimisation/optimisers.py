@@ -37,6 +37,8 @@ class Search:
     """(size,), +inf where there is no bound."""
     iterations: int
     """Greatest number of updates."""
+    updated: Callable[[], None] = lambda: None
+    """Called after each update, by which those who follow the search count them."""
 
     def project(self, vector: Vector) -> Vector:
         """The nearest vector within the bounds."""
@@ -108,6 +110,7 @@ class Adam:
             m_hat = m / (1.0 - self.beta1**t)
             v_hat = v / (1.0 - self.beta2**t)
             theta = search.project(theta - learning_rate * m_hat / (np.sqrt(v_hat) + self.epsilon))
+            search.updated()
         return _all_updates_made("Adam", search, theta)
 
 
@@ -142,6 +145,7 @@ class GradientDescent:
         for _ in range(search.iterations):
             _, g = search.evaluate(x)
             x, before = search.project(x - learning_rate * g + self.momentum * (x - before)), x
+            search.updated()
         return _all_updates_made("Gradient descent", search, x)
 
 
@@ -203,6 +207,7 @@ class LBFGS:
             jac=True,
             method="L-BFGS-B",
             bounds=_scaled_bounds(search, scale),
+            callback=lambda _: search.updated(),
             options={
                 "maxcor": self.memory,
                 "ftol": 0.0,

@@ -16,6 +16,8 @@ class Record:
 
     iteration: int
     """Index of the evaluation, from 0; with Adam and gradient descent also the number of updates before it."""
+    updates: int
+    """Made before it; fewer than the evaluations before it where a line search evaluates several times an update."""
     loss: float
     gradient_norm: float
     """Euclidean, over all the parameters."""
@@ -40,6 +42,8 @@ class Result:
     """The optimiser's last iterate."""
     history: tuple[Record, ...]
     """One per evaluation, in order."""
+    updates: int
+    """That the optimiser made, with those replayed from the checkpoint."""
     evaluations: int
     """How many the optimiser asked for, with those replayed from the checkpoint."""
     message: str

@@ -14,7 +14,7 @@ from cortado.parameters.registry import BY_NAME, Range
 from cortado.parameters.values import Arrays
 from cortado.restart import RestartState
 from cortado.scene.scene import Scene
-from cortado.scene.stability import stability_limit
+from cortado.scene.stability import broken_limit
 
 
 def check_sizes(values: Arrays, precision: Precision) -> None:
@@ -71,10 +71,22 @@ def check_state(state: RestartState, shapes: Mapping[str, tuple[int, ...]], scen
 
 def unstable_sentence(values: Arrays, scene: Scene) -> str | None:
     """What to say of a time step beyond the limit of stability under these parameters; None if there is nothing."""
-    time_step, limit = float(values.get("time_step", scene.solver.time_step)), stability_limit(scene, values)
-    if time_step <= limit * (1.0 + 1e-9):
+    time_step = float(values.get("time_step", scene.solver.time_step))
+    broken = broken_limit(scene, values, time_step)
+    if broken is None:
         return None
-    return f"time_step is {time_step:g} s, but the limit of stability with these parameters is about {limit:.3g} s."
+    found = f"time_step is {time_step:g} s, but the limit of stability with these parameters is about {broken[1]:.3g} s"
+    return f"{found}, which comes from {broken[0]}."
+
+
+def divergence_advice(values: Arrays, scene: Scene) -> str:
+    """What to try where a run with these parameters diverged: with the limit that its time step breaks, if any."""
+    time_step = float(values.get("time_step", scene.solver.time_step))
+    broken = broken_limit(scene, values, time_step)
+    if broken is None:
+        return f"try a smaller time step than {time_step:g} s, or more pressure iterations"
+    name, limit = broken
+    return f"{name} limits the time step to about {limit:.2g} s, but it is {time_step:g} s: try one within the limit"
 
 
 def _outside(scene: Scene, points: Any) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from cortado.device.state import Parameters, State
 from cortado.device.threads import WARP
 from cortado.errors import CortadoWarning, InputError, shown
-from cortado.parameters.checks import check_places, check_sizes, check_state, unstable_sentence
+from cortado.parameters.checks import check_places, check_sizes, check_state, divergence_advice, unstable_sentence
 from cortado.parameters.registry import Role, names
 from cortado.parameters.scene_parameters import DENSITY, RUN, SceneParameters, Simulated
 from cortado.parameters.values import OVER_TIME, Arrays, Values, check_known, checked_value, scene_values
@@ -81,6 +81,8 @@ class ParameterSpace:
             for own, clock in zip(members, clocks, strict=True)
         ]
         rollout.time_steps[:] = [one["time_step"] for one in chosen]
+        each = members * (len(rollout.clocks) // len(members))
+        rollout.advice = lambda member: divergence_advice(each[member], simulation.scene)
         rollout.parameters.set(_stacked(chosen))
         substeps = {simulation.substeps(**{name: one[name] for name in DIFFUSION}) for one in chosen}
         if len(substeps) > 1:

@@ -14,13 +14,21 @@ def scene_in_words(scene: Scene, particles: int) -> str:
     emitter = " of which an emitter gives some," if scene.emitter is not None else ""
     return (
         f"{counted(particles, 'particle')} of {phases} in the {place},{emitter} {scene.discretisation.spacing:g} m "
-        f"apart at rest, {_held(scene)}, under gravity {vector(scene.forces.gravity)} m/s²."
+        f"apart at rest, {_held(scene)}, under gravity {vector(scene.forces.gravity)} m/s²{_scheduled(scene)}."
     )
 
 
 def vector(components: tuple[float, ...]) -> str:
     """``(0, -9.81)``"""
     return f"({', '.join(f'{component:.6g}' for component in components)})"
+
+
+def _scheduled(scene: Scene) -> str:
+    courses = [
+        f"{name.replace('_', ' ')} changes from {course.times[0]:g} s to {course.times[-1]:g} s"
+        for name, course in scene.schedule.courses.items()
+    ]
+    return f"; its {' and '.join(courses)}" if courses else ""
 
 
 def _held(scene: Scene) -> str:

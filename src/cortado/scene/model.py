@@ -48,7 +48,7 @@ class Phase(Table):
     viscosity: Annotated[float, quantity("Pa s", ge=0.0)]
     """Dynamic viscosity [Pa s]."""
     colour: Colour = (0.1, 0.3, 0.8)
-    """(3,) Colour in pictures: red, green and blue, each from 0 to 1."""
+    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light: half as bright is 0.5."""
 
 
 class FixedForces(Table):

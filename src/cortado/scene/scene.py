@@ -16,7 +16,7 @@ from cortado.errors import CortadoWarning, InputError, SceneError, shown
 from cortado.scene.checks import check_scene
 from cortado.scene.model import OTHER_TABLES, SceneTables
 from cortado.scene.sentences import sentences
-from cortado.scene.stability import stability_limits
+from cortado.scene.stability import broken_limit
 from cortado.scene.toml import put_in, read_toml
 
 
@@ -26,13 +26,10 @@ class Scene(SceneTables):
     @model_validator(mode="after")
     def _check(self) -> Self:
         check_scene(self)
-        limits, time_step = stability_limits(self), self.solver.time_step
-        least = min(limits, key=lambda name: limits[name])
-        limit = limits[least]
-        if time_step > limit * (1.0 + 1e-9):
-            found = f"solver.time_step is {time_step:g} s, but the limit of stability is about {limit:.3g} s"
-            sentence = f"{found}, which comes from {least.replace('_', ' ')}."
-            warnings.warn(sentence, CortadoWarning, stacklevel=2)
+        time_step = self.solver.time_step
+        if broken := broken_limit(self, {}, time_step):
+            found = f"solver.time_step is {time_step:g} s, but the limit of stability is about {broken[1]:.3g} s"
+            warnings.warn(f"{found}, which comes from {broken[0]}.", CortadoWarning, stacklevel=2)
         return self
 
     def to_json(self) -> str:

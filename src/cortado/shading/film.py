@@ -19,7 +19,7 @@ from cortado.shading.painter import colours_of, painter
 
 SECONDS = 40.0
 """[s] that a film may take to draw, about; it has fewer frames where one takes long."""
-LEAST_FRAMES = 24
+LEAST_FRAMES = 16
 """Of a film, however long they take."""
 SHORTEST, SLOWEST, QUICKEST = 4.0, 6.0, 25.0
 """[s] that a film lasts if it can, and its frames per second at least and at most."""

@@ -14,6 +14,37 @@ class Passed:
 
 
 @wp.func
+def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, span: wp.vec2):
+    """The part of a ray's span, from where to where, between two planes across an axis; o and d along that axis."""
+    if wp.abs(d) > 1.0e-9:
+        t1 = (lower - o) / d
+        t2 = (upper - o) / d
+        return wp.vec2(wp.max(span[0], wp.min(t1, t2)), wp.min(span[1], wp.max(t1, t2)))
+    if o < lower or o > upper:
+        return wp.vec2(span[0], -FAR)
+    return span
+
+
+@wp.func
+def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
+    """From where to where a ray is within the upright cylinder, open at its ends, that a box holds; from FAR to -FAR
+    where it is not."""
+    radius = 0.5 * (upper[0] - lower[0])
+    x = o[0] - 0.5 * (lower[0] + upper[0])
+    z = o[2] - 0.5 * (lower[2] + upper[2])
+    a = d[0] * d[0] + d[2] * d[2]
+    b = x * d[0] + z * d[2]
+    c = x * x + z * z - radius * radius
+    if a <= 1.0e-12 and c <= 0.0:
+        return wp.vec2(-FAR, FAR)
+    discriminant = b * b - a * c
+    if a <= 1.0e-12 or discriminant <= 0.0:
+        return wp.vec2(FAR, -FAR)
+    root = wp.sqrt(discriminant)
+    return wp.vec2((-b - root) / a, (-b + root) / a)
+
+
+@wp.func
 def pane(s: Surroundings, d: wp.vec3, normal: wp.vec3, rim: wp.float32, is_pane: wp.float32, behind: Passed):
     """One more sheet of glass, behind what is passed already; ``rim``: how much of its edge is seen, 0 to 1."""
     cosine = wp.abs(wp.dot(d, normal))
@@ -74,16 +105,11 @@ def box_glass(
     spread: wp.float32,
     before: Passed,
 ):
-    enter = -FAR
-    leave = FAR
+    span = wp.vec2(-FAR, FAR)
     for a in range(3):
-        if wp.abs(d[a]) > 1.0e-9:
-            t1 = (s.glass_lower[a] - o[a]) / d[a]
-            t2 = (s.glass_upper[a] - o[a]) / d[a]
-            enter = wp.max(enter, wp.min(t1, t2))
-            leave = wp.min(leave, wp.max(t1, t2))
-        elif o[a] < s.glass_lower[a] or o[a] > s.glass_upper[a]:
-            leave = -FAR
+        span = between(s.glass_lower[a], s.glass_upper[a], o[a], d[a], span)
+    enter = span[0]
+    leave = span[1]
     passed = before
     if enter < leave:
         if enter > least and enter < most:
@@ -117,22 +143,14 @@ def cylinder_glass(
     spread: wp.float32,
     before: Passed,
 ):
-    radius = 0.5 * (s.glass_upper[0] - s.glass_lower[0])
-    ox = o[0] - 0.5 * (s.glass_lower[0] + s.glass_upper[0])
-    oz = o[2] - 0.5 * (s.glass_lower[2] + s.glass_upper[2])
-    a = d[0] * d[0] + d[2] * d[2]
-    b = ox * d[0] + oz * d[2]
-    c = ox * ox + oz * oz - radius * radius
-    discriminant = b * b - a * c
+    span = within_tube(s.glass_lower, s.glass_upper, o, d)
+    t1 = span[0]
+    t2 = span[1]
     passed = before
-    if a > 1.0e-12 and discriminant > 0.0:
-        root = wp.sqrt(discriminant)
-        t1 = (-b - root) / a
-        t2 = (-b + root) / a
-        if t1 > least and t1 < most:
-            passed = tube(s, o, d, world, t1, wp.max(0.010 * s.size, 1.2 * spread * t1), passed)
-        if t2 > least and t2 < most:
-            passed = tube(s, o, d, world, t2, wp.max(0.010 * s.size, 1.2 * spread * t2), passed)
+    if t1 > least and t1 < most:
+        passed = tube(s, o, d, world, t1, wp.max(0.010 * s.size, 1.2 * spread * t1), passed)
+    if t2 > least and t2 < most:
+        passed = tube(s, o, d, world, t2, wp.max(0.010 * s.size, 1.2 * spread * t2), passed)
     return passed
 
 
@@ -164,41 +182,19 @@ def background(s: Surroundings, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d
 @wp.func
 def room(s: Surroundings, o: wp.vec3, d: wp.vec3):
     """From where to where on a ray fluid is shown; from FAR to -FAR where it is not."""
-    enter = -FAR
-    leave = FAR
     if s.has_room == 0:
-        return wp.vec2(enter, leave)
+        return wp.vec2(-FAR, FAR)
     p = s.glass_frame * o
     q = s.glass_frame * d
+    span = wp.vec2(-FAR, FAR)
+    if s.glass == 2:
+        span = within_tube(s.room_lower, s.room_upper, p, q)
     for a in range(3):
         if s.glass == 1 or a == 1:
-            if wp.abs(q[a]) > 1.0e-9:
-                t1 = (s.room_lower[a] - p[a]) / q[a]
-                t2 = (s.room_upper[a] - p[a]) / q[a]
-                enter = wp.max(enter, wp.min(t1, t2))
-                leave = wp.min(leave, wp.max(t1, t2))
-            elif p[a] < s.room_lower[a] or p[a] > s.room_upper[a]:
-                leave = -FAR
-    if s.glass == 2:
-        radius = 0.5 * (s.room_upper[0] - s.room_lower[0])
-        x = p[0] - 0.5 * (s.room_lower[0] + s.room_upper[0])
-        z = p[2] - 0.5 * (s.room_lower[2] + s.room_upper[2])
-        a2 = q[0] * q[0] + q[2] * q[2]
-        b = x * q[0] + z * q[2]
-        c = x * x + z * z - radius * radius
-        discriminant = b * b - a2 * c
-        if a2 > 1.0e-12:
-            if discriminant > 0.0:
-                root = wp.sqrt(discriminant)
-                enter = wp.max(enter, (-b - root) / a2)
-                leave = wp.min(leave, (-b + root) / a2)
-            if discriminant <= 0.0:
-                leave = -FAR
-        if a2 <= 1.0e-12 and c > 0.0:
-            leave = -FAR
-    if enter >= leave:
+            span = between(s.room_lower[a], s.room_upper[a], p[a], q[a], span)
+    if span[0] >= span[1]:
         return wp.vec2(FAR, -FAR)
-    return wp.vec2(enter, leave)
+    return span
 
 
 @wp.func

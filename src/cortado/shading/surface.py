@@ -10,7 +10,7 @@ from cortado.errors import ComputationError, InputError
 from cortado.lattice.shapes import Points
 
 MISSING = "Shaded pictures need pysplashsurf, which is not installed: pip install 'cortado-sph[pictures]'."
-FINE, COARSE = 30_000, 200_000
+FINE, COARSE = 30_000, 60_000
 """Particles up to which cells are a third of a spacing wide, and two fifths; half a spacing beyond."""
 
 NEIGHBOURS = 24

@@ -8,7 +8,6 @@ from pydantic import ValidationInfo, field_validator
 
 from cortado.errors import InputError
 from cortado.figures.canvas import PALETTE, whole_numbers
-from cortado.gradients import tuned
 from cortado.inverse.setup import Setup, setup
 from cortado.inverse.task import load_task
 from cortado.io.srgb import to_srgb
@@ -78,7 +77,7 @@ def _search(made: Setup, progress: Progress) -> list[Record]:
                 settings.algorithm(),
                 settings.iterations,
                 bounds=made.bounds,
-                gradient=tuned(settings.gradient.estimator(), search, start),
+                gradient=settings.gradient.estimator(),
                 on_iteration=note,
             )
             start = found.last_parameters

@@ -1,0 +1,92 @@
+"""Differences along what a surrogate gradient says: first and zeroth order together."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from cortado.errors import InputError, shown
+from cortado.gradients.ensemble import EnsembleMean, joined, mean_and_error
+from cortado.gradients.ensemble_members import Ensemble, Sampler
+from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator, checked_estimator
+from cortado.gradients.filters import AdjointViscosity
+from cortado.gradients.points import Point
+from cortado.parameters.values import Arrays, Values
+from cortado.rollout import Observer
+
+SURROGATE = AdjointViscosity()
+
+
+@dataclass(frozen=True)
+class Guided(Ensemble):
+    """The mean of a surrogate's gradients over an ensemble, each of its parts scaled by differences of the loss.
+
+    Formula: in units of the spreads, the mean of the surrogate's gradients is cut along the first axis of each
+    parameter, the steps or knots, into equal parts: p_1 ... p_K are their directions, of length 1, and
+
+        g = sum_k D_k p_k,   D_k = mean over samples of (L(u + r_k p_k) - L(u - r_k p_k)) / (2 r_k),   r_k = sqrt(N_k),
+
+    where N_k is how many numbers part k has; first positions are perturbed in the same way on both sides. So g is the
+    projection of the smoothed gradient on the span of the parts (guided evolution strategies, Maheswaranathan et al.
+    2019, without their search outside of the span).
+
+    Bias: what the surrogate does not point at is missed; but sizes, over time too, are those of the smoothed loss.
+    Noise: the ``standard_error`` of the `Estimate` is that of the D_k. Cost: ``samples`` gradients of the surrogate and
+    2 K ``differences`` forward runs, however many numbers a parameter has.
+    """
+
+    samples: int = 4
+    """Gradients of the surrogate, an even number."""
+    parts: int = 4
+    """Of each parameter; fewer where it has fewer rows, and one for a vector or a number."""
+    differences: int = 2
+    """Samples of each difference."""
+    surrogate: GradientEstimator = SURROGATE
+    """The estimator whose gradients give the directions."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, least in (("parts", 1), ("differences", 2)):
+            value = getattr(self, name)
+            if type(value) is not int or value < least:
+                raise InputError(f"{name} is {shown(value)}, but must be a whole number of at least {least}.")
+        checked_estimator(self.surrogate)
+
+    def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
+        """``observe`` is called with the adjoints of the surrogate's samples."""
+        surrogate = EnsembleMean(
+            self.spread, self.samples, self.position_noise, self.seed, self.surrogate, executor=self.executor
+        ).estimate(problem, parameters, observe)
+        ensemble = self.around(problem, parameters)
+        parts = self._parts(ensemble, surrogate.gradient)
+        reach = [np.sqrt(np.count_nonzero(part)) for part in parts]
+
+        def points() -> Iterator[Point]:
+            for _ in range(self.differences):
+                displacement = ensemble.displacement()
+                for r, part in zip(reach, parts, strict=True):
+                    yield ensemble.sample(r * part, displacement)
+                    yield ensemble.sample(-r * part, displacement)
+
+        losses = np.array([one.loss for one in self.evaluated(problem, points(), None)])
+        pairs = losses.reshape(self.differences, len(parts), 2)
+        slopes = (pairs[..., 0] - pairs[..., 1]) / (2.0 * np.array(reach))
+        found = (slopes @ np.reshape(parts, (len(parts), -1))) / ensemble.spreads
+        gradient, error = (ensemble.named(one) for one in mean_and_error(found))
+        return Estimate(surrogate.loss, gradient, standard_error=error)
+
+    def _parts(self, ensemble: Sampler, gradient: Arrays) -> list[np.ndarray]:
+        """(numbers,) each, of length 1, in spreads: the gradient on one part of one parameter, 0 elsewhere; parts
+        without a gradient are left out."""
+        places = np.concatenate([_places(value, self.parts) for value in ensemble.values.values()])
+        firsts = np.cumsum([0, *(value.size for value in ensemble.values.values())])
+        places += self.parts * np.repeat(np.arange(len(firsts) - 1), np.diff(firsts))
+        whole = ensemble.spreads * joined(gradient, ensemble.values)
+        found = [np.where(places == k, whole, 0.0) for k in np.unique(places)]
+        return [part / np.linalg.norm(part) for part in found if np.any(part)]
+
+
+def _places(value: np.ndarray, parts: int) -> np.ndarray:
+    """(size,) for each number of a parameter, the part that its row belongs to; 0 for a vector and a number."""
+    rows = len(value) if value.ndim > 1 else 1
+    return np.repeat(np.arange(rows) * parts // rows, value.size // rows)
