@@ -69,6 +69,12 @@ SLOW_TESTS = {
         "test_one_phase_loads_what_it_needs_and_no_more",
         "test_two_processes_start_cold_at_once",
     },
+    "test_control": {
+        "test_a_contender_stays_within_its_budget",
+        "test_the_gradient_is_the_limit_of_differences",
+        "test_the_known_solution_does_better_than_no_search",
+        "test_what_is_done_is_not_repeated",
+    },
     "test_driver": {"test_an_old_driver_is_told"},
     "test_estimators": {
         "test_a_mistake_is_a_sentence",

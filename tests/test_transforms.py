@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cortado import InputError, Problem, Simulation, gradients, losses
-from cortado.optimisation.transforms import SMALLEST, Logarithm, Softmax, TimeInterpolation, Transformed
+from cortado.optimisation.transforms import SMALLEST, Affine, Logarithm, Softmax, TimeInterpolation, Transformed
 from finite_differences import decades, distance
 from scenes import plane, plane_of_three
 
@@ -22,6 +22,8 @@ CASES = {
     "softmax, steep": (Softmax(), 20.0 * random_array(5, 2)),
     "knots": (TimeInterpolation(11, 4), random_array(4, 3)),
     "a knot for each step": (TimeInterpolation(5, 5), random_array(5, 2)),
+    "affine": (Affine(random_array(5, 2), random_array(5, 2, 3, 2, seed=3)), random_array(3, 2)),
+    "affine of one vector": (Affine(random_array(6), random_array(6, 4, seed=3)), random_array(4)),
     "two knots for two steps": (TimeInterpolation(2, 2), random_array(2, 2)),
 }
 cases = pytest.mark.parametrize(("coordinates", "u"), CASES.values(), ids=CASES)
@@ -47,6 +49,17 @@ def test_there_and_back(coordinates, u):
     found = coordinates.coordinate(parameter)
     np.testing.assert_allclose(coordinates.parameter(found), parameter, rtol=1e-12)
     np.testing.assert_allclose(coordinates.coordinate(coordinates.parameter(found)), found, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(5, 3), (4, 2, 3), (5, 2)])
+def test_a_matrix_that_does_not_fit_is_a_sentence(shape):
+    with pytest.raises(InputError, match=r"must have \(5, 2\), the shape of base"):
+        Affine(np.zeros((5, 2)), np.zeros(shape))
+
+
+def test_affine_maps_are_told_apart():
+    one, same, other = (Affine(np.zeros(3), scale * np.eye(3)) for scale in (1.0, 1.0, 2.0))
+    assert repr(one) == repr(same) != repr(other)
 
 
 def test_what_is_changed_by_factors_is_positive():

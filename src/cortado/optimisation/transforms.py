@@ -6,6 +6,7 @@ over time that changes slowly.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any, Protocol
 
 import numpy as np
@@ -88,6 +89,34 @@ class TimeInterpolation:
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
         return self._weights.T @ bar
+
+
+class Affine:
+    """p = base + matrix u: such as accelerations after which a tank always stands where it shall, or a nozzle that
+    follows commands with a lag."""
+
+    def __init__(self, base: Any, matrix: Any):
+        """``base`` of the parameter's shape, in its unit; ``matrix`` of that shape followed by the shape of u."""
+        self.base, self.matrix = as_numbers("base", base), as_numbers("matrix", matrix)
+        if self.matrix.shape[: self.base.ndim] != self.base.shape or self.matrix.ndim == self.base.ndim:
+            wanted = f"{self.base.shape}, the shape of base, followed by the shape of the coordinates"
+            raise InputError(f"matrix has shape {self.matrix.shape}, but must have {wanted}.")
+
+    def __repr__(self) -> str:
+        """With a checksum of its numbers, by which a search that is resumed knows it."""
+        return f"Affine({sha256(self.base.tobytes() + self.matrix.tobytes()).hexdigest()[:16]})"
+
+    def parameter(self, u: np.ndarray) -> np.ndarray:
+        return self.base + np.tensordot(self.matrix, u, np.ndim(u))
+
+    def coordinate(self, parameter: np.ndarray) -> np.ndarray:
+        """The least of all u that come nearest to ``parameter``."""
+        shape = self.matrix.shape[self.base.ndim :]
+        matrix = self.matrix.reshape(self.base.size, -1)
+        return np.linalg.lstsq(matrix, (parameter - self.base).ravel(), rcond=None)[0].reshape(shape)
+
+    def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
+        return np.tensordot(bar, self.matrix, self.base.ndim)
 
 
 class Transformed:

@@ -1,0 +1,19 @@
+"""All tasks, by name and size."""
+
+from carry import Carry
+from latte import Latte, LatteDense
+from mix import Mix
+from splash import Splash
+from task import Task
+
+from cortado import InputError
+
+TASKS: dict[str, type[Task]] = {one.name: one for one in (Carry, Splash, Latte, LatteDense, Mix)}
+SIZES = ("small", "large")
+
+
+def task(name: str, size: str) -> Task:
+    """A task; raises `InputError` where there is none of that name or size."""
+    if name not in TASKS or size not in SIZES:
+        raise InputError(f"The task is {name} {size}, but must be one of {', '.join(TASKS)}, small or large.")
+    return TASKS[name].small() if size == "small" else TASKS[name].large()

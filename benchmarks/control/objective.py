@@ -1,0 +1,209 @@
+"""A task as a search sees it: a function of numbers from -1 to 1, that counts the steps it simulates."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from task import Task
+
+from cortado import DivergedError, Problem
+from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator
+from cortado.optimisation.transforms import Transformed
+from cortado.parameters.values import Arrays, Values
+
+BACKWARD = 3.0
+"""Forward steps that a step back costs: it computes the step once more, and its adjoint (README.md)."""
+POSITION_NOISE = 0.01
+"""Of the first positions of a seed [spacings]."""
+GREATEST = 1e100
+"""Components of a gradient are limited to it, so that Adam can square them."""
+BAD = 10.0
+"""A run that diverged counts as so many times the loss of the baseline."""
+
+
+class BudgetSpent(Exception):
+    """A search has simulated as many steps as it may; what it has evaluated beyond them does not count."""
+
+
+@dataclass
+class Meter:
+    """Counts simulated steps."""
+
+    forward: int = 0
+    backward: int = 0
+
+    @property
+    def steps(self) -> float:
+        """All of them, in forward steps."""
+        return self.forward + BACKWARD * self.backward
+
+
+class Objective:
+    """The loss of a task from first positions of a seed's own, as a function of the numbers of its controls."""
+
+    def __init__(self, task: Task, problem: Problem, seed: int, budget: float):
+        """``budget``: simulated steps after which no further run begins."""
+        self.task, self.budget, self.meter, self._problem = task, budget, Meter(), problem
+        self._first = first_positions(problem, seed)
+        self.metered = Metered(problem, self._first, self.meter)
+        self._name = task.controls.parameter
+        self.problem = Transformed(self.metered, {self._name: task.controls.mapping})  # type: ignore[arg-type]
+        self.curve: list[tuple[float, float]] = []
+        """Simulated steps, and the loss of the run that they end with; infinite for one that diverged."""
+        self.best, self.best_loss = task.baseline, math.inf
+        self._bad = BAD * abs(problem.value(task.controls.parameters(task.baseline)))
+
+    @property
+    def start(self) -> np.ndarray:
+        """(numbers,) where searches begin."""
+        return self.task.baseline
+
+    def named(self, u: np.ndarray) -> Arrays:
+        """The numbers as what `problem` is given."""
+        return {self._name: u}
+
+    def values(self, points: Sequence[np.ndarray]) -> np.ndarray:
+        """(points,) the losses, as many at a time in one launch as the device takes; of those that diverged a bad one.
+        Raises `BudgetSpent`."""
+        found: list[float] = []
+        room = max(self.problem.room(), 1)
+        while len(found) < len(points):
+            self._require_budget()
+            part = [self.named(u) for u in points[len(found) : len(found) + room]]
+            before = self.meter.steps
+            if room > 1:
+                losses = [_loss(one) for one in self.problem.together(part)]
+            else:
+                losses = [self._value(one) for one in part]
+            each = (self.meter.steps - before) / len(part)
+            for k, (u, loss) in enumerate(zip(part, losses, strict=True), 1):
+                found.append(self._noted(u[self._name], loss, before + k * each))
+        return np.array(found)
+
+    def value_and_gradient(self, parameters: Arrays, gradient: GradientEstimator | None = None) -> tuple[float, Arrays]:
+        """As `cortado.optimise` asks. Where the run diverged, the gradient leads back to the best controls so far; its
+        numbers that overflowed are 0."""
+        self._require_budget()
+        u = parameters[self._name]
+        try:
+            found = self.problem.estimate(parameters, gradient)
+        except DivergedError:
+            return self._noted(u, math.inf, self.meter.steps), self.named(self._away_from_best(u))
+        slopes = np.nan_to_num(found.gradient[self._name], nan=0.0, posinf=0.0, neginf=0.0)
+        return self._noted(u, found.loss, self.meter.steps), self.named(np.clip(slopes, -GREATEST, GREATEST))
+
+    def score(self) -> dict[str, float]:
+        """Of the best controls."""
+        return self.task.score(self._problem, {**self.task.controls.parameters(self.best), **self._first})
+
+    def _away_from_best(self, u: np.ndarray) -> np.ndarray:
+        """(numbers,) the gradient of a loss that rises evenly from the best controls to these, which are bad."""
+        away = u - self.best
+        return (self._bad - min(self.best_loss, self._bad)) * away / max(float(away @ away), 1e-12)
+
+    def _value(self, u: Arrays) -> float:
+        try:
+            return self.problem.value(u)
+        except DivergedError:
+            return math.inf
+
+    def _noted(self, u: np.ndarray, loss: float, steps: float) -> float:
+        """The loss as a search is told it, which is entered into the curve. Raises `BudgetSpent` for a run that ended
+        after the budget was spent."""
+        if steps > self.budget:
+            raise BudgetSpent
+        loss = loss if math.isfinite(loss) else math.inf
+        self.curve.append((steps, loss))
+        if loss < self.best_loss:
+            self.best, self.best_loss = u.copy(), loss
+        return min(loss, self._bad)
+
+    def _require_budget(self) -> None:
+        if self.meter.steps >= self.budget:
+            raise BudgetSpent
+
+
+class Metered:
+    """A problem whose steps are counted, forward and back, also those of several runs in one launch; if it has first
+    positions of its own, they replace those of the scene."""
+
+    def __init__(self, problem: Problem, first: Arrays, meter: Meter):
+        """``first``: first positions by their name, or nothing for those of the scene."""
+        self._problem, self._meter, self._first = problem, meter, first
+        self.simulation = _Simulation(problem, **first) if first else problem.simulation
+
+    def value(self, parameters: Values) -> Any:
+        self._meter.forward += self._steps
+        return self._problem.value(self._all(parameters))
+
+    def forward_pass(self, parameters: Values) -> "_MeteredPass":
+        self._meter.forward += self._steps
+        return _MeteredPass(self._problem.forward_pass(self._all(parameters)), self._steps, self._meter)
+
+    def room(self, estimator: AdjointEstimator | None = None) -> int:
+        """See `Batchable.room`."""
+        return self._problem.room(estimator)
+
+    def together(
+        self, points: Sequence[Values], estimator: AdjointEstimator | None = None
+    ) -> list[Estimate | DivergedError]:
+        """See `Batchable.together`."""
+        if estimator is None:
+            self._meter.forward += self._steps * len(points)
+        inner: Any = None if estimator is None else _MeteredEstimator(estimator, self._meter)
+        return self._problem.together([self._all(point) for point in points], inner)
+
+    @property
+    def _steps(self) -> int:
+        """In one evaluation, of all scenes of a batch."""
+        return self._problem.steps * (self._problem.simulation.batch or 1)
+
+    def _all(self, parameters: Values) -> Values:
+        return {**self._first, **parameters}
+
+
+class _MeteredPass:
+    """A forward run whose reverse passes are counted."""
+
+    def __init__(self, forward_pass: Any, steps: int, meter: Meter):
+        self._pass, self._steps, self._meter = forward_pass, steps, meter
+        self.loss, self.rollout, self.derivative = forward_pass.loss, forward_pass.rollout, forward_pass.derivative
+
+    def back(self, derivative: Any, observe: Any = None) -> Arrays:
+        self._meter.backward += self._steps
+        return self._pass.back(derivative, observe)
+
+
+@dataclass(frozen=True)
+class _MeteredEstimator:
+    """An estimator that counts what it does to a batch."""
+
+    estimator: AdjointEstimator
+    meter: Meter
+
+    def estimate(self, problem: Any, parameters: Values, observe: Any = None) -> Estimate:
+        return self.estimator.estimate(Metered(problem, {}, self.meter), parameters, observe)
+
+
+class _Simulation:
+    """A simulation with other first positions, as ensembles look at it."""
+
+    batch = None
+
+    def __init__(self, problem: Problem, initial_positions: np.ndarray):
+        self.scene, self.positions = problem.simulation.scene, initial_positions
+
+
+def first_positions(problem: Problem, seed: int) -> Arrays:
+    """The parameter of the first positions (n, d) [m]: those of the scene, with a little noise but in a nozzle."""
+    simulation = problem.simulation
+    noise = np.random.default_rng(seed).standard_normal(simulation.positions.shape)
+    noise[simulation.free_particles or len(noise) :] = 0.0
+    noise *= POSITION_NOISE * simulation.scene.discretisation.spacing
+    return {"initial_positions": simulation.positions + noise}
+
+
+def _loss(found: Estimate | DivergedError) -> float:
+    return math.inf if isinstance(found, DivergedError) else float(found.loss)

@@ -1,0 +1,107 @@
+"""Runs of contenders as lines of a file, by which a benchmark that was stopped goes on."""
+
+import json
+import time
+from dataclasses import asdict, astuple, dataclass
+from pathlib import Path
+
+import numpy as np
+from catalogue import task
+from contenders import contender
+from objective import Objective
+
+from cortado import InputError, __version__
+from cortado.io.files import write_atomically
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is run: one contender on one task."""
+
+    task: str
+    size: str
+    contender: str
+    seed: int
+    budget: float
+    """Simulated steps."""
+    device: str
+    precision: str
+
+
+@dataclass(frozen=True)
+class Record:
+    """What came of it."""
+
+    run: Run
+    steps: list[float]
+    """(evaluations,) simulated until each evaluation had ended"""
+    losses: list[float | None]
+    """(evaluations,), None of a run that diverged"""
+    best: list[float]
+    """(numbers,) the controls with the least loss"""
+    score: dict[str, float]
+    """Of these."""
+    forward_steps: int
+    backward_steps: int
+    seconds: float
+    cortado: str
+
+    @property
+    def so_far(self) -> np.ndarray:
+        """(evaluations,) the least loss until then."""
+        return np.minimum.accumulate([np.inf if loss is None else loss for loss in self.losses])
+
+    @property
+    def diverged(self) -> int:
+        """How many runs did."""
+        return self.losses.count(None)
+
+
+def carried_out(run: Run) -> Record:
+    """Search, and judge what was found."""
+    began, chosen = time.perf_counter(), task(run.task, run.size)
+    problem = chosen.problem(run.device, run.precision)
+    objective = Objective(chosen, problem, run.seed, run.budget)
+    contender(run.contender).search(objective, run.seed)
+    return Record(
+        run=run,
+        steps=[steps for steps, _ in objective.curve],
+        losses=[loss if np.isfinite(loss) else None for _, loss in objective.curve],
+        best=objective.best.tolist(),
+        score=objective.score(),
+        forward_steps=objective.meter.forward,
+        backward_steps=objective.meter.backward,
+        seconds=round(time.perf_counter() - began, 1),
+        cortado=__version__,
+    )
+
+
+class Records:
+    """A file with a line of JSON for each run."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def read(self) -> list[Record]:
+        """Those in the file; none if there is no file. Raises `InputError` for a line of another kind."""
+        if not self.path.exists():
+            return []
+        found = []
+        for number, line in enumerate(self.path.read_text(encoding="utf-8").splitlines(), 1):
+            try:
+                fields = json.loads(line)
+                found.append(Record(**{**fields, "run": Run(**fields["run"])}))
+            except (ValueError, TypeError, KeyError):
+                raise InputError(f"Line {number} of {self.path} is no run of this benchmark; remove it.") from None
+        return found
+
+    def add(self, record: Record) -> None:
+        """The file with one line more."""
+        lines = self.path.read_text(encoding="utf-8") if self.path.exists() else ""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(self.path, lines + json.dumps(asdict(record)) + "\n")
+
+    def missing(self, runs: list[Run]) -> list[Run]:
+        """Those that are not in the file."""
+        done = {astuple(record.run) for record in self.read()}
+        return [run for run in runs if astuple(run) not in done]

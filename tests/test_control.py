@@ -1,0 +1,199 @@
+"""The control tasks of `benchmarks/control`: small ones run, their gradients are right, and searches can be resumed."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from catalogue import TASKS, task
+from contenders import CMAES, CONTENDERS, Descent
+from curves import curves
+from objective import BACKWARD, BudgetSpent, Objective
+from records import Record, Records, Run
+from run import main
+
+from cortado import CortadoWarning, InputError, Simulation, gradients
+from finite_differences import decades, distance
+
+SHORT = {
+    "carry": {"moving": 10, "standing": 5, "blocks": 5, "distance": 1e-3},
+    "splash": {"blocks": 4, "repeats": 3},
+    "latte": {"actions": 4, "repeats": 3, "standing": 2, "column": 2},
+    "latte_dense": {"actions": 4, "repeats": 3, "standing": 2, "column": 2},
+    "mix": {"blocks": 4, "repeats": 3},
+}
+"""The small tasks for a few steps."""
+tasks = pytest.mark.parametrize("name", TASKS)
+
+
+def short(name):
+    return replace(task(name, "small"), **SHORT[name])
+
+
+@tasks
+def test_the_gradient_is_the_limit_of_differences(name):
+    chosen = short(name)
+    objective = Objective(chosen, chosen.problem(precision="float64"), seed=1, budget=np.inf)
+    random = np.random.default_rng(2)
+    point, direction = (objective.named(u) for u in random.uniform(-0.5, 0.5, (2, chosen.controls.numbers)))
+    _, gradient = objective.problem.value_and_gradient(point)
+    derivative = sum((gradient[name] * direction[name]).sum() for name in gradient)
+    assert distance(objective.problem.value, point, direction, derivative, decades(2, 6), 1e-6) < 1e-6
+
+
+@tasks
+def test_the_known_solution_does_better_than_no_search(name):
+    chosen = task(name, "small")
+    problem = chosen.problem()
+    parameters = [chosen.controls.parameters(u) for u in (chosen.known, chosen.baseline)]
+    losses, scores = ([judge(one) for one in parameters] for judge in (problem.value, partial(chosen.score, problem)))
+    assert losses[0] < 0.7 * losses[1]
+    assert scores[0].keys() == scores[1].keys()
+    assert all(scores[0][what] <= scores[1][what] + 1e-12 for what in scores[0])
+
+
+@tasks
+@pytest.mark.parametrize("size", ["small", "large"])
+def test_controls_are_bounded(name, size):
+    chosen = task(name, size)
+    assert np.abs(chosen.known).max() <= 1.0 and not chosen.baseline.any()
+    assert chosen.known.shape == (chosen.controls.numbers,)
+    (parameter,) = chosen.controls.parameters(chosen.known).values()
+    assert parameter.shape == (chosen.steps, chosen.scene.dimension)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_large_tasks_are_long(name):
+    chosen = task(name, "large")
+    assert chosen.steps >= 1000 and chosen.controls.numbers >= 50
+
+
+@pytest.mark.parametrize("blocks", [10, 25, 30])
+def test_a_tank_always_arrives_and_stands(blocks):
+    chosen = replace(task("carry", "small"), blocks=blocks)
+    u = np.random.default_rng(0).uniform(-1.0, 1.0, chosen.controls.numbers)
+    accelerations = -chosen.controls.parameters(u)["gravity"][:, 0]
+    velocities = chosen.time_step * np.cumsum(accelerations)
+    assert abs(velocities[-1]) < 1e-12 and not accelerations[chosen.moving :].any()
+    assert chosen.time_step * velocities.sum() == pytest.approx(chosen.distance)
+
+
+def test_a_nozzle_stays_in_its_reach():
+    chosen = task("latte", "small")
+    for u in (np.ones(25), -np.ones(25), np.random.default_rng(0).choice([-1.0, 1.0], 25)):
+        path = chosen.controls.parameters(u)["nozzle_path"]
+        assert np.abs(path[:, 0]).max() <= 0.6 * chosen.cup
+        assert np.ptp(path[:, 1]) == 0.0
+
+
+def test_milk_counts_once_it_has_come_out():
+    chosen = task("latte_dense", "small")
+    losses = chosen.milk_distances(Simulation(chosen.scene))
+    counts = [len(one.particles) for one in losses.values()]
+    assert counts == sorted(counts) and 0 < counts[0] < counts[-1] == Simulation(chosen.scene).particles - 144
+
+
+def test_steps_are_counted_alone_and_in_batches():
+    chosen = short("splash")
+    problem, steps = chosen.problem(), chosen.steps
+
+    def metered(estimator):
+        objective = Objective(chosen, problem, 0, np.inf)
+        objective.value_and_gradient(objective.named(objective.start), estimator)
+        assert objective.curve == [(objective.meter.steps, objective.best_loss)]
+        return objective.meter
+
+    once = metered(gradients.Exact())
+    assert (once.forward, once.backward, once.steps) == (steps, steps, (1.0 + BACKWARD) * steps)
+    mean = metered(gradients.EnsembleMean(0.05, 4, estimator=gradients.Exact()))
+    assert (mean.forward, mean.backward) == (5 * steps, 4 * steps)
+    objective = Objective(chosen, problem, 0, np.inf)
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (3, chosen.controls.numbers))
+    together = objective.values(list(points))
+    assert objective.meter.forward == 3 * steps and [at for at, _ in objective.curve] == [steps, 2 * steps, 3 * steps]
+    assert together.tolist() == [objective.problem.value(objective.named(u)) for u in points]
+
+
+def test_a_run_that_diverges_is_a_bad_score():
+    chosen = replace(short("splash"), repeats=20)
+    objective = Objective(chosen, chosen.problem(), 0, np.inf)
+    wild = np.full(chosen.controls.numbers, 300.0)
+    with pytest.warns(CortadoWarning, match="time_step"):
+        baseline, bad = objective.values([objective.start, wild])
+    assert bad > 9.0 * baseline and objective.curve[1][1] == np.inf and objective.best_loss == baseline
+    with pytest.warns(CortadoWarning, match="time_step"):
+        loss, gradient = objective.value_and_gradient(objective.named(wild), gradients.Exact())
+    assert loss == bad and (gradient["gravity"] * (wild - objective.start)).sum() == pytest.approx(bad - baseline)
+
+
+@pytest.mark.parametrize("contender", CONTENDERS.values(), ids=CONTENDERS)
+def test_a_contender_stays_within_its_budget(contender):
+    chosen = short("splash")
+    if isinstance(contender, CMAES):
+        pytest.importorskip("cma")
+    objective = Objective(chosen, chosen.problem(), 0, budget=60.0 * chosen.steps)
+    contender.search(objective, seed=0)
+    steps, losses = zip(*objective.curve, strict=True)
+    assert max(steps) <= objective.budget and objective.best_loss == min(losses) and np.abs(objective.best).max() <= 1.0
+    with pytest.raises(BudgetSpent):
+        while True:
+            objective.values([objective.start])
+
+
+def test_descent_goes_down():
+    chosen = short("splash")
+    objective = Objective(chosen, chosen.problem(), 0, budget=40.0 * chosen.steps)
+    Descent(gradients.Exact()).search(objective, 0)
+    assert objective.best_loss < objective.curve[0][1]
+
+
+COMMAND = ["--task", "carry", "--contender", "exact", "random_search", "--budget", "1000"]
+
+
+def test_what_is_done_is_not_repeated(tmp_path, capsys):
+    command = [*COMMAND, "--out", str(tmp_path)]
+    assert main([*command, "--seeds", "1"]) == 0
+    first = (tmp_path / "runs.jsonl").read_text()
+    assert len(first.splitlines()) == 2 and main([*command, "--seeds", "1"]) == 0
+    assert (tmp_path / "runs.jsonl").read_text() == first
+    assert main([*command, "--seeds", "1", "2"]) == 0
+    text = (tmp_path / "runs.jsonl").read_text()
+    assert text.startswith(first) and "2 of 4 runs are in" in capsys.readouterr().out
+    records = Records(tmp_path / "runs.jsonl").read()
+    assert [(one.run.contender, one.run.seed) for one in records] == [
+        (name, seed) for seed in (1, 2) for name in ("exact", "random_search")
+    ]
+    assert all(one.forward_steps + BACKWARD * one.backward_steps >= one.steps[-1] for one in records)
+    assert main([*command, "--seeds", "1", "2", "--figures"]) == 0
+    assert {path.name for path in tmp_path.glob("*.png")} == {"carry_small.png", "carry_small_pictures.png"}
+    assert "| carry | exact | 2 |" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (["--task", "juggle"], "must be one of carry"),
+        (["--contender", "luck"], "must be one of exact"),
+        (["--processes", "0"], "must be at least 1"),
+        (["--figures"], "no runs of carry small"),
+    ],
+)
+def test_a_mistake_is_a_sentence(changed, said, tmp_path, capsys):
+    assert main([*COMMAND, "--out", str(tmp_path), *changed]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_file_of_something_else_is_a_sentence(tmp_path):
+    (tmp_path / "runs.jsonl").write_text('{"loss": 1.0}\n')
+    with pytest.raises(InputError, match=r"Line 1 of .* is no run"):
+        Records(tmp_path / "runs.jsonl").read()
+
+
+def test_curves_are_quartiles_of_the_least_loss():
+    run = Run("carry", "small", "exact", 1, 10.0, "cpu", "float32")
+    losses = [[1.0, 0.5], [2.0, 1.0], [3.0, 1.5], [4.0, 2.0], [5.0, 6.0], [9.0, None]]
+    steps, found = curves([Record(run, [2.0, 6.0], one, [], {}, 0, 0, 0.0, "") for one in losses])
+    before = found[:, steps < 6.0 - 1e-9]
+    assert (steps[0], steps[-1]) == (2.0, 10.0) and 0 < before.shape[1] < len(steps)
+    np.testing.assert_array_equal(before, np.tile([[2.25], [3.5], [4.75]], before.shape[1]))
+    np.testing.assert_array_equal(found[:, -1], np.percentile([0.5, 1.0, 1.5, 2.0, 5.0, 9.0], (25, 50, 75)))
