@@ -6,6 +6,7 @@ from statistics import median
 import numpy as np
 
 from .cells import TRUTH, Cell, Record
+from .estimators import ESTIMATORS
 
 
 def cosine(a: np.ndarray, b: np.ndarray) -> float:
@@ -21,7 +22,7 @@ def ceiling(truth: Record) -> float:
 
 
 def table(records: Iterable[Record]) -> str:
-    """Of every estimator at every horizon the median cosine over seeds [the least], the median size and cost."""
+    """Of every estimator and horizon the median cosine over seeds [the least], the median size; and the cost at the longest."""
     known = {Cell.of(record): record for record in records}
     parts: dict[tuple[str, str, str], dict[Cell, Record]] = {}
     for cell, record in known.items():
@@ -31,7 +32,8 @@ def table(records: Iterable[Record]) -> str:
 
 def _rows(known: dict[Cell, Record]) -> str:
     horizons = sorted({cell.horizon for cell in known})
-    names = list(dict.fromkeys(cell.estimator for cell in known if cell.estimator != TRUTH))
+    present = {cell.estimator for cell in known} - {TRUTH}
+    names = [name for name in ESTIMATORS if name in present] + sorted(present - ESTIMATORS.keys())
     lines = [
         "| estimator | " + " | ".join(f"{horizon:,} steps" for horizon in horizons) + " | cost |",
         "|---" * (len(horizons) + 2) + "|",
@@ -39,7 +41,8 @@ def _rows(known: dict[Cell, Record]) -> str:
     for name in names:
         own = {cell: record for cell, record in known.items() if cell.estimator == name}
         texts = [_score({c: r for c, r in own.items() if c.horizon == horizon}, known) for horizon in horizons]
-        costs = [record["cost"] / cell.horizon for cell, record in own.items() if record.get("derivatives")]
+        longest = max((cell.horizon for cell, record in own.items() if record.get("derivatives")), default=0)
+        costs = [record["cost"] / longest for cell, record in own.items() if cell.horizon == longest]
         lines.append(f"| {name} | {' | '.join(texts)} | {f'{median(costs):.0f}' if costs else '-'} |")
     texts = [_limit([r for c, r in known.items() if c == c.question and c.horizon == horizon]) for horizon in horizons]
     return "\n".join([*lines, f"| *at most* | {' | '.join(texts)} | |"])
