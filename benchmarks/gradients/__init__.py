@@ -1,0 +1,1 @@
+"""The leaderboard of gradient estimators: ``python -m benchmarks.gradients``."""

@@ -1,0 +1,26 @@
+"""The rows of the leaderboard: a new one is an entry in `ESTIMATORS`.
+
+Each is made for the spread of a control and a seed, which differs from that of the truth.
+"""
+
+from collections.abc import Callable
+
+from cortado.gradients import (
+    AdjointViscosity,
+    EnsembleMean,
+    Exact,
+    FrozenGeometry,
+    GradientEstimator,
+    RandomizedSmoothing,
+)
+
+ESTIMATORS: dict[str, Callable[[float, int], GradientEstimator]] = {
+    "exact": lambda spread, seed: Exact(),
+    "frozen-geometry": lambda spread, seed: FrozenGeometry(),
+    "adjoint-viscosity": lambda spread, seed: AdjointViscosity(),
+    "mean-of-8": lambda spread, seed: EnsembleMean(spread, 8, seed=seed),
+    "mean-of-8-frozen": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=FrozenGeometry()),
+    "mean-of-8-exact": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=Exact()),
+    "mean-of-8-viscosity": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=AdjointViscosity()),
+    "smoothing-2": lambda spread, seed: RandomizedSmoothing(spread, 2, seed=seed),
+}

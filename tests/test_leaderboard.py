@@ -1,0 +1,172 @@
+"""The leaderboard of gradient estimators: a cell is computed once, and the truth knows how wrong it is."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.stats import t as student
+
+from benchmarks.gradients import scenes
+from benchmarks.gradients.__main__ import main
+from benchmarks.gradients.cells import Cell
+from benchmarks.gradients.controls import CONTROLS, VelocityModes
+from benchmarks.gradients.counting import Counted, Steps
+from benchmarks.gradients.table import ceiling, cosine, table
+from benchmarks.gradients.truth import DIRECTIONS, FEW, SAMPLES, directions, smoothed
+from cortado import Problem, Scene, Simulation
+from cortado.gradients import EnsembleMean, Exact, RandomizedSmoothing
+from cortado.optimisation.transforms import Transformed
+
+TINY = scenes.dam(0.1, (3, 3))
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return Simulation(Scene(**TINY), precision="float64")
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """A scene of nine particles on the leaderboard."""
+    monkeypatch.setitem(scenes.SCENES, "tiny", TINY)
+
+
+def words(path, *more):
+    cell = {"scenes": "tiny", "controls": "velocity-modes", "losses": "centre-of-mass", "horizons": 2, "seeds": 5}
+    options = [word for name, value in cell.items() for word in (f"--{name}", str(value))]
+    return [str(path), *options, "--estimators", "exact", *more]
+
+
+def test_a_cell_is_computed_and_a_killed_command_goes_on(tiny, tmp_path, capsys):
+    path = tmp_path / "results.jsonl"
+    assert main(words(path)) == 0
+    whole = path.read_bytes()
+    head, *records = map(json.loads, whole.splitlines())
+    assert head["settings"]["precision"] == "float64"
+    assert [Cell.of(record).estimator for record in records] == ["truth", "exact"]
+    assert records[1]["cost"] == 2 * (1 + 3)
+    assert records[0]["cost"] == 2 * (1 + SAMPLES * 2 * 8)
+    first = capsys.readouterr().out
+    assert "| exact | 1.00 [1.00] 1 | 4 |" in first
+
+    path.write_bytes(whole[:-20])  # killed while it wrote the second record
+    assert main(words(path)) == 0
+    again = [json.loads(line) for line in path.read_bytes().splitlines()]
+    assert again[:2] == [head, records[0]]  # not computed again: even the seconds are the same
+    assert again[2]["derivatives"] == records[1]["derivatives"]
+
+    capsys.readouterr()
+    before = path.read_bytes()
+    assert main(words(path, "--table")) == 0
+    assert capsys.readouterr().out == first and path.read_bytes() == before
+
+
+def test_results_of_other_settings_are_refused(tiny, tmp_path, capsys):
+    path = tmp_path / "results.jsonl"
+    assert main(words(path)) == 0
+    assert main(words(path, "--precision", "float32")) == 2
+    assert "but must have" in capsys.readouterr().err
+    path.write_text("something else\n")
+    assert main(words(path)) == 2
+    assert "choose another name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", scenes.SCENES)
+def test_every_scene_is_one(name):
+    assert scenes.scene(name).dimension == (3 if name.startswith("space") else 2)
+
+
+@pytest.mark.parametrize("name", [name for name in CONTROLS if name != "nozzle-path"])
+def test_controls_have_the_shape_of_their_parameter(simulation, name):
+    control, steps = CONTROLS[name], 32
+    u = control.drawn(simulation, steps, np.random.default_rng(0))
+    bijector = control.bijector(simulation, steps)
+    p = bijector.parameter(u)
+    assert p.shape == (simulation.positions.shape if name == "velocity-modes" else (steps, 2))
+    bar = np.random.default_rng(1).standard_normal(p.shape)
+    assert (bar * p).sum() == pytest.approx((bijector.adjoint(u, bar) * u).sum())  # linear
+    assert np.allclose(bijector.coordinate(p), u)
+
+
+class Product:
+    """sum_i v_i . x_i + v_i^2 / 2: its gradient with respect to v is x + v, which the noise of x makes uncertain."""
+
+    def value(self, end):
+        return float((end.velocities * end.positions).sum() + 0.5 * (end.velocities**2).sum())
+
+    def value_and_adjoint(self, end):
+        return self.value(end), (end.velocities, end.positions + end.velocities)
+
+
+def test_the_standard_error_of_the_truth_is_right(simulation):
+    """Of a quadratic loss, whose smoothed gradient is its gradient, the 95 % interval covers it as often as it says."""
+    bijector = VelocityModes().bijector(simulation, 0)
+    problem = Transformed(Problem(simulation, 0, Product()), {"initial_velocities": bijector})
+    u = np.random.default_rng(3).standard_normal((4, 2))
+    right = bijector.adjoint(u, simulation.positions + bijector.parameter(u)).ravel()
+    quantile = student.ppf(0.975, SAMPLES - 1)
+    inside = []
+    for seed in range(60):
+        found = smoothed(problem, "initial_velocities", u, 0.1, seed)
+        inside += list(np.abs(found.derivatives - right) < quantile * found.standard_errors)
+    assert 0.90 <= np.mean(inside) <= 0.98
+    assert np.std(inside) > 0.0
+
+
+class Downhill:
+    """sum_k c_k . g_k of the gravity of each step, times the first height: along a direction q its derivative is c . q
+    times the height."""
+
+    simulation: Simulation
+
+    def __init__(self, simulation, slopes):
+        self.simulation, self.slopes = simulation, slopes
+
+    def value(self, parameters):
+        height = parameters.get("initial_positions", self.simulation.positions)[:, 1].mean()
+        return float((self.slopes * parameters["gravity"]).sum() * height)
+
+
+def test_many_numbers_are_judged_along_random_directions(simulation):
+    slopes = np.random.default_rng(7).standard_normal((400, 2))
+    problem = Downhill(simulation, slopes)
+    quantile, inside = student.ppf(0.975, SAMPLES - 1), []
+    for seed in range(10):
+        along = directions(slopes.size, seed)
+        assert along.shape == (DIRECTIONS, slopes.size) and np.allclose(np.linalg.norm(along, axis=1), 1.0)
+        right = along @ slopes.ravel() * simulation.positions[:, 1].mean()
+        found = smoothed(problem, "gravity", np.zeros_like(slopes), 0.5, seed)
+        assert cosine(found.derivatives, right) > 0.999
+        inside += list(np.abs(found.derivatives - right) < quantile * found.standard_errors)
+    assert 0.90 <= np.mean(inside) <= 0.98
+    assert np.array_equal(directions(FEW, 0), np.eye(FEW))
+
+
+def test_steps_are_counted_in_batches_too(simulation):
+    problem = Problem(simulation, 3, Product())
+    values = {"initial_velocities": np.zeros_like(simulation.positions)}
+    for estimator, forward, reverse in (
+        (Exact(), 1, 1),
+        (EnsembleMean(samples=4, estimator=Exact()), 1 + 4, 4),
+        (RandomizedSmoothing(samples=2), 1 + 2 * 2 * simulation.positions.size, 0),
+    ):
+        steps = Steps()
+        estimator.estimate(Counted(problem, 3, steps), values)
+        assert (steps.forward, steps.reverse) == (3 * forward, 3 * reverse)
+
+
+def test_the_table_says_what_noise_leaves():
+    assert cosine(np.array([1e200, 0.0]), np.array([1.0, 1.0])) == pytest.approx(0.5**0.5)
+    base = {"scene": "s", "control": "c", "loss": "l", "horizon": 100, "cost": 400}
+    truth = {"estimator": "truth", "derivatives": [3.0, 4.0], "standard_errors": [3.0, 0.0]}
+    assert ceiling(truth) == pytest.approx(0.8)
+    records = [
+        *({**base, **truth, "seed": seed} for seed in range(3)),
+        *({**base, "estimator": "one", "seed": seed, "derivatives": [6.0, 8.0]} for seed in range(2)),
+        {**base, "estimator": "one", "seed": 2, "derivatives": None},
+        *({**base, "estimator": "two", "seed": seed, "failed": "it did"} for seed in range(3)),
+    ]
+    text = table(records)
+    assert "| one | 1.00 [1.00] 2, 1 without | 4 |" in text
+    assert "| two | - | - |" in text
+    assert "| *at most* | 0.80 [0.80] | |" in text
