@@ -11,6 +11,7 @@ from cortado.gradients import (
     Exact,
     FrozenGeometry,
     GradientEstimator,
+    Guided,
     RandomizedSmoothing,
 )
 
@@ -22,5 +23,6 @@ ESTIMATORS: dict[str, Callable[[float, int], GradientEstimator]] = {
     "mean-of-8-frozen": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=FrozenGeometry()),
     "mean-of-8-exact": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=Exact()),
     "mean-of-8-viscosity": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=AdjointViscosity()),
+    "guided": lambda spread, seed: Guided(spread, seed=seed),
     "smoothing-2": lambda spread, seed: RandomizedSmoothing(spread, 2, seed=seed),
 }
