@@ -24,5 +24,6 @@ ESTIMATORS: dict[str, Callable[[float, int], GradientEstimator]] = {
     "mean-of-8-exact": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=Exact()),
     "mean-of-8-viscosity": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=AdjointViscosity()),
     "guided": lambda spread, seed: Guided(spread, seed=seed),
+    "guided-2-parts": lambda spread, seed: Guided(spread, parts=2, seed=seed),
     "smoothing-2": lambda spread, seed: RandomizedSmoothing(spread, 2, seed=seed),
 }
