@@ -13,10 +13,13 @@ ROOT = Path(__file__).parent.parent
 FOLDERS = ("examples", "docs/figures", "experiments/scenes", "fuzz/scenes")
 SPACINGS = {
     "dam_break": 0.16,
+    "dam_break_large": 0.16,
     "drop": 0.012,
+    "drop_large": 0.012,
     "identify": 0.01,
     "latte_art": 0.006,
     "latte_art_heart": 0.006,
+    "latte_art_large": 0.008,
     "latte_art_small": 0.008,
     "long_dam_break": 0.05,
     "match_image": 0.061,
@@ -24,7 +27,9 @@ SPACINGS = {
     "pour": 0.007,
     "recover_gravity": 0.25,
     "recover_gravity_small": 0.25,
+    "shaken": 0.03,
     "splash_8000": 0.25,
+    "two_dams": 0.12,
 }
 """Spacing [m] in place of a file's own, for some hundred particles."""
 STEPS, ITERATIONS = 4, 2

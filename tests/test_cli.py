@@ -144,7 +144,7 @@ def test_a_run_that_diverges_says_where_and_keeps_its_frames(cortado_command):
     lost = len(frames.times)
     assert 2 <= lost < 20 and np.isfinite(frames.positions).all()
     assert f"diverged in step {lost}: particle " in sentence and "left the container and was at (" in sentence
-    assert "try a smaller time step" in sentence and sentence.endswith("dam.")
+    assert "limits the time step to about" in sentence and sentence.endswith("dam.")
     assert {path.name for path in Path("dam").iterdir()} == RUN_FILES and len(metrics("dam")) == lost
     assert f'<p class="failed">The simulation diverged in step {lost}' in Path("dam/report.html").read_text()
 

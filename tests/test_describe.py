@@ -101,7 +101,7 @@ def test_mistakes_are_sentences(capsys, arguments, words):
 
 def test_every_limit_is_one_of_those_of_the_time_step():
     scene = plane(forces={"gravity": [0.0, -9.81], "surface_tension": 0.07})
-    assert stability_limits(scene).keys() == {"speed", "gravity", "viscosity", "surface tension"}
+    assert stability_limits(scene).keys() == {"speed", "gravity", "viscosity", "surface tension", "depth"}
 
 
 # ---- the closing line --------------------------------------------------------------------------------------------

@@ -64,8 +64,8 @@ class InBlocks:
         return {"initial_positions": values.get("initial_positions", self._start), "gravity": gravity}
 
     def _gathered(self, gradient: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        bars = [gradient["gravity"]] if gradient else []  # none of a loss alone
-        return {"gravity": bar.reshape(self._blocks, -1, bar.shape[-1]).sum(axis=1) for bar in bars}
+        """Nothing of a loss alone."""
+        return {name: gradient[name].reshape(self._blocks, -1, 2).sum(axis=1) for name in ("gravity",) if gradient}
 
 
 def slopes(problem: InBlocks, gravity: np.ndarray, directions: np.ndarray, start: np.ndarray, seed: int) -> np.ndarray:

@@ -5,14 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cortado.errors import DivergedError
-from cortado.gradients import (
-    AdjointViscosity,
-    EnsembleMean,
-    FrozenGeometry,
-    GradientEstimator,
-    Guided,
-    RandomizedSmoothing,
-)
+from cortado.gradients import AdjointViscosity, Exact, FrozenGeometry, GradientEstimator, RandomizedSmoothing
 from cortado.parameters.values import Arrays
 from cortado.problem import Problem
 
@@ -21,8 +14,7 @@ MOST_NUMBERS = 12
 SAMPLES = 2
 LEAST_COSINE = 0.5
 """An estimator is advised only where the cosine of its gradient with the smoothed one is greater."""
-OTHERS = 1
-"""Seed of the ensembles that are judged; the smoothed gradient has another."""
+ESTIMATORS: tuple[GradientEstimator, ...] = (Exact(), AdjointViscosity(), FrozenGeometry())
 
 
 @dataclass(frozen=True)
@@ -30,7 +22,7 @@ class Judged:
     """An estimator's gradient beside the smoothed one, each component in units of its meaningful perturbation."""
 
     estimator: str
-    """As it is written in Python, after ``gradients.``; ``spread`` stands for the meaningful perturbations by name."""
+    """As it is written in Python, after ``gradients.``"""
     cosine: float
     size: float
     """Its norm over that of the smoothed gradient."""
@@ -77,28 +69,12 @@ def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) ->
     reference, error = numbers(smoothed.gradient), numbers(smoothed.standard_error or {})
     length = float(np.linalg.norm(reference))
 
-    def judged(name: str, gradient: np.ndarray) -> Judged:
+    def judged(estimator: GradientEstimator) -> Judged:
+        gradient = numbers(exact if estimator == Exact() else problem.estimate(values, estimator).gradient)
         size = float(np.linalg.norm(gradient))
-        return Judged(
-            name, float(gradient @ reference) / (size * length) if 0.0 < size < np.inf else 0.0, size / length
-        )
+        cosine = float(gradient @ reference) / (size * length) if 0.0 < size < np.inf else 0.0
+        return Judged(f"{type(estimator).__name__}()", cosine, size / length)
 
     if not length > 0.0:
         return None
-    found = [judged("Exact()", numbers(exact))]
-    for name, estimator in _others(spread).items():
-        try:
-            found.append(judged(name, numbers(problem.estimate(values, estimator).gradient)))
-        except DivergedError:  # in a sample of an ensemble
-            continue
-    return Alignment(float(np.linalg.norm(error)) / length, tuple(found))
-
-
-def _others(spread: dict[str, float]) -> dict[str, GradientEstimator]:
-    """All that are judged beside `Exact`, as they are written."""
-    return {
-        "AdjointViscosity()": AdjointViscosity(),
-        "FrozenGeometry()": FrozenGeometry(),
-        "EnsembleMean(spread)": EnsembleMean(spread, seed=OTHERS),
-        "Guided(spread)": Guided(spread, seed=OTHERS),
-    }
+    return Alignment(float(np.linalg.norm(error)) / length, tuple(map(judged, ESTIMATORS)))

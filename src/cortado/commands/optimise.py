@@ -24,7 +24,7 @@ from cortado.io.progress import track
 from cortado.io.report import MOST_NUMBERS as MOST_WRITTEN
 from cortado.io.report import Section, write_report
 from cortado.io.run_folder import RunFolder
-from cortado.io.terminal import note, say
+from cortado.io.terminal import say
 from cortado.losses.image_losses import psnr
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.parameters.values import UNITS
@@ -127,7 +127,6 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
         noise = psnr(made.image(made.problem.states(estimate, [last])[last]), target)
     first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
     verdict = judge(made.task, result, estimate, noise, first)
-    note(f"{_summary(made, result, verdict)} Now it is drawn.")
     shaded = _shaded(made, result, folder.figures, pictures)
     figures = shaded + task_figures(made, result, folder.figures)
     write_report(folder, made.task.scene.name, _sections(made, estimate, result, verdict, figures))
@@ -186,8 +185,6 @@ def _distance(estimate: ArrayLike, true: ArrayLike) -> float:
 def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> Result:
     settings = made.task.optimise
     known = len(folder.read_metrics()) if resume else 0
-    if known:
-        note(f"The search goes on after evaluation {known}.")
     history: list[Record] = []
     start, shown, updates = made.start, 0, 0
     with track(len(made.searches) * settings.iterations, "optimise") as advance:
@@ -199,11 +196,12 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
             shown = k * settings.iterations + made
 
         def keep(record: Record) -> None:
-            show(record.updates, loss=record.loss, evaluations=len(history) + 1)
+            made_updates = record.updates
             record = replace(record, iteration=len(history), updates=updates + record.updates)
             if record.iteration >= known:
                 folder.append_metrics(iteration=record.iteration, loss=record.loss, gradient_norm=record.gradient_norm)
             history.append(record)
+            show(made_updates, loss=record.loss, evaluations=len(history))
 
         for k, search in enumerate(made.searches):
             result = optimise(
