@@ -1,6 +1,7 @@
 """Changes of a scene or a task as a dictionary, each in place and with words that say what was done."""
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 from fuzz import oddities
@@ -230,7 +231,7 @@ def _name(path: Path) -> str:
 
 def _replace(tables: Tables, path: Path, value: Any) -> str:
     old = _get(tables, path)
-    _get(tables, path[:-1])[path[-1]] = value
+    _get(tables, path[:-1])[path[-1]] = deepcopy(value)  # as later mutations change it in place
     return f"{_name(path)}: {_short(old)} -> {_short(value)}"
 
 
