@@ -23,7 +23,7 @@ class AdjointViscosity(AdjointEstimator):
     fluid neighbours,
 
         a_i <- a_i + sum_j max(s_i, s_j) w_ij (a_j - a_i),    s_i = min(coefficient dt gamma_i, 0.6),
-        gamma_i^2 = sum_j w_ij |v_i - v_j|^2 / (|x_i - x_j|^2 + 0.01 h^2),
+        gamma_i^2 = sum_j w_ij (v_i - v_j)^2 / ((x_i - x_j)^2 + 0.01 h^2),
         w_ij = W_ij / max(S_i, S_j, W(h / 2)),                S_i = sum_j W_ij,
 
     with positions x and velocities v of the state that the adjoint belongs to. The weights are symmetric and add up to
