@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -22,9 +23,11 @@ from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
 from cortado import Problem, Scene, Trajectory
 from cortado.inverse.chapters import Chapters
+from cortado.inverse.task import load_task
 from cortado.io.folder_lock import locked
 from cortado.io.pictures import heart, rosetta, write_picture
 from cortado.io.run_folder import FIGURES, RunFolder
+from cortado.optimisation.transforms import TimeInterpolation
 from full_disk import largest_file
 
 ALWAYS = {"scene.json", "environment.json", "metrics.jsonl", "figures", "report.html", "result.json"}
@@ -270,10 +273,33 @@ def test_optimise_writes_its_folder(cortado_command, folder):
     assert len(losses) == 7 and losses[-1] < 0.5 * losses[0]
 
 
+@pytest.mark.parametrize(
+    ("command", "drawing", "told"),
+    [
+        (["run", "scene.toml", "--steps", 2], "run._write_report", r"2 steps of .* kg/m3\.\n"),
+        (
+            ["optimise", "task.toml"],
+            "optimise.task_figures",
+            r"The loss fell .* times, from .* m² to .* m² .*\.\n  gravity: \(.*\) m/s²; true \(1\.5, -9\.81\) m/s²\n",
+        ),
+    ],
+    ids=["run", "optimise"],
+)
+def test_what_came_out_is_told_before_it_is_drawn(cortado_command, monkeypatch, command, drawing, told):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"cortado.commands.{drawing}", stopped)
+    code, out, _ = cortado_command(*command, "--out", "found")
+    assert code == 130 and re.fullmatch(told, out), out
+    quiet = cortado_command(*command, "--out", "found", "--overwrite", "--quiet")
+    assert quiet[:2] == (130, "")
+
+
 def test_an_optimisation_that_falls_short_fails_and_keeps_its_files(cortado_command):
     hard = ["--set", "optimise.check.loss_reduction=1e9", "--set", "optimise.check.parameter_error=1e-9"]
     code, out, err = cortado_command("optimise", "task.toml", "--out", "found", *hard)
-    assert (code, out) == (1, "") and len(err.splitlines()) == 1
+    assert code == 1 and out.startswith("The loss fell ") and len(err.splitlines()) == 1
     assert "asks for 1e+09 times. The parameter gravity is " in err and err.endswith("found.\n")
     assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
 
@@ -386,7 +412,10 @@ def test_a_killed_optimisation_resumes_bit_for_bit(cortado_command):
     code, resumed, _ = cortado_command(*LONG, "killed", "--resume")
     assert code == 0
     _, whole, _ = cortado_command(*LONG, "whole")
-    assert resumed.partition(" The results")[0] == whole.partition(" The results")[0]
+    first, *found, _ = resumed.splitlines()
+    updates = json.loads(Path("killed/result.json").read_text())["evaluations"]
+    assert re.fullmatch(r"The search goes on from iteration (9|\d\d) of 60, after \d\d evaluations\.", first), first
+    assert found == whole.splitlines()[:-1] and updates == 61
     assert len(metrics("whole")) == 61
     assert_same_optimisation("killed", "whole")
     assert len(json.loads(Path("killed/environment.json").read_text())["resumed"]) == 1
@@ -542,7 +571,7 @@ def test_a_run_is_rendered_as_its_scene_asks(cortado_command, folder):
 def test_places_are_found_for_a_picture(cortado_command):
     Path("task.toml").write_text(PLANE_PICTURE)
     code, out, err = cortado_command("optimise", "task.toml", "--out", "found")
-    assert (code, err) == (0, "") and "the image is matched to " in out and " dB. The results are in " in out
+    assert (code, err) == (0, "") and "the image is matched to " in out
     assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
     assert figures("found") == {"loss.png", "images.png", "progress.png"}
     page = Path("found/report.html").read_text()
@@ -556,9 +585,18 @@ def test_a_cup_is_swung_until_it_looks_as_it_should(cortado_command):
     code, out, err = cortado_command("optimise", "task.toml", "--out", "found")
     assert (code, err) == (0, "")
     assert "gravity is found with an error of " in out and "the image is matched to " in out
+    found = json.loads(Path("found/result.json").read_text())
+    knots, rows = found["knots"]["gravity"], np.array(found["parameters"]["gravity"])
+    task = load_task("task.toml")
+    ends = (0.5 * task.scene.solver.time_step, (task.problem.steps - 0.5) * task.scene.solver.time_step)
+    np.testing.assert_allclose(knots["times"], np.linspace(*ends, 3))
+    for values, course in ((knots["estimate"], rows), (knots["true"], task.true_parameters["gravity"])):
+        np.testing.assert_allclose(TimeInterpolation(len(course), 3).parameter(np.array(values)), course, rtol=1e-9)
+    assert [f"  gravity at {time:.4g} s: " in out for time in knots["times"]] == [True] * 3
     wanted = {"loss.png", "images.png", "progress.png", "gravity.png"}
     assert figures("found") == wanted | ({"estimate.mp4"} if find_spec("av") else set())
     page = Path("found/report.html").read_text()
+    assert page.count("gravity at ") == 3
     assert page.count("<img") == 4 and page.count("<video") == (1 if find_spec("av") else 0)
     assert len(metrics("found")) == 4
 
@@ -594,7 +632,7 @@ def test_an_image_that_is_not_matched_fails_and_keeps_its_files(cortado_command)
     Path("task.toml").write_text(PLANE_PICTURE)
     strict = ["--set", "optimise.check.psnr=80"]
     code, out, err = cortado_command("optimise", "task.toml", "--out", "found", *strict)
-    assert (code, out, len(err.splitlines())) == (1, "", 1)
+    assert (code, len(err.splitlines())) == (1, 1) and out.startswith("The loss fell ")
     assert err.startswith("The image is matched to ") and " dB, but the task asks for 80 dB. " in err
     assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
 

@@ -70,8 +70,8 @@ LAYERS = """
     optimisation.named_optimisers optimisation.result_page optimisation.result optimisation.optimise
     optimisation.transforms
     io.run_folder io.report
-    inverse inverse.tables inverse.file_schema inverse.task inverse.in_words inverse.setup inverse.chapters
-    inverse.figures inverse.shaded
+    inverse inverse.tables inverse.file_schema inverse.task inverse.in_words inverse.setup inverse.knots
+    inverse.chapters inverse.figures inverse.shaded
     study study.canvas study.comparison study.estimates study.lyapunov_spectrum study.one_kernel_loops
     study.reference_losses study.scenes study.palette study.sources study.gravity_tangents study.spatial_scales
     study.ensembles study.tables study.experiment study.forces study.gravity_and_precision study.image_horizon
@@ -81,8 +81,9 @@ LAYERS = """
     bench bench.scene bench.timing bench.floor bench.passes bench.memory bench.dam_break bench.environment
     bench.reference_engine bench.text
     sweep sweep.combinations sweep.table
-    commands commands.executor commands.bench commands.check commands.compare commands.describe commands.examples
-    commands.figure commands.new commands.optimise commands.overview commands.picture commands.run_summary commands.run
+    commands commands.executor commands.found commands.bench commands.check commands.compare commands.describe
+    commands.examples commands.figure commands.new commands.optimise commands.overview commands.picture
+    commands.run_summary commands.run
     commands.schema commands.study
     commands.sweep commands.view_window commands.view_quantities commands.view_recorded commands.view_live
     commands.view_task commands.view

@@ -59,6 +59,16 @@ def test_hostile_overrides_are_sentences(tmp_path, override, words):
     assert_one_sentence(str(caught.value))
 
 
+def test_an_entry_is_called_by_its_name(tmp_path):
+    (tmp_path / "scene.toml").write_text('[[phase]]\nname = "water"\n[[phase]]\nname = "oil"\n')
+    data = read_toml(tmp_path / "scene.toml", ["phase.oil.viscosity=0.1"])
+    assert data["phase"] == [{"name": "water"}, {"name": "oil", "viscosity": 0.1}]
+    for unknown in ("milk", "2"):
+        words = f"is '{unknown}', but must be an index from 0 to 1, or the name water or oil"
+        with pytest.raises(SceneError, match=words):
+            read_toml(tmp_path / "scene.toml", [f"phase.{unknown}.viscosity=0.1"])
+
+
 def test_large_files_and_pipes_are_not_read(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_bytes(b"")

@@ -262,3 +262,13 @@ def test_a_misspelt_table_of_a_task_is_recognised(task_file, table):
 @pytest.mark.parametrize("error, words", [(0.004, "found with an error of 0.4%"), (0.81, "not found, 81% off")])
 def test_what_is_far_off_is_not_called_found(error, words):
     assert found_in_words(error).startswith(words)
+
+
+@pytest.mark.parametrize(
+    "override", ["optimise.start.mobilty=1", 'optimise.logarithmic=["mobilty"]', "problem.target.mobilty=1"]
+)
+def test_only_parameters_of_the_scene_are_offered(task_file, override):
+    with pytest.raises(SceneError, match="must be one of gravity, tilt, ") as caught:
+        load_task(task_file, [override])
+    said = str(caught.value)
+    assert "viscosity" in said and not any(word in said for word in ("flow_rate", "surface", "mass_fractions", "width"))

@@ -249,3 +249,9 @@ def test_a_container_has_its_edges(scene):
     made = cortado.Simulation(scene).scene
     assert outline(made).shape == (4, 2, 2)
     assert isinstance(made, Scene)
+
+
+@pytest.mark.parametrize("path, words", [("absent", "absent does not exist, but"), (".", "There is no run in ")])
+def test_neither_a_run_nor_a_scene(scene, cortado_command, path, words):
+    code, out, err = cortado_command("view", path)
+    assert (code, out) == (2, "") and words in err and len(err.splitlines()) == 1

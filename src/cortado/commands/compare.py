@@ -24,16 +24,8 @@ _UNITS = {"positions": "m", "velocities": "m/s", "mass_fractions": "-"}
 
 def compare_runs(first: Path, second: Path, as_json: bool) -> str:
     """What is the same and what differs, as text or as JSON. Two runs that differ are no failure."""
-    found = _compared(_run(first), _run(second))
+    found = _compared(RunFolder.open(first), RunFolder.open(second))
     return json.dumps(found, indent=2) if as_json else _as_text(found)
-
-
-def _run(path: Path) -> RunFolder:
-    """The folder of a run; raises `InputError`."""
-    try:
-        return RunFolder.open(path)
-    except InputError:
-        raise InputError(f"There is no run in {path.absolute()}, but RUN must be the folder of one.") from None
 
 
 def _compared(one: RunFolder, other: RunFolder) -> dict[str, Any]:

@@ -7,32 +7,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from cortado.commands.executor import HERE, Where
+from cortado.commands.found import Rows, distance, found_lines, found_rows
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
 from cortado.inverse.chapters import Chapters
-from cortado.inverse.figures import component_names, task_figures
+from cortado.inverse.figures import task_figures
 from cortado.inverse.in_words import task_in_words
+from cortado.inverse.knots import KnotValues, knot_values
 from cortado.inverse.setup import Setup, setup
 from cortado.inverse.shaded import shaded_figures
 from cortado.inverse.task import Task, load_task
 from cortado.io.folder_lock import locked
 from cortado.io.interruption import keeping
-from cortado.io.progress import track
-from cortado.io.report import MOST_NUMBERS as MOST_WRITTEN
+from cortado.io.progress import announce, track
 from cortado.io.report import Section, write_report
-from cortado.io.run_folder import RunFolder
+from cortado.io.run_folder import TO_RESUME, RunFolder
 from cortado.io.terminal import say
 from cortado.losses.image_losses import psnr
 from cortado.optimisation.optimise import Record, Result, optimise
-from cortado.parameters.values import UNITS
 from cortado.scene.in_words import scene_in_words
 from cortado.shading.film import lacking
 from cortado.shading.scene_view import scene_view
 
-Rows = list[tuple[object, ...]]
 MOST_NUMBERS = 1000
 """Of a parameter whose estimate is in result.json; larger ones are in the checkpoint."""
 MOST_ERROR = 0.3
@@ -76,7 +74,7 @@ def optimise_task(
         raise InputError(f"{where.option} is given, but must be left out, as optimise.gradient.samples is 1.")
     made = setup(task, device, precision)
     if resume:
-        RunFolder.open(out)
+        RunFolder.open(out, TO_RESUME)
     with where.executor(device) as executor, locked(out):
         folder = _run_folder(made, out, resume, overwrite, command)
         with keeping(lambda: f"{_kept(folder)}; --resume goes on with them" if _kept(folder) else ""):
@@ -127,15 +125,18 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
         noise = psnr(made.image(made.problem.states(estimate, [last])[last]), target)
     first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
     verdict = judge(made.task, result, estimate, noise, first)
+    knots = knot_values(made, result.parameters, estimate)
+    announce("\n".join([_summary(made, result, verdict), *found_lines(made, estimate, knots)]))
     shaded = _shaded(made, result, folder.figures, pictures)
     figures = shaded + task_figures(made, result, folder.figures)
-    write_report(folder, made.task.scene.name, _sections(made, estimate, result, verdict, figures))
-    folder.write_result(**_for_machines(result, estimate, verdict))
+    rows = found_rows(made, estimate, knots, verdict.errors)
+    write_report(folder, made.task.scene.name, _sections(made, estimate, result, verdict, figures, rows))
+    folder.write_result(**_for_machines(result, estimate, verdict, knots))
     if verdict.failures:
         raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
     films = [f"figures/{Path(path).name}" for _, path in shaded.found if Path(path).suffix == ".mp4"]
     to_open = ", or ".join([*films[:1], "report.html"])
-    return f"{_summary(made, result, verdict)} The results are in {folder.path}; open {to_open}."
+    return f"The results are in {folder.path}; open {to_open}."
 
 
 def _shaded(made: Setup, result: Result, folder: Path, wished: bool) -> Chapters:
@@ -162,7 +163,7 @@ def judge(
     first = result.history[0].loss if first is None else first
     reduction = first / result.loss if result.loss > 0.0 else math.inf
     true = task.true_parameters
-    errors = {name: _distance(value, true[name]) for name, value in estimate.items() if name in true}
+    errors = {name: distance(value, true[name]) for name, value in estimate.items() if name in true}
     failures = []
     if reduction < check.loss_reduction:
         failures.append(f"The loss fell {reduction:.3g} times, but the task asks for {check.loss_reduction:g} times.")
@@ -174,12 +175,6 @@ def judge(
         if error > check.parameter_error
     ]
     return Verdict(first, reduction, errors, noise, failures)
-
-
-def _distance(estimate: ArrayLike, true: ArrayLike) -> float:
-    """|estimate - true| / |true|, each repeated over the steps where only the other one changes with time."""
-    estimate, true = np.broadcast_arrays(estimate, true)
-    return float(np.linalg.norm(estimate - true) / (np.linalg.norm(true) or 1.0))
 
 
 def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> Result:
@@ -198,6 +193,8 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
         def keep(record: Record) -> None:
             made_updates = record.updates
             record = replace(record, iteration=len(history), updates=updates + record.updates)
+            if record.iteration + 1 == known:
+                announce(_resumed(record, len(made.searches) * settings.iterations))
             if record.iteration >= known:
                 folder.append_metrics(iteration=record.iteration, loss=record.loss, gradient_norm=record.gradient_norm)
             history.append(record)
@@ -221,7 +218,14 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
     return replace(result, history=tuple(history), updates=updates, evaluations=len(history))
 
 
-def _for_machines(result: Result, estimate: Mapping[str, np.ndarray], verdict: Verdict) -> dict[str, Any]:
+def _resumed(last: Record, iterations: int) -> str:
+    """Where a search goes on, given the last evaluation that is known."""
+    return f"The search goes on from iteration {last.updates} of {iterations}, after {last.iteration + 1} evaluations."
+
+
+def _for_machines(
+    result: Result, estimate: Mapping[str, np.ndarray], verdict: Verdict, knots: Mapping[str, KnotValues]
+) -> dict[str, Any]:
     """What came out, by names."""
     found: dict[str, Any] = {
         "evaluations": len(result.history),
@@ -230,6 +234,7 @@ def _for_machines(result: Result, estimate: Mapping[str, np.ndarray], verdict: V
         "loss_reduction": verdict.reduction,
         "parameter_error": verdict.errors,
         "parameters": {name: value for name, value in estimate.items() if np.size(value) <= MOST_NUMBERS},
+        "knots": {name: one.for_machines() for name, one in knots.items()},
         "converged": result.converged,
         "message": result.message,
         "failures": verdict.failures,
@@ -242,7 +247,9 @@ def _summary(made: Setup, result: Result, verdict: Verdict) -> str:
     if verdict.psnr is not None:
         reached.append(f"the image is matched to {verdict.psnr:.3g} dB")
     fell = f"fell {verdict.reduction:.3g} times" if result.loss > 0.0 else f"went from {verdict.first:.3g} to 0"
-    text = f"The loss {fell} in {len(result.history)} evaluations"
+    unit = "" if made.renderer else " m²"
+    ends = f", from {verdict.first:.3g}{unit} to {result.loss:.3g}{unit}" if result.loss > 0.0 else unit
+    text = f"The loss {fell}{ends} in {len(result.history)} evaluations"
     return f"{'; '.join([text, *reached])}."
 
 
@@ -264,13 +271,14 @@ def _sections(
     result: Result,
     verdict: Verdict,
     figures: Chapters,
+    rows: Rows,
 ) -> list[Section]:
     """The report, in the order in which one would tell it."""
     head = ("", "unit", "first guess", "found", "hidden", "error")
     return [
         _asked(made),
         Section("What was found", [_summary(made, result, verdict)], verdict.failures, figures.found),
-        Section("In numbers", head=head, rows=_found_rows(made, estimate, verdict)),
+        Section("In numbers", head=head, rows=rows),
         Section("To turn and to play", view=_view(made, estimate)),
         Section("Before, found and target", figures=figures.compared),
         Section("Found against hidden", figures=figures.parameters),
@@ -287,26 +295,6 @@ def _view(made: Setup, estimate: dict[str, np.ndarray]) -> str:
     states = {name: made.problem.states(parameters, steps) for name, parameters in runs.items()}
     shown = {name: [found[step] for step in steps] for name, found in states.items()}
     return scene_view(made.task.scene, shown, np.array(steps) * made.task.scene.solver.time_step)
-
-
-def _found_rows(made: Setup, estimate: dict[str, np.ndarray], verdict: Verdict) -> Rows:
-    """Of each number that was searched, and of those with very many numbers one row."""
-    rows: Rows = []
-    start = made.search.parameters(made.start)
-    for name, value in estimate.items():
-        unit, true = UNITS[name], made.true_parameter(name)
-        known = [np.asarray(start[name]), np.asarray(value), *([] if true is None else [true])]
-        error = f"{verdict.errors[name]:.3%}" if name in verdict.errors else ""
-        columns = np.broadcast_arrays(*known)
-        names = component_names(made.task.scene, name, columns[0])
-        if len(names) != columns[0].size or len(names) > MOST_WRITTEN:
-            rows.append((name.replace("_", " "), unit, *known[:2], "" if true is None else true, error))
-            continue
-        for k, label in enumerate(names):
-            numbers = [column.ravel()[k] for column in columns]
-            off = [""] if true is None else [f"{_distance(*numbers[1:]):.3%}"]
-            rows.append((label, unit, *numbers, *([] if true is not None else [""]), *off))
-    return rows
 
 
 def _rows(made: Setup, result: Result, verdict: Verdict) -> Rows:

@@ -16,7 +16,7 @@ from cortado.errors import CortadoWarning, DivergedError
 from cortado.figures import density_errors, images, particles
 from cortado.io.folder_lock import locked
 from cortado.io.interruption import keeping
-from cortado.io.progress import track
+from cortado.io.progress import announce, track
 from cortado.io.report import Figures, Section, write_report
 from cortado.io.run_folder import RunFolder
 from cortado.io.terminal import say
@@ -54,11 +54,11 @@ def run_scene(
     with locked(out):
         folder = RunFolder.create(out, scene.to_json(), command, overwrite=overwrite, **noted)
         with keeping(lambda: f"the frames so far are in {folder.trajectory}" if folder.trajectory.exists() else ""):
-            summary = _compute(simulation, rollout, folder, record_every, pictures)
+            _compute(simulation, rollout, folder, record_every, pictures)
     converged = rollout.diagnostics["converged"]
     if not converged.all():
         warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=2)
-    return f"{summary}\nThe results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
+    return f"The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
 
 
 def run_settings(steps: int, precision: str, record_every: int) -> dict[str, Any]:
@@ -66,10 +66,8 @@ def run_settings(steps: int, precision: str, record_every: int) -> dict[str, Any
     return {"steps": steps, "precision": precision, "record_every": record_every}
 
 
-def _compute(
-    simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int, pictures: bool
-) -> RunSummary:
-    """Run, and fill the folder, also where the run diverges."""
+def _compute(simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int, pictures: bool) -> None:
+    """Run, say how it went, and fill the folder, also where the run diverges."""
     compile_ahead(rollout.solver, simulation.device)
     begun = time.perf_counter()
     try:
@@ -80,10 +78,10 @@ def _compute(
         folder.write_result(**_for_machines(simulation, rollout), failures=[str(told)])
         raise told from error
     summary = RunSummary.of(simulation, rollout, last, time.perf_counter() - begun)
+    announce(str(summary))
     numbers = Section("In numbers", head=("", "value", "unit"), rows=summary.rows())
     _write_report(simulation, rollout, folder, numbers, pictures)
     folder.write_result(**_for_machines(simulation, rollout), **summary.for_machines(), failures=[])
-    return summary
 
 
 def _for_machines(simulation: Simulation, rollout: Rollout) -> dict[str, Any]:

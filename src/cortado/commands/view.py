@@ -36,6 +36,8 @@ def opened(
     path: Path, overrides: list[str], device: str, precision: str, port: int
 ) -> LiveView | RecordedView | TaskView:
     """The view of a run folder, of a task file, or of a scene file."""
+    if not path.exists():
+        raise InputError(f"{path} does not exist, but must be the folder of a run, or the file of a scene or a task.")
     if not path.is_dir():
         if {"problem", "optimise"} & set(read_toml(path, overrides)):
             made = setup(load_task(path, overrides), device, precision)

@@ -91,8 +91,8 @@ def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> d
     try:
         ends = Problem(simulation, task.problem.steps, nothing).states(task.true_parameters, steps)
     except DivergedError as error:
-        advice = f"this is the run with the parameters of problem.target, so change those, or {error.advice}"
-        raise error.with_advice(advice) from None
+        run = "this is the run that makes the target, with the parameters of problem.target"
+        raise error.with_advice(f"{run}; {error.advice}, or change those") from None
     except InputError as error:
         raise InputError(f"problem.target: {error}") from None
     if renderer is None:

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import (
     BeforeValidator,
     ValidationError,
+    ValidationInfo,
     ValidatorFunctionWrapHandler,
     WithJsonSchema,
     WrapValidator,
@@ -43,17 +44,29 @@ RANDOM = "random"
 CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
 
 
-def _arrays(values: Any, words: tuple[str, ...] = ()) -> dict[str, Any]:
+def _arrays(values: Any, info: ValidationInfo, words: tuple[str, ...] = ()) -> dict[str, Any]:
     """Values by name as arrays, or as one of the words where a parameter can be random; raises a `field_error`."""
     if not isinstance(values, Mapping) or not values:
         raise field_error((), Words("empty") if values == {} else values, wanted(_VALUES))
     found = {}
     for name, value in values.items():
         if name not in NAMES:
-            raise field_error((name,), Words("unknown"), f"one of {', '.join(NAMES)}")
+            raise field_error((name,), Words("unknown"), _offered(info))
         is_word = name in CAN_BE_RANDOM and isinstance(value, str) and value in words
         found[name] = value if is_word else _array(name, value)
     return found
+
+
+def _offered(info: ValidationInfo) -> str:
+    """Which names are right: of parameters that the scene has, where whoever reads the tables says which."""
+    return f"one of {', '.join((info.context or {}).get('names', NAMES))}"
+
+
+def _known(name: Any, info: ValidationInfo) -> Any:
+    """The name of a parameter; raises a `field_error`."""
+    if name not in NAMES:
+        raise field_error((), name, _offered(info))
+    return name
 
 
 def _array(name: str, value: Any) -> Any:
@@ -218,7 +231,7 @@ class OptimiseTable(Table):
     word "random"."""
     knots: Annotated[int, count(2, 10_000_000)] | None = None
     """Number of free rows between which parameters over time are interpolated; if left out, one row for each step."""
-    logarithmic: tuple[Annotated[str, OneOf(NAMES)], ...] = ()
+    logarithmic: tuple[Annotated[str, OneOf(NAMES), BeforeValidator(_known)], ...] = ()
     """Parameters that are searched by their logarithm."""
     bounds: Values | None = None
     """By the name of a parameter the lower and the upper bound; viscosity, mobility and fractions never go below 0

@@ -12,7 +12,7 @@ from cortado.discretise.sampling import fluid_particles
 from cortado.errors import SceneError, Words
 from cortado.inverse.tables import OptimiseTable, ProblemTable, TaskTables
 from cortado.optimisation.transforms import TimeInterpolation
-from cortado.parameters.registry import BY_NAME, Range
+from cortado.parameters.registry import BY_NAME, Range, offered
 from cortado.parameters.values import OVER_TIME, SUM_TOLERANCE, Arrays, is_too_small
 from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, scene_from_dict
@@ -44,7 +44,8 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
         raise SceneError(file, "problem", MISSING, "a table; a scene without one is run by cortado run")
     try:
         with sentences(TaskTables):
-            tables = TaskTables.model_validate({key: data[key] for key in TaskTables.model_fields if key in data})
+            given = {key: data[key] for key in TaskTables.model_fields if key in data}
+            tables = TaskTables.model_validate(given, context={"names": offered(scene)})
         problem, optimise = tables.problem, tables.optimise
         true, steps = problem.target or {}, problem.steps
         for name in optimise.start:

@@ -1,4 +1,5 @@
-"""How far a long computation is: a bar with the time left, or now and then a line where no terminal is."""
+"""How far a long computation is: a bar with the time left, or now and then a line where no terminal is; and what is
+known before it ends."""
 
 from __future__ import annotations
 
@@ -9,10 +10,16 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, Protocol, TextIO
 
-from cortado.io.terminal import is_quiet
+from cortado.io.terminal import is_quiet, tell
 
 LINE_INTERVAL = 10.0
 """[s] between two lines when the stream is no terminal."""
+
+
+def announce(result: str) -> None:
+    """What is known while work goes on, on stdout; not where progress is not shown."""
+    if not _hidden.get() and not is_quiet():
+        tell(result)
 
 
 class Advance(Protocol):

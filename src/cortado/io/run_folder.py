@@ -29,6 +29,8 @@ _SHADED = ("first", "last", "picture", "found", "search")
 _FILMS = ("run", "estimate", "film", "found", "search")
 FIGURES = (*(f"{name}.png" for name in (*_PICTURES, *_SHADED)), *(f"{name}.mp4" for name in _FILMS))
 """Every file that a run may have in its figures; whatever else is there is the user's."""
+TO_RESUME = "; choose another --out, or begin one without --resume"
+"""How a sentence ends that finds no run to go on with."""
 
 
 @dataclass(frozen=True)
@@ -77,15 +79,15 @@ class RunFolder:
         return folder
 
     @classmethod
-    def open(cls, path: str | Path) -> Self:
-        """The folder of an existing run.
+    def open(cls, path: str | Path, otherwise: str = ", but RUN must be the folder of one") -> Self:
+        """The folder of an existing run; ``otherwise``: how the sentence ends if there is none.
 
         Raises:
             InputError: there is no run in it.
         """
         folder = cls(Path(path).absolute())
         if not folder._holds_run():
-            raise InputError(f"There is no run in {folder.path}; choose another --out, or begin one without --resume.")
+            raise InputError(f"There is no run in {folder.path}{otherwise}.")
         return folder
 
     @classmethod
@@ -105,7 +107,7 @@ class RunFolder:
             InputError: there is no run in it, or one of another kind, scene or settings; the sentence says which.
             ComputationError: the disk is full.
         """
-        folder = cls.open(path)
+        folder = cls.open(path, TO_RESUME)
         folder.require(scene_json, kind, settings)
         noted = _read_json(folder.environment)
         noted.setdefault("resumed", []).append(session(command, device))

@@ -76,6 +76,11 @@ class TimeInterpolation:
     knots: int
 
     @property
+    def places(self) -> np.ndarray:
+        """(k,) the steps at which the knots are, counted from 0; in between where the numbers do not fit."""
+        return np.linspace(0.0, self.steps - 1.0, self.knots)
+
+    @property
     def _weights(self) -> np.ndarray:
         """(steps, knots)"""
         places = np.linspace(0.0, self.knots - 1.0, self.steps)

@@ -79,16 +79,6 @@ def unstable_sentence(values: Arrays, scene: Scene) -> str | None:
     return f"{found}, which comes from {broken[0]}."
 
 
-def divergence_advice(values: Arrays, scene: Scene) -> str:
-    """What to try where a run with these parameters diverged: with the limit that its time step breaks, if any."""
-    time_step = float(values.get("time_step", scene.solver.time_step))
-    broken = broken_limit(scene, values, time_step)
-    if broken is None:
-        return f"try a smaller time step than {time_step:g} s, or more pressure iterations"
-    name, limit = broken
-    return f"{name} limits the time step to about {limit:.2g} s, but it is {time_step:g} s: try one within the limit"
-
-
 def _outside(scene: Scene, points: Any) -> np.ndarray:
     """The numbers of the points (n, d) [m] that are outside of the container; along a period nothing is."""
     walled = scene.container.region(scene.dimension).opened(scene.container.periods(scene.dimension)[1])

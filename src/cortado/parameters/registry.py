@@ -293,3 +293,9 @@ BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 def names(role: Role | None = None, axis: Axis | None = None) -> tuple[str, ...]:
     """The names of parameters of a role and with an axis, of any where none is given, in the order of the list."""
     return tuple(p.name for p in PARAMETERS if role in (None, p.role) and axis in (None, p.axis))
+
+
+def offered(scene: Any) -> tuple[str, ...]:
+    """The names of parameters that a scene has, without those of a mixture where there is only one phase."""
+    mixture = (_several_phases, _diffuses) if len(scene.phase) == 1 else ()
+    return tuple(p.name for p in PARAMETERS if p.present(scene) and p.acts not in mixture)

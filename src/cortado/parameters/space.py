@@ -9,12 +9,13 @@ import numpy as np
 from cortado.device.state import Parameters, State
 from cortado.device.threads import WARP
 from cortado.errors import CortadoWarning, InputError, shown
-from cortado.parameters.checks import check_places, check_sizes, check_state, divergence_advice, unstable_sentence
+from cortado.parameters.checks import check_places, check_sizes, check_state, unstable_sentence
 from cortado.parameters.registry import Role, names
 from cortado.parameters.scene_parameters import DENSITY, RUN, SceneParameters, Simulated
 from cortado.parameters.values import OVER_TIME, Arrays, Values, check_known, checked_value, scene_values
 from cortado.restart import Clock, RestartState
 from cortado.rollout import Rollout
+from cortado.scene.stability import divergence_advice
 
 STATE = names(Role.STATE)
 DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
@@ -82,7 +83,11 @@ class ParameterSpace:
         ]
         rollout.time_steps[:] = [one["time_step"] for one in chosen]
         each = members * (len(rollout.clocks) // len(members))
-        rollout.advice = lambda member: divergence_advice(each[member], simulation.scene)
+
+        def advice(member: int) -> str:
+            return divergence_advice(simulation.scene, each[member], float(rollout.time_steps[member]))
+
+        rollout.advice = advice
         rollout.parameters.set(_stacked(chosen))
         substeps = {simulation.substeps(**{name: one[name] for name in DIFFUSION}) for one in chosen}
         if len(substeps) > 1:

@@ -19,6 +19,7 @@ from cortado.reference.engine import extension, precisions
 from cortado.reference.histories import Gradient, History
 from cortado.reference.losses import Loss
 from cortado.scene.scene import Scene, as_scene
+from cortado.scene.stability import divergence_advice
 
 METHODS = (
     "analytic",
@@ -100,7 +101,8 @@ class Simulation:
         """Run from the scene's first state; ``controls`` replace its parameters. Raises `DivergedError` when a
         particle is lost."""
         at = self._parameters(controls or {}, steps, "parameter")
-        return self._history(self._engine.run(at, steps, _positive("record_every", record_every), observe))
+        raw = self._engine.run(at, steps, _positive("record_every", record_every), observe)
+        return self._history(raw, controls or {})
 
     def tangent(
         self,
@@ -139,7 +141,8 @@ class Simulation:
         at, along = self._parameters(parameters, steps), self._parameters(directions, steps, "direction")
         every = _positive("record_every", record_every)
         chosen = extension().Terms(*astuple(terms or Terms()))
-        return self._history(self._engine.tangent(at, along, steps, every, method, chosen, difference, observe))
+        raw = self._engine.tangent(at, along, steps, every, method, chosen, difference, observe)
+        return self._history(raw, parameters)
 
     def gradient(
         self,
@@ -169,7 +172,7 @@ class Simulation:
         chosen = extension().Terms(*astuple(terms or Terms()))
         every = _positive("record_every", record_every)
         raw = self._engine.gradient(at, steps, every, chosen, adjoint, observe)
-        history = self._history(raw.history)
+        history = self._history(raw.history, parameters)
         found = {}
         for name in parameters:
             bar = getattr(raw.bar, name.removeprefix("initial_"))
@@ -206,27 +209,34 @@ class Simulation:
         high = checked_value(name, value.high if isinstance(value, Digits) else value, shapes, what)
         return Digits(high, value.low) if isinstance(value, Digits) else Digits.of(high)
 
-    def _history(self, raw: Any) -> History:
+    def _history(self, raw: Any, parameters: Mapping[str, Any]) -> History:
+        """What a run with these parameters recorded; raises `DivergedError` if a particle was lost."""
         time_step = self.scene.solver.time_step
-        if raw.bad_step >= 0:
-            raise DivergedError(step=raw.bad_step + 1, particle=raw.bad_particle, advice=self._advice)
-        history = History.of(raw, self.positions.shape, time_step)
-        if self.scene.forces.pressure:
-            self._check_contained(history)
+        history = None if raw.bad_step >= 0 else History.of(raw, self.positions.shape, time_step)
+        lost = self._lost(history) if history else (raw.bad_step + 1, raw.bad_particle, "was lost", 0)
+        if lost:
+            values = {name: _float64(value) for name, value in parameters.items()}
+            step, particle, where, others = lost
+            raise DivergedError(step, particle, divergence_advice(self.scene, values, time_step), where, others)
+        assert history is not None
         return history
 
-    @property
-    def _advice(self) -> str:
-        return f"try a smaller time step than {self.scene.solver.time_step:g} s, or more pressure iterations"
-
-    def _check_contained(self, history: History) -> None:
-        """Raises `DivergedError` if a particle is beyond the walls in a recorded state."""
+    def _lost(self, history: History) -> tuple[int, int, str, int] | None:
+        """The first recorded step after which a particle is beyond the walls, the particle, what became of it, and how
+        many more are."""
+        if not self.scene.forces.pressure:
+            return None
         region, tolerance = self._region, TOLERANCE * self.scene.discretisation.spacing
         frames = history.positions.high
         for step, before, after in zip(history.steps[1:], frames, frames[1:], strict=False):
             lost = np.flatnonzero(region.escaped(before, after, tolerance))
             if lost.size:
-                raise DivergedError(int(step), int(lost[0]), self._advice, "left the container", lost.size - 1)
+                return int(step), int(lost[0]), "left the container", lost.size - 1
+        return None
+
+
+def _float64(value: Any) -> np.ndarray:
+    return np.asarray(value.high if isinstance(value, Digits) else value, dtype=np.float64)
 
 
 def _engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:

@@ -38,6 +38,16 @@ def broken_limit(scene: SceneTables, values: Arrays, time_step: float) -> tuple[
     return (name, limit) if time_step > limit * (1.0 + 1e-9) else None
 
 
+def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> str:
+    """What to try where a run diverged with parameters that replace the scene's: with the limit that its time step [s]
+    breaks, if any."""
+    broken = broken_limit(scene, values, time_step)
+    if broken is None:
+        return f"try a smaller time step than {time_step:g} s, or more pressure iterations"
+    name, limit = broken
+    return f"{name} limits the time step to about {limit:.2g} s, but it is {time_step:g} s: try one within the limit"
+
+
 def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
     """Several limits of the time step by what they are of [s], infinite where nothing is limited; h is the support
     radius.

@@ -27,7 +27,8 @@ _KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
 def read_toml(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> dict[str, Any]:
     """The contents of a TOML file with overrides put in. Raises `SceneError`.
 
-    An override is ``key=value``: ``forces.gravity=[0,-5,0]``, ``fluid.0.upper=[1,1,1]`` or ``fluid[0].upper=[1,1,1]``.
+    An override is ``key=value``: ``forces.gravity=[0,-5,0]``, ``fluid.0.upper=[1,1,1]`` or ``fluid[0].upper=[1,1,1]``;
+    an entry with a name may be called by it, ``phase.oil.viscosity=0.1``.
     A value that is not TOML is taken as text.
     """
     file = os.fspath(path)
@@ -87,10 +88,10 @@ def _apply(data: dict[str, Any], override: str, file: str) -> None:
         last = depth == len(parts) - 1
         index: str | int = part
         if isinstance(place, list):
-            if not part.isdecimal() or len(part) > 9 or int(part) >= len(place):
-                wanted = f"an index from 0 to {len(place) - 1}" if place else "left out, as the list is empty"
-                raise SceneError(file, field, part, wanted)
-            index = int(part)
+            found = _entry(place, part)
+            if found is None:
+                raise SceneError(file, field, part, _entries(place))
+            index = found
         elif not isinstance(place, dict):
             raise SceneError(
                 file, field, sentence=f"cannot be set, as {'.'.join(parts[:depth])[:LONGEST]} is not a table."
@@ -101,6 +102,22 @@ def _apply(data: dict[str, Any], override: str, file: str) -> None:
             place[index] = _value(text.strip())
         else:
             place = place[index]
+
+
+def _entry(tables: list[Any], part: str) -> int | None:
+    """Where an entry is in a list, given its index or its name; None if there is none."""
+    if part.isdecimal():
+        return int(part) if len(part) <= 9 and int(part) < len(tables) else None
+    return next((k for k, table in enumerate(tables) if isinstance(table, dict) and table.get("name") == part), None)
+
+
+def _entries(tables: list[Any]) -> str:
+    """How the entries of a list are addressed."""
+    if not tables:
+        return "left out, as the list is empty"
+    names = [str(table["name"]) for table in tables if isinstance(table, dict) and "name" in table]
+    wanted = f"an index from 0 to {len(tables) - 1}"
+    return f"{wanted}, or the name {' or '.join(names)}" if names else wanted
 
 
 def _value(text: str) -> Any:
