@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from catalogue import TASKS, task
-from contenders import CMAES, CONTENDERS, Descent
+from contenders import CONTENDERS, Descent
 from curves import curves
 from objective import BACKWARD, BudgetSpent, Objective
 from records import Record, Records, Run
@@ -129,8 +129,6 @@ def test_a_run_that_diverges_is_a_bad_score():
 @pytest.mark.parametrize("contender", CONTENDERS.values(), ids=CONTENDERS)
 def test_a_contender_stays_within_its_budget(contender):
     chosen = short("splash")
-    if isinstance(contender, CMAES):
-        pytest.importorskip("cma")
     objective = Objective(chosen, chosen.problem(), 0, budget=60.0 * chosen.steps)
     contender.search(objective, seed=0)
     steps, losses = zip(*objective.curve, strict=True)

@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import mathml
 import outer_pages
 import pytest
 
@@ -44,3 +45,26 @@ def test_a_page_has_one_title_links_and_pictures_that_are_there(page):
 def test_a_page_from_elsewhere_is_there_and_says_where(page, file):
     assert (DOCS.parent / file).exists()
     assert f"](../{file})" in (DOCS / f"{page}.md").read_text(encoding="utf-8")
+
+
+def test_bars_around_a_number_are_no_relations():
+    """Without a form, a bar inside of a formula has room on both sides, and its superscript hangs below it."""
+    left, right = (
+        f'<mo form="{form}" stretchy="false" lspace="0" rspace="0">&#x0007C;</mo>' for form in ("prefix", "postfix")
+    )
+    made = mathml.mathml(r"a \lvert c_i - c_j \rvert^2 + P(x | y) \lvert z \rvert", "inline")
+    assert re.findall(r"<mo[^>]*>&#x0007C;</mo>", made) == [
+        left,
+        right,
+        '<mo stretchy="false">&#x0007C;</mo>',
+        left,
+        right,
+    ]
+    assert f"<msup>{right}<mn>2</mn></msup>" in made
+
+
+def test_primes_are_as_large_as_their_letter():
+    made = mathml.mathml(r"\alpha f'' + f'(x) + g^2", "block")
+    assert made.count("<msup>") == 1 and 'display="block"' in made
+    for prime in ("2", "3"):
+        assert f'<mrow><mi>f</mi><mo lspace="0" rspace="0">&#x0203{prime};</mo></mrow>' in made

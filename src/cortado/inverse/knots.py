@@ -46,4 +46,4 @@ def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndar
 def _without_round_off(values: np.ndarray) -> np.ndarray:
     """To twelve digits of the largest: what a user wrote comes back from the course as it was written."""
     largest = np.abs(values).max()
-    return np.round(values, 11 - int(np.floor(np.log10(largest)))) if largest > 0.0 else values
+    return np.round(values, 11 - int(np.floor(np.log10(largest)))) + 0.0 if largest > 0.0 else values  # no -0
