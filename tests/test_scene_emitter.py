@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from bad_scenes import plane
+from cortado import Problem, Simulation, losses
 from cortado.discretise.sampling import fluid_particles
 from cortado.errors import CortadoWarning, SceneError
 from cortado.lattice.shapes import across, disc
@@ -159,3 +160,43 @@ def test_an_emitter_counts_for_the_stability_limit():
         thicker = Scene(**plane(emitter=SLOT | {"phase": "honey"}, phase=[honey[0], honey[1] | {"viscosity": 2e5}]))
     assert stability_limit(scene) == pytest.approx(2.0 * stability_limit(thicker))
     assert stability_limit(scene) < 0.06 * 0.2**2 * 1000 / 1e5
+
+
+def alone(**tables) -> dict:
+    """A tank in the plane that is empty at the start, and an emitter that fills it."""
+    return {
+        "dimension": 2,
+        "discretisation": {"spacing": SPACING},
+        "phase": [{"name": "water", "rest_density": 1000, "viscosity": 0.1}],
+        "emitter": SLOT | {"flow_rate": 0.5, "outlet": [0.5, 1.5]},
+        "container": {"shape": "box", "lower": [0, 0], "upper": [1, 2]},
+        "solver": {"time_step": 0.004},
+        **tables,
+    }
+
+
+@pytest.mark.filterwarnings("ignore::cortado.errors.CortadoWarning")  # the jet does not converge
+@pytest.mark.parametrize("container", [{"shape": "box", "lower": [0, 0], "upper": [1, 2]}, {"shape": "none"}])
+def test_a_scene_may_be_filled_by_its_emitter_alone(container):
+    scene = Scene(**alone(container=container))
+    limit = {"none": 0.25 * np.sqrt(2 * SPACING / 9.81)}.get(
+        container["shape"], 0.4 * 2 * SPACING / (1.0 + np.sqrt(4 * 9.81))
+    )
+    assert stability_limit(scene) == pytest.approx(limit)
+    simulation = Simulation(scene, precision="float64")
+    column = simulation.positions
+    assert simulation.free_particles == 0 and len(column) == 140
+    last = simulation.run(30)[-1].positions
+    moved = np.linalg.norm(last - column, axis=1)
+    assert (last[:, 1] < 1.5).sum() == 20 and moved.min() == pytest.approx(0.12)
+    problem = Problem(simulation, 30, losses.FinalPositions(column))
+    at, h = {"flow_rate": np.array(0.51)}, 1e-6
+    _, gradient = problem.value_and_gradient(at)
+    high, low = (problem.value({"flow_rate": at["flow_rate"] + sign * h}) for sign in (1, -1))
+    assert gradient["flow_rate"] == pytest.approx((high - low) / (2 * h), rel=1e-5)
+
+
+@pytest.mark.parametrize("fluid", [{}, {"fluid": []}])
+def test_without_an_emitter_there_must_be_fluid(fluid):
+    with pytest.raises(SceneError, match=r"fluid is (missing|empty), but must be a list of at least one table"):
+        Scene(**alone(emitter=None, **fluid))

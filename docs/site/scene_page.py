@@ -127,7 +127,8 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     ),
     (
         "## A jet: `[emitter]`",
-        "A column of particles waits behind an opening and comes out of it with one speed. Where the opening is may "
+        "A column of particles waits behind an opening and comes out of it with one speed. With an emitter a scene may "
+        "leave out `[[fluid]]`: its container is then filled by the emitter alone. Where the opening is may "
         "change over time: the parameter `nozzle_path`.",
         (
             (

@@ -11,7 +11,7 @@ from cortado.lattice.shapes import Points
 from cortado.parameters.registry import BY_NAME
 from cortado.scene.containers import check_length
 from cortado.scene.emitter import Emitter
-from cortado.scene.fields import FieldPath, field_error
+from cortado.scene.fields import MISSING, FieldPath, field_error
 from cortado.scene.fluids import Body, Fluid, PointsFluid
 from cortado.scene.mixture import Mixture
 from cortado.scene.model import SceneTables
@@ -27,6 +27,9 @@ NEAREST = 0.5
 def check_scene(scene: SceneTables) -> None:
     """All checks, those that guard others first."""
     spacing = scene.discretisation.spacing
+    if not scene.fluid and scene.emitter is None:
+        found = Words("empty") if "fluid" in scene.model_fields_set else MISSING
+        raise field_error(("fluid",), found, "a list of at least one table, as there is no emitter")
     _check_phases(scene)
     _check_files(scene)
     _check_counts(scene)

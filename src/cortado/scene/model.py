@@ -111,8 +111,8 @@ class SceneTables(Table):
     """How the fluid is cut into particles."""
     phase: Several[Phase]
     """The materials: in this order the components of mass fractions."""
-    fluid: Several[AnyFluid]
-    """The bodies of fluid; particles come in this order."""
+    fluid: tuple[AnyFluid, ...] = ()
+    """The bodies of fluid; particles come in this order. With an emitter there may be none."""
     emitter: Emitter | None = None
     """An emitter, out of which fluid comes; its particles come after those of all fluids."""
     container: AnyContainer = Field(default=NoContainer(), validate_default=True)

@@ -96,7 +96,7 @@ def _first_speed(scene: SceneTables, values: Arrays) -> float:
     if "initial_velocities" in values:
         speed = float(np.linalg.norm(values["initial_velocities"], axis=1).max())
     else:
-        speed = max(float(np.linalg.norm(fluid.velocity)) for fluid in scene.fluid)
+        speed = max((float(np.linalg.norm(fluid.velocity)) for fluid in scene.fluid), default=0.0)
     if scene.emitter is None:
         return speed
     faster = float(values.get("flow_rate", scene.emitter.flow_rate)) / scene.emitter.flow_rate
@@ -121,7 +121,7 @@ def _viscous_limit(scene: SceneTables, values: Arrays) -> float:
 
 def _depth_limit(scene: SceneTables, gravity: Points) -> float:
     """``gravity``: (k, d) [m/s2], of which the one that allows least counts."""
-    if not scene.forces.pressure or not gravity.any():
+    if not scene.forces.pressure or not gravity.any() or not scene.fluid:
         return inf
     cut = scene.discretisation
     extents = np.array([fluid.extent(cut.spacing) for fluid in scene.fluid])
@@ -150,10 +150,14 @@ def _extent(scene: SceneTables) -> tuple[Points, Points]:
 
 
 def _room(scene: SceneTables) -> tuple[Points, Points]:
-    """The box around the container, or around the fluids if there is none: lower and upper, each (d,) [m]."""
+    """The box around the container, or around the fluids if there is none, or around the outlet if there is only the
+    emitter: lower and upper, each (d,) [m]."""
     ends = scene.container.extent()
     if ends is not None:
         return ends
+    if not scene.fluid:
+        assert scene.emitter is not None
+        return np.array(scene.emitter.outlet), np.array(scene.emitter.outlet)
     lower, upper = np.swapaxes([fluid.extent(scene.discretisation.spacing) for fluid in scene.fluid], 0, 1)
     half = 0.5 * scene.discretisation.spacing
     return lower.min(axis=0) - half, upper.max(axis=0) + half
