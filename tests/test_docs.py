@@ -26,6 +26,7 @@ COMMANDS = {
 TUTORIALS = [name for name in CODE if name.startswith("tutorials/")]
 
 
+@pytest.mark.filterwarnings("error:.*limit of stability:cortado.errors.CortadoWarning")
 @pytest.mark.parametrize("name", [name for name, blocks in CODE.items() if blocks])
 def test_the_code_runs_as_printed(name, tmp_path, monkeypatch):
     """All of a document in one go, in a folder that has the examples."""

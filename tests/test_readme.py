@@ -32,6 +32,7 @@ def root(monkeypatch):
     monkeypatch.chdir(ROOT)
 
 
+@pytest.mark.filterwarnings("error:.*limit of stability:cortado.errors.CortadoWarning")
 def test_the_code_runs_as_printed(capsys):
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len(code.splitlines()) <= 25

@@ -1,0 +1,61 @@
+"""No scene that is shipped is warned of for its time step, nor is a search from its start to its target."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cortado.commands.new import new_scene
+from cortado.errors import CortadoWarning
+from cortado.inverse.task import load_task
+from cortado.parameters.checks import unstable_sentence
+from cortado.parameters.tilt import Tilt
+from cortado.scene.scene import load_scene
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = ("examples", "docs/figures", "experiments/scenes")
+FILES = [path for folder in FOLDERS for path in sorted((ROOT / folder).glob("*.toml"))]
+TASKS = [path for path in FILES if "[optimise]" in path.read_text(encoding="utf-8")]
+DEEP_WHEN_TILTED = {"latte_art", "latte_art_heart", "latte_art_large"}
+"""Searches for a GPU that lean a cup so far that its fluid, were it to come to rest so, would be too deep for their
+time step; they are over before it does, and warn."""
+
+
+def loaded(path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CortadoWarning)
+        load_scene(path)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_no_scene_is_warned_of(path):
+    loaded(path)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_no_new_scene_is_warned_of(tmp_path, dimension):
+    new_scene(tmp_path / "scene.toml", dimension)
+    loaded(tmp_path / "scene.toml")
+
+
+@pytest.mark.parametrize("path", TASKS, ids=lambda path: path.stem)
+def test_no_search_is_warned_of(path):
+    """At its start, at its target, and where a cup lies on its side."""
+    task = load_task(path)
+    tilt = Tilt(task.scene.forces.gravity)
+    places = [{name: value for name, value in task.start.items() if not isinstance(value, str)}, task.true_parameters]
+    if "tilt" in task.start:
+        angles = np.linspace(-90.0, 90.0, 19)
+        lying = np.stack(np.meshgrid(*[angles] * task.start["tilt"].shape[-1]), axis=-1)
+        places.append({"tilt": lying.reshape(-1, lying.shape[-1])})
+    found = []
+    for values in places:
+        upright = dict(values)
+        if "tilt" in upright:
+            upright["gravity"] = tilt.gravity(np.atleast_2d(upright.pop("tilt")))
+        found.append(unstable_sentence(upright, task.scene))
+    if path.stem in DEEP_WHEN_TILTED:
+        assert "comes from depth" in found[-1]
+    elif task.problem.steps:
+        assert found == [None] * len(places)
