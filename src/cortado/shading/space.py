@@ -1,6 +1,6 @@
 """Pictures of fluid in 3-D, by a ray tracer on the device of the run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import wait
 from functools import partial
 from typing import Any
@@ -13,9 +13,9 @@ from cortado.device.launching import launch
 from cortado.device.threads import MOST_CORES, WARP, helpers
 from cortado.lattice.shapes import Points
 from cortado.shading.meeting import FluidSurface
-from cortado.shading.shadow import floor_shadow
+from cortado.shading.scenery import Scenery, State, processes_for, sceneries, scenery
 from cortado.shading.stage import Stage, screen_axes
-from cortado.shading.surface import Surface, liquid, spheres
+from cortado.shading.surface import Surface
 from cortado.shading.surroundings import GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Surroundings
 from cortado.shading.trace import Eye, illuminate, trace
 
@@ -30,10 +30,10 @@ LIGHT_RAYS = {"liquid": (20, 4), "spheres": (10, 1)}
 
 
 class SpacePainter:
-    """Draws states of one scene: `image`."""
+    """Draws states of one scene of so many particles: `image` and `images`."""
 
-    def __init__(self, stage: Stage, device: Any = "cpu"):
-        self.stage, self.device = stage, wp.get_device(device)
+    def __init__(self, stage: Stage, particles: int, device: Any = "cpu"):
+        self.stage, self.device, self.at_once = stage, wp.get_device(device), processes_for(particles)
         self._compiled: set[Any] = set()
         self._surroundings, self._eye = _surroundings(stage), _eye(stage)
         around, lamp = LIGHT_RAYS[stage.picture.surface]
@@ -44,22 +44,21 @@ class SpacePainter:
 
     def image(self, positions: Points, colours: Points) -> Points:
         """A picture (rows, columns, 3), linear from 0 to 1: particles at positions (n, 3) [m] with colours (n, 3)."""
-        stage, picture = self.stage, self.stage.picture
-        placed = stage.placed(np.asarray(positions, dtype=np.float64))
-        colours = np.asarray(colours, dtype=np.float64)
-        if picture.surface == "liquid":
-            wet, of = stage.wetting(placed)
-            surface = liquid(wet, colours[of], stage.spacing)
-        else:
-            surface = spheres(placed, colours, stage.spacing)
-        light, corner, cell = floor_shadow(stage, placed, colours)
+        return self._traced(scenery(self.stage, positions, colours))
+
+    def images(self, states: Iterable[State]) -> Iterator[Points]:
+        """The `image` of each state in their order; surfaces of large fluids are computed in several processes."""
+        return map(self._traced, sceneries(self.stage, states, self.at_once))
+
+    def _traced(self, fluid: Scenery) -> Points:
         s = self._surroundings
+        light, corner, cell = fluid.shadow
         s.shadow_corner, s.shadow_cell = wp.vec3(*corner), cell
         shadow = wp.array(light, dtype=wp.vec3, device=self.device)
         with WARP:
-            return self._traced(surface, s, shadow)
+            return self._rays(fluid.surface, s, shadow)
 
-    def _traced(self, surface: Surface, s: Any, shadow: wp.array) -> Points:
+    def _rays(self, surface: Surface, s: Any, shadow: wp.array) -> Points:
         picture, device = self.stage.picture, self.device
         points = wp.array(surface.points, dtype=wp.vec3, device=device)
         corners = wp.array(surface.triangles.ravel(), dtype=wp.int32, device=device)
