@@ -18,8 +18,8 @@ AIR = 0.1
 FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
 """Elevation of the camera [degrees]: where the fluid is drawn on, as in latte art, and elsewhere."""
 TOUCHING, TOUCHING_ROUND = 0.8, 1.5
-"""In spacings: fluid that is nearer to a flat and to a round wall touches it. A cubic lattice in a round cup ends up to one
-and a half spacings from its wall."""
+"""In spacings: fluid that is nearer to a flat and to a round wall touches it. A cubic lattice in a round cup ends up to
+one and a half spacings from its wall."""
 AZIMUTH = 24.0
 """Of the camera, to the right of the direction towards the viewer [degrees]."""
 
