@@ -5,10 +5,12 @@ import os
 
 import numpy as np
 import pytest
+import warp as wp
 
 import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.cli import main
+from cortado.device.launching import launch
 from cortado.errors import ComputationError, InputError, SceneError
 from cortado.io.run_folder import RunFolder
 from cortado.io.srgb import to_srgb
@@ -24,6 +26,7 @@ from cortado.shading.scenery import sceneries, scenery
 from cortado.shading.shadow import floor_shadow
 from cortado.shading.stage import Stage, screen_axes, upright
 from cortado.shading.surface import spheres
+from cortado.shading.trace import find_contrast
 
 SMALL = {"width": 96, "height": 64}
 FILLED = np.array([[0.05, 0.05, 0.05], [0.25, 0.25, 0.25]])
@@ -198,6 +201,22 @@ def test_spheres_have_their_size_and_look_outwards():
     a, b, c = (surface.points[surface.triangles[:, k]] for k in range(3))
     outwards = np.einsum("tk,tk->t", np.cross(b - a, c - a), (a + b + c) / 3.0 - (1.0, 2.0, 3.0))
     assert (outwards > 0.0).all() and len(surface.triangles) == 128
+
+
+def test_contrast_is_found_between_neighbours_alone():
+    image = np.random.default_rng(3).random((5, 7, 3)).astype(np.float32)
+    image[:2, :4] = 0.5
+    across, down = (np.abs(np.diff(image, axis=axis)).max(axis=2) > 0.8 for axis in (1, 0))
+    wanted = np.zeros((5, 7), dtype=bool)
+    wanted[:, 1:] |= across
+    wanted[:, :-1] |= across
+    wanted[1:] |= down
+    wanted[:-1] |= down
+    found = wp.zeros(35, dtype=wp.bool, device="cpu")
+    pixels = wp.array(image.reshape(-1, 3), dtype=wp.vec3, device="cpu")
+    launch(find_contrast, 35, "cpu", first=0, columns=7, image=pixels, contrast=0.8, found=found)
+    np.testing.assert_array_equal(found.numpy().reshape(5, 7), wanted)
+    assert 0 < wanted.sum() < 35
 
 
 class _Shades:

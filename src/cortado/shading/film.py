@@ -23,6 +23,8 @@ SECONDS = 40.0
 """[s] that a film may take to draw, about; it has fewer frames where one takes long."""
 LEAST_FRAMES = 16
 """Of a film, however long they take."""
+ALONE = 0.25
+"""The part of the time of a picture of a large fluid that is not shared by processes, about."""
 SHORTEST, SLOWEST, QUICKEST = 4.0, 6.0, 25.0
 """[s] that a film lasts if it can, and its frames per second at least and at most."""
 Figures = list[tuple[str, str | Path]]
@@ -71,7 +73,7 @@ def film(path: Path, page: Page, frames: Sequence[int], most: int) -> Path:
     """Write a film of so many of these frames at most, evenly chosen, as are drawn in `SECONDS`; returns its path."""
     begun = time.monotonic()
     page.image(frames[len(frames) // 2])
-    each = (time.monotonic() - begun) / page.painter.at_once
+    each = (time.monotonic() - begun) * (ALONE + (1.0 - ALONE) / page.painter.at_once)
     count = min(most, len(frames), max(int(SECONDS / max(each, 1e-6)), LEAST_FRAMES))
     chosen = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
     rate = float(np.clip(len(chosen) / SHORTEST, SLOWEST, QUICKEST))

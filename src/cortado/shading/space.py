@@ -17,7 +17,7 @@ from cortado.shading.scenery import Scenery, State, processes_for, sceneries, sc
 from cortado.shading.stage import Stage, screen_axes
 from cortado.shading.surface import Surface
 from cortado.shading.surroundings import GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Surroundings
-from cortado.shading.trace import Eye, illuminate, trace
+from cortado.shading.trace import Eye, find_contrast, illuminate, trace
 
 ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 """Where in a pixel four more rays go, in pixels from its middle."""
@@ -74,19 +74,21 @@ class SpacePainter:
         reach = 0.2 * self.stage.size
         self._launch(illuminate, len(points), **given, **lit, reach=reach, clearness=self.stage.clearness)
 
-        def rays(pixels: np.ndarray, offset: tuple[float, float]) -> Points:
+        def rays(pixels: np.ndarray, offset: tuple[float, float]) -> wp.array:
             found = wp.zeros(len(pixels), dtype=wp.vec3, device=device)
             asked = wp.array(pixels, dtype=wp.int32, device=device)
             where = wp.vec2(*offset)
             self._launch(
                 trace, len(pixels), **given, eye=self._eye, shadow=shadow, pixels=asked, offset=where, image=found
             )
-            return found.numpy()
+            return found
 
-        image = rays(np.arange(picture.width * picture.height), (0.0, 0.0))
-        rough = np.flatnonzero(_rough(image.reshape(picture.height, picture.width, 3)))
+        count = picture.width * picture.height
+        once, mask = rays(np.arange(count), (0.0, 0.0)), wp.zeros(count, dtype=bool, device=device)
+        self._launch(find_contrast, count, columns=picture.width, image=once, contrast=CONTRAST, found=mask)
+        image, rough = once.numpy(), np.flatnonzero(mask.numpy())
         if len(rough):
-            image[rough] = np.mean([rays(rough, offset) for offset in ROTATED_GRID], axis=0)
+            image[rough] = np.mean([rays(rough, offset).numpy() for offset in ROTATED_GRID], axis=0)
         return image.reshape(picture.height, picture.width, 3)
 
     @property
@@ -126,18 +128,6 @@ def _shared(work: Callable[[Any], Any], items: Any, cores: int) -> None:
         wait(begun)
     for helper in begun:
         helper.result()
-
-
-def _rough(image: Points) -> Points:
-    """(rows, columns) whether a pixel differs much from one beside it."""
-    found = np.zeros(image.shape[:2], dtype=bool)
-    across = np.abs(np.diff(image, axis=1)).max(axis=2) > CONTRAST
-    down = np.abs(np.diff(image, axis=0)).max(axis=2) > CONTRAST
-    found[:, 1:] |= across
-    found[:, :-1] |= across
-    found[1:] |= down
-    found[:-1] |= down
-    return found
 
 
 def _directions(count: int) -> Points:
