@@ -58,8 +58,8 @@ LAYERS = """
     figures.canvas figures.panels figures.particle_sets figures.side_by_side
     io.trajectory io.trajectory_batch
     shading shading.surface shading.stage shading.shadow shading.surroundings shading.glass shading.meeting
-    shading.trace shading.space shading.plane
-    shading.painter shading.labels shading.film shading.scene_view
+    shading.scenery shading.trace shading.space shading.plane
+    shading.painter shading.page shading.labels shading.film shading.scene_view
     simulation
     problem
     figures.curves figures

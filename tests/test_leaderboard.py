@@ -11,6 +11,7 @@ from benchmarks.gradients.__main__ import main
 from benchmarks.gradients.cells import Cell
 from benchmarks.gradients.controls import CONTROLS, VelocityModes
 from benchmarks.gradients.counting import Counted, Steps
+from benchmarks.gradients.resolution import resolution
 from benchmarks.gradients.table import ceiling, cosine, table
 from benchmarks.gradients.truth import DIRECTIONS, FEW, SAMPLES, directions, smoothed
 from cortado import Problem, Scene, Simulation
@@ -170,3 +171,20 @@ def test_the_table_says_what_noise_leaves():
     assert "| one | 1.00 [1.00] 2, 1 without | 4 |" in text
     assert "| two | - | - |" in text
     assert "| *at most* | 0.80 [0.80] | |" in text
+
+
+def test_resolutions_are_compared_at_the_same_times():
+    def record(name, horizon, estimator, derivatives):
+        cell = {"scene": name, "control": "c", "loss": "l", "horizon": horizon, "seed": 1, "estimator": estimator}
+        return {**cell, "derivatives": derivatives}
+
+    records = [
+        record(name, horizon, *what)
+        for name, horizons in (("plane-144", (100, 200)), ("plane-576", (200, 400)))
+        for horizon in horizons
+        for what in (("truth", [1.0, 0.0]), ("exact", [0.5, 0.0] if horizon < 400 else [0.8, 0.6]))
+    ]
+    head, _, coarse, fine = resolution(records).splitlines()[2:]
+    assert head == "| spacing [mm] | 0.1 s | 0.2 s | useful up to |"
+    assert coarse == "| 25 | 1.00 [0.5] | 1.00 [0.5] | more than 0.2 s |"
+    assert fine == "| 12.5 | 1.00 [0.5] | 0.80 [1] | 0.15 s |"

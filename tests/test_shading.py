@@ -1,14 +1,17 @@
 """Shaded pictures: what they show, that they show it whatever the order of particles, and that they change nothing."""
 
 import json
+import os
 
 import numpy as np
 import pytest
+import warp as wp
 
 import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.cli import main
-from cortado.errors import InputError, SceneError
+from cortado.device.launching import launch
+from cortado.errors import ComputationError, InputError, SceneError
 from cortado.io.run_folder import RunFolder
 from cortado.io.srgb import to_srgb
 from cortado.lattice.shapes import corners
@@ -17,10 +20,13 @@ from cortado.scene.picture import Picture
 from cortado.shading import film as shading_film
 from cortado.shading.film import film, lacking
 from cortado.shading.labels import labelled, side_by_side
+from cortado.shading.page import Page
 from cortado.shading.painter import colours_of, painter
+from cortado.shading.scenery import sceneries, scenery
 from cortado.shading.shadow import floor_shadow
 from cortado.shading.stage import Stage, screen_axes, upright
 from cortado.shading.surface import spheres
+from cortado.shading.trace import find_contrast
 
 SMALL = {"width": 96, "height": 64}
 FILLED = np.array([[0.05, 0.05, 0.05], [0.25, 0.25, 0.25]])
@@ -197,10 +203,87 @@ def test_spheres_have_their_size_and_look_outwards():
     assert (outwards > 0.0).all() and len(surface.triangles) == 128
 
 
+def test_contrast_is_found_between_neighbours_alone():
+    image = np.random.default_rng(3).random((5, 7, 3)).astype(np.float32)
+    image[:2, :4] = 0.5
+    across, down = (np.abs(np.diff(image, axis=axis)).max(axis=2) > 0.8 for axis in (1, 0))
+    wanted = np.zeros((5, 7), dtype=bool)
+    wanted[:, 1:] |= across
+    wanted[:, :-1] |= across
+    wanted[1:] |= down
+    wanted[:-1] |= down
+    found = wp.zeros(35, dtype=wp.bool, device="cpu")
+    pixels = wp.array(image.reshape(-1, 3), dtype=wp.vec3, device="cpu")
+    launch(find_contrast, 35, "cpu", first=0, columns=7, image=pixels, contrast=0.8, found=found)
+    np.testing.assert_array_equal(found.numpy().reshape(5, 7), wanted)
+    assert 0 < wanted.sum() < 35
+
+
+class _Shades:
+    """A painter of states that are pictures."""
+
+    at_once = 1
+
+    def image(self, picture, _):
+        return picture
+
+    def images(self, states):
+        return (picture for picture, _ in states)
+
+
+def page_of(picture):
+    """A page that shows what a function returns for the number of a frame."""
+    return Page(_Shades(), [lambda k: (picture(k), None)])
+
+
+def test_a_page_shows_its_states_side_by_side():
+    page = Page(_Shades(), [lambda k: (k, None), lambda k: (10 * k, None)], tuple)
+    assert page.image(3) == (3, 30)
+    assert list(page.images([1, 2])) == [(1, 10), (2, 20)]
+
+
+def test_processes_draw_what_one_draws():
+    positions, colours = first_state(scene_of(fluids=2))
+    states = [(positions + (0.0, 0.02 * k, 0.0), colours) for k in range(5)]
+    stage = Stage.of(scene_of(fluids=2), positions)
+    for one, other in zip(sceneries(stage, states, 1), sceneries(stage, states, 2), strict=True):
+        assert len(one.surface.triangles) == len(other.surface.triangles)  # whose order differs from call to call
+        found, wanted = (np.sort(each.surface.points, axis=0) for each in (one, other))
+        np.testing.assert_allclose(found, wanted, atol=1e-6)
+        np.testing.assert_array_equal(one.shadow[0], other.shadow[0])
+
+
+def _killed(*_):
+    os.abort()
+
+
+def test_a_process_that_is_killed_is_a_sentence(monkeypatch):
+    positions, colours = first_state(scene_of())
+    stage = Stage.of(scene_of(), positions)
+    monkeypatch.setattr("cortado.shading.scenery.scenery", _killed)
+    with pytest.raises(ComputationError, match="CORTADO_CORES"):
+        list(sceneries(stage, [(positions, colours)], 2))
+
+
+def test_a_lattice_in_a_round_cup_reaches_its_glass():
+    cup = {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.5}
+    for radius in (0.5, 0.437, 0.4):
+        scene = scene_of(
+            fluid=[{**cup, "radius": radius, "height": 0.4, "phase": "one"}],
+            container={**cup, "radius": radius, "height": 0.8},
+        )
+        positions, colours = first_state(scene)
+        off = scenery(Stage.of(scene, positions), positions, colours).surface.points
+        level = off[np.abs(off[:, 1] + 0.2) < 0.1]  # halfway up the fluid
+        turn = np.arctan2(level[:, 2], level[:, 0])
+        reached = [np.hypot(*level[np.abs(turn - at) < 0.1][:, ::2].T).max() for at in np.linspace(-3.0, 3.0, 31)]
+        assert min(reached) > radius
+
+
 def test_a_film_has_its_size_and_its_frames(tmp_path):
     av = pytest.importorskip("av")
     shades = [np.full((34, 64, 3), k / 10.0) for k in range(11)]
-    path = film(tmp_path / "film.mp4", shades.__getitem__, range(11), 6)
+    path = film(tmp_path / "film.mp4", page_of(shades.__getitem__), range(11), 6)
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         frames = [frame.to_ndarray(format="rgb24").mean() for frame in container.decode(stream)]
@@ -211,7 +294,7 @@ def test_a_film_has_its_size_and_its_frames(tmp_path):
 def test_a_film_takes_no_longer_than_it_may(tmp_path, monkeypatch):
     av = pytest.importorskip("av")
     monkeypatch.setattr(shading_film, "SECONDS", 0.0)
-    path = film(tmp_path / "film.mp4", lambda k: np.zeros((32, 32, 3)), range(100), 90)
+    path = film(tmp_path / "film.mp4", page_of(lambda k: np.zeros((32, 32, 3))), range(100), 90)
     with av.open(str(path)) as container:
         assert sum(1 for _ in container.decode(video=0)) == shading_film.LEAST_FRAMES
 

@@ -8,7 +8,7 @@ from cortado.io.run_folder import RunFolder
 from cortado.io.trajectory import Trajectory
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
-from cortado.shading.film import film, lacking, state_images
+from cortado.shading.film import film, lacking, run_page
 
 
 def draw_run(run: Path, frame: int, as_film: bool, out: Path | None, overrides: list[str], device: str) -> str:
@@ -23,13 +23,13 @@ def draw_run(run: Path, frame: int, as_film: bool, out: Path | None, overrides: 
     missing = lacking(scene)
     if missing:
         raise InputError(missing)
-    image = state_images(scene, trajectory, device)
+    page = run_page(scene, trajectory, device)
     if as_film:
         path = out or folder.figures / "film.mp4"
-        film(path, image, range(len(trajectory)), (scene.picture or Picture()).film_frames or len(trajectory))
+        film(path, page, range(len(trajectory)), (scene.picture or Picture()).film_frames or len(trajectory))
         return f"The film is in {path}."
     if frame not in range(-len(trajectory), len(trajectory)):
         raise InputError(f"--frame is {frame}, but the run has {len(trajectory)} frames, from 0.")
     path = out or folder.figures / "picture.png"
-    write_picture(path, image(frame))
+    write_picture(path, page.image(frame))
     return f"The picture is in {path}."

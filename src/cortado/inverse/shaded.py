@@ -17,7 +17,9 @@ from cortado.optimisation.optimise import Result
 from cortado.scene.picture import Picture
 from cortado.shading.film import film
 from cortado.shading.labels import labelled, side_by_side
-from cortado.shading.painter import Painter, colours_of, painter
+from cortado.shading.page import Page
+from cortado.shading.painter import colours_of, painter
+from cortado.shading.scenery import State
 
 EVALUATIONS = (1, 5, 20, 100)
 """Whose runs are shown, as far as the search went; 0 is the first guess."""
@@ -40,15 +42,15 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> Chapters:
     runs = {"first guess": before, "found": after}
     if made.task.problem.picture is None:  # else there is a picture to aim at, and no run
         runs["target"] = run(made.task.true_parameters)
-    page = partial(_pages, made, device=device)
+    page = partial(_page, made, device=device)
     three = page(list(runs), list(runs.values()))
     path = folder / "found.png"
-    write_picture(path, three(steps[-1]))
+    write_picture(path, three.image(steps[-1]))
     compared: Figures = [(f"The end of the run: {', '.join(runs)}.", path)]
     shown = [k for k in EVALUATIONS if k < len(result.history)] or [0]
     searched = page([f"evaluation {k}" for k in shown], [found(result.history[k].parameters) for k in shown])
     path = folder / "search.png"
-    write_picture(path, searched(steps[-1]))
+    write_picture(path, searched.image(steps[-1]))
     search: Figures = [("The end of the run as the search went on.", path)]
     if not picture.film_frames or len(steps) < 2:
         return Chapters(compared=compared, search=search)
@@ -59,8 +61,8 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> Chapters:
     return Chapters(found=[(f"The run: {' and '.join(pair)}.", motion)], compared=compared, search=search)
 
 
-def _pages(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -> Any:
-    """A function from a number of steps to a picture of the runs then, side by side, each with its name."""
+def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -> Page:
+    """The runs after a number of steps, side by side, each with its name."""
     scene, across = made.task.scene, len(runs) if len(runs) < 4 else 2
     picture, half = scene.picture or Picture(), len(runs) > 1
     size = {"width": picture.width // (1 + half), "height": picture.height // (1 + (len(runs) > across))}
@@ -68,14 +70,12 @@ def _pages(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) 
     places = np.stack([run[step].positions for run in runs for step in run])
     artist = painter(scene.model_copy(update={"picture": panel}), places, device)
 
-    def page(step: int) -> Points:
-        return side_by_side(
-            [labelled(_image(made, artist, run[step]), name) for run, name in zip(runs, names, strict=True)], across
-        )
+    def composed(images: list[Points]) -> Points:
+        return side_by_side([labelled(*one) for one in zip(images, names, strict=True)], across)
 
-    return page
+    return Page(artist, [partial(_state, made, run) for run in runs], composed)
 
 
-def _image(made: Setup, artist: Painter, state: Snapshot) -> Points:
-    colours = colours_of(made.task.scene, state.mass_fractions, len(state.positions), state.colours)
-    return artist.image(state.positions, colours)
+def _state(made: Setup, run: Run, step: int) -> State:
+    state = run[step]
+    return state.positions, colours_of(made.task.scene, state.mass_fractions, len(state.positions), state.colours)

@@ -17,19 +17,21 @@ def labelled(image: Points, text: str) -> Points:
     """A picture (rows, columns, 3), linear, with a word at its top, on the left."""
     from PIL import Image, ImageDraw
 
-    rows, columns = image.shape[:2]
-    size = max(round(0.042 * rows), 11)
-    mask = Image.new("L", (columns, rows))
+    size = max(round(0.042 * image.shape[0]), 11)
+    labelled = np.array(image)
+    strip = labelled[: 3 * size]
+    mask = Image.new("L", strip.shape[1::-1])
     ImageDraw.Draw(mask).text((round(0.9 * size), round(0.7 * size)), text, fill=255, font=_font(size))
     cover = (np.asarray(mask) / 255.0)[..., None]
-    return image * (1.0 - cover) + INK * cover
+    strip[:] = strip * (1.0 - cover) + INK * cover
+    return labelled
 
 
 def side_by_side(images: Sequence[Points], across: int) -> Points:
     """Pictures of one size in rows of so many, a thin light line between them; the end of the last row may be empty."""
     rows, columns = images[0].shape[:2]
     down = -(-len(images) // across)
-    page = np.ones((down * rows, across * columns, 3))
+    page = np.ones((down * rows, across * columns, 3), images[0].dtype)
     for k, image in enumerate(images):
         row, column = divmod(k, across)
         page[row * rows : (row + 1) * rows, column * columns : (column + 1) * columns] = image

@@ -1,5 +1,6 @@
 """Who draws a scene: a ray tracer in 3-D, a painter of the plane in 2-D."""
 
+from collections.abc import Iterable, Iterator
 from typing import Any, Protocol
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from cortado.lattice.shapes import Points
 from cortado.scene.scene import Scene
 from cortado.shading.plane import PlanePainter
+from cortado.shading.scenery import State
 from cortado.shading.space import SpacePainter
 from cortado.shading.stage import Stage, extent_of
 
@@ -17,17 +19,24 @@ ENOUGH = 1_000_000
 class Painter(Protocol):
     """Draws states of one scene."""
 
+    @property
+    def at_once(self) -> int:
+        """How many states `images` works on at a time."""
+
     def image(self, positions: Points, colours: Points) -> Points:
         """A picture (rows, columns, 3), linear from 0 to 1: particles at positions (n, d) [m] with colours (n, 3)."""
+
+    def images(self, states: Iterable[State]) -> Iterator[Points]:
+        """The `image` of each state in their order."""
 
 
 def painter(scene: Scene, positions: Points, device: Any = "cpu") -> Painter:
     """The painter of a scene, whose fluid will be at positions (frames, n, d) [m]; ``device``: that of the rays."""
-    particles = np.asarray(positions).reshape(-1, scene.dimension)
+    count, particles = np.shape(positions)[-2], np.asarray(positions).reshape(-1, scene.dimension)
     particles = particles[:: max(len(particles) // ENOUGH, 1)]
     if scene.dimension == 2:
         return PlanePainter.of(scene, *extent_of(particles))
-    return SpacePainter(Stage.of(scene, particles), device)
+    return SpacePainter(Stage.of(scene, particles), count, device)
 
 
 def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:

@@ -1,7 +1,10 @@
 """Pictures of fluid in 2-D: a body with a smooth edge and a little gloss, in its container, on paper."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import starmap
+from typing import ClassVar
 
 import numpy as np
 
@@ -10,6 +13,7 @@ from cortado.lattice.shapes import Points
 from cortado.scene.containers import BoxContainer
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
+from cortado.shading.scenery import State
 
 FILLED = 0.80
 """The part of the picture's width or height that the container takes."""
@@ -27,7 +31,7 @@ LIGHT = (-0.45, 0.70, 0.55)
 
 @dataclass(frozen=True)
 class PlanePainter:
-    """Draws states of one scene: `image`."""
+    """Draws states of one scene: `image` and `images`."""
 
     picture: Picture
     container: BoxContainer | None
@@ -37,6 +41,7 @@ class PlanePainter:
     """(2,) [m]"""
     spacing: float
     """[m]"""
+    at_once: ClassVar[int] = 1
 
     @classmethod
     def of(cls, scene: Scene, lower: Points, upper: Points) -> "PlanePainter":
@@ -66,6 +71,10 @@ class PlanePainter:
             opacity, glass = self._glass
             image = image * (1.0 - opacity) + glass
         return np.clip(image, 0.0, 1.0)
+
+    def images(self, states: Iterable[State]) -> Iterator[Points]:
+        """The `image` of each state in their order."""
+        return starmap(self.image, states)
 
     @cached_property
     def _pixels(self) -> tuple[Points, Points]:

@@ -1,6 +1,6 @@
 """Pictures of fluid in 3-D, by a ray tracer on the device of the run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import wait
 from functools import partial
 from typing import Any
@@ -13,11 +13,11 @@ from cortado.device.launching import launch
 from cortado.device.threads import MOST_CORES, WARP, helpers
 from cortado.lattice.shapes import Points
 from cortado.shading.meeting import FluidSurface
-from cortado.shading.shadow import floor_shadow
+from cortado.shading.scenery import Scenery, State, processes_for, sceneries, scenery
 from cortado.shading.stage import Stage, screen_axes
-from cortado.shading.surface import Surface, liquid, spheres
+from cortado.shading.surface import Surface
 from cortado.shading.surroundings import GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Surroundings
-from cortado.shading.trace import Eye, illuminate, trace
+from cortado.shading.trace import Eye, find_contrast, illuminate, trace
 
 ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 """Where in a pixel four more rays go, in pixels from its middle."""
@@ -30,10 +30,10 @@ LIGHT_RAYS = {"liquid": (20, 4), "spheres": (10, 1)}
 
 
 class SpacePainter:
-    """Draws states of one scene: `image`."""
+    """Draws states of one scene of so many particles: `image` and `images`."""
 
-    def __init__(self, stage: Stage, device: Any = "cpu"):
-        self.stage, self.device = stage, wp.get_device(device)
+    def __init__(self, stage: Stage, particles: int, device: Any = "cpu"):
+        self.stage, self.device, self.at_once = stage, wp.get_device(device), processes_for(particles)
         self._compiled: set[Any] = set()
         self._surroundings, self._eye = _surroundings(stage), _eye(stage)
         around, lamp = LIGHT_RAYS[stage.picture.surface]
@@ -44,22 +44,21 @@ class SpacePainter:
 
     def image(self, positions: Points, colours: Points) -> Points:
         """A picture (rows, columns, 3), linear from 0 to 1: particles at positions (n, 3) [m] with colours (n, 3)."""
-        stage, picture = self.stage, self.stage.picture
-        placed = stage.placed(np.asarray(positions, dtype=np.float64))
-        colours = np.asarray(colours, dtype=np.float64)
-        if picture.surface == "liquid":
-            wet, of = stage.wetting(placed)
-            surface = liquid(wet, colours[of], stage.spacing)
-        else:
-            surface = spheres(placed, colours, stage.spacing)
-        light, corner, cell = floor_shadow(stage, placed, colours)
+        return self._traced(scenery(self.stage, positions, colours))
+
+    def images(self, states: Iterable[State]) -> Iterator[Points]:
+        """The `image` of each state in their order; surfaces of large fluids are computed in several processes."""
+        return map(self._traced, sceneries(self.stage, states, self.at_once))
+
+    def _traced(self, fluid: Scenery) -> Points:
         s = self._surroundings
+        light, corner, cell = fluid.shadow
         s.shadow_corner, s.shadow_cell = wp.vec3(*corner), cell
         shadow = wp.array(light, dtype=wp.vec3, device=self.device)
         with WARP:
-            return self._traced(surface, s, shadow)
+            return self._rays(fluid.surface, s, shadow)
 
-    def _traced(self, surface: Surface, s: Any, shadow: wp.array) -> Points:
+    def _rays(self, surface: Surface, s: Any, shadow: wp.array) -> Points:
         picture, device = self.stage.picture, self.device
         points = wp.array(surface.points, dtype=wp.vec3, device=device)
         corners = wp.array(surface.triangles.ravel(), dtype=wp.int32, device=device)
@@ -75,19 +74,21 @@ class SpacePainter:
         reach = 0.2 * self.stage.size
         self._launch(illuminate, len(points), **given, **lit, reach=reach, clearness=self.stage.clearness)
 
-        def rays(pixels: np.ndarray, offset: tuple[float, float]) -> Points:
+        def rays(pixels: np.ndarray, offset: tuple[float, float]) -> wp.array:
             found = wp.zeros(len(pixels), dtype=wp.vec3, device=device)
             asked = wp.array(pixels, dtype=wp.int32, device=device)
             where = wp.vec2(*offset)
             self._launch(
                 trace, len(pixels), **given, eye=self._eye, shadow=shadow, pixels=asked, offset=where, image=found
             )
-            return found.numpy()
+            return found
 
-        image = rays(np.arange(picture.width * picture.height), (0.0, 0.0))
-        rough = np.flatnonzero(_rough(image.reshape(picture.height, picture.width, 3)))
+        count = picture.width * picture.height
+        once, mask = rays(np.arange(count), (0.0, 0.0)), wp.zeros(count, dtype=bool, device=device)
+        self._launch(find_contrast, count, columns=picture.width, image=once, contrast=CONTRAST, found=mask)
+        image, rough = once.numpy(), np.flatnonzero(mask.numpy())
         if len(rough):
-            image[rough] = np.mean([rays(rough, offset) for offset in ROTATED_GRID], axis=0)
+            image[rough] = np.mean([rays(rough, offset).numpy() for offset in ROTATED_GRID], axis=0)
         return image.reshape(picture.height, picture.width, 3)
 
     @property
@@ -127,18 +128,6 @@ def _shared(work: Callable[[Any], Any], items: Any, cores: int) -> None:
         wait(begun)
     for helper in begun:
         helper.result()
-
-
-def _rough(image: Points) -> Points:
-    """(rows, columns) whether a pixel differs much from one beside it."""
-    found = np.zeros(image.shape[:2], dtype=bool)
-    across = np.abs(np.diff(image, axis=1)).max(axis=2) > CONTRAST
-    down = np.abs(np.diff(image, axis=0)).max(axis=2) > CONTRAST
-    found[:, 1:] |= across
-    found[:, :-1] |= across
-    found[1:] |= down
-    found[:-1] |= down
-    return found
 
 
 def _directions(count: int) -> Points:

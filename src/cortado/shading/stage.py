@@ -1,8 +1,6 @@
 """Where a picture is taken: which way is up, the floor, the container of glass, the lamps, and a camera."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,8 +17,9 @@ AIR = 0.1
 """Beside fluid that no container holds, in its widths."""
 FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
 """Elevation of the camera [degrees]: where the fluid is drawn on, as in latte art, and elsewhere."""
-TOUCHING = 0.8
-"""In spacings: fluid that is nearer to a wall touches it."""
+TOUCHING, TOUCHING_ROUND = 0.8, 1.5
+"""In spacings: fluid that is nearer to a flat and to a round wall touches it. A cubic lattice in a round cup ends up to
+one and a half spacings from its wall."""
 AZIMUTH = 24.0
 """Of the camera, to the right of the direction towards the viewer [degrees]."""
 
@@ -101,40 +100,31 @@ class Stage:
         return (positions - self.origin) @ self.frame.T
 
     def wetting(self, points: Points) -> tuple[Points, np.ndarray]:
-        """Points (n, 3) [m] in the frame of the picture and their mirror images behind walls that they touch, and which
-        point each shows, (m,): a surface around them all goes on beyond the walls, at which it is cut."""
+        """Points (n, 3) [m] in the frame of the picture and others behind walls that they touch, and which point each
+        shows, (m,): a surface around them all goes on beyond the walls, at which it is cut."""
         of = np.arange(len(points))
         if not self.cuts:
             return points, of
-        own, reach = points @ self.glass_frame.T, TOUCHING * self.spacing
-        for image in self._images:
-            behind, distance = image(own)
-            near = np.abs(distance) < reach
-            own, of = np.concatenate([own, behind[near]]), np.concatenate([of, of[near]])
+        own, box = points @ self.glass_frame.T, isinstance(self.container, BoxContainer)
+        if not box:
+            more, shown = self._behind_round_wall(own)
+            own, of = np.concatenate([own, more]), np.concatenate([of, shown])
+        for axis, place in ((k, end[k]) for k in range(3) for end in self.room if box or k == 1):
+            if np.isfinite(place):
+                near = np.abs(own[:, axis] - place) < TOUCHING * self.spacing
+                behind = own[near]
+                behind[:, axis] = 2.0 * place - behind[:, axis]
+                own, of = np.concatenate([own, behind]), np.concatenate([of, of[near]])
         return own @ self.glass_frame, of
 
-    @property
-    def _images(self) -> list[Callable[[Points], tuple[Points, Points]]]:
-        """For each wall, a function from points (n, 3) to their mirror images (n, 3) and their distances (n,) [m]."""
+    def _behind_round_wall(self, own: Points) -> tuple[Points, np.ndarray]:
+        """Points one and two spacings further out than those (n, 3) that touch the wall, and which they show."""
         lower, upper = self.glass_ends
-        middle, radius = 0.5 * (lower + upper), 0.5 * float((upper - lower)[0])
-
-        def flat(own: Points, axis: int, place: float) -> tuple[Points, Points]:
-            behind = own.copy()
-            behind[:, axis] = 2.0 * place - own[:, axis]
-            return behind, own[:, axis] - place
-
-        def around(own: Points) -> tuple[Points, Points]:
-            off = (own - middle) * (1.0, 0.0, 1.0)
-            away = np.maximum(np.linalg.norm(off, axis=1), 1e-30)
-            return own + off * (2.0 * (radius - away) / away)[:, None], radius - away
-
-        ends = self.room
-        box = isinstance(self.container, BoxContainer)
-        walls = [(k, end[k]) for k in range(3) for end in ends if (box or k == 1) and np.isfinite(end[k])]
-        sides: list[Callable[[Points], tuple[Points, Points]]]
-        sides = [partial(flat, axis=axis, place=place) for axis, place in walls]
-        return sides if box else [*sides, around]
+        off = (own - 0.5 * (lower + upper)) * (1.0, 0.0, 1.0)
+        away = np.linalg.norm(off, axis=1)
+        near = np.flatnonzero(np.abs(0.5 * (upper - lower)[0] - away) < TOUCHING_ROUND * self.spacing)
+        step = self.spacing * off[near] / np.maximum(away[near], 1e-30)[:, None]
+        return np.concatenate([own[near] + step, own[near] + 2.0 * step]), np.tile(near, 2)
 
     @property
     def glass_frame(self) -> Points:

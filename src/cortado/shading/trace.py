@@ -170,6 +170,29 @@ def trace(
 
 
 @wp.kernel(module=wp.get_module("cortado_shading"), enable_backward=False)
+def find_contrast(
+    first: wp.int32,
+    columns: wp.int32,
+    image: wp.array(dtype=wp.vec3),
+    contrast: wp.float32,
+    found: wp.array(dtype=wp.bool),
+):
+    """Whether a pixel differs by more than ``contrast``, in one of its colours, from one beside, above or below it."""
+    i = first + wp.tid()
+    column = i % columns
+    greatest = wp.float32(0.0)
+    if column > 0:
+        greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i - 1])))
+    if column < columns - 1:
+        greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i + 1])))
+    if i >= columns:
+        greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i - columns])))
+    if i < image.shape[0] - columns:
+        greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i + columns])))
+    found[i] = greatest > contrast
+
+
+@wp.kernel(module=wp.get_module("cortado_shading"), enable_backward=False)
 def illuminate(
     first: wp.int32,
     s: Surroundings,
