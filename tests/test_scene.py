@@ -5,7 +5,7 @@ import pickle
 import tomllib
 import warnings
 from datetime import date
-from math import sqrt
+from math import cos, sin, sqrt
 
 import numpy as np
 import pytest
@@ -332,6 +332,9 @@ def test_the_depth_is_that_of_the_fluid():
     assert depth([slab(0, 1)], forces=gravity) == pytest.approx(1.0)
     assert depth([slab(1, 2), slab(0, 1)], forces=gravity) == pytest.approx(2.0)
     assert depth([slab(0, 1), slab(3, 3.5)], forces=gravity) == pytest.approx(1.5)
+    assert depth([slab(0, 1)], forces={"gravity": [9.81 * sin(0.3), -9.81 * cos(0.3)]}) == pytest.approx(
+        cos(0.3) + 0.5 * sin(0.3)
+    )
     assert depth([slab(0, 1)], forces={"gravity": [0, 0]}) == 0.0
     assert depth([slab(0, 1)], forces=gravity | {"pressure": False}) == 0.0
 

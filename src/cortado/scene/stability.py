@@ -59,8 +59,9 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     and the lightest phase in use, as they may meet. It is about 0.023 h^2 rho / mu of the pairwise form with the cubic
     spline, and 0.043 of the laminar one.
 
-    Depth: C s^(3/2) / (H sqrt(|g|)) of fluid that is H deep along gravity at the start, see `DEPTH_FACTORS`, with the
-    spacing s; it grows in proportion to the support.
+    Depth: C s^(3/2) / (H sqrt(|g|)) of fluid that is H deep, see `DEPTH_FACTORS`, with the spacing s; it grows in
+    proportion to the support. In a container that leans, H is the depth in the lowest corner once the surface is level:
+    the height of the fluid and half its width, each along gravity.
 
     Optional forces have limits of their own, in the registry of parameters.
 
@@ -126,8 +127,10 @@ def _depth_limit(scene: SceneTables, gravity: Points) -> float:
     cut = scene.discretisation
     extents = np.array([fluid.extent(cut.spacing) for fluid in scene.fluid])
     covered = np.array([_covered(extents[:, :, axis], cut.spacing) for axis in range(scene.dimension)])
-    weights = np.abs(gravity[gravity.any(axis=1)])
-    depths = weights @ covered / np.sqrt(np.linalg.norm(weights, axis=1))  # times sqrt(|g|)
+    pulls = np.abs(gravity[gravity.any(axis=1)])
+    along = pulls * covered
+    upright = np.take_along_axis(along, pulls.argmax(axis=1)[:, None], axis=1)[:, 0]
+    depths = 0.5 * (upright + along.sum(axis=1)) / np.sqrt(np.linalg.norm(pulls, axis=1))  # times sqrt(|g|)
     return float(DEPTH_FACTORS[cut.kernel] * 0.5 * cut.support * cut.spacing**1.5 / depths.max())
 
 
