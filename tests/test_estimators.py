@@ -618,6 +618,83 @@ def test_standard_errors_of_guided_differences_tell_how_they_scatter():
     np.testing.assert_allclose(believed, scatter, rtol=0.4)
 
 
+def noisy_quadratic(first):
+    """A quadratic whose slope along one number of gravity differs from one set of first positions to the next."""
+
+    def function(p):
+        x = p.get("initial_positions", first)
+        return quadratic(p) + 1e4 * p["gravity"][0, 0] * (x[3, 0] - first[3, 0])
+
+    return function
+
+
+class NoisySlopes:
+    """In place of an estimator: the gradient of a quadratic with noise that differs from one sample to the next."""
+
+    def __init__(self, seed):
+        self.random = np.random.default_rng(seed)
+
+    def estimate(self, problem, parameters, observe=None):
+        found = slopes_of_quadratic().estimate(problem, parameters)
+        noise = self.random.standard_normal((2, 2))
+        return gradients.Estimate(7.0, {**found.gradient, "gravity": found.gradient["gravity"] + noise})
+
+
+@pytest.mark.parametrize("samples", [2, 8])
+def test_an_interval_covers_the_smoothed_gradient_as_often_as_it_says(samples):
+    stub = Stub(noisy_quadratic(simulation_of("2-D").positions), simulation_of("2-D"))
+    inside = {0.5: [], 0.95: []}
+    for seed in range(200):
+        found = gradients.RandomizedSmoothing(0.5, samples, seed=seed).estimate(stub, POINT)
+        assert found.degrees_of_freedom == samples - 1
+        for level, covered in inside.items():
+            least, greatest = (bars["gravity"][0, 0] for bars in found.interval(level))
+            covered.append(least <= 6.0 <= greatest)
+    assert 0.9 <= np.mean(inside[0.95]) <= 0.98
+    assert 0.4 <= np.mean(inside[0.5]) <= 0.6
+
+
+@pytest.mark.parametrize("samples", [4, 8])
+def test_an_interval_of_a_mean_covers_it_as_often_as_it_says(samples):
+    stub, inside = Stub(quadratic, simulation_of("2-D")), []
+    for seed in range(200):
+        mean = gradients.EnsembleMean(0.5, samples, seed=seed, estimator=NoisySlopes(seed))
+        found = mean.estimate(stub, POINT)
+        assert found.degrees_of_freedom == samples // 2 - 1
+        least, greatest = (bars["gravity"] for bars in found.interval())
+        right = np.array([[6.0, -0.5], [2.0, 1.4]])
+        inside += list(((least <= right) & (right <= greatest)).ravel())
+    assert 0.9 <= np.mean(inside) <= 0.98
+
+
+@pytest.mark.parametrize("differences", [2, 6])
+def test_an_interval_of_guided_differences_covers_as_often_as_it_says(differences):
+    stub = Stub(noisy_quadratic(simulation_of("2-D").positions), simulation_of("2-D"))
+    inside = []
+    for seed in range(200):
+        guided = gradients.Guided(
+            0.5,
+            differences=differences,
+            seed=seed,
+            surrogate=Slopes(lambda g, mu: [[1.0, 0.0], [0.0, 1.0]], lambda g, mu: 1.0),
+        )
+        found = guided.estimate(stub, POINT)
+        assert found.degrees_of_freedom == differences - 1
+        least, greatest = (bars["gravity"][0, 0] for bars in found.interval())
+        inside.append(least <= 6.0 <= greatest)
+    assert 0.9 <= np.mean(inside) <= 0.98
+
+
+def test_an_interval_needs_a_standard_error_and_a_level():
+    with pytest.raises(InputError, match="no standard error"):
+        gradients.Estimate(1.0, {"gravity": np.zeros(2)}).interval()
+    known = gradients.Estimate(1.0, {"gravity": np.zeros(2)}, {"gravity": np.ones(2)}, 1)
+    for level in (0.0, 1.0):
+        with pytest.raises(InputError, match="level"):
+            known.interval(level)
+    np.testing.assert_allclose(known.interval(0.95)[1]["gravity"], 12.706, rtol=1e-4)
+
+
 def test_before_chaos_guided_differences_and_the_exact_gradient_agree():
     simulation = Simulation(splash())
     problem = Problem(simulation, 60, losses.CentreOfMass([0.1, 0.1, 0.1]))
