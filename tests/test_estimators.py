@@ -508,6 +508,39 @@ def test_standard_errors_tell_how_gradients_scatter():
     assert runs[0].gradient["gravity"].tobytes() == again.gradient["gravity"].tobytes()
 
 
+def test_intervals_contain_the_mean_as_often_as_they_say():
+    """For a mean of so few samples that a normal distribution would promise far too much."""
+    first = simulation_of("2-D").positions
+
+    def noisy(p):
+        x = p.get("initial_positions", first)
+        return quadratic(p) + 1e4 * p["gravity"][0, 0] * (x[3, 0] - first[3, 0])
+
+    stub = Stub(noisy, simulation_of("2-D"))
+    inside = []
+    makers = (
+        lambda seed: gradients.RandomizedSmoothing(0.5, samples=3, seed=seed),
+        lambda seed: gradients.Guided(0.5, differences=3, seed=seed, surrogate=slopes_of_quadratic()),
+    )
+    for make in makers:
+        runs = [make(seed).estimate(stub, POINT) for seed in range(500)]
+        middle = np.mean([run.gradient["gravity"][0, 0] for run in runs])
+        ends = [[end["gravity"][0, 0] for end in run.interval(0.9)] for run in runs]
+        inside.append(np.mean([lower <= middle <= upper for lower, upper in ends]))
+    assert np.abs(np.array(inside) - 0.9).max() < 0.05, inside
+
+
+def test_an_interval_needs_an_average():
+    estimate = gradients.RandomizedSmoothing(0.3, samples=2).estimate(Stub(quadratic, simulation_of("2-D")), POINT)
+    assert estimate.degrees_of_freedom == 1
+    lower, upper = estimate.interval()
+    assert (lower["gravity"] <= estimate.gradient["gravity"]).all() and lower.keys() == upper.keys()
+    with pytest.raises(InputError, match="confidence is 95, but must be between 0 and 1"):
+        estimate.interval(95)
+    with pytest.raises(InputError, match="no average over samples"):
+        replace(estimate, standard_error=None).interval()
+
+
 def test_before_chaos_smoothed_and_exact_agree():
     simulation = Simulation(splash(), precision="float64")
     problem = Problem(simulation, 60, losses.CentreOfMass([0.1, 0.1, 0.1]))

@@ -25,7 +25,31 @@ class Estimate:
     gradient: Arrays
     """For each parameter given, an array of its shape (float64), of a batch with a first axis for the scenes."""
     standard_error: Arrays | None = None
-    """Of every component of the gradient, where it is an average (`RandomizedSmoothing`, `EnsembleMean`)."""
+    """Of every component of the gradient, where it is an average (`RandomizedSmoothing`, `EnsembleMean`, `Guided`)."""
+    degrees_of_freedom: int | None = None
+    """Of the standard error: the number of independent samples less one."""
+
+    def interval(self, confidence: float = 0.95) -> tuple[Arrays, Arrays]:
+        """The lower and the upper end, by parameter, of an interval for each component of the gradient.
+
+        With this probability it contains the mean that the estimator would have over endlessly many samples: by
+        Student's distribution, as the scatter is known from few samples. A bias of the estimator comes on top.
+
+        Raises:
+            InputError: the estimate is no average, or the confidence is not between 0 and 1.
+        """
+        if self.standard_error is None or self.degrees_of_freedom is None:
+            raise InputError(
+                "The estimate has no standard error, as it is no average over samples: it has no interval."
+            )
+        if not 0.0 < as_one_number("confidence", confidence) < 1.0:
+            raise InputError(f"confidence is {confidence}, but must be between 0 and 1.")
+        from scipy.stats import t as student
+
+        reach = float(student.ppf(0.5 + 0.5 * confidence, self.degrees_of_freedom))
+        errors = self.standard_error
+        lower = {name: value - reach * errors[name] for name, value in self.gradient.items()}
+        return lower, {name: value + reach * errors[name] for name, value in self.gradient.items()}
 
     def member(self, number: int, shapes: Mapping[str, tuple[int, ...]]) -> "Estimate":
         """That of one scene of a batch, with gradients of these shapes."""
