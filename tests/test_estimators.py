@@ -508,6 +508,64 @@ def test_standard_errors_tell_how_gradients_scatter():
     assert runs[0].gradient["gravity"].tobytes() == again.gradient["gravity"].tobytes()
 
 
+def test_intervals_contain_the_mean_as_often_as_they_say():
+    """For a mean of so few samples that a normal distribution would promise far too much."""
+    first = simulation_of("2-D").positions
+
+    def noisy(p):
+        x = p.get("initial_positions", first)
+        return quadratic(p) + 1e4 * p["gravity"][0, 0] * (x[3, 0] - first[3, 0])
+
+    stub = Stub(noisy, simulation_of("2-D"))
+    inside = []
+    makers = (
+        lambda seed: gradients.RandomizedSmoothing(0.5, samples=3, seed=seed),
+        lambda seed: gradients.Guided(0.5, differences=3, seed=seed, surrogate=slopes_of_quadratic()),
+    )
+    for make in makers:
+        runs = [make(seed).estimate(stub, POINT) for seed in range(500)]
+        middle = np.mean([run.gradient["gravity"][0, 0] for run in runs])
+        ends = [[end["gravity"][0, 0] for end in run.interval(0.9)] for run in runs]
+        inside.append(np.mean([lower <= middle <= upper for lower, upper in ends]))
+    assert np.abs(np.array(inside) - 0.9).max() < 0.05, inside
+
+
+class NoisySlopes:
+    """In place of an estimator: the gradient of a quadratic, with noise that differs from one sample to the next."""
+
+    def __init__(self, seed):
+        self.random = np.random.default_rng(seed)
+
+    def estimate(self, problem, parameters, observe=None):
+        found = slopes_of_quadratic().estimate(problem, parameters)
+        noise = self.random.standard_normal((2, 2))
+        return gradients.Estimate(7.0, {**found.gradient, "gravity": found.gradient["gravity"] + noise})
+
+
+@pytest.mark.parametrize("samples", [4, 8])
+def test_intervals_of_a_mean_of_gradients_contain_it_as_often_as_they_say(samples):
+    """Samples come in pairs, so that there are half as many independent ones."""
+    stub, right, inside = Stub(quadratic, simulation_of("2-D")), np.array([[6.0, -0.5], [2.0, 1.4]]), []
+    for seed in range(200):
+        mean = gradients.EnsembleMean(0.5, samples, seed=seed, estimator=NoisySlopes(seed))
+        found = mean.estimate(stub, POINT)
+        assert found.degrees_of_freedom == samples // 2 - 1
+        lower, upper = (end["gravity"] for end in found.interval())
+        inside += list(((lower <= right) & (right <= upper)).ravel())
+    assert 0.9 <= np.mean(inside) <= 0.98
+
+
+def test_an_interval_needs_an_average():
+    estimate = gradients.RandomizedSmoothing(0.3, samples=2).estimate(Stub(quadratic, simulation_of("2-D")), POINT)
+    assert estimate.degrees_of_freedom == 1
+    lower, upper = estimate.interval()
+    assert (lower["gravity"] <= estimate.gradient["gravity"]).all() and lower.keys() == upper.keys()
+    with pytest.raises(InputError, match="confidence is 95, but must be between 0 and 1"):
+        estimate.interval(95)
+    with pytest.raises(InputError, match="no average over samples"):
+        replace(estimate, standard_error=None).interval()
+
+
 def test_before_chaos_smoothed_and_exact_agree():
     simulation = Simulation(splash(), precision="float64")
     problem = Problem(simulation, 60, losses.CentreOfMass([0.1, 0.1, 0.1]))
@@ -616,83 +674,6 @@ def test_standard_errors_of_guided_differences_tell_how_they_scatter():
     scatter = np.std([run.gradient["gravity"][0] for run in runs], axis=0, ddof=1)
     believed = np.sqrt(np.mean([run.standard_error["gravity"][0] ** 2 for run in runs], axis=0))
     np.testing.assert_allclose(believed, scatter, rtol=0.4)
-
-
-def noisy_quadratic(first):
-    """A quadratic whose slope along one number of gravity differs from one set of first positions to the next."""
-
-    def function(p):
-        x = p.get("initial_positions", first)
-        return quadratic(p) + 1e4 * p["gravity"][0, 0] * (x[3, 0] - first[3, 0])
-
-    return function
-
-
-class NoisySlopes:
-    """In place of an estimator: the gradient of a quadratic with noise that differs from one sample to the next."""
-
-    def __init__(self, seed):
-        self.random = np.random.default_rng(seed)
-
-    def estimate(self, problem, parameters, observe=None):
-        found = slopes_of_quadratic().estimate(problem, parameters)
-        noise = self.random.standard_normal((2, 2))
-        return gradients.Estimate(7.0, {**found.gradient, "gravity": found.gradient["gravity"] + noise})
-
-
-@pytest.mark.parametrize("samples", [2, 8])
-def test_an_interval_covers_the_smoothed_gradient_as_often_as_it_says(samples):
-    stub = Stub(noisy_quadratic(simulation_of("2-D").positions), simulation_of("2-D"))
-    inside = {0.5: [], 0.95: []}
-    for seed in range(200):
-        found = gradients.RandomizedSmoothing(0.5, samples, seed=seed).estimate(stub, POINT)
-        assert found.degrees_of_freedom == samples - 1
-        for level, covered in inside.items():
-            least, greatest = (bars["gravity"][0, 0] for bars in found.interval(level))
-            covered.append(least <= 6.0 <= greatest)
-    assert 0.9 <= np.mean(inside[0.95]) <= 0.98
-    assert 0.4 <= np.mean(inside[0.5]) <= 0.6
-
-
-@pytest.mark.parametrize("samples", [4, 8])
-def test_an_interval_of_a_mean_covers_it_as_often_as_it_says(samples):
-    stub, inside = Stub(quadratic, simulation_of("2-D")), []
-    for seed in range(200):
-        mean = gradients.EnsembleMean(0.5, samples, seed=seed, estimator=NoisySlopes(seed))
-        found = mean.estimate(stub, POINT)
-        assert found.degrees_of_freedom == samples // 2 - 1
-        least, greatest = (bars["gravity"] for bars in found.interval())
-        right = np.array([[6.0, -0.5], [2.0, 1.4]])
-        inside += list(((least <= right) & (right <= greatest)).ravel())
-    assert 0.9 <= np.mean(inside) <= 0.98
-
-
-@pytest.mark.parametrize("differences", [2, 6])
-def test_an_interval_of_guided_differences_covers_as_often_as_it_says(differences):
-    stub = Stub(noisy_quadratic(simulation_of("2-D").positions), simulation_of("2-D"))
-    inside = []
-    for seed in range(200):
-        guided = gradients.Guided(
-            0.5,
-            differences=differences,
-            seed=seed,
-            surrogate=Slopes(lambda g, mu: [[1.0, 0.0], [0.0, 1.0]], lambda g, mu: 1.0),
-        )
-        found = guided.estimate(stub, POINT)
-        assert found.degrees_of_freedom == differences - 1
-        least, greatest = (bars["gravity"][0, 0] for bars in found.interval())
-        inside.append(least <= 6.0 <= greatest)
-    assert 0.9 <= np.mean(inside) <= 0.98
-
-
-def test_an_interval_needs_a_standard_error_and_a_level():
-    with pytest.raises(InputError, match="no standard error"):
-        gradients.Estimate(1.0, {"gravity": np.zeros(2)}).interval()
-    known = gradients.Estimate(1.0, {"gravity": np.zeros(2)}, {"gravity": np.ones(2)}, 1)
-    for level in (0.0, 1.0):
-        with pytest.raises(InputError, match="level"):
-            known.interval(level)
-    np.testing.assert_allclose(known.interval(0.95)[1]["gravity"], 12.706, rtol=1e-4)
 
 
 def test_before_chaos_guided_differences_and_the_exact_gradient_agree():

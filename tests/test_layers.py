@@ -66,7 +66,8 @@ LAYERS = """
     certificate.growth certificate.alignment certificate.perturbations certificate.twin certificate.loss_history
     certificate.horizon
     certificate.consistency certificate.text certificate.certificate certificate certificate.figure
-    optimisation optimisation.evaluate optimisation.differentiable optimisation.replay_log optimisation.optimisers
+    optimisation optimisation.evaluate optimisation.differentiable optimisation.replay_log optimisation.search
+    optimisation.line_search optimisation.optimisers
     optimisation.named_optimisers optimisation.result_page optimisation.result optimisation.optimise
     optimisation.transforms
     io.run_folder io.report

@@ -11,6 +11,7 @@ from benchmarks.gradients.__main__ import main
 from benchmarks.gradients.cells import Cell
 from benchmarks.gradients.controls import CONTROLS, VelocityModes
 from benchmarks.gradients.counting import Counted, Steps
+from benchmarks.gradients.over_scenes import over_scenes
 from benchmarks.gradients.resolution import resolution
 from benchmarks.gradients.table import ceiling, cosine, table
 from benchmarks.gradients.truth import DIRECTIONS, FEW, SAMPLES, directions, smoothed
@@ -171,6 +172,20 @@ def test_the_table_says_what_noise_leaves():
     assert "| one | 1.00 [1.00] 2, 1 without | 4 |" in text
     assert "| two | - | - |" in text
     assert "| *at most* | 0.80 [0.80] | |" in text
+
+
+def test_scenes_and_seeds_are_put_together():
+    def record(scene, estimator, **found):
+        cell = {"scene": scene, "control": "c", "loss": "l", "horizon": 1200, "seed": 1, "estimator": estimator}
+        return {**cell, **found}
+
+    truth = {"derivatives": [3.0, 4.0], "standard_errors": [3.0, 0.0]}
+    records = [record(scene, "truth", **truth) for scene in ("a", "b", "e")]
+    records += [record("a", "one", derivatives=[6.0, 8.0]), record("b", "one", derivatives=[-4.0, 3.0])]
+    records += [record("e", "one", derivatives=None), record("without a truth", "one", derivatives=[1.0, 0.0])]
+    text = over_scenes(records)
+    assert "| l | 1,200 | one | 0.50 [0.00] | 1.50 | 2 |" in text
+    assert "| l | 1,200 | *at most* | 0.80 [0.80] |  | 3 |" in text
 
 
 def test_resolutions_are_compared_at_the_same_times():

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 import cortado
-from cortado.errors import ComputationError, InputError
+from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.optimisation.named_optimisers import BY_NAME
 from cortado.optimisation.optimise import Record, Result, optimise
-from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent
+from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch
 from cortado.optimisation.replay_log import FILE_NAME
 from rosenbrock_valley import Interrupted, Rosenbrock, rosenbrock
 
-OPTIMISERS = [Adam(learning_rate=0.05), GradientDescent(learning_rate=1e-3, momentum=0.5), LBFGS()]
+OPTIMISERS = [Adam(learning_rate=0.05), GradientDescent(learning_rate=1e-3, momentum=0.5), LBFGS(), LineSearch()]
 
 
 class Quadratic:
@@ -202,21 +202,82 @@ def test_a_component_with_equal_bounds_stays():
         assert {record.parameters["g"][1] for record in result.history} == {0.3}
 
 
+# The line search
+
+
+class Rough:
+    """A bowl with dents of 0.02 everywhere, whose gradient is that of the bowl; some of it cannot be computed."""
+
+    def __init__(self):
+        self.tried = []
+
+    def value(self, parameters):
+        x = np.asarray(parameters["x"])
+        self.tried.append(x)
+        if x[0] > 2.5:
+            raise DivergedError(step=1, particle=0, advice="")
+        return float(x @ x + 0.02 * np.sin(200.0 * x).sum())
+
+    def value_and_gradient(self, parameters, gradient=None):
+        return self.value(parameters), {"x": 2.0 * np.asarray(parameters["x"])}
+
+
+def test_a_line_search_goes_down_a_rough_slope():
+    result = optimise(Rough(), {"x": np.array([2.0, -1.0])}, LineSearch(), 20)
+    assert result.loss < 0.02 and np.abs(result.parameters["x"]).max() < 0.1
+
+
+def test_a_line_search_leaves_runs_that_diverge_aside():
+    """It is led to where runs diverge, and goes as far as it can."""
+
+    class Wrong(Rough):
+        def value_and_gradient(self, parameters, gradient=None):
+            return -parameters["x"][0], {"x": np.array([-1.0, 0.0])}
+
+        def value(self, parameters):
+            super().value(parameters)
+            return -parameters["x"][0]
+
+    problem = Wrong()
+    result = optimise(problem, {"x": np.array([2.0, 0.0])}, LineSearch(scale=2.0), 30)
+    assert max(x[0] for x in problem.tried) > 2.5
+    assert 2.4 < result.parameters["x"][0] <= 2.5
+
+
+def test_a_line_search_takes_shorter_steps_about_a_minimum():
+    problem = Quadratic({"g": np.array([1.0, 2.0])})
+    result = optimise(problem, {"g": np.array([0.0, 0.0])}, LineSearch(), 40)
+    np.testing.assert_allclose(result.last_parameters["g"], [1.0, 2.0], atol=1e-3)
+    still = optimise(problem, {"g": np.array([1.0, 2.0])}, LineSearch(), 3)
+    assert still.loss == 0.0 and still.updates == 3
+
+
+def test_the_scale_of_a_line_search_is_its_longest_step():
+    problem = Rough()
+    optimise(problem, {"x": np.array([0.9, -0.9])}, LineSearch(scale=0.5, trials=3, shortest=0.25), 1)
+    steps = [np.abs(x - [0.9, -0.9]).max() for x in problem.tried[1:4]]
+    np.testing.assert_allclose(steps, [0.125, 0.25, 0.5])
+
+
 # Resuming
 
 
 @pytest.mark.parametrize("optimiser", OPTIMISERS, ids=lambda optimiser: type(optimiser).__name__)
 @pytest.mark.parametrize("evaluations", [0, 1, 13])
 def test_interrupted_run_resumes_bit_for_bit(optimiser, evaluations, tmp_path):
-    whole = rosenbrock(optimiser)
+    valley = Rosenbrock()
+    whole = rosenbrock(optimiser, problem=valley)
     with pytest.raises(Interrupted):
         rosenbrock(optimiser, problem=Rosenbrock(fail_at=evaluations), checkpoint=tmp_path / "run")
     rest, records = Rosenbrock(), []
     resumed = rosenbrock(optimiser, problem=rest, checkpoint=tmp_path / "run", resume=True, on_iteration=records.append)
     assert bits(resumed) == bits(whole)
     assert resumed.message == whole.message
-    assert rest.evaluations == whole.evaluations - evaluations
-    assert [record.replayed for record in records] == [i < evaluations for i in range(whole.evaluations)]
+    assert rest.evaluations == valley.evaluations - evaluations
+    replayed = [record.replayed for record in records]
+    assert replayed == sorted(replayed, reverse=True) and any(replayed) == (evaluations > 0)
+    if not isinstance(optimiser, LineSearch):  # which also replays the losses that it has tried
+        assert replayed == [i < evaluations for i in range(whole.evaluations)]
     assert records == list(resumed.history)
 
 
@@ -463,7 +524,7 @@ def test_wrong_settings_are_refused(make):
         ({"optimiser": Adam}, "^The optimiser must be an object such as"),
         (
             {"optimiser": "adm"},
-            "^The optimiser is 'adm', but must be one of 'adam', 'gradient_descent', 'lbfgs', or an object.$",
+            "^The optimiser is 'adm', but must be one of 'adam', 'gradient_descent', 'lbfgs', 'line_search', or an obj",
         ),
         (
             {"optimiser": "gradient_descent"},

@@ -1,4 +1,4 @@
-"""What searches the controls of a task: gradients of every estimator with Adam, CMA-ES, and a random search."""
+"""What searches the controls of a task: gradients with Adam or a line search, CMA-ES, and a random search."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -16,20 +16,22 @@ class Contender(Protocol):
         """Evaluates at first where searches begin. Raises `InputError` where it cannot do this task."""
 
 
+ADAM = optimisers.Adam(0.1)
+"""For controls that go from -1 to 1."""
+
+
 @dataclass(frozen=True)
 class Descent:
-    """Adam with the gradients of an estimator."""
+    """An optimiser with the gradients of an estimator."""
 
     estimator: gradients.GradientEstimator
-    learning_rate: float = 0.1
-    """Of controls, which go from -1 to 1."""
+    optimiser: optimisers.Optimiser = ADAM
 
     def search(self, objective: Objective, seed: int) -> None:
         start = objective.named(objective.start)
         iterations = 1 + int(objective.budget)
         try:
-            adam = optimisers.Adam(self.learning_rate)
-            optimise(objective, start, adam, iterations, _bounds(start), gradient=self.estimator)
+            optimise(objective, start, self.optimiser, iterations, _bounds(start), gradient=self.estimator)
         except BudgetSpent:
             return
 
@@ -81,6 +83,8 @@ CONTENDERS: dict[str, Contender] = {
     "frozen_geometry": Descent(gradients.FrozenGeometry()),
     "damped": Descent(gradients.Damped(5.0)),
     "adjoint_viscosity": Descent(gradients.AdjointViscosity()),
+    "line_search": Descent(gradients.AdjointViscosity(), optimisers.LineSearch()),
+    "line_search_exact": Descent(gradients.Exact(), optimisers.LineSearch()),
     "ensemble_mean": Descent(gradients.EnsembleMean(0.05)),
     "guided": Descent(gradients.Guided(0.05)),
     "randomized_smoothing": Descent(gradients.RandomizedSmoothing(0.05, samples=2)),

@@ -94,6 +94,18 @@ class Objective:
         slopes = np.nan_to_num(found.gradient[self._name], nan=0.0, posinf=0.0, neginf=0.0)
         return self._noted(u, found.loss, self.meter.steps), self.named(np.clip(slopes, -GREATEST, GREATEST))
 
+    def value(self, parameters: Arrays) -> float:
+        """As a line search asks."""
+        return float(self.values([parameters[self._name]])[0])
+
+    def room(self, estimator: AdjointEstimator | None = None) -> int:
+        """See `Batchable.room`."""
+        return max(self.problem.room(estimator), 1)
+
+    def together(self, points: Sequence[Arrays], estimator: None = None) -> list[Estimate]:
+        """See `Batchable.together`; losses alone."""
+        return [Estimate(loss, {}) for loss in self.values([point[self._name] for point in points])]
+
     def score(self) -> dict[str, float]:
         """Of the best controls."""
         return self.task.score(self._problem, {**self.task.controls.parameters(self.best), **self._first})

@@ -60,7 +60,7 @@ class RandomizedSmoothing(Ensemble):
         for k, q in enumerate(directions):
             found[k // numbers] += (losses[2 * k] - losses[2 * k + 1]) / (2.0 * r) * q
         gradient, error = (ensemble.named(one / ensemble.spreads) for one in mean_and_error(found))
-        return Estimate(loss, gradient, error, degrees_of_freedom=self.samples - 1)
+        return Estimate(loss, gradient, error, self.samples - 1)
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class EnsembleMean(Ensemble):
         numbers = [joined(one.gradient, ensemble.values) for one in samples]
         means = [np.mean(pair, axis=0) for pair in zip(numbers[::2], numbers[1::2], strict=True)]
         gradient, error = (ensemble.named(one) for one in mean_and_error(np.array(means)))
-        return Estimate(at_them.loss, gradient, error, degrees_of_freedom=len(means) - 1)
+        return Estimate(at_them.loss, gradient, error, len(means) - 1)
 
 
 def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number
 from cortado.device.state import Parameters, State
-from cortado.errors import DivergedError, InputError, shown
+from cortado.errors import DivergedError, InputError
 from cortado.parameters.values import Arrays, Values
 from cortado.rollout import BackwardStep, Observer, Rollout
 from cortado.solvers.solver import Counts
@@ -27,25 +27,29 @@ class Estimate:
     standard_error: Arrays | None = None
     """Of every component of the gradient, where it is an average (`RandomizedSmoothing`, `EnsembleMean`, `Guided`)."""
     degrees_of_freedom: int | None = None
-    """Of the standard error: one less than how many independent samples the average is of."""
+    """Of the standard error: the number of independent samples less one."""
 
-    def interval(self, level: float = 0.95) -> tuple[Arrays, Arrays]:
-        """The least and the greatest gradient of an interval that covers each component's expectation so often.
+    def interval(self, confidence: float = 0.95) -> tuple[Arrays, Arrays]:
+        """The lower and the upper end, by parameter, of an interval for each component of the gradient.
 
-        It is the gradient, less and more the standard error times the quantile of Student's t, as the error is itself
-        estimated from few samples. A bias of the estimator is not in it. Raises `InputError` where the estimate has no
-        standard error with degrees of freedom, and for a level that is not between 0 and 1.
+        With this probability it contains the mean that the estimator would have over endlessly many samples: by
+        Student's distribution, as the scatter is known from few samples. A bias of the estimator comes on top.
+
+        Raises:
+            InputError: the estimate is no average, or the confidence is not between 0 and 1.
         """
-        from scipy.stats import t  # takes longer to import than the rest of this package
-
         if self.standard_error is None or self.degrees_of_freedom is None:
-            raise InputError("the estimate has no standard error, but must have one for an interval: average samples.")
-        if not 0.0 < level < 1.0:
-            raise InputError(f"level is {shown(level)}, but must be greater than 0 and less than 1.")
-        quantile = float(t.ppf(0.5 * (1.0 + level), self.degrees_of_freedom))
+            raise InputError(
+                "The estimate has no standard error, as it is no average over samples: it has no interval."
+            )
+        if not 0.0 < as_one_number("confidence", confidence) < 1.0:
+            raise InputError(f"confidence is {confidence}, but must be between 0 and 1.")
+        from scipy.stats import t as student
+
+        reach = float(student.ppf(0.5 + 0.5 * confidence, self.degrees_of_freedom))
         errors = self.standard_error
-        least = {name: bar - quantile * errors[name] for name, bar in self.gradient.items()}
-        return least, {name: bar + quantile * errors[name] for name, bar in self.gradient.items()}
+        lower = {name: value - reach * errors[name] for name, value in self.gradient.items()}
+        return lower, {name: value + reach * errors[name] for name, value in self.gradient.items()}
 
     def member(self, number: int, shapes: Mapping[str, tuple[int, ...]]) -> "Estimate":
         """That of one scene of a batch, with gradients of these shapes."""

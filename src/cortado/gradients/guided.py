@@ -73,7 +73,7 @@ class Guided(Ensemble):
         slopes = (pairs[..., 0] - pairs[..., 1]) / (2.0 * np.array(reach))
         found = (slopes @ np.reshape(parts, (len(parts), -1))) / ensemble.spreads
         gradient, error = (ensemble.named(one) for one in mean_and_error(found))
-        return Estimate(surrogate.loss, gradient, error, degrees_of_freedom=self.differences - 1)
+        return Estimate(surrogate.loss, gradient, error, self.differences - 1)
 
     def _parts(self, ensemble: Sampler, gradient: Arrays) -> list[np.ndarray]:
         """(numbers,) each, of length 1, in spreads: the gradient on one part of one parameter, 0 elsewhere; parts

@@ -3,7 +3,12 @@
 from cortado.inverse.task import Task
 from cortado.words import counted
 
-_ALGORITHMS = {"adam": "Adam", "gradient_descent": "gradient descent", "lbfgs": "L-BFGS"}
+_ALGORITHMS = {
+    "adam": "Adam",
+    "gradient_descent": "gradient descent",
+    "lbfgs": "L-BFGS",
+    "line_search": "a line search",
+}
 
 
 def task_in_words(task: Task) -> list[str]:

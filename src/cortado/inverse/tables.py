@@ -22,7 +22,7 @@ from cortado.errors import Words
 from cortado.executors import Executor, InProcess
 from cortado.gradients import AdjointEstimator, AdjointViscosity, EnsembleMean, Exact, FrozenGeometry, GradientEstimator
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
-from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, Optimiser
+from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch, Optimiser
 from cortado.parameters.values import NAMES, UNITS
 from cortado.scene.fields import MISSING, OneOf, Several, Text, as_number, count, field_error, quantity
 from cortado.scene.sentences import wanted
@@ -32,8 +32,10 @@ OPTIMISERS: dict[str, Callable[[float], Optimiser]] = {
     "adam": Adam,
     "gradient_descent": GradientDescent,
     "lbfgs": lambda scale: LBFGS(scale=scale),
+    "line_search": LineSearch,
 }
-"""By the names in a file; each is made from the learning rate (for L-BFGS the size of its first step)."""
+"""By the names in a file; each is made from the learning rate (for L-BFGS the size of its first step, for the line
+search the longest one)."""
 DISTANCES: dict[str, ImageLoss] = {"squared_difference": SquaredDifference(), "pyramid": Pyramid()}
 ESTIMATORS: dict[str, AdjointEstimator] = {
     "exact": Exact(),
@@ -242,7 +244,7 @@ class OptimiseTable(Table):
     optimiser: Annotated[str, OneOf(OPTIMISERS)] = "adam"
     """Name of the algorithm; the line search of "lbfgs" needs exact gradients."""
     learning_rate: Annotated[float, quantity("units of the parameters", gt=0.0)]
-    """In units of the parameters; for L-BFGS the size of its first step."""
+    """In units of the parameters; for L-BFGS the size of its first step, for the line search its longest step."""
     tolerance: Annotated[float, quantity(gt=0.0, le=0.5)] | None = None
     """L-BFGS ends where the gradient is this part of the first one; if left out, where round-off stops it."""
     iterations: Annotated[int, count(1, 10_000_000)]

@@ -5,10 +5,10 @@ from dataclasses import MISSING, fields
 from typing import Any
 
 from cortado.errors import InputError, shown
-from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, Optimiser
+from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch, Optimiser
 from cortado.words import quoted
 
-BY_NAME: dict[str, Any] = {"adam": Adam, "gradient_descent": GradientDescent, "lbfgs": LBFGS}
+BY_NAME: dict[str, Any] = {"adam": Adam, "gradient_descent": GradientDescent, "lbfgs": LBFGS, "line_search": LineSearch}
 """The optimisers by the names that `cortado.optimise` takes."""
 
 

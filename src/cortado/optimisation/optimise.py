@@ -7,7 +7,7 @@ parameters back.
 import math
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,10 +17,11 @@ import numpy as np
 from cortado.arrays import as_numbers, as_one_number
 from cortado.errors import ComputationError, InputError, shown
 from cortado.optimisation.differentiable import Differentiable, LossFunction, as_differentiable, loss_and_gradient
+from cortado.optimisation.evaluate import evaluate
 from cortado.optimisation.named_optimisers import as_optimiser
-from cortado.optimisation.optimisers import Optimiser, Search
 from cortado.optimisation.replay_log import Evaluation, Log, MemoryLog, ParameterLayout, ReplayLog, Vector
 from cortado.optimisation.result import Parameters, Record, Result
+from cortado.optimisation.search import Optimiser, Search
 
 GREATEST_GRADIENT = 1e150
 # Components beyond it are refused like infinite ones: their squares, which optimisers take, overflow.
@@ -44,8 +45,9 @@ def optimise(
         problem: a `Problem`, or any object with `value_and_gradient`, or a function that takes the parameters by name
             and returns the loss and its gradient, `{"gravity": array of the parameter's shape}`.
         start: numbers or arrays of any shape by name; they are optimised together, in float64.
-        optimiser: such as `cortado.optimisers.Adam(learning_rate=0.1)`; or "adam", "gradient_descent" or "lbfgs",
-            with its settings as keywords: `optimise(problem, start, "adam", learning_rate=0.1, iterations=50)`.
+        optimiser: such as `cortado.optimisers.Adam(learning_rate=0.1)`; or "adam", "gradient_descent", "lbfgs" or
+            "line_search", with its settings as keywords:
+            `optimise(problem, start, "adam", learning_rate=0.1, iterations=50)`.
         iterations: greatest number of updates. Adam and gradient descent evaluate once more, to judge the
             last iterate.
         bounds: by name, (lower, upper), each a number, an array of the parameter's shape, or None.
@@ -54,7 +56,8 @@ def optimise(
         resume: go on with the run in `checkpoint`, bit for bit as if it had not been interrupted; begin it if
             there is none. `iterations` may then be another number.
         on_iteration: called with the `Record` of every evaluation, also of each one read from the checkpoint.
-            The line search of L-BFGS may evaluate several times an iteration; all of them are recorded.
+            The line search of L-BFGS may evaluate several times an iteration; all of them are recorded. The losses
+            that `LineSearch` tries are in the checkpoint alone.
 
     Raises InputError for a start, bounds or settings that do not fit, and for a checkpoint of another run;
     ComputationError if the loss or its gradient is not finite; what came before is in the checkpoint.
@@ -74,7 +77,7 @@ def optimise(
     }
     with closing(_open_log(checkpoint, resume, layout, identity)) as log:
         evaluator = _Evaluator(differentiable, gradient, layout, start, log, on_iteration)
-        search = Search(evaluator, layout, vector, lower, upper, iterations, evaluator.count_update)
+        search = Search(evaluator, evaluator.losses, layout, vector, lower, upper, iterations, evaluator.count_update)
         outcome = algorithm.minimise(search)
     best = min(evaluator.history, key=lambda record: record.loss)
     return Result(
@@ -107,6 +110,8 @@ class _Evaluator:
     history: list[Record] = field(default_factory=list)
     updates: int = 0
     """Made by the optimiser so far."""
+    logged: int = 0
+    """Entries of the log that this run has come to: evaluations, and losses that were tried."""
 
     def count_update(self) -> None:
         """Called by the optimiser after each update."""
@@ -114,8 +119,9 @@ class _Evaluator:
 
     def __call__(self, vector: Vector) -> tuple[float, Vector]:
         """The loss and its gradient (size,) at a vector (size,)."""
-        replayed = len(self.history) < len(self.log)
+        replayed = self.logged < len(self.log)
         evaluation = self._replay(vector) if replayed else self._compute(vector)
+        self.logged += 1
         record = Record(
             iteration=len(self.history),
             updates=self.updates,
@@ -129,9 +135,34 @@ class _Evaluator:
             self.on_iteration(record)
         return evaluation.loss, evaluation.gradient.copy()
 
-    def _replay(self, vector: Vector) -> Evaluation:
-        """The logged evaluation, if it is the one asked for."""
-        evaluation = self.log.read(len(self.history))
+    def losses(self, vectors: Sequence[Vector]) -> list[float]:
+        """The losses at vectors (size,), computed in one launch if the problem can; infinite for a run that diverges.
+        They are in the log, with a gradient of 0, and not in the history."""
+        known = [self._replay(vector, k).loss for k, vector in enumerate(vectors[: len(self.log) - self.logged])]
+        left = vectors[len(known) :]
+        found: list[float] = []
+
+        def keep(loss: float) -> None:
+            self.log.append(Evaluation(left[len(found)].copy(), loss, np.zeros_like(left[0])))
+            found.append(loss)
+
+        points, problem = [self.layout.unravel(vector) for vector in left], self.problem
+        if hasattr(problem, "value"):
+            made: Any = problem
+            evaluate(made, points, loss_if_diverged=math.inf, on_result=lambda _, one: keep(float(one.loss)))
+        else:
+            for point in points:
+                keep(as_one_number("The problem's loss", self._evaluated(point)[0]))
+        self.logged += len(vectors)
+        return [loss if math.isfinite(loss) else math.inf for loss in (*known, *found)]
+
+    def _evaluated(self, parameters: dict[str, Any]) -> tuple[Any, Mapping[str, Any]]:
+        """The loss and its gradient, as the problem returns them."""
+        return loss_and_gradient(self.problem.value_and_gradient(parameters, gradient=self.estimator))
+
+    def _replay(self, vector: Vector, ahead: int = 0) -> Evaluation:
+        """The logged evaluation, or the one so many ahead of it, if it is the one asked for."""
+        evaluation = self.log.read(self.logged + ahead)
         changed = vector.view(np.uint64) != evaluation.parameters.view(np.uint64)
         if changed.any():
             raise InputError(
@@ -148,7 +179,7 @@ class _Evaluator:
         A first evaluation that is refused has a wrong start; later ones, parameters to which the search has come.
         """
         try:
-            found = self.problem.value_and_gradient(self.layout.unravel(vector), gradient=self.estimator)
+            loss, gradients = self._evaluated(self.layout.unravel(vector))
         except InputError as error:
             if not self.history:
                 raise
@@ -157,7 +188,6 @@ class _Evaluator:
                 f"smaller learning rate, or bounds on the parameters. The {len(self.history)} evaluations before "
                 f"{self.log.fate}."
             ) from error
-        loss, gradients = loss_and_gradient(found)
         evaluation = Evaluation(vector.copy(), as_one_number("The problem's loss", loss), self._ravelled(gradients))
         self._require_finite(evaluation)
         self.log.append(evaluation)

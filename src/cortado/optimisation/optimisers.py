@@ -5,67 +5,25 @@ before, and on nothing else. Resuming (`cortado.optimisation.optimise`) rests on
 must draw them from a seed of its own.
 """
 
-from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from cortado.errors import InputError
+from cortado.optimisation.line_search import LineSearch
 from cortado.optimisation.replay_log import ParameterLayout, Vector
-from cortado.scene.fields import as_number
-from cortado.words import quoted
+from cortado.optimisation.search import (
+    Optimiser,
+    Outcome,
+    PerParameter,
+    Search,
+    all_updates_made,
+    require_fraction,
+    require_names,
+    require_positive,
+)
 
-__all__ = ["LBFGS", "Adam", "GradientDescent", "Optimiser", "Outcome", "Search"]
-
-PerParameter = float | Mapping[str, float]
-
-
-@dataclass(frozen=True, eq=False)
-class Search:
-    """The problem that an optimiser is given, as a function of one vector."""
-
-    evaluate: Callable[[Vector], tuple[float, Vector]]
-    """Vector (size,) -> loss, gradient (size,)."""
-    layout: ParameterLayout
-    """Which components of the vectors belong to which parameter."""
-    start: Vector
-    """(size,), within the bounds."""
-    lower: Vector
-    """(size,), -inf where there is no bound."""
-    upper: Vector
-    """(size,), +inf where there is no bound."""
-    iterations: int
-    """Greatest number of updates."""
-    updated: Callable[[], None] = lambda: None
-    """Called after each update, by which those who follow the search count them."""
-
-    def project(self, vector: Vector) -> Vector:
-        """The nearest vector within the bounds."""
-        return np.clip(vector, self.lower, self.upper)
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What an optimiser returns."""
-
-    last: Vector
-    """(size,), the last iterate, which has been evaluated."""
-    converged: bool
-    """Whether the optimiser's own test was met."""
-    message: str
-    """A sentence."""
-
-
-@runtime_checkable
-class Optimiser(Protocol):
-    """An algorithm that lowers the loss."""
-
-    def check(self, layout: ParameterLayout) -> None:
-        """Raise InputError if the settings do not fit these parameters."""
-
-    def minimise(self, search: Search) -> Outcome:
-        """Lower the loss by at most `search.iterations` updates."""
+__all__ = ["LBFGS", "Adam", "GradientDescent", "LineSearch", "Optimiser", "Outcome", "Search"]
 
 
 @dataclass(frozen=True)
@@ -89,14 +47,14 @@ class Adam:
     """Covers the division where the gradient has always been 0, the step is then 0 [unit of the gradient]."""
 
     def __post_init__(self) -> None:
-        _require_positive("learning_rate", self.learning_rate)
-        _require_fraction("beta1", self.beta1)
-        _require_fraction("beta2", self.beta2)
-        _require_positive("epsilon", self.epsilon)
+        require_positive("learning_rate", self.learning_rate)
+        require_fraction("beta1", self.beta1)
+        require_fraction("beta2", self.beta2)
+        require_positive("epsilon", self.epsilon)
 
     def check(self, layout: ParameterLayout) -> None:
         """Raise InputError if the learning rates are not those of these parameters."""
-        _require_names("learning_rate", self.learning_rate, layout)
+        require_names("learning_rate", self.learning_rate, layout)
 
     def minimise(self, search: Search) -> Outcome:
         """Make `search.iterations` updates; one gradient each, and one evaluation of the last iterate."""
@@ -111,7 +69,7 @@ class Adam:
             v_hat = v / (1.0 - self.beta2**t)
             theta = search.project(theta - learning_rate * m_hat / (np.sqrt(v_hat) + self.epsilon))
             search.updated()
-        return _all_updates_made("Adam", search, theta)
+        return all_updates_made("Adam", search, theta)
 
 
 @dataclass(frozen=True)
@@ -131,12 +89,12 @@ class GradientDescent:
     """In [0, 1) [-]."""
 
     def __post_init__(self) -> None:
-        _require_positive("learning_rate", self.learning_rate)
-        _require_fraction("momentum", self.momentum)
+        require_positive("learning_rate", self.learning_rate)
+        require_fraction("momentum", self.momentum)
 
     def check(self, layout: ParameterLayout) -> None:
         """Raise InputError if the learning rates are not those of these parameters."""
-        _require_names("learning_rate", self.learning_rate, layout)
+        require_names("learning_rate", self.learning_rate, layout)
 
     def minimise(self, search: Search) -> Outcome:
         """Make `search.iterations` updates; one gradient each, and one evaluation of the last iterate."""
@@ -146,7 +104,7 @@ class GradientDescent:
             _, g = search.evaluate(x)
             x, before = search.project(x - learning_rate * g + self.momentum * (x - before)), x
             search.updated()
-        return _all_updates_made("Gradient descent", search, x)
+        return all_updates_made("Gradient descent", search, x)
 
 
 @dataclass(frozen=True)
@@ -176,12 +134,12 @@ class LBFGS:
     def __post_init__(self) -> None:
         if not isinstance(self.memory, int) or self.memory < 1:
             raise InputError(f"The memory of L-BFGS must be an integer of at least 1, not {self.memory!r}.")
-        _require_fraction("The tolerance of L-BFGS", self.tolerance)
-        _require_positive("scale", self.scale)
+        require_fraction("The tolerance of L-BFGS", self.tolerance)
+        require_positive("scale", self.scale)
 
     def check(self, layout: ParameterLayout) -> None:
         """Raise InputError if the scales are not those of these parameters."""
-        _require_names("scale", self.scale, layout)
+        require_names("scale", self.scale, layout)
 
     def minimise(self, search: Search) -> Outcome:
         """Make at most `search.iterations` updates, of one or more evaluations each."""
@@ -239,41 +197,6 @@ def _greatest_projected(search: Search, x: Vector, gradient: Vector, scale: Vect
     """The greatest component, in units of `scale`, of the gradient without what points out of the bounds."""
     outwards = ((x <= search.lower) & (gradient > 0.0)) | ((x >= search.upper) & (gradient < 0.0))
     return float(np.max(np.abs(np.where(outwards, 0.0, scale * gradient))))
-
-
-def _all_updates_made(name: str, search: Search, last: Vector) -> Outcome:
-    """The outcome of an optimiser that does not test convergence; evaluates the last iterate."""
-    search.evaluate(last)
-    return Outcome(last, False, f"{name} made all its {search.iterations} updates.")
-
-
-def _values(values: PerParameter) -> Iterator[object]:
-    """The numbers of a setting that may be given per parameter."""
-    return iter(values.values() if isinstance(values, Mapping) else [values])
-
-
-def _require_positive(name: str, values: PerParameter) -> None:
-    """Raise InputError unless every number is positive and finite."""
-    for value in _values(values):
-        number = as_number(value)
-        if number is None or number <= 0.0:
-            raise InputError(f"{name} must be a positive, finite number, not {value!r}.")
-
-
-def _require_fraction(name: str, value: float) -> None:
-    """Raise InputError unless a number is in [0, 1)."""
-    number = as_number(value)
-    if number is None or not 0.0 <= number < 1.0:
-        raise InputError(f"{name} must be a number in [0, 1), not {value!r}.")
-
-
-def _require_names(name: str, values: PerParameter, layout: ParameterLayout) -> None:
-    """Raise InputError if a setting is given per parameter for others than these parameters."""
-    if isinstance(values, Mapping) and set(values) != set(layout.names):
-        raise InputError(
-            f"{name} is given for {quoted(values)}, but the optimised parameters are "
-            f"{quoted(layout.names)}; give it for each of these, or one number for all."
-        )
 
 
 def __dir__() -> list[str]:

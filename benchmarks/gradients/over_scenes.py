@@ -1,0 +1,63 @@
+"""Estimators over all scenes of a file of results: ``python -m benchmarks.gradients.over_scenes FILE``."""
+
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from cortado import InputError
+
+from .cells import TRUTH, Cell, Record
+from .results import Results
+from .table import ceiling, cosine
+
+
+def over_scenes(records: Iterable[Record]) -> str:
+    """A table in Markdown for each control, with a row for each loss, horizon and estimator: over scenes and seeds the
+    median cosine to the truth [the least], the median size, and in how many cases; in the row of the truth, what the
+    smoothed gradient itself would have."""
+    known = {Cell.of(record): record for record in records}
+    found: dict[str, dict[tuple[str, int, str], list[tuple[float, float]]]] = {}
+    for cell, record in known.items():
+        truth = known.get(cell.question, {})
+        if truth.get("derivatives") and record.get("derivatives"):
+            row = (cell.loss, cell.horizon, cell.estimator)
+            found.setdefault(cell.control, {}).setdefault(row, []).append(_score(record, truth))
+    return "\n\n".join(f"**{control}**\n\n{_rows(found[control])}" for control in sorted(found))
+
+
+def _score(record: Record, truth: Record) -> tuple[float, float]:
+    if record is truth:
+        return ceiling(truth), 1.0
+    estimate, wanted = np.array(record["derivatives"]), np.array(truth["derivatives"])
+    return cosine(estimate, wanted), float(np.linalg.norm(estimate) / np.linalg.norm(wanted))
+
+
+def _rows(scores: dict[tuple[str, int, str], list[tuple[float, float]]]) -> str:
+    lines = ["| loss | steps | estimator | cosine | size | cases |", "|---" * 6 + "|"]
+    for loss, horizon, estimator in sorted(scores, key=lambda row: (*row[:2], row[2] == TRUTH, row[2])):
+        own = scores[loss, horizon, estimator]
+        cosines, sizes = zip(*own, strict=True)
+        name, size = ("*at most*", "") if estimator == TRUTH else (estimator, f"{median(sizes):.2f}")
+        score = f"{median(cosines):.2f} [{min(cosines):.2f}]"
+        lines.append(f"| {loss} | {horizon:,} | {name} | {score} | {size} | {len(own)} |")
+    return "\n".join(lines)
+
+
+def main(words: Sequence[str]) -> int:
+    """Prints the tables of a file of results; returns the exit code."""
+    if len(words) != 1:
+        print(__doc__, file=sys.stderr)
+        return 2
+    try:
+        print(over_scenes(Results(Path(words[0])).records.values()))
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,88 @@
+"""Descent along the gradient with several step lengths tried at a time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cortado.errors import InputError
+from cortado.optimisation.replay_log import ParameterLayout, Vector
+from cortado.optimisation.search import (
+    Outcome,
+    PerParameter,
+    Search,
+    all_updates_made,
+    require_fraction,
+    require_names,
+    require_positive,
+)
+
+GROWTH = 3.0
+"""How much longer than the best length the longest one may be at the next update."""
+
+
+@dataclass(frozen=True)
+class LineSearch:
+    """Descent along the gradient, as far as the best of several lengths that are tried in one launch.
+
+    For losses that are rough, and for gradients that have the right direction and not the right size, such as those of
+    long runs: a search steps over dents that are narrower than its trials, and never to where the run diverges. A trial
+    is a run without a gradient, and all trials of an update are one batch.
+
+    Formula: with g the gradient times the scale, and unit(a) = a over its root mean square,
+
+        d_k = unit(momentum d_{k-1} - unit(g_k)),   x_{k+1} = the best of P(x_k + r_k s scale d_k),
+
+    over lengths s at even ratios from ``shortest`` to 1; P projects onto the bounds. The reach r is 1 at first, and
+    then `GROWTH` times the length that was best, at most 1. An update takes the best trial even if it raises the loss,
+    and the next ones are then shorter. There is no test of convergence: all the iterations are made.
+
+    Raises InputError for settings out of range.
+    """
+
+    scale: PerParameter = 1.0
+    """The longest change worth trying, one number or one per parameter by name [unit of the parameter]."""
+    trials: int = 5
+    """Lengths that are tried at a time."""
+    shortest: float = 1.0 / 64.0
+    """Of these lengths, over the longest."""
+    momentum: float = 0.5
+    """How much of the direction before is kept, in [0, 1) [-]."""
+
+    def __post_init__(self) -> None:
+        require_positive("scale", self.scale)
+        require_fraction("momentum", self.momentum)
+        require_fraction("shortest", self.shortest)
+        if type(self.trials) is not int or self.trials < 2 or self.shortest == 0.0:
+            raise InputError(
+                f"trials is {self.trials!r} and shortest {self.shortest!r}, but must be at least 2 and greater than 0."
+            )
+
+    def check(self, layout: ParameterLayout) -> None:
+        """Raise InputError if the scales are not those of these parameters."""
+        require_names("scale", self.scale, layout)
+
+    def minimise(self, search: Search) -> Outcome:
+        """Make at most `search.iterations` updates, of one gradient and some trials each; evaluate the last iterate."""
+        scale, x, reach = search.layout.spread(self.scale), search.start, 1.0
+        along = np.zeros_like(x)
+        for _ in range(search.iterations):
+            _, gradient = search.evaluate(x)
+            along = unit(self.momentum * along - unit(gradient * scale))
+            lengths = reach * np.geomspace(self.shortest, 1.0, self.trials)
+            tried = [search.project(x + length * scale * along) for length in lengths]
+            losses = search.losses(tried)
+            best = int(np.argmin(losses))
+            if np.isfinite(losses[best]):
+                x, reach = tried[best], min(GROWTH * lengths[best], 1.0)
+            else:
+                along, reach = np.zeros_like(x), reach * self.shortest
+            search.updated()
+        return all_updates_made("The line search", search, x)
+
+
+def unit(vector: Vector) -> Vector:
+    """A vector (size,) divided by its root mean square, or 0."""
+    greatest = np.abs(vector).max(initial=0.0)
+    scaled = vector / greatest if greatest else vector
+    size = np.sqrt(np.mean(scaled**2)) if greatest else 1.0
+    return scaled / size
