@@ -23,9 +23,8 @@ State = tuple[Points, Points]
 """Positions (n, d) [m] of particles, in the scene's axes, and their colours (n, 3), linear from 0 to 1"""
 LARGE = 20_000
 """Particles from which on a surface takes longer than to hand it from one process to another."""
-CORES_EACH = 2
-"""Cores that one surface keeps busy."""
-MOST_PROCESSES = 8
+FEWEST, MOST = 4, 16
+"""Processes: with fewer cores one does all, on all of them."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ def sceneries(stage: Stage, states: Iterable[State], processes: int) -> Iterator
     except BrokenProcessPool as problem:
         raise ComputationError(
             "A process that computes surfaces for pictures was stopped, by the system perhaps for want of memory: "
-            "set the environment variable CORTADO_CORES to 2, and one process does all."
+            "set the environment variable CORTADO_CORES to 1, and one process does all."
         ) from problem
     finally:
         pool.shutdown(cancel_futures=True)
@@ -80,10 +79,11 @@ def sceneries(stage: Stage, states: Iterable[State], processes: int) -> Iterator
 
 def processes_for(particles: int) -> int:
     """How many processes compute the sceneries of so many particles."""
-    return min(max(usable_cores() // CORES_EACH, 1), MOST_PROCESSES) if particles >= LARGE else 1
+    cores = min(usable_cores(), MOST)
+    return cores if particles >= LARGE and cores >= FEWEST else 1
 
 
 def _worker() -> None:
-    """The first process alone hears Ctrl-C and stops the others."""
+    """Each on a core of its own; the first process alone hears Ctrl-C and stops the others."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ["RAYON_NUM_THREADS"] = os.environ["CORTADO_CORES"] = str(CORES_EACH)
+    os.environ["RAYON_NUM_THREADS"] = os.environ["CORTADO_CORES"] = "1"

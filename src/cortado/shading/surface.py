@@ -48,7 +48,7 @@ def liquid(positions: Points, colours: Points, spacing: float) -> Surface:
     n = len(positions)
     order = np.lexsort(positions.T)  # so that sums are those of the same fluid, whatever the order of its particles
     with_data, _ = pysplashsurf.reconstruction_pipeline(
-        np.ascontiguousarray(positions[order], dtype=np.float64),
+        np.ascontiguousarray(positions[order], dtype=np.float32),
         particle_radius=0.5 * spacing,
         smoothing_length=3.0,
         cube_size=0.65 if n <= FINE else 0.8 if n <= COARSE else 1.0,
