@@ -88,6 +88,19 @@ def test_beyond_the_horizon_another_estimator_is_advised():
     assert exact.size > 3.0
 
 
+def test_averages_are_tried_where_no_single_run_is_good(monkeypatch):
+    monkeypatch.setattr("cortado.certificate.alignment.GOOD_COSINE", 2.0)
+    problem = problem_of(plane(), 20)
+    found = certify(problem)
+    names = [judged.estimator for judged in found.alignment.estimators]
+    assert names[3:] == ["EnsembleMean(spread)", "Guided(spread)"] and found.estimator == "Exact()"
+    assert all(judged.cosine > 0.99 for judged in found.alignment.estimators[3:])
+    late = replace(found, horizons=tuple(replace(one, exact=10.0 * one.exact) for one in found.horizons))
+    guided = tuple(one for one in late.alignment.estimators if one.estimator != "EnsembleMean(spread)")[::3]
+    advised = replace(late, alignment=replace(late.alignment, estimators=guided))
+    assert "use gradients.Guided(spread) with spread = {'gravity': 0." in str(advised)
+
+
 def test_within_the_horizon_the_exact_gradient_is_advised():
     found = certify(problem_of(plane(), 40))
     assert found.estimator == "Exact()" and found.horizon == 40

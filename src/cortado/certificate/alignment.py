@@ -1,11 +1,21 @@
 """How well each estimator's gradient is aligned with that of the loss smoothed over meaningful perturbations."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from cortado.errors import DivergedError
-from cortado.gradients import AdjointViscosity, Exact, FrozenGeometry, GradientEstimator, RandomizedSmoothing
+from cortado.gradients import (
+    AdjointViscosity,
+    EnsembleMean,
+    Exact,
+    FrozenGeometry,
+    GradientEstimator,
+    Guided,
+    RandomizedSmoothing,
+)
 from cortado.parameters.values import Arrays
 from cortado.problem import Problem
 
@@ -14,7 +24,16 @@ MOST_NUMBERS = 12
 SAMPLES = 2
 LEAST_COSINE = 0.5
 """An estimator is advised only where the cosine of its gradient with the smoothed one is greater."""
+GOOD_COSINE = 0.95
+"""Where no estimator of one run has this cosine, averages over an ensemble are tried, which cost some ten times as
+much."""
 ESTIMATORS: tuple[GradientEstimator, ...] = (Exact(), AdjointViscosity(), FrozenGeometry())
+"""Of one run."""
+AVERAGES: dict[str, Callable[[dict[str, float]], GradientEstimator]] = {
+    "EnsembleMean(spread)": lambda spread: EnsembleMean(spread, estimator=AdjointViscosity()),
+    "Guided(spread)": Guided,
+}
+"""The best ones of the table in `docs/gradients.md`."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +60,8 @@ class Alignment:
     """Standard error of the smoothed gradient, relative."""
     estimators: tuple[Judged, ...]
     """`Exact` comes first."""
+    spread: Mapping[str, float] = field(default_factory=dict)
+    """By parameter, of the smoothed gradient and of averages."""
 
     @property
     def best(self) -> Judged | None:
@@ -69,12 +90,16 @@ def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) ->
     reference, error = numbers(smoothed.gradient), numbers(smoothed.standard_error or {})
     length = float(np.linalg.norm(reference))
 
-    def judged(estimator: GradientEstimator) -> Judged:
+    def judged(name: str, estimator: GradientEstimator) -> Judged:
         gradient = numbers(exact if estimator == Exact() else problem.estimate(values, estimator).gradient)
         size = float(np.linalg.norm(gradient))
         cosine = float(gradient @ reference) / (size * length) if 0.0 < size < np.inf else 0.0
-        return Judged(f"{type(estimator).__name__}()", cosine, size / length)
+        return Judged(name, cosine, size / length)
 
     if not length > 0.0:
         return None
-    return Alignment(float(np.linalg.norm(error)) / length, tuple(map(judged, ESTIMATORS)))
+    found = [judged(f"{type(estimator).__name__}()", estimator) for estimator in ESTIMATORS]
+    if max(one.cosine for one in found) < GOOD_COSINE:
+        with suppress(DivergedError):
+            found += [judged(name, make(spread)) for name, make in AVERAGES.items()]
+    return Alignment(float(np.linalg.norm(error)) / length, tuple(found), spread)

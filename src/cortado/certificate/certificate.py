@@ -42,6 +42,8 @@ class Certificate:
 
     particles: int
     steps: int
+    time_step: float
+    """[s]"""
     loss: float
     loss_changes: dict[str, float]
     """For every parameter, by how much a meaningful perturbation of it changes the loss, by the adjoint."""
@@ -74,8 +76,9 @@ class Certificate:
             f"The adjoint of a state grows by e^{self.growth:.4f} a step.",
             horizon_table(self.horizons),
             *([] if self.alignment is None else [gradient_table(self.alignment)]),
-            f"Up to step {self.horizon} of {self.steps} the exact gradient is useful. For {self.steps} steps use "
-            f"gradients.{self.estimator}.",
+            f"Up to step {self.horizon} of {self.steps}, {self.horizon * self.time_step:.4g} of "
+            f"{self.steps * self.time_step:.4g} s, the exact gradient is useful. For {self.steps} steps use "
+            f"gradients.{self.estimator}{self._spread}.",
         ]
         return "\n".join(lines)
 
@@ -103,6 +106,13 @@ class Certificate:
             return "AdjointViscosity()"
         best = self.alignment.best
         return "RandomizedSmoothing()" if best is None else best.estimator
+
+    @property
+    def _spread(self) -> str:
+        """What the estimator that is advised is given."""
+        if self.alignment is None or "(spread)" not in self.estimator:
+            return ""
+        return f" with spread = { {name: float(f'{value:.3g}') for name, value in self.alignment.spread.items()} }"
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -161,6 +171,7 @@ def certify(
     return Certificate(
         particles=problem.simulation.particles,
         steps=problem.steps,
+        time_step=float(values["time_step"]),
         loss=exact.loss,
         loss_changes={name: abs(float((exact.gradient[name] * along[name]).sum())) for name in along},
         consistency=consistency,
