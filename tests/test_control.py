@@ -56,7 +56,7 @@ def test_the_known_solution_does_better_than_no_search(name):
 @pytest.mark.parametrize("size", ["small", "large"])
 def test_controls_are_bounded(name, size):
     chosen = task(name, size)
-    assert np.abs(chosen.known).max() <= 1.0 and not chosen.baseline.any()
+    assert np.abs(chosen.known).max() <= 1.0 and np.abs(chosen.baseline).max() <= 0.5
     assert chosen.known.shape == (chosen.controls.numbers,)
     (parameter,) = chosen.controls.parameters(chosen.known).values()
     assert parameter.shape == (chosen.steps, chosen.scene.dimension)

@@ -11,6 +11,7 @@ from benchmarks.gradients.__main__ import main
 from benchmarks.gradients.cells import Cell
 from benchmarks.gradients.controls import CONTROLS, VelocityModes
 from benchmarks.gradients.counting import Counted, Steps
+from benchmarks.gradients.coverage import REFERENCE, Intervals, coverage, intervals
 from benchmarks.gradients.over_scenes import over_scenes
 from benchmarks.gradients.resolution import resolution
 from benchmarks.gradients.table import ceiling, cosine, table
@@ -186,6 +187,30 @@ def test_scenes_and_seeds_are_put_together():
     text = over_scenes(records)
     assert "| l | 1,200 | one | 0.50 [0.00] | 1.50 | 2 |" in text
     assert "| l | 1,200 | *at most* | 0.80 [0.80] |  | 3 |" in text
+
+
+def drawn(seed, mean, error):
+    """Intervals of 400 averages of 5 normal numbers each: right ones, about this mean, times an error."""
+    samples = np.random.default_rng(seed).normal(mean, 1.0, (400, 5, 3))
+    middle, scatter = samples.mean(axis=1), samples.std(axis=1, ddof=1) / np.sqrt(5)
+    reach = error * student.ppf(0.975, 4) * scatter
+    return Intervals(middle, middle - reach, middle + reach)
+
+
+def test_coverage_tells_right_intervals_from_narrow_and_biased_ones():
+    right, narrow, biased = drawn(1, 5.0, 1.0), drawn(2, 5.0, 0.5), drawn(3, 7.0, 1.0)
+    assert right.contain_mean == pytest.approx(0.95, abs=0.02)
+    assert narrow.contain_mean < 0.85
+    assert biased.contain_mean == pytest.approx(0.95, abs=0.02) and biased.contain(np.full(3, 5.0)) < 0.5
+    *_, reference, moved = coverage({REFERENCE: right, "biased": biased}).splitlines()
+    assert reference.endswith("|  |") and "| 0.40 |" in moved
+
+
+def test_intervals_are_of_seeds_that_differ(tiny):
+    cell = Cell("tiny", "gravity-4", "centre-of-mass", 8, 5, "guided-2-differences")
+    found = intervals(cell, range(3))
+    assert found.gradients.shape == (3, 8) and len(np.unique(found.gradients[:, 0])) == 3
+    assert (found.lower <= found.gradients).all() and (found.gradients <= found.upper).all()
 
 
 def test_resolutions_are_compared_at_the_same_times():

@@ -4,9 +4,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from descent import Descent
+from multiple_shooting import MultipleShooting
 from objective import BudgetSpent, Objective
+from staged import Easier, Staged
 
-from cortado import InputError, gradients, optimise, optimisers
+from cortado import InputError, gradients, optimisers
 
 
 class Contender(Protocol):
@@ -14,26 +17,6 @@ class Contender(Protocol):
 
     def search(self, objective: Objective, seed: int) -> None:
         """Evaluates at first where searches begin. Raises `InputError` where it cannot do this task."""
-
-
-ADAM = optimisers.Adam(0.1)
-"""For controls that go from -1 to 1."""
-
-
-@dataclass(frozen=True)
-class Descent:
-    """An optimiser with the gradients of an estimator."""
-
-    estimator: gradients.GradientEstimator
-    optimiser: optimisers.Optimiser = ADAM
-
-    def search(self, objective: Objective, seed: int) -> None:
-        start = objective.named(objective.start)
-        iterations = 1 + int(objective.budget)
-        try:
-            optimise(objective, start, self.optimiser, iterations, _bounds(start), gradient=self.estimator)
-        except BudgetSpent:
-            return
 
 
 @dataclass(frozen=True)
@@ -78,16 +61,20 @@ class RandomSearch:
             return
 
 
+LINE_SEARCH = Descent(gradients.AdjointViscosity(), optimisers.LineSearch())
 CONTENDERS: dict[str, Contender] = {
     "exact": Descent(gradients.Exact()),
     "frozen_geometry": Descent(gradients.FrozenGeometry()),
     "damped": Descent(gradients.Damped(5.0)),
     "adjoint_viscosity": Descent(gradients.AdjointViscosity()),
-    "line_search": Descent(gradients.AdjointViscosity(), optimisers.LineSearch()),
+    "line_search": LINE_SEARCH,
     "line_search_exact": Descent(gradients.Exact(), optimisers.LineSearch()),
     "ensemble_mean": Descent(gradients.EnsembleMean(0.05)),
     "guided": Descent(gradients.Guided(0.05)),
     "randomized_smoothing": Descent(gradients.RandomizedSmoothing(0.05, samples=2)),
+    "viscosity_continuation": Staged((Easier(viscosity=256.0), Easier(viscosity=16.0)), LINE_SEARCH),
+    "growing_horizon": Staged((Easier(late=0.25), Easier(late=0.5)), LINE_SEARCH),
+    "multiple_shooting": MultipleShooting(),
     "cma_es": CMAES(),
     "random_search": RandomSearch(),
 }
@@ -100,6 +87,3 @@ def contender(name: str) -> Contender:
         raise InputError(f"The contender is {name}, but must be one of {', '.join(CONTENDERS)}.")
     return CONTENDERS[name]
 
-
-def _bounds(start: dict[str, np.ndarray]) -> dict[str, tuple[float, float]]:
-    return dict.fromkeys(start, (-1.0, 1.0))

@@ -24,6 +24,8 @@ LAG = 0.08
 """Of the pouring: in so long the nozzle comes nearer to where it is sent, by a factor of e."""
 REACH = 0.6
 """How far from the middle the nozzle can be sent along an axis, in radii of the cup."""
+CIRCLE = 0.5
+"""Radius of the path where searches begin, over the reach."""
 FRAMES = 20
 """States that the dense loss looks at."""
 
@@ -123,9 +125,19 @@ class Latte(Task):
         return Controls("nozzle_path", Affine(base, matrix.reshape(self.steps, self.dimension, -1)))
 
     @cached_property
+    def baseline(self) -> np.ndarray:
+        """A circle, in the plane its breadth alone: milk that falls on one point says nothing of where it should go."""
+        return CIRCLE * np.stack([np.sin(self._angle), -np.cos(self._angle)][: self.dimension - 1], axis=1).ravel()
+
+    @property
+    def _angle(self) -> np.ndarray:
+        """(actions,) once around."""
+        return 2.0 * np.pi * np.arange(self.actions) / self.actions
+
+    @cached_property
     def known(self) -> np.ndarray:
         """The hidden path: the outline of a heart, in the plane its breadth alone."""
-        angle = 2.0 * np.pi * np.arange(self.actions) / self.actions
+        angle = self._angle
         height = (13 * np.cos(angle) - 5 * np.cos(2 * angle) - 2 * np.cos(3 * angle) - np.cos(4 * angle)) / 17
         return np.stack([np.sin(angle) ** 3, -height][: self.dimension - 1], axis=1).ravel()
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,20 +46,27 @@ class Objective:
 
     def __init__(self, task: Task, problem: Problem, seed: int, budget: float):
         """``budget``: simulated steps after which no further run begins."""
-        self.task, self.budget, self.meter, self._problem = task, budget, Meter(), problem
-        self._first = first_positions(problem, seed)
-        self.metered = Metered(problem, self._first, self.meter)
+        self.task, self.budget, self.meter, self.inner = task, budget, Meter(), problem
         self._name = task.controls.parameter
-        self.problem = Transformed(self.metered, {self._name: task.controls.mapping})  # type: ignore[arg-type]
+        self._bad = BAD * abs(problem.value(task.controls.parameters(task.baseline)))
+        self._begin(task.baseline, first_positions(problem, seed))
+
+    def _begin(self, start: np.ndarray, fixed: Arrays, late: float = 1.0) -> None:
+        self.start, self.fixed = start, fixed
+        self.late = np.arange(start.size) >= (1.0 - late) * start.size
+        self.metered = Metered(self.inner, fixed, self.meter)
+        self.problem = Transformed(self.metered, {self._name: self.task.controls.mapping})  # type: ignore[arg-type]
         self.curve: list[tuple[float, float]] = []
         """Simulated steps, and the loss of the run that they end with; infinite for one that diverged."""
-        self.best, self.best_loss = task.baseline, math.inf
-        self._bad = BAD * abs(problem.value(task.controls.parameters(task.baseline)))
+        self.best, self.best_loss = start, math.inf
 
-    @property
-    def start(self) -> np.ndarray:
-        """(numbers,) where searches begin."""
-        return self.task.baseline
+    def easier(self, start: np.ndarray, share: float, fixed: Arrays, late: float) -> "Objective":
+        """The same for a share of the budget and from another start, with a curve of its own: parameters of the scene
+        are replaced by these, and only a share of the controls is changed, the last ones."""
+        found = copy(self)
+        found.budget = min(self.meter.steps + share * self.budget, self.budget)
+        found._begin(start, {**self.fixed, **fixed}, late)
+        return found
 
     def named(self, u: np.ndarray) -> Arrays:
         """The numbers as what `problem` is given."""
@@ -70,7 +78,7 @@ class Objective:
         found: list[float] = []
         room = max(self.problem.room(), 1)
         while len(found) < len(points):
-            self._require_budget()
+            self.require_budget()
             part = [self.named(u) for u in points[len(found) : len(found) + room]]
             before = self.meter.steps
             if room > 1:
@@ -85,14 +93,15 @@ class Objective:
     def value_and_gradient(self, parameters: Arrays, gradient: GradientEstimator | None = None) -> tuple[float, Arrays]:
         """As `cortado.optimise` asks. Where the run diverged, the gradient leads back to the best controls so far; its
         numbers that overflowed are 0."""
-        self._require_budget()
+        self.require_budget()
         u = parameters[self._name]
         try:
             found = self.problem.estimate(parameters, gradient)
         except DivergedError:
             return self._noted(u, math.inf, self.meter.steps), self.named(self._away_from_best(u))
         slopes = np.nan_to_num(found.gradient[self._name], nan=0.0, posinf=0.0, neginf=0.0)
-        return self._noted(u, found.loss, self.meter.steps), self.named(np.clip(slopes, -GREATEST, GREATEST))
+        slopes = np.clip(np.where(self.late, slopes, 0.0), -GREATEST, GREATEST)
+        return self._noted(u, found.loss, self.meter.steps), self.named(slopes)
 
     def value(self, parameters: Arrays) -> float:
         """As a line search asks."""
@@ -108,7 +117,7 @@ class Objective:
 
     def score(self) -> dict[str, float]:
         """Of the best controls."""
-        return self.task.score(self._problem, {**self.task.controls.parameters(self.best), **self._first})
+        return self.task.score(self.inner, {**self.task.controls.parameters(self.best), **self.fixed})
 
     def _away_from_best(self, u: np.ndarray) -> np.ndarray:
         """(numbers,) the gradient of a loss that rises evenly from the best controls to these, which are bad."""
@@ -132,19 +141,20 @@ class Objective:
             self.best, self.best_loss = u.copy(), loss
         return min(loss, self._bad)
 
-    def _require_budget(self) -> None:
+    def require_budget(self) -> None:
+        """Raises `BudgetSpent`."""
         if self.meter.steps >= self.budget:
             raise BudgetSpent
 
 
 class Metered:
-    """A problem whose steps are counted, forward and back, also those of several runs in one launch; if it has first
-    positions of its own, they replace those of the scene."""
+    """A problem whose steps are counted, forward and back, also those of several runs in one launch; if it has
+    parameters of its own, such as first positions, they replace those of the scene."""
 
-    def __init__(self, problem: Problem, first: Arrays, meter: Meter):
-        """``first``: first positions by their name, or nothing for those of the scene."""
-        self._problem, self._meter, self._first = problem, meter, first
-        self.simulation = _Simulation(problem, **first) if first else problem.simulation
+    def __init__(self, problem: Problem, fixed: Arrays, meter: Meter):
+        """``fixed``: parameters by their name, or nothing for those of the scene."""
+        self._problem, self._meter, self._fixed = problem, meter, fixed
+        self.simulation = _Simulation(problem, fixed["initial_positions"]) if fixed else problem.simulation
 
     def value(self, parameters: Values) -> Any:
         self._meter.forward += self._steps
@@ -173,7 +183,7 @@ class Metered:
         return self._problem.steps * (self._problem.simulation.batch or 1)
 
     def _all(self, parameters: Values) -> Values:
-        return {**self._first, **parameters}
+        return {**self._fixed, **parameters}
 
 
 class _MeteredPass:

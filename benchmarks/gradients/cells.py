@@ -72,15 +72,24 @@ class Bench:
         seconds = round(time.perf_counter() - started, 3)
         return {**asdict(cell), **found, "cost": steps.cost, "seconds": seconds}
 
-    def _derivatives(self, cell: Cell, steps: Steps) -> Record:
+    def posed(self, cell: Cell) -> tuple[Transformed, np.ndarray]:
+        """The problem that a cell is about, of coordinates of its control, and the place where it is differentiated."""
         simulation, control = self._simulation(cell), CONTROLS[cell.control]
         random = np.random.default_rng(cell.seed)
         hidden, u = (control.drawn(simulation, cell.horizon, random) for _ in range(2))
-        name, spread = control.parameter, control.spread(simulation)
         bijector = control.bijector(simulation, cell.horizon)
-        end = simulation_end(simulation, cell.horizon, {name: bijector.parameter(hidden)})
+        end = simulation_end(simulation, cell.horizon, {control.parameter: bijector.parameter(hidden)})
         problem = Problem(simulation, cell.horizon, LOSSES[cell.loss](simulation, end))
-        counted = Counted(Transformed(problem, {name: bijector}), cell.horizon, steps)
+        return Transformed(problem, {control.parameter: bijector}), u
+
+    def spread(self, cell: Cell) -> float:
+        """That of the control of a cell, in units of its parameter."""
+        return CONTROLS[cell.control].spread(self._simulation(cell))
+
+    def _derivatives(self, cell: Cell, steps: Steps) -> Record:
+        problem, u = self.posed(cell)
+        name, spread = CONTROLS[cell.control].parameter, self.spread(cell)
+        counted = Counted(problem, cell.horizon, steps)
         if cell.estimator == TRUTH:
             truth = smoothed(counted, name, u, spread, seed=2 * cell.seed)
             return {

@@ -15,6 +15,8 @@ from cortado.gradients import (
     RandomizedSmoothing,
 )
 
+from .averages import MedianOfMeans, TrimmedMean
+
 ESTIMATORS: dict[str, Callable[[float, int], GradientEstimator]] = {
     "exact": lambda spread, seed: Exact(),
     "frozen-geometry": lambda spread, seed: FrozenGeometry(),
@@ -23,6 +25,8 @@ ESTIMATORS: dict[str, Callable[[float, int], GradientEstimator]] = {
     "mean-of-8-frozen": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=FrozenGeometry()),
     "mean-of-8-exact": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=Exact()),
     "mean-of-8-viscosity": lambda spread, seed: EnsembleMean(spread, 8, seed=seed, estimator=AdjointViscosity()),
+    "trimmed-mean-of-8": lambda spread, seed: TrimmedMean(spread, 8, seed=seed, estimator=AdjointViscosity()),
+    "median-of-means-of-8": lambda spread, seed: MedianOfMeans(spread, 8, seed=seed, estimator=AdjointViscosity()),
     "guided": lambda spread, seed: Guided(spread, seed=seed),
     "guided-2-parts": lambda spread, seed: Guided(spread, parts=2, seed=seed),
     "smoothing-2": lambda spread, seed: RandomizedSmoothing(spread, 2, seed=seed),

@@ -99,10 +99,14 @@ class EnsembleMean(Ensemble):
                 yield ensemble.sample(-u, -displacement, self.estimator)
 
         at_them, *samples = self.evaluated(problem, points(), observe)
-        numbers = [joined(one.gradient, ensemble.values) for one in samples]
-        means = [np.mean(pair, axis=0) for pair in zip(numbers[::2], numbers[1::2], strict=True)]
-        gradient, error = (ensemble.named(one) for one in mean_and_error(np.array(means)))
-        return Estimate(at_them.loss, gradient, error, len(means) - 1)
+        numbers = np.array([joined(one.gradient, ensemble.values) for one in samples])
+        gradient, error = (ensemble.named(one) for one in self.combined(numbers))
+        return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1)
+
+    def combined(self, gradients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The average (numbers,) of the gradients of the samples (samples, numbers), and its standard error: that of
+        the means of antithetic pairs, which follow each other."""
+        return mean_and_error((gradients[::2] + gradients[1::2]) / 2.0)
 
 
 def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
