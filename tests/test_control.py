@@ -8,9 +8,11 @@ import pytest
 from catalogue import TASKS, task
 from contenders import CONTENDERS, Descent
 from curves import curves
+from multiple_shooting import Gaps, MultipleShooting
 from objective import BACKWARD, BudgetSpent, Objective
 from records import Record, Records, Run
 from run import main
+from staged import Easier
 
 from cortado import CortadoWarning, InputError, Simulation, gradients
 from finite_differences import decades, distance
@@ -143,6 +145,45 @@ def test_descent_goes_down():
     objective = Objective(chosen, chosen.problem(), 0, budget=40.0 * chosen.steps)
     Descent(gradients.Exact()).search(objective, 0)
     assert objective.best_loss < objective.curve[0][1]
+
+
+@pytest.mark.parametrize("name", ["carry", "splash", "mix"])
+def test_the_lagrangian_of_segments_has_the_right_gradient(name):
+    """With gaps between them, and multipliers that have learnt."""
+    chosen, random = short(name), np.random.default_rng(3)
+    objective = Objective(chosen, chosen.problem(precision="float64"), seed=1, budget=np.inf)
+    gaps = Gaps(objective, 3, gradients.Exact(), 2.0)
+    u = random.uniform(-0.5, 0.5, chosen.controls.numbers)
+    point = {"controls": u, **gaps.closed(u)}
+    closed, _ = gaps.value_and_gradient(point)
+    assert closed == pytest.approx(objective.problem.value(objective.named(u)), rel=1e-9)
+    direction = {part: random.standard_normal(value.shape) for part, value in point.items()}
+    for part in ("positions", "velocities"):
+        point[part] = point[part] + 0.02 * random.standard_normal(point[part].shape)
+    gaps.value_and_gradient(point)
+    gaps.learn()
+    _, gradient = gaps.value_and_gradient(point)
+    derivative = sum((gradient[part] * direction[part]).sum() for part in point)
+    assert distance(lambda p: gaps.value_and_gradient(p)[0], point, direction, derivative, decades(4, 7), 1e-6) < 1e-5
+
+
+def test_segments_need_all_particles():
+    chosen = short("latte")
+    with pytest.raises(InputError, match="nozzle"):
+        MultipleShooting().search(Objective(chosen, chosen.problem(), 0, np.inf), 0)
+
+
+def test_easier_problems_have_curves_and_parameters_of_their_own():
+    chosen = short("mix")
+    objective = Objective(chosen, chosen.problem(), 0, budget=60.0 * chosen.steps)
+    thick = Easier(viscosity=16.0, share=0.5).of(objective, objective.start)
+    assert thick.fixed["viscosity"].tolist() == [0.8, 0.8] and "viscosity" not in objective.fixed
+    thick.values([thick.start])
+    assert (len(thick.curve), len(objective.curve)) == (1, 0) and objective.meter.forward == chosen.steps
+    late = Easier(late=0.5).of(objective, objective.start)
+    _, gradient = late.value_and_gradient(late.named(late.start), gradients.Exact())
+    half = chosen.controls.numbers // 2
+    assert not gradient["gravity"][:half].any() and gradient["gravity"][half:].all()
 
 
 COMMAND = ["--task", "carry", "--contender", "exact", "random_search", "--budget", "1000"]

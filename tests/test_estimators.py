@@ -555,6 +555,36 @@ def test_intervals_of_a_mean_of_gradients_contain_it_as_often_as_they_say(sample
     assert 0.9 <= np.mean(inside) <= 0.98
 
 
+def test_intervals_of_guided_differences_know_that_directions_are_noisy():
+    """The loss has no noise here, but the surrogate, by which the gradient is turned."""
+    stub = Stub(quadratic, simulation_of("2-D"))
+
+    def found(seed):
+        return gradients.Guided(0.1, parts=1, seed=seed, position_noise=0.0, surrogate=NoisySlopes(seed)).estimate(
+            stub, POINT
+        )
+
+    estimates = [found(seed) for seed in range(300)]
+    mean = np.mean([one.gradient["gravity"] for one in estimates], axis=0)
+    ends = [[end["gravity"] for end in one.interval()] for one in estimates]
+    assert 0.9 <= np.mean([(lower <= mean) & (mean <= upper) for lower, upper in ends]) <= 0.99
+    assert all(1.0 - 1e-9 <= one.degrees_of_freedom <= 2.0 + 1e-9 for one in estimates)
+
+
+def test_guided_differences_of_nothing_are_nothing():
+    stub = Stub(lambda values: 7.0, simulation_of("2-D"))
+    flat = gradients.Guided(0.1, surrogate=Flat()).estimate(stub, POINT)
+    assert not flat.gradient["gravity"].any() and not flat.standard_error["gravity"].any()
+    assert all(not end["gravity"].any() for end in flat.interval())
+
+
+class Flat:
+    """In place of an estimator: no gradient at all."""
+
+    def estimate(self, problem, parameters, observe=None):
+        return gradients.Estimate(7.0, {name: np.zeros_like(value) for name, value in parameters.items()})
+
+
 def test_an_interval_needs_an_average():
     estimate = gradients.RandomizedSmoothing(0.3, samples=2).estimate(Stub(quadratic, simulation_of("2-D")), POINT)
     assert estimate.degrees_of_freedom == 1

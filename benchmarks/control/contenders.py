@@ -72,7 +72,7 @@ CONTENDERS: dict[str, Contender] = {
     "ensemble_mean": Descent(gradients.EnsembleMean(0.05)),
     "guided": Descent(gradients.Guided(0.05)),
     "randomized_smoothing": Descent(gradients.RandomizedSmoothing(0.05, samples=2)),
-    "viscosity_continuation": Staged((Easier(viscosity=256.0), Easier(viscosity=16.0)), LINE_SEARCH),
+    "viscosity_continuation": Staged((Easier(viscosity=16.0), Easier(viscosity=4.0)), LINE_SEARCH),
     "growing_horizon": Staged((Easier(late=0.25), Easier(late=0.5)), LINE_SEARCH),
     "multiple_shooting": MultipleShooting(),
     "cma_es": CMAES(),
@@ -86,4 +86,3 @@ def contender(name: str) -> Contender:
     if name not in CONTENDERS:
         raise InputError(f"The contender is {name}, but must be one of {', '.join(CONTENDERS)}.")
     return CONTENDERS[name]
-

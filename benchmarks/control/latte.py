@@ -24,6 +24,8 @@ LAG = 0.08
 """Of the pouring: in so long the nozzle comes nearer to where it is sent, by a factor of e."""
 REACH = 0.6
 """How far from the middle the nozzle can be sent along an axis, in radii of the cup."""
+VISCOSITY = 0.3
+"""Of coffee and milk [Pa s]: thick enough for a line of milk to stay where it is poured."""
 CIRCLE = 0.5
 """Radius of the path where searches begin, over the reach."""
 FRAMES = 20
@@ -57,7 +59,7 @@ class Latte(Task):
 
     @classmethod
     def large(cls) -> Self:
-        return cls(3, 16, 9, 2, 75, 0.0021, 0.0012, actions=250, repeats=4, standing=320)
+        return cls(3, 17, 9, 1, 60, 0.0021, 0.0012, actions=250, repeats=4, standing=320)
 
     @property
     def steps(self) -> int:
@@ -101,7 +103,7 @@ class Latte(Task):
                 self.spacing,
                 self.time_step,
                 cup,
-                phase=[COFFEE, MILK],
+                phase=[{**one, "viscosity": VISCOSITY} for one in (COFFEE, MILK)],
                 fluid=[{**pool, "phase": "coffee"}],
                 emitter={**jet, "flow_rate": flow_rate},
                 render=render,

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from objective import BudgetSpent, Objective
@@ -12,6 +13,8 @@ from cortado.errors import ComputationError, DivergedError
 from cortado.losses import Frames, Loss, Snapshot
 from cortado.losses.loss import Adjoint, by_field
 from cortado.parameters.values import Arrays
+
+SHORT_RUNS = gradients.AdjointViscosity()
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class MultipleShooting:
     """Of the penalty, after a round that is not kept."""
     learning_rate: float = 0.05
     """Of states, in their units: spacings, and speeds of a fall by a spacing."""
-    estimator: gradients.AdjointEstimator = gradients.AdjointViscosity()
+    estimator: gradients.AdjointEstimator = SHORT_RUNS
 
     def search(self, objective: Objective, seed: int) -> None:
         """Raises `InputError` for tasks with a nozzle."""
@@ -65,7 +68,8 @@ class Gaps:
         self._objective, self._estimator, self.penalty = objective, estimator, penalty
         task, problem = objective.task, objective.inner
         ends = np.linspace(0, task.steps, segments + 1).astype(int)
-        by_step = problem.loss.losses if isinstance(problem.loss, Frames) else {task.steps: problem.loss}
+        asked: Any = problem.loss
+        by_step: dict[int, Loss] = asked.losses if isinstance(asked, Frames) else {task.steps: asked}
         spacing = task.scene.discretisation.spacing
         self._units = {"positions": spacing, "velocities": np.sqrt(GRAVITY * spacing)}
         self._borders = [Border(self._units) for _ in ends[1:-1]]
@@ -84,8 +88,7 @@ class Gaps:
         controls = self._objective.task.controls.parameters(u)
         states = self._objective.inner.states({**controls, **self._objective.fixed}, steps)
         return {
-            name: np.array([getattr(states[step], name) for step in steps]) / unit
-            for name, unit in self._units.items()
+            name: np.array([getattr(states[step], name) for step in steps]) / unit for name, unit in self._units.items()
         }
 
     def learn(self) -> None:

@@ -1,5 +1,6 @@
 """Estimators over all scenes of a file of results: ``python -m benchmarks.gradients.over_scenes FILE``."""
 
+import argparse
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -14,15 +15,15 @@ from .results import Results
 from .table import ceiling, cosine
 
 
-def over_scenes(records: Iterable[Record]) -> str:
+def over_scenes(records: Iterable[Record], least_ceiling: float = 0.0) -> str:
     """A table in Markdown for each control, with a row for each loss, horizon and estimator: over scenes and seeds the
     median cosine to the truth [the least], the median size, and in how many cases; in the row of the truth, what the
-    smoothed gradient itself would have."""
+    smoothed gradient itself would have. Cases where that is below ``least_ceiling`` are left out."""
     known = {Cell.of(record): record for record in records}
     found: dict[str, dict[tuple[str, int, str], list[tuple[float, float]]]] = {}
     for cell, record in known.items():
         truth = known.get(cell.question, {})
-        if truth.get("derivatives") and record.get("derivatives"):
+        if truth.get("derivatives") and record.get("derivatives") and ceiling(truth) >= least_ceiling:
             row = (cell.loss, cell.horizon, cell.estimator)
             found.setdefault(cell.control, {}).setdefault(row, []).append(_score(record, truth))
     return "\n\n".join(f"**{control}**\n\n{_rows(found[control])}" for control in sorted(found))
@@ -48,11 +49,17 @@ def _rows(scores: dict[tuple[str, int, str], list[tuple[float, float]]]) -> str:
 
 def main(words: Sequence[str]) -> int:
     """Prints the tables of a file of results; returns the exit code."""
-    if len(words) != 1:
-        print(__doc__, file=sys.stderr)
-        return 2
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.gradients.over_scenes", description=__doc__)
+    parser.add_argument("file", type=Path, help="made by python -m benchmarks.gradients")
+    parser.add_argument(
+        "--truth",
+        type=float,
+        default=0.0,
+        help="least cosine that the smoothed gradient would have to so noisy a truth",
+    )
+    chosen = parser.parse_args(words)
     try:
-        print(over_scenes(Results(Path(words[0])).records.values()))
+        print(over_scenes(Results(chosen.file).records.values(), chosen.truth))
     except InputError as error:
         print(error, file=sys.stderr)
         return 2

@@ -26,8 +26,8 @@ class Estimate:
     """For each parameter given, an array of its shape (float64), of a batch with a first axis for the scenes."""
     standard_error: Arrays | None = None
     """Of every component of the gradient, where it is an average (`RandomizedSmoothing`, `EnsembleMean`, `Guided`)."""
-    degrees_of_freedom: int | None = None
-    """Of the standard error: the number of independent samples less one."""
+    degrees_of_freedom: float | None = None
+    """Of the standard error: the number of independent samples less one; of `Guided` those of its two parts."""
 
     def interval(self, confidence: float = 0.95) -> tuple[Arrays, Arrays]:
         """The lower and the upper end, by parameter, of an interval for each component of the gradient.

@@ -31,7 +31,8 @@ class Guided(Ensemble):
     2019, without their search outside of the span).
 
     Bias: what the surrogate does not point at is missed; but sizes, over time too, are those of the smoothed loss.
-    Noise: the ``standard_error`` of the `Estimate` is that of the D_k. Cost: ``samples`` gradients of the surrogate and
+    Noise: the ``standard_error`` of the `Estimate` is that of the D_k and of the directions p_k together, with degrees
+    of freedom by Welch and Satterthwaite. Cost: ``samples`` gradients of the surrogate and
     2 K ``differences`` forward runs, however many numbers a parameter has.
     """
 
@@ -57,8 +58,9 @@ class Guided(Ensemble):
         surrogate = EnsembleMean(
             self.spread, self.samples, self.position_noise, self.seed, self.surrogate, executor=self.executor
         ).estimate(problem, parameters, observe)
+        assert surrogate.standard_error is not None and surrogate.degrees_of_freedom is not None
         ensemble = self.around(problem, parameters)
-        parts = self._parts(ensemble, surrogate.gradient)
+        parts, turns = self._parts(ensemble, surrogate.gradient, surrogate.standard_error)
         reach = [np.sqrt(np.count_nonzero(part)) for part in parts]
 
         def points() -> Iterator[Point]:
@@ -71,22 +73,35 @@ class Guided(Ensemble):
         losses = np.array([one.loss for one in self.evaluated(problem, points(), None)])
         pairs = losses.reshape(self.differences, len(parts), 2)
         slopes = (pairs[..., 0] - pairs[..., 1]) / (2.0 * np.array(reach))
-        found = (slopes @ np.reshape(parts, (len(parts), -1))) / ensemble.spreads
-        gradient, error = (ensemble.named(one) for one in mean_and_error(found))
-        return Estimate(surrogate.loss, gradient, error, self.differences - 1)
+        sizes, size_errors = mean_and_error(slopes)
+        along, across = (np.reshape(rows, (-1, len(ensemble.spreads))) for rows in (parts, turns))
+        errors = np.array([size_errors @ np.abs(along), np.abs(sizes) @ across])
+        gradient, error = (ensemble.named(one / ensemble.spreads) for one in (sizes @ along, np.hypot(*errors)))
+        freedom = _freedom(errors, (self.differences - 1, surrogate.degrees_of_freedom))
+        return Estimate(surrogate.loss, gradient, error, freedom)
 
-    def _parts(self, ensemble: Sampler, gradient: Arrays) -> list[np.ndarray]:
-        """(numbers,) each, of length 1, in spreads: the gradient on one part of one parameter, 0 elsewhere; parts
-        without a gradient are left out."""
+    def _parts(self, ensemble: Sampler, gradient: Arrays, error: Arrays) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """(numbers,) each, of length 1, in spreads: the gradient on one part of one parameter, 0 elsewhere; and its
+        standard error. Parts without a gradient are left out."""
         places = np.concatenate([_places(value, self.parts) for value in ensemble.values.values()])
         firsts = np.cumsum([0, *(value.size for value in ensemble.values.values())])
         places += self.parts * np.repeat(np.arange(len(firsts) - 1), np.diff(firsts))
-        whole = ensemble.spreads * joined(gradient, ensemble.values)
-        found = [np.where(places == k, whole, 0.0) for k in np.unique(places)]
-        return [part / np.linalg.norm(part) for part in found if np.any(part)]
+        whole, errors = (ensemble.spreads * joined(one, ensemble.values) for one in (gradient, error))
+        lengths = {k: np.linalg.norm(whole[places == k]) for k in np.unique(places)}
+        parts, turns = (
+            [np.where(places == k, one, 0.0) / length for k, length in lengths.items() if length]
+            for one in (whole, errors)
+        )
+        return parts, turns
 
 
 def _places(value: np.ndarray, parts: int) -> np.ndarray:
     """(size,) for each number of a parameter, the part that its row belongs to; 0 for a vector and a number."""
     rows = len(value) if value.ndim > 1 else 1
     return np.repeat(np.arange(rows) * parts // rows, value.size // rows)
+
+
+def _freedom(errors: np.ndarray, freedoms: tuple[float, float]) -> float:
+    """Degrees of freedom of the sum of two errors (2, numbers) that have their own (Welch 1947)."""
+    shares = (errors**2).sum(axis=1) / max((errors**2).sum(), np.finfo(float).tiny)
+    return float(1.0 / max((shares**2 / freedoms).sum(), 1.0 / sum(freedoms)))
