@@ -1,11 +1,12 @@
 """Emitters: led particles move as the nozzle says, are let go without a jump, and every gradient is right."""
 
+import warnings
 from functools import cache
 
 import numpy as np
 import pytest
 
-from cortado import InputError, Problem, Simulation, gradients, losses
+from cortado import CortadoWarning, InputError, Problem, Scene, Simulation, gradients, losses
 from finite_differences import decades, distance
 from scenes import jet, plane, pour, scene
 
@@ -246,3 +247,22 @@ def test_without_an_emitter_its_parameters_are_a_sentence(value):
         with pytest.raises(InputError, match=r"must be left out, as the scene has no emitter\."):
             refused()
     assert value.keys().isdisjoint(simulation.parameters())
+
+
+def test_a_column_in_a_wall_is_named_where_the_pressure_does_not_converge():
+    """Its particles cannot move away from a wall that presses on them."""
+    nozzle = {"phase": "water", "outlet": [0.25, 0.3], "radius": 0.03, "flow_rate": 0.06}
+    box = {
+        "name": "jet",
+        "dimension": 2,
+        "discretisation": {"spacing": 0.01},
+        "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.05}],
+        "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.5, 0.4]},
+        "forces": {"gravity": [0.0, -9.81]},
+        "solver": {"time_step": 0.001},
+    }
+    with pytest.warns(CortadoWarning, match=r"did not converge.*Shorten emitter\.length"):
+        Simulation(Scene(**box, emitter={**nozzle, "length": 0.3})).run(3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CortadoWarning)
+        Simulation(Scene(**box, emitter={**nozzle, "length": 0.1})).run(3)

@@ -188,7 +188,7 @@ class Simulation:
         rollout.forward(keep, keep=False)
         converged = rollout.diagnostics["converged"]
         if not converged.all():
-            warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=5)
+            warnings.warn(not_converged_sentence(converged, self.scene), CortadoWarning, stacklevel=5)
         if rollout.lost:
             warnings.warn(lost_sentence(rollout.lost, rollout.solver.layout.members), CortadoWarning, stacklevel=5)
         fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
@@ -373,11 +373,23 @@ def whole_number(what: str, value: Any, least: int) -> int:
     return int(value)
 
 
-def not_converged_sentence(converged: np.ndarray) -> str:
+def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
     """What to say of steps that ended above the tolerance."""
-    return (
-        f"the pressure did not converge in {np.count_nonzero(~converged)} of {converged.size} steps: "
-        "try a smaller time step, more iterations or a larger tolerance."
+    advice = "try a smaller time step, more iterations or a larger tolerance."
+    if _waits_in_a_wall(scene):
+        advice = (
+            "the column that waits in the emitter is not all inside the container, whose walls press on it. Shorten "
+            "emitter.length, or make the container larger."
+        )
+    return f"the pressure did not converge in {np.count_nonzero(~converged)} of {converged.size} steps: {advice}"
+
+
+def _waits_in_a_wall(scene: Scene) -> bool:
+    """Whether particles of the emitter start in a wall of the container, or outside of it."""
+    spacing = scene.discretisation.spacing
+    return bool(
+        scene.emitter is not None
+        and not scene.container.contains(scene.emitter.particles(spacing), -0.25 * spacing).all()
     )
 
 

@@ -24,7 +24,7 @@ from cortado.io.trajectory import Trajectory, append_frame, frame_writer
 from cortado.io.video import MOST_FRAMES, write_video
 from cortado.rollout import Rollout
 from cortado.scene.in_words import scene_in_words
-from cortado.scene.scene import load_scene
+from cortado.scene.scene import Scene, load_scene
 from cortado.shading.film import lacking, run_pictures
 from cortado.shading.scene_view import trajectory_view
 from cortado.simulation import Simulation, check_steps, not_converged_sentence
@@ -57,7 +57,7 @@ def run_scene(
             _compute(simulation, rollout, folder, record_every, pictures)
     converged = rollout.diagnostics["converged"]
     if not converged.all():
-        warnings.warn(not_converged_sentence(converged), CortadoWarning, stacklevel=2)
+        warnings.warn(not_converged_sentence(converged, scene), CortadoWarning, stacklevel=2)
     return f"The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
 
 
@@ -180,7 +180,7 @@ def _write_report(simulation: Simulation, rollout: Rollout, folder: RunFolder, t
         Section("To turn and to play", view=trajectory_view(scene, trajectory)),
         told,
         Section("Pictures", figures=[*(pair for pair in shaded if pair not in films), *figures]),
-        Section("The solver", _converged(rollout), figures=solver),
+        Section("The solver", _converged(rollout, scene), figures=solver),
     ]
     write_report(folder, scene.name, sections)
 
@@ -196,11 +196,11 @@ def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:
     return [question, f"{length}, in {where}.{wall}{substeps}"]
 
 
-def _converged(rollout: Rollout) -> list[str]:
+def _converged(rollout: Rollout, scene: Scene) -> list[str]:
     """Whether steps did."""
     converged = rollout.diagnostics["converged"]
     if not len(converged):
         return []
     if converged.all():
         return ["The pressure converged in every step."]
-    return [not_converged_sentence(converged)]
+    return [not_converged_sentence(converged, scene)]
