@@ -10,6 +10,8 @@ from tyro.conf import Positional, UseAppendAction, arg
 from cortado.errors import InputError
 
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
+Flag = Annotated[bool, arg(help_behavior_hint="")]
+"""An option without a value, of which the help says no default."""
 Overrides = Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")]
 
 

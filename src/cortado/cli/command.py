@@ -12,7 +12,7 @@ from cortado.io.terminal import quietly
 
 Work = Callable[[], str]
 """What a command does once its arguments are understood; returns what it prints."""
-Quiet = Annotated[bool, arg(help="Say nothing but results, warnings and errors.")]
+Quiet = Annotated[bool, arg(help="Say nothing but results, warnings and errors.", help_behavior_hint="")]
 
 
 def command(group: SubcommandApp, answers: bool = False) -> Callable[[Callable[..., Work]], Callable[..., Work]]:

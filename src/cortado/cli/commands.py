@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from cortado.cli.arguments import Overrides, Scene, as_text, command_line, require_at_least
+from cortado.cli.arguments import Flag, Overrides, Scene, as_text, command_line, require_at_least
 from cortado.cli.command import Work, command
 from cortado.cli.gradient_commands import gradients
 from cortado.cli.parsing import completion_script
@@ -57,7 +57,7 @@ def describe(
     overrides: Overrides = (),
     device: str = "cpu",
     precision: str = "float32",
-    json: bool = False,
+    json: Flag = False,
 ) -> Work:
     """Describe a scene before it is run: its particles, what limits its time step, its memory, its time.
 
@@ -84,8 +84,8 @@ def run(
     device: str = "cpu",
     precision: str = "float32",
     record_every: int = 1,
-    overwrite: bool = False,
-    pictures: bool = True,
+    overwrite: Flag = False,
+    pictures: Flag = True,
 ) -> Work:
     """Run a scene forward and write its trajectory.
 
@@ -98,7 +98,7 @@ def run(
         precision: "float32" or "float64".
         record_every: Steps from one frame of the trajectory to the next.
         overwrite: Replace an earlier run in the same folder.
-        pictures: Draw shaded pictures and a film; --no-pictures leaves them out.
+        pictures: Leave out the shaded pictures and the film.
     """
     require_at_least(1, record_every, "--record-every")
     from cortado.commands.run import run_scene
@@ -111,7 +111,7 @@ def run(
 def compare(
     first: Annotated[Positional[Path], arg(metavar="RUN")],
     second: Annotated[Positional[Path], arg(metavar="RUN")],
-    json: bool = False,
+    json: Flag = False,
 ) -> Work:
     """Compare two runs: their scenes and settings, their last states, their metrics, and where they were made.
 
@@ -132,11 +132,11 @@ def optimise(
     overrides: Overrides = (),
     device: str = "cpu",
     precision: str = "float32",
-    resume: bool = False,
-    overwrite: bool = False,
+    resume: Flag = False,
+    overwrite: Flag = False,
     scheduler: str | None = None,
     workers: int | None = None,
-    pictures: bool = True,
+    pictures: Flag = True,
 ) -> Work:
     """Optimise what a task file names, and check the result as the file asks.
 
@@ -150,7 +150,7 @@ def optimise(
         overwrite: Replace an earlier run in the same folder.
         scheduler: Address of a scheduler of Dask's, whose workers compute the samples of an ensemble.
         workers: Number of worker processes on this machine that do; on a GPU each has one of its own.
-        pictures: Draw shaded pictures and films; --no-pictures leaves them out.
+        pictures: Leave out the shaded pictures and the films.
     """
     if resume and overwrite:
         raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
@@ -165,7 +165,7 @@ def optimise(
 def picture(
     run: Annotated[Positional[Path], arg(metavar="RUN")],
     frame: int = -1,
-    film: bool = False,
+    film: Flag = False,
     out: Path | None = None,
     overrides: Overrides = (),
     device: str = "cpu",
@@ -246,7 +246,7 @@ def bench(
     device: str = "cpu",
     precision: str = "float32",
     engine: Literal["warp", "reference"] = "warp",
-    json: bool = False,
+    json: Flag = False,
 ) -> Work:
     """Time a dam break: each pass of a step, the step, a rollout and its gradient, beside what the hardware allows.
 

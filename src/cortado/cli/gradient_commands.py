@@ -7,7 +7,7 @@ from typing import Annotated
 from tyro.conf import Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from cortado.cli.arguments import Overrides, Scene, as_text, require_at_least
+from cortado.cli.arguments import Flag, Overrides, Scene, as_text, require_at_least
 from cortado.cli.command import Work, command
 
 gradients = SubcommandApp()
@@ -23,7 +23,7 @@ def check(
     out: Path | None = None,
     overrides: Overrides = (),
     device: str = "cpu",
-    json: bool = False,
+    json: Flag = False,
     seed: int = 0,
 ) -> Work:
     """Check the gradients of a scene, in float64: are they right, up to which step are they useful, what to use beyond.
@@ -52,8 +52,8 @@ def figure(
     experiment: Annotated[Positional[Path], arg(metavar="EXPERIMENT.toml")],
     out: Path | None = None,
     overrides: Overrides = (),
-    reduced: bool = False,
-    redraw: bool = False,
+    reduced: Flag = False,
+    redraw: Flag = False,
 ) -> Work:
     """Measure and draw one experiment of the gradient study.
 
@@ -74,7 +74,7 @@ def study(
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")] = Path("experiments"),
     out: Path = Path("runs/study"),
     only: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (),
-    reduced: bool = False,
+    reduced: Flag = False,
 ) -> Work:
     """Measure and draw all experiments; those that are there already, with the same settings, are not repeated.
 
