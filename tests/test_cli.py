@@ -296,6 +296,17 @@ def test_what_came_out_is_told_before_it_is_drawn(cortado_command, monkeypatch, 
     assert quiet[:2] == (130, "")
 
 
+@pytest.mark.parametrize(
+    ("steps", "estimator", "told"), [(100, "exact", True), (99, "exact", False), (100, "adjoint_viscosity", False)]
+)
+def test_a_search_of_a_long_run_that_comes_to_nothing_says_what_to_try(cortado_command, steps, estimator, told):
+    short = [f"problem.steps={steps}", f"optimise.gradient.name={estimator}", "optimise.iterations=1"]
+    options = [word for one in (*short, "optimise.learning_rate=1e-9") for word in ("--set", one)]
+    code, out, _ = cortado_command("optimise", "task.toml", "--out", "found", "--no-pictures", *options)
+    assert code == 1 and ("The loss hardly fell. Over 100 steps the exact gradient may mean nothing" in out) is told
+    assert ("The loss hardly fell" in Path("found/report.html").read_text()) is told
+
+
 def test_an_optimisation_that_falls_short_fails_and_keeps_its_files(cortado_command):
     hard = ["--set", "optimise.check.loss_reduction=1e9", "--set", "optimise.check.parameter_error=1e-9"]
     code, out, err = cortado_command("optimise", "task.toml", "--out", "found", *hard)

@@ -35,6 +35,10 @@ MOST_NUMBERS = 1000
 """Of a parameter whose estimate is in result.json; larger ones are in the checkpoint."""
 MOST_ERROR = 0.3
 """Of a parameter, relative, up to which it counts as found."""
+LITTLE = 2.0
+"""How many times smaller a loss must be for a search to have come to something."""
+LONG = 100
+"""Steps from which on a search that came to nothing may have had meaningless gradients."""
 VIEWED = 60
 """States of a run that the view in the report shows at most."""
 
@@ -126,7 +130,8 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
     first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
     verdict = judge(made.task, result, estimate, noise, first)
     knots = knot_values(made, result.parameters, estimate)
-    announce("\n".join([_summary(made, result, verdict), *found_lines(made, estimate, knots)]))
+    lines = [_summary(made, result, verdict), *found_lines(made, estimate, knots), *_advice(made.task, verdict)]
+    announce("\n".join(lines))
     shaded = _shaded(made, result, folder.figures, pictures)
     figures = shaded + task_figures(made, result, folder.figures)
     rows = found_rows(made, estimate, knots, verdict.errors)
@@ -242,6 +247,18 @@ def _for_machines(
     return found if verdict.psnr is None else {**found, "psnr": verdict.psnr}
 
 
+def _advice(task: Task, verdict: Verdict) -> list[str]:
+    """What to try where a search in a long run came to next to nothing."""
+    steps = task.problem.steps
+    if verdict.reduction >= LITTLE or steps < LONG or task.optimise.gradient.name != "exact":
+        return []
+    return [
+        f"The loss hardly fell. Over {steps} steps the exact gradient may mean nothing: cortado gradients check says "
+        'up to which step it is of use. Beyond it set optimise.gradient.name = "adjoint_viscosity" and '
+        'optimise.optimiser = "line_search".'
+    ]
+
+
 def _summary(made: Setup, result: Result, verdict: Verdict) -> str:
     reached = [f"{name} is {found_in_words(error)}" for name, error in verdict.errors.items()]
     if verdict.psnr is not None:
@@ -256,7 +273,8 @@ def _summary(made: Setup, result: Result, verdict: Verdict) -> str:
 def found_in_words(error: float) -> str:
     """How well a parameter is found, by its distance from the true value relative to it."""
     if error > MOST_ERROR:
-        return f"not found, {100 * error:.2g}% off: other values do as well, or the search is too short"
+        why = "the search is too short, it ended in a wrong valley of the loss, or other values do as well"
+        return f"not found, {100 * error:.2g}% off: {why}"
     return f"found with an error of {100 * error:.2g}%"
 
 
@@ -277,7 +295,12 @@ def _sections(
     head = ("", "unit", "first guess", "found", "hidden", "error")
     return [
         _asked(made),
-        Section("What was found", [_summary(made, result, verdict)], verdict.failures, figures.found),
+        Section(
+            "What was found",
+            [_summary(made, result, verdict), *_advice(made.task, verdict)],
+            verdict.failures,
+            figures.found,
+        ),
         Section("In numbers", head=head, rows=rows),
         Section("To turn and to play", view=_view(made, estimate)),
         Section("Before, found and target", figures=figures.compared),
