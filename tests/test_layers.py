@@ -31,7 +31,7 @@ LAYERS = """
     device.smoothing
     device.neighbourhood device.arrays device.fields device.launching device.state device.cells
     device.candidates device.neighbours
-    scene.checks scene.scene scene.in_words
+    scene.overlaps scene.checks scene.scene scene.in_words
     parameters.checks
     discretise.sampling discretise.discrete_scene
     sph sph.density sph.free_energy sph.integration sph.order sph.materials sph.emitter_kernels sph.pair_forces

@@ -156,3 +156,5 @@ def test_a_wrong_tilt_is_a_sentence(made, values, words):
 def test_a_tilt_does_not_vary_where_gravity_is_given():
     with pytest.raises(InputError, match="direction tilt is given, but must be left out, as gravity is given"):
         problem_of(splash()).tangent({"gravity": [0.0, -9.0, 0.0]}, {"tilt": [1.0, 0.0]})
+    with pytest.raises(InputError, match="direction gravity is given, but must be left out, as tilt is given"):
+        problem_of(splash()).tangent({"tilt": [1.0, 0.0]}, {"gravity": [0.0, -1.0, 0.0]})

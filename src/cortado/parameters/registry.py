@@ -174,7 +174,8 @@ PARAMETERS = (
     Parameter(
         "tilt",
         "°",
-        "how far the scene's gravity leans, with its size kept; in the place of gravity",
+        "how far the scene's gravity leans, with its size kept, in the place of gravity: where it points along -y, "
+        "towards x and, in 3-D, towards z",
         Axis.STEP,
         lambda s: np.zeros(s.scene.dimension - 1),
         components=lambda dimension, phases: dimension - 1,

@@ -134,6 +134,8 @@ class SceneParameters:
 
     def direction(self, values: Arrays, along: Arrays) -> tuple[Arrays, Arrays]:
         """A direction by name as tangents of the fields of the first state and of what steps depend on."""
+        if "gravity" in along and "tilt" in values:
+            raise InputError("direction gravity is given, but must be left out, as tilt is given in its place.")
         if "tilt" in along:
             if "gravity" in values:
                 raise InputError("direction tilt is given, but must be left out, as gravity is given in its place.")

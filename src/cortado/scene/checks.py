@@ -1,7 +1,5 @@
 """What must hold for a scene as a whole: names, sizes, and where the fluid is. Each check raises a `field_error`."""
 
-from itertools import product
-
 import numpy as np
 from pydantic_core import PydanticCustomError
 
@@ -15,13 +13,12 @@ from cortado.scene.fields import MISSING, FieldPath, field_error
 from cortado.scene.fluids import Body, Fluid, PointsFluid
 from cortado.scene.mixture import Mixture
 from cortado.scene.model import SceneTables
-from cortado.scene.sentences import field_name
+from cortado.scene.overlaps import check_distinct, check_overlaps
+from cortado.scene.sentences import point_in_words
 
 MOST_PARTICLES = 2e8
 FURTHEST = 1e9
 """In spacings from the origin; further away, neighbours would not have distinct positions in float64."""
-NEAREST = 0.5
-"""In spacings: particles that start nearer to each other overlap."""
 
 
 def check_scene(scene: SceneTables) -> None:
@@ -43,10 +40,10 @@ def check_scene(scene: SceneTables) -> None:
     _check_place(scene)
     for index, fluid in enumerate(scene.fluid):
         _check_inside(scene, index, fluid)
-        _check_distinct(index, fluid, spacing)
+        check_distinct(("fluid", index), fluid, spacing)
     if scene.emitter is not None:
         _check_outlet(scene, scene.emitter)
-    _check_overlaps(scene)
+    check_overlaps(_bodies(scene), scene.container.periods(scene.dimension)[1], spacing)
     _check_schedule(scene)
 
 
@@ -136,7 +133,7 @@ def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
 
 
 def _outside(index: int, place: Points) -> PydanticCustomError:
-    found = Words(f"partly outside, for example at {_place(place)}")
+    found = Words(f"partly outside, for example at {point_in_words(place)}")
     return field_error(("fluid", index), found, "inside the container")
 
 
@@ -151,7 +148,7 @@ def _check_outlet(scene: SceneTables, emitter: Emitter) -> None:
         raise field_error(("emitter", "outlet"), emitter.outlet, "inside the container")
     outside = ~scene.container.contains(opening, tolerance)
     if outside.any():
-        wanted = f"so small that the opening is inside the container, also at {_place(opening[outside][0])}"
+        wanted = f"so small that the opening is inside the container, also at {point_in_words(opening[outside][0])}"
         raise field_error(("emitter", "radius"), emitter.radius, wanted)
     ahead = outlet + np.where(lengths > 0.0, 0.0, spacing * np.array(emitter.direction))
     if not scene.container.contains(ahead[None], tolerance).all():
@@ -188,62 +185,5 @@ def _check_schedule(scene: SceneTables) -> None:
             raise field_error(("schedule", "nozzle_path", "values", index), place, wanted)
 
 
-def _check_distinct(index: int, fluid: Fluid, spacing: float) -> None:
-    """The points of a file may overlap each other; those of a lattice cannot."""
-    if not isinstance(fluid, PointsFluid) or fluid.count(spacing) < 2:
-        return
-    points = fluid.points()
-    distinct, counts = np.unique(points, axis=0, return_counts=True)
-    if len(distinct) < len(points):
-        raise field_error(("fluid", index), *_overlap("itself", distinct[np.argmax(counts)], spacing))
-    from scipy.spatial import cKDTree
-
-    distances = cKDTree(points).query(points, k=[2])[0].ravel()
-    if distances.min() < _nearest(spacing):
-        raise field_error(("fluid", index), *_overlap("itself", points[np.argmin(distances)], spacing))
-
-
-def _check_overlaps(scene: SceneTables) -> None:
-    """Between different bodies, and between a body and the periodic images of all."""
-    spacing = scene.discretisation.spacing
-    paths, bodies = zip(*_bodies(scene), strict=True)
-    lengths = scene.container.periods(scene.dimension)[1]
-    lower, upper = np.swapaxes([body.extent(spacing) for body in bodies], 0, 1)
-    shifts = [np.array(s) * lengths for s in product(*[(0, -1, 1) if length else (0,) for length in lengths])]
-    for second, shift in product(range(len(bodies)), shifts):
-        last = second + 1 if shift.any() else second
-        gaps = np.maximum(lower[:last] - upper[second] - shift, lower[second] + shift - upper[:last])
-        for first in np.nonzero((gaps < _nearest(spacing)).all(axis=1))[0]:
-            place = _meeting(bodies[first], bodies[second], shift, spacing)
-            if place is not None:
-                raise field_error(paths[second], *_overlap(field_name(paths[first]), place, spacing))
-
-
-def _meeting(first: Body, second: Body, shift: Points, spacing: float) -> Points | None:
-    """(d,) where a particle of the second body, shifted, is too near to one of the first; None if nowhere."""
-    lower, upper = first.extent(spacing)
-    moved = second.particles(spacing) + shift
-    near = moved[((moved > lower - spacing) & (moved < upper + spacing)).all(axis=1)]
-    if not len(near):
-        return None
-    from scipy.spatial import cKDTree
-
-    distances = cKDTree(first.particles(spacing)).query(near)[0]
-    return near[np.argmin(distances)] if distances.min() < _nearest(spacing) else None
-
-
-def _overlap(other: str, place: Points, spacing: float) -> tuple[Words, str]:
-    wanted = f"at least half a spacing, {NEAREST * spacing:g} m, from it everywhere"
-    return Words(f"overlapping {other} at {_place(place)}"), wanted
-
-
-def _nearest(spacing: float) -> float:
-    return NEAREST * spacing * (1.0 - 1e-6)
-
-
 def _nearer(spacing: float) -> str:
     return f"within {FURTHEST:g} spacings of {spacing:g} m"
-
-
-def _place(point: Points) -> str:
-    return f"({', '.join(f'{value:g}' for value in point)})"

@@ -101,6 +101,8 @@ def wanted(schema: Schema, name: str = "") -> str:
             return f"a list of {len(first) + 1} components: {', '.join(first)} and {last}"
         case {"type": "array", "items": {"$ref": _} | {"discriminator": _}}:
             return f"a list of at least one table, each written [[{name}]]"
+        case {"type": "array", "items": items, "minItems": 1, "maxItems": most}:
+            return f"a list of at most {most} components, each {wanted(items)}"
         case {"type": "array", "items": items, "maxItems": _}:
             return f"a list with one component for each axis, each {wanted(items)}"
         case {"type": "array", "items": items}:
@@ -122,3 +124,8 @@ def _limits(schema: Schema) -> str:
     limits += [f"at least {least:g}{unit}"] if least not in (-GREATEST, 1.0 / GREATEST) else []
     limits += [f"at most {most:g}{unit}"] if most != GREATEST else []
     return " and ".join(limits) or f"a number{unit and f' in{unit}'}"
+
+
+def point_in_words(point: Iterable[float]) -> str:
+    """Its coordinates, in brackets."""
+    return f"({', '.join(f'{value:g}' for value in point)})"

@@ -48,6 +48,9 @@ def read_toml(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> di
 
 def put_in(data: dict[str, Any], overrides: Sequence[str], file: str) -> dict[str, Any]:
     """The contents of a file with overrides put in. Raises `SceneError`."""
+    if isinstance(overrides, str):
+        sentence = f"must be in a list, as [{shown(overrides)}], as there may be several overrides."
+        raise SceneError(file, shown(overrides), sentence=sentence)
     for override in overrides:
         _apply(data, override, file)
     return data
