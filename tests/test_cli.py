@@ -290,8 +290,9 @@ def test_what_came_out_is_told_before_it_is_drawn(cortado_command, monkeypatch, 
         raise KeyboardInterrupt
 
     monkeypatch.setattr(f"cortado.commands.{drawing}", stopped)
-    code, out, _ = cortado_command(*command, "--out", "found")
+    code, out, err = cortado_command(*command, "--out", "found")
     assert code == 130 and re.fullmatch(told, out), out
+    assert ("the search has ended" in err and "--resume draws its pictures" in err) == (command[0] == "optimise")
     quiet = cortado_command(*command, "--out", "found", "--overwrite", "--quiet")
     assert quiet[:2] == (130, "")
 

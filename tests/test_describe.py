@@ -8,9 +8,11 @@ import pytest
 
 import cortado
 from bad_scenes import assert_one_sentence
-from bad_tasks import PARTICLES, TINY_LATTE, TINY_SCENE
+from bad_tasks import GOOD_TASK, PARTICLES, TINY_LATTE, TINY_SCENE
 from cortado.cli import main
 from cortado.commands.run_summary import Energy, RunSummary
+from cortado.inverse.in_words import task_in_words
+from cortado.inverse.task import load_task
 from cortado.io.pictures import read_picture
 from cortado.lattice.calibration import SLACK
 from cortado.scene.stability import stability_limit, stability_limits
@@ -162,3 +164,11 @@ def test_potential_energy_without_gravity_or_container():
     simulation = cortado.Simulation(scene)
     rollout = simulation.rollout(1)
     assert Energy.of(simulation, rollout, rollout.initial, 0).total == 0.0
+
+
+def test_a_task_is_told_in_words(capsys):
+    Path("task.toml").write_text(GOOD_TASK)
+    main(["describe", "task.toml"])
+    search = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("search"))
+    assert "Which gravity makes the fluid come to the same positions" in search and "by Adam" in search
+    assert described(capsys, "task.toml")["search"] == task_in_words(load_task("task.toml"))

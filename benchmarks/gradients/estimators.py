@@ -29,5 +29,6 @@ ESTIMATORS: dict[str, Callable[[float, int], GradientEstimator]] = {
     "median-of-means-of-8": lambda spread, seed: MedianOfMeans(spread, 8, seed=seed, estimator=AdjointViscosity()),
     "guided": lambda spread, seed: Guided(spread, seed=seed),
     "guided-2-parts": lambda spread, seed: Guided(spread, parts=2, seed=seed),
+    "guided-order-2": lambda spread, seed: Guided(spread, seed=seed, surrogate=AdjointViscosity(order=2)),
     "smoothing-2": lambda spread, seed: RandomizedSmoothing(spread, 2, seed=seed),
 }

@@ -15,10 +15,13 @@ from cortado.bench.memory import estimated_bytes
 from cortado.device.memory import frame_parts, step_parts
 from cortado.errors import DivergedError, InputError
 from cortado.figures import particles
+from cortado.inverse.in_words import task_in_words
+from cortado.inverse.task import load_task
 from cortado.io.files import sentences
 from cortado.rollout import MEMORY_BUDGET, Rollout
 from cortado.scene.scene import load_scene
 from cortado.scene.stability import stability_limits
+from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation, check_steps
 from cortado.solvers.particles import ParticleSolver
 
@@ -65,6 +68,8 @@ def describe_scene(
         raise InputError(f"--picture is {str(picture)!r}, but must be the name of a PNG file, such as first.png.")
     simulation = Simulation(load_scene(scene_file, overrides), device, precision)
     found = _described(simulation, check_steps(steps))
+    if "optimise" in read_toml(scene_file):
+        found["search"] = task_in_words(load_task(scene_file, overrides))
     if picture is not None:
         with sentences(picture.parent):
             picture.parent.mkdir(parents=True, exist_ok=True)
@@ -158,6 +163,7 @@ def _as_text(found: dict[str, Any]) -> str:
     ]
     courses = [f"{name} changes until {last:g} s" for name, last in found["scheduled_until_s"].items()]
     rows += [("schedule", f"{', '.join(courses)}, and is constant from then on")] if courses else []
+    rows += [("search", " ".join(found["search"]))] if "search" in found else []
     rows += [("picture", found["picture"])] if "picture" in found else []
     return "\n".join([found["name"], *(f"{label:<12}{text}" for label, text in rows)])
 

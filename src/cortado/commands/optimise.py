@@ -132,11 +132,12 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
     knots = knot_values(made, result.parameters, estimate)
     lines = [_summary(made, result, verdict), *found_lines(made, estimate, knots), *_advice(made.task, verdict)]
     announce("\n".join(lines))
-    shaded = _shaded(made, result, folder.figures, pictures)
-    figures = shaded + task_figures(made, result, folder.figures)
-    rows = found_rows(made, estimate, knots, verdict.errors)
-    write_report(folder, made.task.scene.name, _sections(made, estimate, result, verdict, figures, rows))
-    folder.write_result(**_for_machines(result, estimate, verdict, knots))
+    with keeping(lambda: f"the search has ended, and is in {folder.checkpoint}; --resume draws its pictures"):
+        shaded = _shaded(made, result, folder.figures, pictures)
+        figures = shaded + task_figures(made, result, folder.figures)
+        rows = found_rows(made, estimate, knots, verdict.errors)
+        write_report(folder, made.task.scene.name, _sections(made, estimate, result, verdict, figures, rows))
+        folder.write_result(**_for_machines(result, estimate, verdict, knots))
     if verdict.failures:
         raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
     films = [f"figures/{Path(path).name}" for _, path in shaded.found if Path(path).suffix == ".mp4"]

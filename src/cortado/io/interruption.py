@@ -52,14 +52,16 @@ def finish() -> None:
 @contextmanager
 def keeping(kept: Callable[[], str]) -> Iterator[None]:
     """Within it an interruption is an exception; ``kept`` then gives the end of its sentence: what is there, and where,
-    or nothing."""
+    or nothing. Of several within each other, the innermost one that gives something does."""
     ours = [number for number in SIGNALS if signal.getsignal(number) is _leave]
     for number in ours:
         signal.signal(number, _raise)
     try:
         yield
-    except KeyboardInterrupt as stop:
-        raise Interrupted(stop.args[0] if isinstance(stop, Interrupted) else signal.SIGINT, kept()) from None
+    except Interrupted as stop:
+        raise Interrupted(stop.args[0], stop.kept or kept()) from None
+    except KeyboardInterrupt:
+        raise Interrupted(signal.SIGINT, kept()) from None
     finally:
         for number in ours:
             signal.signal(number, _leave)
