@@ -46,14 +46,19 @@ class Objective:
 
     def __init__(self, task: Task, problem: Problem, seed: int, budget: float):
         """``budget``: simulated steps after which no further run begins."""
-        self.task, self.budget, self.meter, self.inner = task, budget, Meter(), problem
+        self.task, self.budget, self.meter = task, budget, Meter()
+        self.inner = problem
+        """Whose steps are not counted."""
         self._name = task.controls.parameter
         self._bad = BAD * abs(problem.value(task.controls.parameters(task.baseline)))
         self._begin(task.baseline, first_positions(problem, seed))
 
     def _begin(self, start: np.ndarray, fixed: Arrays, late: float = 1.0) -> None:
-        self.start, self.fixed = start, fixed
-        self.late = np.arange(start.size) >= (1.0 - late) * start.size
+        self.start = start
+        """(numbers,) where searches begin."""
+        self.fixed = fixed
+        """Parameters in the place of the scene's, such as the seed's first positions."""
+        self._changed = np.arange(start.size) >= (1.0 - late) * start.size
         self.metered = Metered(self.inner, fixed, self.meter)
         self.problem = Transformed(self.metered, {self._name: self.task.controls.mapping})  # type: ignore[arg-type]
         self.curve: list[tuple[float, float]] = []
@@ -100,7 +105,7 @@ class Objective:
         except DivergedError:
             return self._noted(u, math.inf, self.meter.steps), self.named(self._away_from_best(u))
         slopes = np.nan_to_num(found.gradient[self._name], nan=0.0, posinf=0.0, neginf=0.0)
-        slopes = np.clip(np.where(self.late, slopes, 0.0), -GREATEST, GREATEST)
+        slopes = np.clip(np.where(self._changed, slopes, 0.0), -GREATEST, GREATEST)
         return self._noted(u, found.loss, self.meter.steps), self.named(slopes)
 
     def value(self, parameters: Arrays) -> float:
