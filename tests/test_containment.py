@@ -208,6 +208,15 @@ def test_fluid_that_has_gone_round_a_period_may_be_where_it_is():
         problem.value({"initial_positions": simulation.positions - [0.0, 1.0]})
 
 
+@pytest.mark.parametrize("scale", [0.0, 0.001])
+def test_fluid_crowded_into_a_point_is_refused(scale):
+    simulation = Simulation(plane(), precision="float64")
+    problem = Problem(simulation, 1, losses.CentreOfMass([0.0, 0.0]))
+    middle = simulation.positions.mean(axis=0)
+    with pytest.raises(InputError, match=r"initial_positions has all particles within 0\.002\d* m2, but must leave"):
+        problem.value({"initial_positions": middle + scale * (simulation.positions - middle)})
+
+
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
 def test_parameters_that_cannot_be_are_refused():
     simulation = Simulation(plane(), precision="float64")

@@ -116,10 +116,11 @@ def test_random_places_are_the_same_each_time_and_within_the_container(made):
 
 
 def test_random_places_in_a_round_cup(made):
+    hidden = np.random.default_rng(5).uniform([-0.006, 0.001, -0.006], [0.006, 0.015, 0.006], (LATTE_PARTICLES, 3))
     ready = made(
         TINY_LATTE.replace("knots = 3", ""),
-        "problem.steps=2",  # before fluid that is all in one place leaves the cup
-        "problem.target.initial_positions=" + str(np.full((LATTE_PARTICLES, 3), 0.001).tolist()),
+        "problem.steps=2",  # before fluid that is crowded leaves the cup
+        f"problem.target.initial_positions={hidden.tolist()}",
         'optimise.start={initial_positions="random"}',
     )
     x = ready.start["initial_positions"]

@@ -190,7 +190,7 @@ def test_unfinished_file_stays_small_on_disk(tmp_path):
 
 
 def test_missing_foreign_and_damaged_files_are_sentences(tmp_path):
-    good, foreign, text, cut = (tmp_path / name for name in ("good", "foreign", "text", "cut"))
+    good, foreign, text, cut = (tmp_path / name for name in ("good.hdf", "foreign", "text", "cut"))
     example(3).save(good)
     with h5py.File(foreign, "w") as file:
         file["x"] = 1.0
@@ -210,8 +210,8 @@ def test_missing_foreign_and_damaged_files_are_sentences(tmp_path):
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_damaged_file_gives_the_same_arrays_or_an_input_error(tmp_path, dimension):
     saved = example(dimension)
-    saved.save(tmp_path / "good")
-    content = (tmp_path / "good").read_bytes()
+    saved.save(tmp_path / "good.vtkhdf")
+    content = (tmp_path / "good.vtkhdf").read_bytes()
     generator = random.Random(dimension)
     refused = 0
     for _ in range(400):
@@ -232,11 +232,11 @@ def test_a_damaged_file_gives_the_same_arrays_or_an_input_error(tmp_path, dimens
 
 @pytest.mark.parametrize("name", ["dimension", "format"])
 def test_a_number_that_says_how_to_read_is_covered_too(tmp_path, name):
-    example(3).save(tmp_path / "a")
-    with h5py.File(tmp_path / "a", "r+") as file:
+    example(3).save(tmp_path / "a.vtkhdf")
+    with h5py.File(tmp_path / "a.vtkhdf", "r+") as file:
         file["cortado"].attrs[name] -= 1
     with pytest.raises(InputError, match="damaged"):
-        read(tmp_path / "a")
+        read(tmp_path / "a.vtkhdf")
 
 
 def test_vtk_opens_a_file_that_grows(tmp_path):
@@ -310,6 +310,13 @@ def test_writer_refuses_what_was_not_announced(tmp_path):
     with TrajectoryWriter(tmp_path / "b", times=[0.0], particles=3, dimension=2):
         pass
     assert os.listdir(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize("name", ["run.npz", "run", "run.mp4"])
+def test_a_trajectory_has_the_suffix_of_its_format(name, tmp_path):
+    with pytest.raises(InputError, match=r"must be a VTKHDF file, whose name ends in \.vtkhdf or \.hdf\.$"):
+        example(2).save(tmp_path / name)
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_frame_is_taken_by_its_number():

@@ -158,7 +158,7 @@ def case(scene: str, seed: int, steps: int, count: int, device: str) -> list[dic
         truth: Smoothed | AlongDirections
         if blocks == BLOCKS:
             truth = Smoothed.found(problem, gravity, 1000 * seed)
-            rows.append(of | {"estimator": OTHER_HALF, "cosine": truth.likeness, "size": np.nan})
+            rows.append(of | {"estimator": OTHER_HALF, "cosine": truth.likeness})
         else:
             truth = AlongDirections.found(problem, gravity, start, 1000 * seed, count)
         for name, make in ESTIMATORS.items():
@@ -176,7 +176,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
             for key in ("cosine", "size", "error")
         )
         median = np.median(cosines)
-        most = np.sqrt(2.0 * median / (1.0 + median))
+        most = np.sqrt(2.0 * max(median, 0.0) / (1.0 + max(median, 0.0)))
         size = f", at most {most:6.3f}" if name == OTHER_HALF else f" {np.median(sizes):8.2g}"
         error = f", cosines to {np.median(errors):.3f}" if np.isfinite(errors).all() else ""
         lines.append(f"{name:20} {median:6.3f} [{min(cosines):6.3f}]{size}{error}")

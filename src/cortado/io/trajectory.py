@@ -201,9 +201,12 @@ class Trajectory:
         """Writes a VTKHDF file, which ParaView opens; a file of that name is replaced.
 
         Raises:
-            InputError: no frames, or a path that cannot be written.
+            InputError: no frames, a name that does not end in one of `SUFFIXES`, or a path that cannot be written.
             ComputationError: the disk is full.
         """
+        if Path(path).suffix.lower() not in SUFFIXES:
+            wanted = f"must be a VTKHDF file, whose name ends in {' or '.join(SUFFIXES)}"
+            raise InputError(f"path is {str(path)!r}, but {wanted}.")
         frames = self._fields
         first = {name: array[0] if len(array) else array for name, array in frames.items()}
         with frame_writer(path, self.times, first, self.constants, len(self.converged), self.diagnostics) as writer:
@@ -242,6 +245,8 @@ def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
 
 
 FRACTION = "mass_fraction_"
+SUFFIXES = (".vtkhdf", ".hdf")
+"""By which ParaView knows a trajectory."""
 
 
 def frame_writer(

@@ -16,6 +16,9 @@ from cortado.restart import RestartState
 from cortado.scene.scene import Scene
 from cortado.scene.stability import broken_limit
 
+CROWDED = 0.5
+"""Of the room that their fluid fills: particles with less for all of them cannot be pushed apart."""
+
 
 def check_sizes(values: Arrays, precision: Precision) -> None:
     """Numbers are no larger than the precision bears, nor smaller where they must be positive; raises `InputError`."""
@@ -38,6 +41,7 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
         for particle in _outside(scene, positions[:free])[:1]:
             place = _place(positions[particle])
             raise InputError(f"parameter initial_positions has particle {particle} at {place}, outside the container.")
+        _check_room(positions[:free], spacing)
     if "nozzle_path" in values and scene.emitter is not None:
         path, opening = np.atleast_2d(values["nozzle_path"]), scene.emitter.opening(spacing) - scene.emitter.outlet
         for step in _outside(scene, (path[:, None] + opening).reshape(-1, scene.dimension))[:1] // len(opening):
@@ -77,6 +81,18 @@ def unstable_sentence(values: Arrays, scene: Scene) -> str | None:
         return None
     found = f"time_step is {time_step:g} s, but the limit of stability with these parameters is about {broken[1]:.3g} s"
     return f"{found}, which comes from {broken[0]}."
+
+
+def _check_room(positions: np.ndarray, spacing: float) -> None:
+    """Positions (n, d) [m] are not crowded into a small part of the room that their fluid needs."""
+    room = np.prod(np.ptp(positions, axis=0) + spacing) if len(positions) else np.inf
+    needed = len(positions) * spacing ** positions.shape[-1]
+    if room < CROWDED * needed:
+        unit = "m2" if positions.shape[-1] == 2 else "m3"
+        raise InputError(
+            f"parameter initial_positions has all particles within {room:.3g} {unit}, but must leave them about the "
+            f"{needed:.3g} {unit} that their fluid fills."
+        )
 
 
 def _outside(scene: Scene, points: Any) -> np.ndarray:

@@ -40,7 +40,8 @@ def scene_values(source: Source) -> Arrays:
 def check_known(name: str, scene: Any, what: str = "parameter") -> None:
     """Whether there is such a parameter, and a scene has it; raises `InputError`."""
     if name not in BY_NAME:
-        raise InputError(f"{what} {name!r} is unknown, but must be one of {', '.join(NAMES)}.")
+        present = [known for known, parameter in BY_NAME.items() if parameter.present(scene)]
+        raise InputError(f"{what} {name!r} is unknown, but must be one of {', '.join(present)} in this scene.")
     parameter = BY_NAME[name]
     if not parameter.present(scene):
         raise InputError(f"{what} {name} is given, but must be left out, as the scene {parameter.absent}.")
