@@ -176,16 +176,18 @@ def test_the_table_says_what_noise_leaves():
 
 
 def test_scenes_and_seeds_are_put_together():
-    def record(scene, estimator, **found):
-        cell = {"scene": scene, "control": "c", "loss": "l", "horizon": 1200, "seed": 1, "estimator": estimator}
+    def record(scene, estimator, loss="l", **found):
+        cell = {"scene": scene, "control": "c", "loss": loss, "horizon": 1200, "seed": 1, "estimator": estimator}
         return {**cell, **found}
 
     truth = {"derivatives": [3.0, 4.0], "standard_errors": [3.0, 0.0]}
     records = [record(scene, "truth", **truth) for scene in ("a", "b", "e")]
     records += [record("a", "one", derivatives=[6.0, 8.0]), record("b", "one", derivatives=[-4.0, 3.0])]
     records += [record("e", "one", derivatives=None), record("without a truth", "one", derivatives=[1.0, 0.0])]
+    records += [record("a", "truth", "m", **truth), record("a", "one", "m", derivatives=[3.0, 4.0])]
     text = over_scenes(records)
     assert "| l | 1,200 | one | 0.50 [0.00] | 1.50 | 2 |" in text
+    assert "| all of these | 1,200 | one | 1.00 [0.00] | 1.00 | 3 |" in text
     assert "| l | 1,200 | *at most* | 0.80 [0.80] |  | 3 |" in text
 
 

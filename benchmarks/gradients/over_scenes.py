@@ -14,18 +14,22 @@ from .cells import TRUTH, Cell, Record
 from .results import Results
 from .table import ceiling, cosine
 
+ALL_LOSSES = "all of these"
+
 
 def over_scenes(records: Iterable[Record], least_ceiling: float = 0.0) -> str:
-    """A table in Markdown for each control, with a row for each loss, horizon and estimator: over scenes and seeds the
-    median cosine to the truth [the least], the median size, and in how many cases; in the row of the truth, what the
-    smoothed gradient itself would have. Cases where that is below ``least_ceiling`` are left out."""
+    """A table in Markdown for each control, with a row for each loss (and for all of them), horizon and estimator: over
+    scenes and seeds the median cosine to the truth [the least], the median size, and in how many cases; in the row of
+    the truth, what the smoothed gradient itself would have. Left out are cases where that is below ``least_ceiling``.
+    """
     known = {Cell.of(record): record for record in records}
     found: dict[str, dict[tuple[str, int, str], list[tuple[float, float]]]] = {}
     for cell, record in known.items():
         truth = known.get(cell.question, {})
         if truth.get("derivatives") and record.get("derivatives") and ceiling(truth) >= least_ceiling:
-            row = (cell.loss, cell.horizon, cell.estimator)
-            found.setdefault(cell.control, {}).setdefault(row, []).append(_score(record, truth))
+            rows = found.setdefault(cell.control, {})
+            for loss in (cell.loss, ALL_LOSSES):
+                rows.setdefault((loss, cell.horizon, cell.estimator), []).append(_score(record, truth))
     return "\n\n".join(f"**{control}**\n\n{_rows(found[control])}" for control in sorted(found))
 
 
@@ -38,7 +42,9 @@ def _score(record: Record, truth: Record) -> tuple[float, float]:
 
 def _rows(scores: dict[tuple[str, int, str], list[tuple[float, float]]]) -> str:
     lines = ["| loss | steps | estimator | cosine | size | cases |", "|---" * 6 + "|"]
-    for loss, horizon, estimator in sorted(scores, key=lambda row: (*row[:2], row[2] == TRUTH, row[2])):
+    for loss, horizon, estimator in sorted(
+        scores, key=lambda row: (row[0] == ALL_LOSSES, *row[:2], row[2] == TRUTH, row[2])
+    ):
         own = scores[loss, horizon, estimator]
         cosines, sizes = zip(*own, strict=True)
         name, size = ("*at most*", "") if estimator == TRUTH else (estimator, f"{median(sizes):.2f}")
