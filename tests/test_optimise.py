@@ -227,6 +227,13 @@ def test_a_line_search_goes_down_a_rough_slope():
     assert result.loss < 0.02 and np.abs(result.parameters["x"]).max() < 0.1
 
 
+def test_a_line_search_leaves_a_dent_again():
+    result = optimise(Rough(), {"x": np.array([2.0, -1.0])}, LineSearch(), 60)
+    iterates = np.array([record.parameters["x"] for record in result.history])
+    steps = np.abs(np.diff(iterates, axis=0)).max(axis=1)
+    assert (steps[-20:] > 0.01).sum() >= 5
+
+
 def test_a_line_search_leaves_runs_that_diverge_aside():
     """It is led to where runs diverge, and goes as far as it can."""
 

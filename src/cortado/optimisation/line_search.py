@@ -33,8 +33,9 @@ class LineSearch:
         d_k = unit(momentum d_{k-1} - unit(g_k)),   x_{k+1} = the best of P(x_k + r_k s scale d_k),
 
     over lengths s at even ratios from ``shortest`` to 1; P projects onto the bounds. The reach r is 1 at first, and
-    then `GROWTH` times the length that was best, at most 1. An update takes the best trial even if it raises the loss,
-    and the next ones are then shorter. There is no test of convergence: all the iterations are made.
+    then `GROWTH` times the length that was best, at most 1. Where no trial lowers the loss, at the bottom of a dent or
+    of the valley, an update still takes the best one, and the reach is 1 again, by which the search leaves dents. So
+    the last iterate need not be the best. There is no test of convergence: all the iterations are made.
 
     Raises InputError for settings out of range.
     """
@@ -66,14 +67,14 @@ class LineSearch:
         scale, x, reach = search.layout.spread(self.scale), search.start, 1.0
         along = np.zeros_like(x)
         for _ in range(search.iterations):
-            _, gradient = search.evaluate(x)
+            loss, gradient = search.evaluate(x)
             along = unit(self.momentum * along - unit(gradient * scale))
             lengths = reach * np.geomspace(self.shortest, 1.0, self.trials)
             tried = [search.project(x + length * scale * along) for length in lengths]
             losses = search.losses(tried)
             best = int(np.argmin(losses))
             if np.isfinite(losses[best]):
-                x, reach = tried[best], min(GROWTH * lengths[best], 1.0)
+                x, reach = tried[best], min(GROWTH * lengths[best], 1.0) if losses[best] < loss else 1.0
             else:
                 along, reach = np.zeros_like(x), reach * self.shortest
             search.updated()
