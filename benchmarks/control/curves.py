@@ -1,5 +1,6 @@
 """What searches found: curves of the loss over simulated steps, last pictures, and a table of medians."""
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ from contenders import CONTENDERS
 from objective import first_positions
 from records import Record
 
-from cortado import InputError, Problem
+from cortado import DivergedError, InputError, Problem
 from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE, drawing
 from cortado.io.srgb import to_srgb
 from cortado.losses import Image
@@ -32,7 +33,8 @@ def by_contender(records: list[Record]) -> dict[str, list[Record]]:
 
 
 def draw(name: str, size: str, records: list[Record], folder: Path) -> None:
-    """``NAME_SIZE.png`` with the curves, and ``NAME_SIZE_pictures.png`` with the last pictures of median runs."""
+    """``NAME_SIZE.png`` with the curves, and ``NAME_SIZE_pictures.png`` with the last pictures of median runs;
+    one that diverges on this device, though not on that which found it, has none."""
     if not records:
         raise InputError(f"There are no runs of {name} {size} to draw; leave out --figures to compute them.")
     problem = task(name, size).problem(records[0].run.device, records[0].run.precision)
@@ -67,7 +69,10 @@ def _draw_pictures(name: str, size: str, problem: Problem, records: list[Record]
         median = sorted(runs, key=lambda one: one.so_far[-1])[len(runs) // 2]
         first = first_positions(problem, median.run.seed)
         parameters[who] = chosen.controls.parameters(np.array(median.best)) | first
-    pictures = {who: picture(problem, one) for who, one in parameters.items()}
+    pictures = {}
+    for who, one in parameters.items():
+        with suppress(DivergedError):
+            pictures[who] = picture(problem, one)
     if isinstance(problem.loss, Image):
         pictures = {"target": problem.loss.target, **pictures}
     columns = 5
