@@ -40,7 +40,7 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     (tmp_path / "task.toml").write_text(GOOD_TASK)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("cortado.commands.run.run_pictures", lambda *_: [])  # tests/test_shading.py draws them
+    monkeypatch.setattr("cortado.commands.run_report.run_pictures", lambda *_: [])  # tests/test_shading.py draws them
     monkeypatch.setattr("cortado.commands.optimise.shaded_figures", lambda *_: Chapters())
     return tmp_path
 
@@ -179,6 +179,29 @@ def test_an_interrupted_run_keeps_its_frames(cortado_command, folder, monkeypatc
     assert len(Trajectory.load("dam/trajectory.vtkhdf").times) == 5
 
 
+def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(cortado_command, folder, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("cortado.commands.run_report.lacking", lambda _: None)
+    monkeypatch.setattr("cortado.commands.run_report.run_pictures", stopped)
+    code, _, err = cortado_command("run", "scene.toml", "--steps", 5, "--out", "dam")
+    there = Path("dam").absolute()
+    sentence = f"Interrupted; the run has ended, and is in {there}; cortado picture {there} --film draws it."
+    assert (code, err.splitlines()[-1]) == (130, sentence)
+    assert {path.name for path in there.iterdir()} == RUN_FILES
+
+
+def test_memory_that_runs_out_is_a_sentence(cortado_command, monkeypatch):
+    def too_much(*_):
+        raise MemoryError("Unable to allocate 64 GiB")
+
+    monkeypatch.setattr("cortado.commands.run.write_run_report", too_much)
+    code, _, err = cortado_command("run", "scene.toml", "--steps", 5, "--out", "dam")
+    assert code == 1 and err.splitlines()[-1].startswith("Memory ran out (Unable to allocate 64 GiB); take a larger")
+    assert Path("dam/result.json").exists() and Path("dam/trajectory.vtkhdf").exists()
+
+
 @pytest.mark.parametrize("command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"])
 def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command, monkeypatch, command):
     for module in (cortado.commands.run, cortado.commands.optimise):
@@ -223,6 +246,8 @@ def test_wrong_arguments_of_run_are_refused(cortado_command, folder, arguments, 
     [
         (["--steps", "3"], "--steps is "),
         (["walk"], "walk is unknown, but must be one of gradients, new, "),
+        (["rnu", "scene.toml"], "rnu is unknown; run may be meant"),
+        (["run", "scene"], "scene: the scene cannot be read: No such file or directory; did you mean scene.toml?"),
         (["run"], "SCENE.toml is missing; see cortado run --help."),
         (["gradients"], "a command is missing, one of check, figure, study; see cortado gradients --help."),
         (["run", "scene.toml", "--steps", "many"], "--steps is 'many', but must be a whole number; see cortado run "),
@@ -276,7 +301,7 @@ def test_optimise_writes_its_folder(cortado_command, folder):
 @pytest.mark.parametrize(
     ("command", "drawing", "told"),
     [
-        (["run", "scene.toml", "--steps", 2], "run._write_report", r"2 steps of .* kg/m3\.\n"),
+        (["run", "scene.toml", "--steps", 2], "run.write_run_report", r"2 steps of .* kg/m3\.\n"),
         (
             ["optimise", "task.toml"],
             "optimise.task_figures",

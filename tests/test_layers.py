@@ -84,7 +84,7 @@ LAYERS = """
     sweep sweep.combinations sweep.table
     commands commands.executor commands.found commands.bench commands.check commands.compare commands.describe
     commands.examples commands.figure commands.new commands.optimise commands.overview commands.picture
-    commands.run_summary commands.run
+    commands.run_summary commands.run_report commands.run
     commands.schema commands.study
     commands.sweep commands.view_window commands.view_quantities commands.view_recorded commands.view_live
     commands.view_task commands.view

@@ -440,6 +440,12 @@ class Breaks:
         return (self.loss if broken else float(x**2 + np.sum(parameters["g"] ** 2))), {"x": 2.0 * x, "g": g}
 
 
+def test_a_loss_that_is_not_finite_at_the_start_says_so():
+    start = {"x": 1.0, "g": np.ones((2, 3))}
+    with pytest.raises(ComputationError, match=r"^At the start the loss is nan as a function of 'x', 'g'; begin else"):
+        optimise(Breaks(loss=np.nan, evaluations=2), start, Adam(0.1), 10)
+
+
 @pytest.mark.parametrize("optimiser", [Adam(0.1), GradientDescent(0.1), LBFGS()])
 @pytest.mark.parametrize(
     ("problem", "what"),

@@ -192,3 +192,16 @@ def test_unwritable_pictures_are_sentences(tmp_path):
         with pytest.raises(InputError, match=words):
             write_picture(tmp_path / "a.png", image)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "image", "wanted"),
+    [
+        ("a.foo", np.zeros((2, 2, 3)), "must be the name of a PNG file"),
+        ("a.png", np.zeros((2, 2, 3), np.uint8), "made of whole numbers, but must be linear light from 0 to 1"),
+    ],
+)
+def test_what_would_be_written_wrong_is_refused(tmp_path, name, image, wanted):
+    with pytest.raises(InputError, match=wanted):
+        write_picture(tmp_path / name, image)
+    assert not list(tmp_path.iterdir())

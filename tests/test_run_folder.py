@@ -14,7 +14,7 @@ import pytest
 import cortado.io.run_folder
 from cortado.errors import InputError
 from cortado.io.files import unfinished
-from cortado.io.particle_view import Cloud, particle_view
+from cortado.io.particle_view import Cloud, particle_view, thinned
 from cortado.io.progress import track
 from cortado.io.report import Section, write_report, written
 from cortado.io.run_folder import RunFolder
@@ -223,8 +223,9 @@ def test_a_view_in_a_report_holds_its_particles_and_no_network(tmp_path):
     random = np.random.default_rng(0)
     positions = random.uniform(size=(300, 200, 3))
     speeds = random.uniform(size=(300, 200))
-    clouds = [Cloud("found", positions, speeds), Cloud("</script>", positions, speeds)]
-    view = particle_view(clouds, np.arange(300) * 0.01, 0.1, lines=[[[0, 0, 0], [2, 1, 1]]], most_bytes=100_000)
+    chosen, stride = thinned(300, 200, numbers=14, most_bytes=100_000)
+    clouds = [Cloud(name, positions[chosen], speeds[chosen]) for name in ("found", "</script>")]
+    view = particle_view(clouds, chosen * 0.01, 0.1, lines=[[[0, 0, 0], [2, 1, 1]]], stride=stride)
     assert len(view) < 150_000 and view.count("</script>") == 1
     data = json.loads(view.partition('"application/json">')[2].partition("</script>")[0])
     assert data["particles"] == 200 and data["times"][-1] == 2.99 and data["half"] == [1.0, 0.5, 0.5]
@@ -236,8 +237,9 @@ def test_a_view_in_a_report_holds_its_particles_and_no_network(tmp_path):
 
 
 def test_a_view_of_very_many_particles_leaves_some_out():
-    positions = np.zeros((30, 5000, 2))
-    view = particle_view([Cloud("a", positions, positions[..., 0])], np.arange(30), 0.1, most_bytes=100_000)
+    chosen, stride = thinned(30, 5000, numbers=5, most_bytes=100_000)
+    positions = np.zeros((30, 5000, 2))[chosen, ::stride]
+    view = particle_view([Cloud("a", positions, positions[..., 0])], chosen, 0.1, stride=stride)
     assert len(view) < 160_000 and "One particle in 6 is shown." in view
 
 

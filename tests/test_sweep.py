@@ -3,6 +3,7 @@ killed."""
 
 import csv
 import json
+import signal
 import threading
 import time
 from functools import partial
@@ -18,6 +19,7 @@ from cortado import InputError
 from cortado.cli import main
 from cortado.executors import Distributed
 from cortado.executors import distributed as of_dask
+from cortado.io.interruption import Interrupted
 from cortado.sweep.combinations import combinations
 from cortado.sweep.table import write_table
 from dask_processes import PATIENCE, scheduler
@@ -167,7 +169,8 @@ def test_a_scene_is_run_and_what_diverges_is_in_the_table(sweep, folder):
     assert (code, out) == (1, "")
     warning, sentence = err.splitlines()
     assert warning.startswith("Warning: solver.time_step=0.2: solver.time_step is 0.2 s, but the limit")
-    assert sentence.startswith("Of 2 combinations 1 failed; the table is ")
+    assert sentence.startswith("Of 2 combinations 1 failed, the first of them solver.time_step=0.2: The simulation div")
+    assert sentence.endswith(f" The table is {folder / 'runs' / 'sweep.csv'}, beside a folder for each.")
     good, bad = rows("runs")
     assert (good["status"], good["steps"], good["particles"], good["mean.iterations"]) == ("done", "6", "64", "3.0")
     assert bad["status"] == "failed" and bad["failures"].startswith("The simulation diverged in step 1: ")
@@ -175,7 +178,7 @@ def test_a_scene_is_run_and_what_diverges_is_in_the_table(sweep, folder):
 
     code, out, err = sweep("scene.toml", "--set", "solver.time_step=0.2,0.001,0.002", "--steps", 6, "--out", "runs")
     assert (code, out) == (1, "")
-    assert err.startswith("Of 3 combinations, 2 of them there already, 1 failed; ")
+    assert err.startswith("Of 3 combinations, 2 of them there already, 1 failed, the first of them ")
     assert [row["status"] for row in rows("runs")] == ["failed", "done", "done"]
 
 
@@ -185,7 +188,7 @@ def test_an_interrupted_sweep_goes_on(sweep, folder, monkeypatch):
     def stopped(*arguments):
         begun.append(arguments)
         if len(begun) == 2:
-            raise KeyboardInterrupt
+            raise Interrupted(signal.SIGINT, "the evaluations so far are somewhere; --resume goes on with them")
         return optimise_task(*arguments)
 
     monkeypatch.setattr(cortado.commands.sweep, "optimise_task", stopped)

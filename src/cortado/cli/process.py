@@ -45,6 +45,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(_say(stop, stop.code))
     except BrokenPipeError:
         sys.exit(BROKEN_PIPE)
+    except MemoryError as error:
+        what = f" ({error})" if str(error) else ""
+        say(f"Memory ran out{what}; take a larger spacing, or record fewer frames with --record-every.")
+        sys.exit(1)
     except Exception as error:
         sentence = complaint(error)
         if sentence is None:

@@ -22,6 +22,7 @@ from cortado.rollout import MEMORY_BUDGET, Rollout
 from cortado.scene.scene import load_scene
 from cortado.scene.stability import stability_limits
 from cortado.scene.toml import read_toml
+from cortado.shading.painter import colours_of
 from cortado.simulation import Simulation, check_steps
 from cortado.solvers.particles import ParticleSolver
 
@@ -133,7 +134,7 @@ def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
 def _drawn(simulation: Simulation, path: Path) -> Path:
     """Where the fluid is at the start, in the colours of its phases."""
     scene = simulation.scene
-    colours = np.array([phase.colour for phase in scene.phase])[np.argmax(simulation.mass_fractions, axis=1)]
+    colours = colours_of(scene, simulation.mass_fractions, simulation.particles)
     title = f"{scene.name}, the first state{', seen along the third axis' * (scene.dimension == 3)}"
     return particles([simulation.positions], [title], path, colours=[colours], container=scene.container.extent())
 

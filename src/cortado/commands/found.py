@@ -68,6 +68,17 @@ def found_rows(
     return rows
 
 
+def worst_in_words(made: Setup, name: str, estimate: np.ndarray, error: float) -> str:
+    """Which number of a few is farther off than twice the error of all of them together, and how far; empty where none
+    is, or where the true ones are not known or 0."""
+    true, names = made.true_parameter(name), component_names(made.task.scene, name, estimate)
+    if true is None or not 1 < len(names) == np.size(true) == np.size(estimate) <= MOST_NUMBERS or not np.all(true):
+        return ""
+    errors = [distance(*pair) for pair in zip(np.ravel(estimate), np.ravel(true), strict=True)]
+    worst = int(np.argmax(errors))
+    return f" ({names[worst]}: {100 * errors[worst]:.2g}%)" if errors[worst] > 2.0 * error else ""
+
+
 def _knot_rows(name: str, knots: KnotValues) -> Rows:
     rows: Rows = []
     for k, time in enumerate(knots.times):

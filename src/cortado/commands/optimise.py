@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cortado.commands.executor import HERE, Where
-from cortado.commands.found import Rows, distance, found_lines, found_rows
+from cortado.commands.found import Rows, distance, found_lines, found_rows, worst_in_words
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
 from cortado.inverse.chapters import Chapters
@@ -130,7 +130,11 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
     first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
     verdict = judge(made.task, result, estimate, noise, first)
     knots = knot_values(made, result.parameters, estimate)
-    lines = [_summary(made, result, verdict), *found_lines(made, estimate, knots), *_advice(made.task, verdict)]
+    lines = [
+        _summary(made, estimate, result, verdict),
+        *found_lines(made, estimate, knots),
+        *_advice(made.task, verdict),
+    ]
     announce("\n".join(lines))
     with keeping(lambda: f"the search has ended, and is in {folder.checkpoint}; --resume draws its pictures"):
         shaded = _shaded(made, result, folder.figures, pictures)
@@ -260,8 +264,11 @@ def _advice(task: Task, verdict: Verdict) -> list[str]:
     ]
 
 
-def _summary(made: Setup, result: Result, verdict: Verdict) -> str:
-    reached = [f"{name} is {found_in_words(error)}" for name, error in verdict.errors.items()]
+def _summary(made: Setup, estimate: Mapping[str, np.ndarray], result: Result, verdict: Verdict) -> str:
+    reached = [
+        f"{name} is {found_in_words(error)}{worst_in_words(made, name, estimate[name], error)}"
+        for name, error in verdict.errors.items()
+    ]
     if verdict.psnr is not None:
         reached.append(f"the image is matched to {verdict.psnr:.3g} dB")
     fell = f"fell {verdict.reduction:.3g} times" if result.loss > 0.0 else f"went from {verdict.first:.3g} to 0"
@@ -298,7 +305,7 @@ def _sections(
         _asked(made),
         Section(
             "What was found",
-            [_summary(made, result, verdict), *_advice(made.task, verdict)],
+            [_summary(made, estimate, result, verdict), *_advice(made.task, verdict)],
             verdict.failures,
             figures.found,
         ),

@@ -11,7 +11,7 @@ from cortado.commands.run import run_scene, run_settings
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
 from cortado.inverse.task import load_task
 from cortado.io.folder_lock import LOCK, locked
-from cortado.io.interruption import keeping
+from cortado.io.interruption import Interrupted, keeping
 from cortado.io.progress import track, untracked
 from cortado.io.run_folder import RunFolder
 from cortado.scene.scene import load_scene
@@ -94,6 +94,8 @@ class Member:
                     every = self._record_every
                     command = ["cortado", "run", *words, "--steps", str(self.steps), "--record-every", str(every)]
                     run_scene(self.file, self.steps, out, overrides, self.device, self.precision, every, begun, command)
+        except Interrupted as stop:  # what is kept of one combination says less than the sweep does
+            raise Interrupted(stop.args[0]) from None
         except CortadoError as error:
             folder = self._folder(combination)
             return (folder and folder.read_result()) or {"failures": [str(error)]}
@@ -136,10 +138,14 @@ def run_sweep(
         executor.map(member, [chosen[number] for number in left], note)
     failures = sum(map(failed, done.values()))
     all_of_them = f"Of {counted(len(chosen), 'combination')}{f', {there} of them there already,' if there else ''}"
-    table = f"the table is {out.absolute() / NAME}, beside a folder for each."
+    table = f"table is {out.absolute() / NAME}, beside a folder for each."
     if failures:
-        raise ComputationError(f"{all_of_them} {failures} failed; {table}")
-    return f"{all_of_them} none failed; {table}"
+        first = next(number for number in sorted(done) if failed(done[number]))
+        why = " ".join(done[first]["failures"])
+        raise ComputationError(
+            f"{all_of_them} {failures} failed, the first of them {chosen[first].name}: {why} The {table}"
+        )
+    return f"{all_of_them} none failed; the {table}"
 
 
 def _there(member: Member, chosen: list[Combination]) -> dict[int, dict[str, Any]]:

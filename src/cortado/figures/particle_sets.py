@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cortado.figures.canvas import FAINT, drawing
+from cortado.io.srgb import to_srgb
 
 _FAR, _NEAR = "#c9d9e4", "#27506f"
 _MOST_DRAWN = 150_000
@@ -36,7 +37,7 @@ def particles(
         positions: one (n, d) [m] for each panel.
         titles: one for each panel.
         colours: for each panel (n,) numbers, drawn with one scale (speed, density), or (n, 3) red, green,
-            blue in [0, 1]; None shades by depth.
+            blue, linear light in [0, 1]; None shades by depth.
         colour_label: beside the scale, with its unit.
         container: lower and upper corner (d,) [m], outlined.
         dimension: 2 or 3; that of the first set when left out. In 2-D a third component is ignored.
@@ -100,7 +101,7 @@ class _ColourScale:
     def rgb(self, points: NDArray[Any], colours: NDArray[Any] | None) -> NDArray[Any]:
         """(n, 3) in [0, 1]"""
         if colours is not None and colours.ndim == 2:
-            return np.clip(colours, 0.0, 1.0)
+            return to_srgb(colours[None])[0] / 255.0
         return self._map.to_rgba(_depth(points) if colours is None else colours)[:, :3]
 
 

@@ -16,9 +16,11 @@ from cortado.parameters.tilt import Tilt
 from cortado.parameters.values import OVER_TIME, UNITS
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
+from cortado.shading.painter import colours_of
 
 MOST_CURVES = 12
 """Parameters with more components get no picture of their own."""
+TITLES = ("first guess", "found", "target")
 IMAGES = 6
 """Images that show the course of the optimisation."""
 
@@ -38,10 +40,13 @@ def task_figures(made: Setup, result: Result, folder: Path) -> Chapters:
 
 
 def _particles(made: Setup, result: Result, folder: Path) -> tuple[str, Path]:
+    scene, simulation = made.task.scene, made.problem.simulation
     before, after = (made.problem.end(made.search.parameters(u)).positions for u in (made.start, result.parameters))
-    target = made.targets[made.problem.steps]
-    path = particles([before, after, target], ["start", "estimate", "target"], folder / "particles.png")
-    return "Where the fluid ends: with the first guess, with the estimate, and the target.", path
+    shown = [before, after, made.targets[made.problem.steps]]
+    several = len(scene.phase) > 1
+    colours = [colours_of(scene, simulation.mass_fractions, simulation.particles)] * len(shown) if several else None
+    path = particles(shown, TITLES, folder / "particles.png", colours=colours, container=scene.container.extent())
+    return "Where the fluid ends: with the first guess, as found, and the target.", path
 
 
 def _images(made: Setup, result: Result, folder: Path) -> Chapters:
@@ -50,10 +55,8 @@ def _images(made: Setup, result: Result, folder: Path) -> Chapters:
     def image(u: dict[str, np.ndarray]) -> np.ndarray:
         return made.image(made.problem.states(made.search.parameters(u), [last])[last])
 
-    path = images(
-        [image(made.start), image(result.parameters), target], ["start", "estimate", "target"], folder / "images.png"
-    )
-    compared: Figures = [("The last image: with the first guess, with the estimate, and the target.", path)]
+    path = images([image(made.start), image(result.parameters), target], TITLES, folder / "images.png")
+    compared: Figures = [("The last image: with the first guess, as found, and the target.", path)]
     evaluations = np.unique(np.linspace(0, len(result.history) - 1, IMAGES).astype(int))
     shown = [image(result.history[k].parameters) for k in evaluations]
     path = images(shown, [f"evaluation {k}" for k in evaluations], folder / "progress.png")
@@ -63,7 +66,7 @@ def _images(made: Setup, result: Result, folder: Path) -> Chapters:
         numbers = np.unique(np.linspace(0, steps, MOST_FRAMES).astype(int))
         states = made.problem.states(made.search.parameters(result.parameters), numbers.tolist())
         path = write_video(folder / "estimate.mp4", (made.image(states[k]) for k in numbers.tolist()), 20)
-        compared.append(("The run with the estimated parameters.", path))
+        compared.append(("The run with the parameters that were found.", path))
     return Chapters(compared=compared, search=search)
 
 

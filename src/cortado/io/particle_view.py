@@ -59,13 +59,19 @@ def script() -> str:
     return f"<script>\n{source}</script>"
 
 
+def thinned(frames: int, particles: int, numbers: int, most_bytes: int = MOST_BYTES) -> tuple[NDArray[np.intp], int]:
+    """Which frames to show, and that of every so many particles one is, until a view has no more than so many bytes.
+
+    ``numbers``: bytes of one particle in one frame, two for each component of a position, one for the speed, three for
+    a colour that changes, of all clouds together.
+    """
+    count = min(frames, MOST_FRAMES, max(most_bytes // (numbers * particles), LEAST_FRAMES))
+    stride = max(-(-count * numbers * particles // most_bytes), 1)
+    return np.unique(np.linspace(0, frames - 1, count).astype(int)), stride
+
+
 def particle_view(
-    clouds: Sequence[Cloud],
-    times: ArrayLike,
-    spacing: float,
-    *,
-    lines: ArrayLike = (),
-    most_bytes: int = MOST_BYTES,
+    clouds: Sequence[Cloud], times: ArrayLike, spacing: float, *, lines: ArrayLike = (), stride: int = 1
 ) -> str:
     """HTML that shows the clouds side by side, turned together; y is up. `script` must follow, and `STYLE` be there.
 
@@ -74,34 +80,28 @@ def particle_view(
         times: (frames,) [s].
         spacing: between particles at rest [m].
         lines: (k, 2, d) ends of lines [m], such as the edges of a container.
-        most_bytes: of what is shown; frames, and then particles, are left out until it is less.
+        stride: the clouds have one of so many particles (`thinned`).
     """
-    times, (frames, particles, dimension) = np.asarray(times, dtype=float), clouds[0].positions.shape
-    moving = any(cloud.colours is not None and np.ndim(cloud.colours) == 3 for cloud in clouds)
-    each = len(clouds) * (2 * dimension + 1 + 3 * moving)
-    count = min(frames, MOST_FRAMES, max(most_bytes // (each * particles), LEAST_FRAMES))
-    stride = max(-(-count * each * particles // most_bytes), 1)
-    chosen = np.unique(np.linspace(0, frames - 1, count).astype(int))
+    times, dimension = np.asarray(times, dtype=float), clouds[0].positions.shape[2]
     ends = np.asarray(lines, dtype=float).reshape(-1, 2, dimension)
-    seen = [cloud.positions[chosen][:, ::stride] for cloud in clouds]
-    lower, upper = _extent([*seen, ends])
+    lower, upper = _extent([*(cloud.positions for cloud in clouds), ends])
     middle, half = 0.5 * (lower + upper), np.maximum(0.5 * (upper - lower), 0.5 * spacing)
-    fastest = max(float(np.nanmax(cloud.speeds[chosen], initial=0.0)) for cloud in clouds) or 1.0
+    fastest = max(float(np.nanmax(cloud.speeds, initial=0.0)) for cloud in clouds) or 1.0
     drawn = [
         {
             "name": cloud.name,
             "still": cloud.colours is None or np.ndim(cloud.colours) == 2,
-            "positions": _base64(np.round((places - middle) / half * LARGEST).astype("<i2")),
-            "speeds": _base64(np.round(cloud.speeds[chosen][:, ::stride] / fastest * 255).astype(np.uint8)),
-            "colours": _base64(_colours(cloud, chosen, stride)),
+            "positions": _base64(np.round((cloud.positions - middle) / half * LARGEST).astype("<i2")),
+            "speeds": _base64(np.round(cloud.speeds / fastest * 255).astype(np.uint8)),
+            "colours": _base64(_colours(cloud)),
         }
-        for cloud, places in zip(clouds, seen, strict=True)
+        for cloud in clouds
     ]
     data = {
         "dimension": dimension,
-        "particles": seen[0].shape[1],
-        "times": [float(f"{t:.6g}") for t in times[chosen]],
-        "seconds": float(np.clip(len(chosen) / 20.0, SHORTEST, LONGEST)),
+        "particles": clouds[0].positions.shape[1],
+        "times": [float(f"{t:.6g}") for t in times],
+        "seconds": float(np.clip(len(times) / 20.0, SHORTEST, LONGEST)),
         "half": _space(half).tolist(),
         "radius": 0.56 * spacing * stride ** (1.0 / dimension),
         "lines": _space(ends - middle).tolist(),
@@ -152,12 +152,11 @@ def _space(vectors: NDArray[Any]) -> NDArray[Any]:
     return np.array([float(f"{number:.6g}") for number in padded.ravel()]).reshape(padded.shape)
 
 
-def _colours(cloud: Cloud, chosen: NDArray[Any], stride: int) -> NDArray[Any]:
-    """(n, 3) or (frames, n, 3), sRGB, of what is shown."""
+def _colours(cloud: Cloud) -> NDArray[Any]:
+    """(n, 3) or (frames, n, 3), sRGB."""
     particles = cloud.positions.shape[1]
     colours = np.tile(_PLAIN, (particles, 1)) if cloud.colours is None else np.asarray(cloud.colours)
-    shown = colours[::stride] if colours.ndim == 2 else colours[chosen][:, ::stride]
-    return to_srgb(shown.reshape(1, -1, 3)).reshape(shown.shape)
+    return to_srgb(colours.reshape(1, -1, 3)).reshape(colours.shape)
 
 
 def _base64(array: NDArray[Any]) -> str:

@@ -133,10 +133,15 @@ def write_picture(path: str | Path, image: ArrayLike) -> Path:
     """Writes a linear image (rows, columns, 3) as a PNG with 8 bits of sRGB, clipped to 0..1, and returns its path.
 
     Raises:
-        InputError: another shape, values that are not finite, or a file that cannot be written.
+        InputError: another shape, whole numbers, values that are not finite, a name that does not end in .png, or a
+            file that cannot be written.
     """
     from PIL import Image
 
+    if Path(path).suffix.lower() != ".png":
+        raise InputError(f"path is {str(path)!r}, but must be the name of a PNG file, such as picture.png.")
+    if np.issubdtype(np.asarray(image).dtype, np.integer):
+        raise InputError("The image is made of whole numbers, but must be linear light from 0 to 1.")
     content = BytesIO()
     Image.fromarray(to_srgb(image)).save(content, format="PNG")
     write_atomically(Path(path), content.getvalue())
@@ -193,9 +198,9 @@ def _in_rosetta(x: Any, y: Any) -> Any:
 
 
 def _columns_and_rows(resolution: Resolution) -> tuple[int, int]:
-    columns, rows = found = (resolution, resolution) if isinstance(resolution, int) else resolution
+    found = (resolution, resolution) if isinstance(resolution, int) else resolution
     check_resolution(found)
-    return columns, rows
+    return found
 
 
 def _bands(picture: Any) -> Iterator[tuple[int, Any]]:

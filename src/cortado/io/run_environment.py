@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cortado import __version__
-from cortado.errors import InputError, shown
+from cortado.errors import LONGEST, InputError, shown
 
 _PACKAGES = ("warp-lang", "numpy", "scipy", "pydantic", "h5py", "matplotlib")
 
@@ -53,9 +53,17 @@ def require_same(former: Any, given: Any, folder: Path, field: str = "") -> None
             require_same(*pair, folder, f"{field}[{k}]")
     elif former != given:
         raise InputError(
-            f"The run in {folder} was begun with {field} = {shown(former)} and is now given {field} = {shown(given)}; "
+            f"The run in {folder} was begun with {field} = {_written(former)} and is now given {field} = "
+            f"{_written(given)}; "
             f"give the former, or choose another --out."
         )
+
+
+def _written(value: Any) -> str:
+    """As in a file; what is left out has no value."""
+    if value is None:
+        return "nothing"
+    return json.dumps(value)[: 2 * LONGEST] if isinstance(value, dict) else shown(value)
 
 
 def _are_tables(value: Any) -> bool:

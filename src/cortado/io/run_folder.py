@@ -174,7 +174,8 @@ class RunFolder:
         return self.path / "result.json"
 
     def write_result(self, **values: Any) -> None:
-        """Writes result.json, the last file of a run; takes NumPy values too. A number that is not finite is null."""
+        """Writes result.json, by which a run is known to have ended; takes NumPy values too. A number that is not
+        finite is null."""
         write_atomically(self.result, json.dumps(_finite(as_json(values)), indent=2) + "\n")
 
     def read_result(self) -> dict[str, Any] | None:

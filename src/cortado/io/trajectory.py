@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cortado.errors import InputError, shown
 from cortado.io import vtkhdf
 from cortado.io.notebook import as_text, with_view
-from cortado.io.particle_view import Cloud, particle_view
+from cortado.io.particle_view import Cloud, particle_view, thinned
 from cortado.restart import Clock, RestartState
 from cortado.words import counted
 
@@ -99,8 +99,10 @@ class Trajectory:
         titles = [f"t = {frame.time:.4g} s" for frame in shown]
         speeds = [np.linalg.norm(frame.velocities, axis=1) for frame in shown]
         sets, label = [frame.positions for frame in shown], "speed [m/s]"
-        cloud = Cloud("run", self.positions, np.linalg.norm(self.velocities, axis=2))
-        view = particle_view([cloud], self.times, _spacing(self.positions[0]), most_bytes=IN_A_NOTEBOOK)
+        chosen, stride = thinned(len(self), self.particles, 2 * self.positions.shape[2] + 1, IN_A_NOTEBOOK)
+        thin = [array[chosen, ::stride] for array in (self.positions, self.velocities)]
+        cloud = Cloud("run", thin[0], np.linalg.norm(thin[1], axis=2))
+        view = particle_view([cloud], self.times[chosen], _spacing(self.positions[0]), stride=stride)
         return with_view(self, view, lambda path: particles(sets, titles, path, colours=speeds, colour_label=label))
 
     def __len__(self) -> int:

@@ -1,7 +1,8 @@
 """A command line that cannot be understood, in one sentence instead of the box that tyro draws around several."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 
 from cortado.errors import LONGEST
 
@@ -10,11 +11,21 @@ _COMMAND = re.compile(
     r"|gradients( (check|figure|study))?)(?= |$)"
 )
 _EDGES = "│|╭╮╰╯─-+ "
-_SENTENCES = (
+
+
+def _unknown_command(match: re.Match[str]) -> str:
+    word, commands = match.groups()
+    close = get_close_matches(word, commands.split(", "), n=1)
+    return (
+        f"{word} is unknown; {close[0]} may be meant" if close else f"{word} is unknown, but must be one of {commands}"
+    )
+
+
+_SENTENCES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"Expected one of \{(.*)\}", r"a command is missing, one of \1"),
     (r"Unrecognized or misplaced options: (\S+?),?(?: .*)?", r"\1 is no option here"),
     (r"Unrecognized .*?options: (\S+?),?(?: .*)? Perhaps you meant: (\S+).*", r"\1 is unknown; \2 may be meant"),
-    (r"Unrecognized .*?options: (\S+?),?(?: .*)? Available subcommands: (.*)", r"\1 is unknown, but must be one of \2"),
+    (r"Unrecognized .*?options: (\S+?),?(?: .*)? Available subcommands: (.*)", _unknown_command),
     (r"Unrecognized .*?options: (\S+?),?(?: .*)?", r"\1 is unknown, or one too many"),
     (r"Missing from .*?: (\S+) .*", r"\1 is missing"),
     (r"Missing value for argument '(-\S+)'.*", r"\1 is given without a value"),
@@ -33,7 +44,7 @@ def usage_sentence(box: str, arguments: Sequence[str]) -> str:
     text = " ".join(line for line in lines if line)
     text = re.split(r" (?:Argument helptext:|For full helptext,)", text)[0].rstrip(". ")
     found = ((re.fullmatch(theirs, text), ours) for theirs, ours in _SENTENCES)
-    said = next((match.expand(ours) for match, ours in found if match), text)
+    said = next((ours(match) if callable(ours) else match.expand(ours) for match, ours in found if match), text)
     said = said if len(said) <= 2 * LONGEST else f"{said[: 2 * LONGEST]}..."
     command = _COMMAND.match(" ".join(arguments))
     return f"{said}; see cortado {f'{command[0]} ' if command else ''}--help."

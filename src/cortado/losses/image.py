@@ -12,6 +12,9 @@ from cortado.errors import InputError
 from cortado.losses.image_losses import ImageLoss, SquaredDifference
 from cortado.losses.loss import Snapshot, SnapshotAdjoint
 
+MOST_LIGHT = 2.0
+"""Of a target: more is taken for values of a file, which go up to 255."""
+
 
 class Pictures(Protocol):
     """What makes pictures, such as `cortado.render.renderer.Renderer`."""
@@ -27,8 +30,9 @@ class Image:
     """How far the picture of a state is from a target picture."""
 
     def __init__(self, renderer: Pictures, target: np.ndarray, distance: ImageLoss | None = None):
-        """``target`` (rows, columns, 3), linear RGB; ``distance``: `cortado.image_losses.SquaredDifference`, the
-        default, or `Pyramid`, whose gradient leads shapes to each other that do not overlap."""
+        """``target`` (rows, columns, 3), linear RGB from 0 to 1; ``distance``:
+        `cortado.image_losses.SquaredDifference`, the default, or `Pyramid`, whose gradient leads shapes to each other
+        that do not overlap. Raises `InputError` for a target of another shape, or with values of a file up to 255."""
         self.renderer, self.distance = renderer, SquaredDifference() if distance is None else distance
         self.target = _target_image(target, getattr(renderer, "shape", None))
         self.target.setflags(write=False)
@@ -63,4 +67,9 @@ def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray
         raise InputError(f"target has shape {image.shape}, but must have that of the renderer's pictures, {shape}.")
     if not np.isfinite(image).all():
         raise InputError("target has a value that is not finite, but must be made of finite numbers.")
+    if image.max() > MOST_LIGHT:
+        raise InputError(
+            f"target has values up to {image.max():g}, but must be linear light from 0 to 1, as that of "
+            "cortado.pictures.read_picture."
+        )
     return image

@@ -216,6 +216,10 @@ class _Evaluator:
         else:
             names = self._names_of(np.ones_like(broken))
             what = f"the loss is {evaluation.loss} as a function of {names}"
+        if not self.history:
+            raise ComputationError(
+                f"At the start {what}; begin elsewhere, look at the loss, or take a shorter horizon."
+            )
         raise ComputationError(
             f"In evaluation {len(self.history)} {what}; try a smaller learning rate, bounds on the "
             f"parameters, or a shorter horizon. The {len(self.history)} evaluations before {self.log.fate}."

@@ -42,7 +42,9 @@ def read_toml(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> di
     except (ValueError, RecursionError) as problem:  # among them TOMLDecodeError, which names the line
         raise _unreadable(file, f"is not valid TOML: {reason(problem)}.") from None
     except OSError as problem:
-        raise _unreadable(file, f"cannot be read: {reason(problem)}.") from None
+        beside = f"{file}.toml"
+        there = f"; did you mean {beside}?" if os.path.isfile(beside) else "."
+        raise _unreadable(file, f"cannot be read: {reason(problem)}{there}") from None
     return put_in(data, overrides, file)
 
 

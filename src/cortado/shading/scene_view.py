@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cortado.io.particle_view import Cloud, particle_view
+from cortado.io.particle_view import Cloud, particle_view, thinned
 from cortado.io.trajectory import Trajectory
 from cortado.lattice.shapes import Points, corners
 from cortado.scene.containers import CylinderContainer
@@ -44,8 +44,13 @@ def scene_view(scene: Scene, runs: Mapping[str, Iterable[MovingState]], times: A
     """HTML that shows runs of a scene side by side, each by its name with a state for each of the times (frames,) [s];
     see `particle_view`."""
     turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
-    clouds = [_cloud(scene, name, list(states), turn) for name, states in runs.items()]
-    return particle_view(clouds, times, scene.discretisation.spacing, lines=outline(scene) @ turn.T)
+    states, times = {name: list(of_run) for name, of_run in runs.items()}, np.asarray(times)
+    particles = len(next(iter(states.values()))[0].positions)
+    numbers = len(states) * (2 * scene.dimension + 1 + 3 * (len(scene.phase) > 1))
+    chosen, stride = thinned(len(times), particles, numbers)
+    clouds = [_cloud(scene, name, [of_run[k] for k in chosen], turn, stride) for name, of_run in states.items()]
+    lines = outline(scene) @ turn.T
+    return particle_view(clouds, times[chosen], scene.discretisation.spacing, lines=lines, stride=stride)
 
 
 def outline(scene: Scene) -> Points:
@@ -72,11 +77,13 @@ def _cup(container: CylinderContainer) -> Points:
     return np.concatenate([*rims, sides])
 
 
-def _cloud(scene: Scene, name: str, states: list[MovingState], turn: Points) -> Cloud:
-    positions = np.stack([state.positions for state in states]) @ turn.T
-    speeds = np.stack([np.linalg.norm(state.velocities, axis=1) for state in states])
+def _cloud(scene: Scene, name: str, states: list[MovingState], turn: Points, stride: int) -> Cloud:
+    """Of every so many particles one."""
+    positions = np.stack([state.positions[::stride] for state in states]) @ turn.T
+    speeds = np.stack([np.linalg.norm(state.velocities[::stride], axis=1) for state in states])
     particles = positions.shape[1]
     if len(scene.phase) == 1:
         return Cloud(name, positions, speeds, colours_of(scene, None, particles))
-    colours = [colours_of(scene, state.mass_fractions, particles) for state in states]
+    fractions = [None if state.mass_fractions is None else state.mass_fractions[::stride] for state in states]
+    colours = [colours_of(scene, one, particles) for one in fractions]
     return Cloud(name, positions, speeds, np.stack(colours))
