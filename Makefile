@@ -20,9 +20,9 @@ $(VENV)/.ready: pyproject.toml $(shell find cpp -type f)
 	touch $@
 
 $(VENV)/.demo: pyproject.toml $(shell find cpp -type f)
-	@test -e $(VENV)/.ready || echo 'Installing Cortado and its pictures in $(VENV), once: a minute or two.'
+	@test -e $(VENV)/.ready || echo 'Installing Cortado, its pictures and its viewer in $(VENV), once: a minute or two.'
 	@test -e $(VENV)/.ready || $(PYTHON) -m venv $(VENV)
-	@test -e $(VENV)/.ready || $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[pictures]'
+	@test -e $(VENV)/.ready || $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[pictures,view]'
 	touch $@
 
 demo: $(VENV)/.demo

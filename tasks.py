@@ -6,8 +6,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent
 VENV = ROOT / ".venv"
-STAMPS = {"test": VENV / ".ready", "pictures": VENV / ".demo"}
-"""What says that an extra is installed."""
+STAMPS = {"test": VENV / ".ready", "pictures,view": VENV / ".demo"}
+"""What says that extras are installed."""
 BIN = VENV / ("Scripts" if sys.platform == "win32" else "bin")
 INSTALL = ("python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--editable")
 COMMANDS: dict[str, tuple[str, ...]] = {
@@ -30,7 +30,7 @@ def main(arguments: list[str]) -> int:
     if name not in SEVERAL:
         print(f"python -m tasks TASK, one of: {', '.join(SEVERAL)}", file=sys.stderr)
         return 2
-    set_up("pictures" if name == "demo" else "test")
+    set_up("pictures,view" if name == "demo" else "test")
     steps = [COMMANDS[part] for part in SEVERAL[name]]
     for number, step in enumerate(steps, 1):
         code = run((*step, *options) if number == len(steps) else step)
@@ -40,7 +40,7 @@ def main(arguments: list[str]) -> int:
 
 
 def set_up(extra: str) -> None:
-    """Make the virtual environment, and install Cortado in it with what an extra has, unless nothing has changed since
+    """Make the virtual environment, and install Cortado in it with what extras have, unless nothing has changed since
     that, or since all that tests need was installed."""
     sources = [ROOT / "pyproject.toml", *(path for path in (ROOT / "cpp").rglob("*") if path.is_file())]
     changed, stamp = max(path.stat().st_mtime for path in sources), STAMPS[extra]

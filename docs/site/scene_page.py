@@ -66,9 +66,9 @@ act, and how long a time step is. It is written in [TOML](https://toml.io). All 
 In Python the same keys are arguments, with a list of tables for `[[phase]]` and `[[fluid]]`:
 `cortado.Scene(dimension=3, discretisation={{"spacing": 0.05}}, phase=[{{...}}], fluid=[{{...}}], solver={{...}})`.
 
-d stands for the number of dimensions, 2 or 3. A key whose last but one column says *needed* has to be there; all others
-may be left out. A key that does not exist, a number out of its range or a missing key is refused in a sentence that
-names the file and the key.
+d stands for the number of dimensions, 2 or 3. Defaults of vectors are for 3-D: in 2-D the last component is left out. A
+key whose last but one column says *needed* has to be there; all others may be left out. A key that does not exist, a
+number out of its range or a missing key is refused in a sentence that names the file and the key.
 
 Each example below is a part of a file. Put in the place of the table of the same name in the file above, it makes
 another whole file.
