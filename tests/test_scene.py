@@ -76,9 +76,22 @@ def test_json_brings_the_scene_back(data):
     assert Scene.from_json(scene.to_json()).to_json() == scene.to_json()
 
 
+def test_a_scene_with_other_values_is_another_one():
+    scene = scene_from_dict(full_data())
+    other = scene.replaced(
+        "solver.time_step=0.0005", "schedule.tilt.times=[0, 1]", "schedule.tilt.values=[[0, 0], [9, 0]]"
+    )
+    assert scene.replaced() == scene and other.schedule.courses["tilt"].times == (0.0, 1.0)
+    assert other.solver.time_step == 0.0005 != scene.solver.time_step
+    for wrong in ("solver.timestep=1", "solver.time_step=-1", "x", 3):
+        with pytest.raises(SceneError) as caught:
+            scene.replaced(wrong)
+        assert_one_sentence(str(caught.value))
+
+
 def test_a_scene_is_frozen():
     scene = Scene(**plane())
-    with pytest.raises(ValueError, match="frozen"):
+    with pytest.raises(InputError, match=r"^dimension cannot be set, as a scene does not change; make another one"):
         scene.dimension = 3
     assert hash(scene) == hash(Scene(**plane()))
 

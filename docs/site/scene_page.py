@@ -65,6 +65,8 @@ act, and how long a time step is. It is written in [TOML](https://toml.io). All 
 
 In Python the same keys are arguments, with a list of tables for `[[phase]]` and `[[fluid]]`:
 `cortado.Scene(dimension=3, discretisation={{"spacing": 0.05}}, phase=[{{...}}], fluid=[{{...}}], solver={{...}})`.
+A scene does not change once it is made: `scene.replaced("solver.time_step=0.001", "phase.water.viscosity=0.1")` is the
+same scene with other values.
 
 d stands for the number of dimensions, 2 or 3. Defaults of vectors are for 3-D: in 2-D the last component is left out. A
 key whose last but one column says *needed* has to be there; all others may be left out. A key that does not exist, a

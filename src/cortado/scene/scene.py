@@ -32,6 +32,13 @@ class Scene(SceneTables):
             warnings.warn(f"{found}, which comes from {broken[0]}.", CortadoWarning, stacklevel=2)
         return self
 
+    def replaced(self, *overrides: str) -> "Scene":
+        """The same scene with other values: ``scene.replaced("solver.time_step=0.002", "phase.oil.viscosity=2")``.
+
+        Raises `SceneError` as `load_scene` does, whose overrides these are.
+        """
+        return Scene.from_json(self.to_json(), overrides, "the scene")
+
     def to_json(self) -> str:
         """The scene with all defaults filled in, to be read by `from_json`."""
         return json.dumps(self.model_dump(mode="json"), indent=2)
@@ -48,8 +55,15 @@ class Scene(SceneTables):
         except (ValueError, RecursionError) as problem:
             raise SceneError(None, "", sentence=f"is not valid JSON: {problem}.") from None
         if overrides and isinstance(data, dict):
-            data = put_in({name: table for name, table in data.items() if table is not None}, overrides, file)
+            data = put_in(_given(data), overrides, file)
         return scene_from_dict(data)
+
+
+def _given(value: Any) -> Any:
+    """Tables without what is left out, which JSON has as null."""
+    if isinstance(value, dict):
+        return {name: _given(entry) for name, entry in value.items() if entry is not None}
+    return [_given(entry) for entry in value] if isinstance(value, list) else value
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Scene:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 from pydantic import BaseModel, ConfigDict, model_validator
 from pydantic_core import PydanticCustomError
 
-from cortado.errors import Words
+from cortado.errors import InputError, Words
 from cortado.scene.fields import PER_AXIS, FieldPath, field_error, without_numpy
 from cortado.scene.sentences import sentences
 
@@ -25,6 +25,12 @@ class Table(BaseModel):
     def __init__(self, /, **data: Any):
         with sentences(type(self)):
             super().__init__(**data)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise InputError(
+            f"{name} cannot be set, as a scene does not change; make another one, such as "
+            'scene.replaced("solver.time_step=0.001").'
+        )
 
     # Tells pydantic to build nested tables without this method, so that an error carries its whole path.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]

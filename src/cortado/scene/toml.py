@@ -54,6 +54,9 @@ def put_in(data: dict[str, Any], overrides: Sequence[str], file: str) -> dict[st
         sentence = f"must be in a list, as [{shown(overrides)}], as there may be several overrides."
         raise SceneError(file, shown(overrides), sentence=sentence)
     for override in overrides:
+        if not isinstance(override, str):
+            sentence = "is no override, which is a text such as 'solver.time_step=0.002'."
+            raise SceneError(file, shown(override), sentence=sentence)
         _apply(data, override, file)
     return data
 
