@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado import InputError, Problem, Simulation, gradients, losses
+from cortado import ComputationError, InputError, Problem, Simulation, evaluate, gradients, losses
 from cortado.gradients import AdjointEstimator, Estimate, Filtered
 from cortado.gradients.adjoint_filters import EddyViscosity
 from reference import complex_step
@@ -578,11 +578,53 @@ def test_guided_differences_of_nothing_are_nothing():
     assert all(not end["gravity"].any() for end in flat.interval())
 
 
+@pytest.mark.parametrize("size", [1e-200, 1e200])
+def test_guided_differences_take_the_direction_of_a_gradient_of_any_size(size):
+    stub = Stub(quadratic, simulation_of("2-D"))
+    surrogate = Slopes(lambda g, mu: [[size, 0.0], [size, 0.0]], lambda g, mu: 0.0)
+    found = gradients.Guided(0.5, parts=1, surrogate=surrogate).estimate(stub, POINT)
+    np.testing.assert_allclose(found.gradient["gravity"], [[4.0, 0.0], [4.0, 0.0]], rtol=1e-12)
+    assert all(np.isfinite(end["gravity"]).all() for end in found.interval())
+
+
+@pytest.mark.parametrize("size", [np.nan, np.inf])
+def test_guided_differences_say_that_there_is_no_direction(size):
+    surrogate = Slopes(lambda g, mu: [[size, 0.0], [1.0, 0.0]], lambda g, mu: 0.0)
+    with pytest.raises(ComputationError, match=r"^The gradient of .* is not finite, so that Guided has no direction"):
+        gradients.Guided(0.5, surrogate=surrogate).estimate(Stub(quadratic, simulation_of("2-D")), POINT)
+
+
+def test_guided_differences_and_their_directions_draw_other_random_numbers():
+    """The first positions of the samples of both kinds are not the same numbers in another order."""
+    first, spacing = simulation_of("2-D").positions, simulation_of("2-D").scene.discretisation.spacing
+    stub, surrogate = Stub(quadratic, simulation_of("2-D")), slopes_of_quadratic()
+    gradients.Guided(0.5, surrogate=surrogate).estimate(stub, POINT)
+    drawn = [
+        (one["initial_positions"] - first).ravel() / spacing
+        for one in (*surrogate.asked, *stub.calls)
+        if "initial_positions" in one
+    ]
+    both = [np.round(abs(array), 9) for array in drawn]
+    assert len(drawn) == 4 + 2 * 2 * 3
+    assert not np.isin(both[0], both[-1]).any() and np.isin(both[-1], both[-2]).all()
+
+
 class Flat:
     """In place of an estimator: no gradient at all."""
 
     def estimate(self, problem, parameters, observe=None):
         return gradients.Estimate(7.0, {name: np.zeros_like(value) for name, value in parameters.items()})
+
+
+AVERAGES = [gradients.RandomizedSmoothing(1e-3), gradients.EnsembleMean(1e-3), gradients.Guided(1e-3)]
+
+
+@pytest.mark.parametrize("estimator", AVERAGES, ids=lambda one: type(one).__name__)
+def test_no_step_at_all_is_a_run_too(estimator):
+    """Of the first state, in several samples at a time."""
+    problem = Problem(simulation_of("2-D"), 0, losses.CentreOfMass([0.2, 0.1]))
+    (found,) = evaluate(problem, [{"viscosity": 0.1}], estimator)
+    assert found.loss == problem.value({}) and found.gradient == {"viscosity": 0.0}
 
 
 def test_an_interval_needs_an_average():
@@ -831,6 +873,17 @@ MISTAKES = {
     "limit below 1": lambda p: gradients.AdjointViscosity(limit=0.5),
     "rate below 0": lambda p: gradients.Damped(-1.0),
     "one sample": lambda p: gradients.RandomizedSmoothing(samples=1),
+    "an odd number of guiding samples": lambda p: gradients.Guided(samples=3),
+    "a spread in words": lambda p: gradients.Guided("wide"),
+    "a spread below 0": lambda p: gradients.EnsembleMean({"viscosity": -1.0}),
+    "nothing to smooth": lambda p: p.estimate({}, gradients.RandomizedSmoothing()),
+    "nothing to average": lambda p: p.estimate({}, gradients.EnsembleMean()),
+    "nothing to guide": lambda p: p.estimate({}, gradients.Guided()),
+    "a spread that is round-off": lambda p: p.estimate({"viscosity": 1.0}, gradients.Guided(1e-17)),
+    "a number of one's own averaged": lambda p: p.estimate(
+        {"viscosity": 1.0}, gradients.EnsembleMean(estimator=Returning(3.0))
+    ),
+    "a number of one's own at many points": lambda p: evaluate(p, [{"viscosity": 1.0}], Returning(3.0)),
     "an average of one": lambda p: gradients.EnsembleMean(samples=1),
     "an average over no spread": lambda p: p.estimate({"viscosity": 1.0}, gradients.EnsembleMean(0.0)),
     "differences of no parts": lambda p: gradients.Guided(parts=0),

@@ -175,7 +175,9 @@ def test_a_target_of_another_size_is_a_sentence():
         (np.zeros((16, 20)), r"shape \(16, 20\), but must be a picture \(rows, columns, 3\)\.$"),
         (np.full((16, 20, 3), np.nan), r"not finite, but must be made of finite numbers\.$"),
         ("heart", r"^target is 'heart', but must be a number or an array"),
-        (np.full((16, 20, 3), 200, np.uint8), r"up to 200, but must be linear light from 0 to 1, as that of cortado"),
+        (np.full((16, 20, 3), 200.0), r"a value of 200, but must be linear light from 0 to 1, as that of cortado"),
+        (np.full((16, 20, 3), -5.0), r"a value of -5, but must be linear light from 0 to 1, as that of cortado"),
+        (np.ones((16, 20, 3), np.uint8), r"made of whole numbers, but must be linear light from 0 to 1, as"),
     ]:
         with pytest.raises(InputError, match=wanted):
             losses.Image(renderer, target)

@@ -251,6 +251,29 @@ def test_a_line_search_leaves_runs_that_diverge_aside():
     assert 2.4 < result.parameters["x"][0] <= 2.5
 
 
+@pytest.mark.parametrize("error", [DivergedError(step=1, particle=0, advice=""), InputError("viscosity is below 0.")])
+@pytest.mark.parametrize("kind", ["function", "object without losses", "object"])
+def test_a_trial_that_cannot_be_is_left_aside(error, kind):
+    def both(parameters, gradient=None):
+        if parameters["x"] < 0.5:
+            raise error
+        return parameters["x"], {"x": 1.0}
+
+    members = {"value_and_gradient": staticmethod(both)}
+    if kind == "object":
+        members["value"] = staticmethod(lambda parameters: both(parameters)[0])
+    problem = both if kind == "function" else type("Slope", (), members)()
+    result = optimise(problem, {"x": 2.0}, LineSearch(scale=2.0), 30)
+    assert 0.5 <= result.parameters["x"] < 0.6
+
+
+@pytest.mark.parametrize("value", [None, "low", [1.0, 2.0]])
+def test_a_loss_of_a_trial_is_one_number(value):
+    problem = type("Slope", (), {"value": lambda *_: value, "value_and_gradient": lambda *_, **__: (1.0, {"x": 1.0})})
+    with pytest.raises(InputError, match=r"^The problem's loss"):
+        optimise(problem(), {"x": 2.0}, LineSearch(), 3)
+
+
 def test_a_line_search_takes_shorter_steps_about_a_minimum():
     problem = Quadratic({"g": np.array([1.0, 2.0])})
     result = optimise(problem, {"g": np.array([0.0, 0.0])}, LineSearch(), 40)

@@ -57,6 +57,35 @@ def test_a_matrix_that_does_not_fit_is_a_sentence(shape):
         Affine(np.zeros((5, 2)), np.zeros(shape))
 
 
+WRONG_SHAPES = {
+    "affine": lambda: Affine(np.zeros((5, 2)), np.zeros((5, 2, 4))).parameter(np.zeros(3)),
+    "affine of a number": lambda: Affine(np.zeros((5, 2)), np.zeros((5, 2, 4))).parameter(np.float64(1.0)),
+    "affine of a table": lambda: Affine(np.zeros(5), np.zeros((5, 4))).parameter(np.zeros((4, 4))),
+    "affine, back": lambda: Affine(np.zeros((5, 2)), np.zeros((5, 2, 4))).coordinate(np.zeros((4, 2))),
+    "knots": lambda: TimeInterpolation(5, 3).parameter(np.zeros((4, 2))),
+    "knots, back": lambda: TimeInterpolation(5, 3).coordinate(np.zeros((4, 2))),
+    "one knot": lambda: TimeInterpolation(5, 3).parameter(np.float64(1.0)),
+    "softmax": lambda: Softmax().parameter(np.zeros(3)),
+}
+
+
+@pytest.mark.parametrize("call", WRONG_SHAPES.values(), ids=WRONG_SHAPES)
+def test_numbers_of_another_shape_are_a_sentence(call):
+    with pytest.raises(InputError, match=r"have shape \(.*\), but must have"):
+        call()
+
+
+@pytest.mark.parametrize(("steps", "knots"), [(5, 0), (0, 3), (5, 2.5), (True, 1)])
+def test_so_many_knots_cannot_be(steps, knots):
+    with pytest.raises(InputError, match="but must be a whole number of at least 1"):
+        TimeInterpolation(steps, knots)
+
+
+def test_coordinates_of_a_parameter_that_is_misspelt_are_a_sentence(problem):
+    with pytest.raises(InputError, match=r"'viscosty' is unknown, but must be one of .*viscosity"):
+        Transformed(problem, {"viscosty": Logarithm()})
+
+
 def test_affine_maps_are_told_apart():
     one, same, other = (Affine(np.zeros(3), scale * np.eye(3)) for scale in (1.0, 1.0, 2.0))
     assert repr(one) == repr(same) != repr(other)

@@ -175,7 +175,10 @@ class One:
     def __init__(self, case: Case, name: str):
         self._case, self._name = case, name
         self._problem = Problem(case.simulation, case.steps, case.losses[name])
-        self.simulation = SimpleNamespace(positions=case.start, scene=case.simulation.scene, batch=None)
+        simulation = case.simulation
+        self.simulation = SimpleNamespace(
+            positions=case.start, scene=simulation.scene, batch=None, precision=simulation.precision
+        )
 
     def value(self, values: dict[str, np.ndarray]) -> float:
         return self._case.values(values)[self._name]

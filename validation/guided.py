@@ -53,7 +53,10 @@ class InBlocks:
 
     def __init__(self, problem: Problem, start: np.ndarray, blocks: int):
         self._problem, self._start, self._blocks = problem, start, blocks
-        self.simulation = SimpleNamespace(positions=start, scene=problem.simulation.scene, batch=None)
+        simulation = problem.simulation
+        self.simulation = SimpleNamespace(
+            positions=start, scene=simulation.scene, batch=None, precision=simulation.precision
+        )
         self.room = problem.room
 
     def value(self, values: Mapping[str, Any]) -> float:

@@ -221,6 +221,7 @@ class _Simulation:
 
     def __init__(self, problem: Problem, initial_positions: np.ndarray):
         self.scene, self.positions = problem.simulation.scene, initial_positions
+        self.precision = problem.simulation.precision
 
 
 def first_positions(problem: Problem, seed: int) -> Arrays:

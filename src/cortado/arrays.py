@@ -47,6 +47,11 @@ def as_one_number(what: str, value: Any) -> float:
     return float(array)
 
 
+def is_whole(value: object) -> bool:
+    """Whether a value is a whole number, of Python or of NumPy; a truth value is none."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
 def _is_masked(value: Any) -> bool:
     """Whether entries are masked, of a masked array or of a list with masked arrays in it."""
     if isinstance(value, np.ma.MaskedArray):

@@ -274,7 +274,7 @@ class Simulation:
         many bytes of ``checkpoints`` in all."""
         neighbours, real = first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
         own = sum(simulation_parts(self.particles, 0, neighbours, real).values())
-        states = real * self.numbers_in_frame(3) * 2 * isqrt(steps)
+        states = real * self.numbers_in_frame(3) * 2 * max(isqrt(steps), 1)
         fitting = within(np.inf, self.device) // own
         kept = checkpoints // states if checkpoints else fitting
         return int(max(min(WORTH["cpu" if self.device.is_cpu else "cuda"] // self.particles, fitting, kept), 1))

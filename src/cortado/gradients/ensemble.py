@@ -8,7 +8,7 @@ import numpy as np
 
 from cortado.errors import InputError, shown
 from cortado.gradients.ensemble_members import Ensemble
-from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator, checked_estimator
+from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator, checked_estimate, checked_estimator
 from cortado.gradients.filters import AdjointViscosity
 from cortado.gradients.points import Point
 from cortado.parameters.values import Arrays, Values
@@ -37,6 +37,7 @@ class RandomizedSmoothing(Ensemble):
     """
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
+        """``observe`` is not called, as there are no adjoints."""
         ensemble = self.around(problem, parameters)
         numbers = len(ensemble.spreads)
         if numbers > MOST_NUMBERS:
@@ -55,7 +56,7 @@ class RandomizedSmoothing(Ensemble):
                     yield ensemble.sample(r * q, displacement)
                     yield ensemble.sample(-r * q, displacement)
 
-        loss, *losses = (one.loss for one in self.evaluated(problem, points(), observe))
+        loss, *losses = (one.loss for one in self.evaluated(problem, points(), None))
         found = np.zeros((self.samples, numbers))
         for k, q in enumerate(directions):
             found[k // numbers] += (losses[2 * k] - losses[2 * k + 1]) / (2.0 * r) * q
@@ -83,8 +84,7 @@ class EnsembleMean(Ensemble):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.samples % 2 or self.samples < 4:
-            raise InputError(f"samples is {shown(self.samples)}, but must be an even number of at least 4.")
+        require_pairs(self.samples)
         checked_estimator(self.estimator)
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
@@ -99,7 +99,8 @@ class EnsembleMean(Ensemble):
                 yield ensemble.sample(-u, -displacement, self.estimator)
 
         at_them, *samples = self.evaluated(problem, points(), observe)
-        numbers = np.array([joined(one.gradient, ensemble.values) for one in samples])
+        checked = [checked_estimate(one, ensemble.values) for one in samples]
+        numbers = np.array([joined(one.gradient, ensemble.values) for one in checked])
         gradient, error = (ensemble.named(one) for one in self.combined(numbers))
         return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1)
 
@@ -109,9 +110,19 @@ class EnsembleMean(Ensemble):
         return mean_and_error((gradients[::2] + gradients[1::2]) / 2.0)
 
 
+def require_pairs(samples: int) -> None:
+    """Raises `InputError` unless there are two antithetic pairs of samples or more, to know how they scatter."""
+    if samples % 2 or samples < 4:
+        raise InputError(f"samples is {shown(samples)}, but must be an even number of at least 4.")
+
+
 def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The mean of the rows and its standard error."""
-    return samples.mean(axis=0), samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
+    """The mean of the rows and its standard error, also of numbers whose squares overflow; no number where one is
+    infinite."""
+    size = np.abs(samples).max(initial=0.0)
+    unit = size if 0.0 < size < np.inf else 1.0
+    with np.errstate(invalid="ignore"):
+        return samples.mean(axis=0), unit * (samples / unit).std(axis=0, ddof=1) / np.sqrt(len(samples))
 
 
 def joined(gradient: Arrays, names: Iterable[str]) -> np.ndarray:

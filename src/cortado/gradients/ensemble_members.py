@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cortado.arrays import as_numbers
+from cortado.arrays import as_numbers, is_whole
+from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
 from cortado.executors.executor import Executor, InProcess, checked_executor
 from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator
@@ -35,29 +36,37 @@ class Ensemble:
     """Where the members of the ensemble are computed, which changes no bit of the result."""
 
     def __post_init__(self) -> None:
-        if not _is_whole(self.samples) or self.samples < 2:
+        if not is_whole(self.samples) or self.samples < 2:
             raise InputError(f"samples is {shown(self.samples)}, but must be at least 2, to know how they scatter.")
         position_noise = as_number(self.position_noise)
         if position_noise is None or position_noise < 0.0:
             raise InputError(
                 f"position_noise is {shown(self.position_noise)}, but must be a number of at least 0, in spacings."
             )
-        if not _is_whole(self.seed) or self.seed < 0:
+        if not is_whole(self.seed) or self.seed < 0:
             raise InputError(f"seed is {shown(self.seed)}, but must be a whole number of at least 0.")
+        for name, spread in self.spread.items() if isinstance(self.spread, Mapping) else [("parameters", self.spread)]:
+            _checked_spread(name, spread)
         checked_executor(self.executor)
 
-    def around(self, problem: Differentiable, parameters: Values) -> "Sampler":
-        """The ensemble around these parameters of a problem. Raises `InputError` for a batch."""
+    def around(self, problem: Differentiable, parameters: Values, draw: int = 0) -> "Sampler":
+        """The ensemble around these parameters of a problem; another ``draw`` has other samples, independent of these.
+        Raises `InputError` for a batch, for no parameters, and for spreads that round-off swallows."""
         if problem.simulation.batch is not None:
             raise InputError(
                 f"{type(self).__name__} is given a problem of a batch, but must be given one of a single scene, whose "
                 "samples it runs in batches of its own."
             )
+        if not parameters:
+            raise InputError(f"parameters is empty, but must name what {type(self).__name__} is to vary.")
         values = {name: as_numbers(f"parameter {name}", value) for name, value in parameters.items()}
-        spreads = np.concatenate([np.full(value.size, self._spread(name)) for name, value in values.items()])
+        widths = {name: self._spread(name) for name in values}
+        for name, value in values.items():
+            _check_resolved(name, value, widths[name], problem.simulation.precision)
+        spreads = np.concatenate([np.full(value.size, widths[name]) for name, value in values.items()])
         start = problem.simulation.positions
         position_noise = self.position_noise * problem.simulation.scene.discretisation.spacing
-        return Sampler(values, spreads, start, position_noise, np.random.default_rng(self.seed))
+        return Sampler(values, spreads, start, position_noise, np.random.default_rng([self.seed, draw]))
 
     def evaluated(self, problem: Differentiable, points: Iterable[Point], observe: Observer | None) -> list[Estimate]:
         """Estimates at points, in their order. Where ``observe`` is given they are computed in this process, which has
@@ -68,11 +77,7 @@ class Ensemble:
     def _spread(self, name: str) -> float:
         if isinstance(self.spread, Mapping) and name not in self.spread:
             raise InputError(f"spread has nothing for {name}, but must have a number for every parameter.")
-        spread = self.spread[name] if isinstance(self.spread, Mapping) else self.spread
-        number = as_number(spread)
-        if number is None or number <= 0.0:
-            raise InputError(f"spread of {name} is {shown(spread)}, but must be a number greater than 0.")
-        return number
+        return _checked_spread(name, self.spread[name] if isinstance(self.spread, Mapping) else self.spread)
 
 
 @dataclass(frozen=True)
@@ -115,12 +120,23 @@ class Sampler:
         return _moved({name: np.zeros_like(value) for name, value in self.values.items()}, numbers)
 
 
+def _checked_spread(name: str, spread: object) -> float:
+    number = as_number(spread)
+    if number is None or number <= 0.0:
+        raise InputError(f"spread of {name} is {shown(spread)}, but must be a number greater than 0.")
+    return number
+
+
+def _check_resolved(name: str, value: np.ndarray, spread: float, precision: Precision) -> None:
+    """Raises `InputError` where a spread is lost in round-off, so that all samples would be the same."""
+    lost = np.asarray(value, precision.numpy) == np.asarray(value + spread, precision.numpy)
+    if lost.any():
+        wanted = f"large enough to change {value[lost].flat[0]:g} in {precision.name}"
+        raise InputError(f"spread of {name} is {spread:g}, but must be {wanted}.")
+
+
 def _moved(values: Arrays, change: np.ndarray) -> Arrays:
     """Values plus a change (numbers,), which is one vector for all of them."""
     ends = np.cumsum([value.size for value in values.values()])
     parts = np.split(change, ends[:-1])
     return {name: value + part.reshape(value.shape) for (name, value), part in zip(values.items(), parts, strict=True)}
-
-
-def _is_whole(value: object) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)

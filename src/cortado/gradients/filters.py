@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cortado.arrays import is_whole
 from cortado.device.state import State
 from cortado.errors import InputError, shown
 from cortado.gradients.adjoint_filters import Drag, EddyViscosity, Limit
@@ -11,6 +12,7 @@ from cortado.gradients.estimator import AdjointEstimator, Differentiable, Estima
 from cortado.gradients.exact import Exact
 from cortado.parameters.values import Values
 from cortado.rollout import BackwardStep, Observer, Rollout
+from cortado.scene.fields import as_number
 
 EXACT = Exact()
 
@@ -61,11 +63,12 @@ class AdjointViscosity(AdjointEstimator):
     """The estimator whose adjoint is filtered."""
 
     def __post_init__(self) -> None:
-        if type(self.order) is not int or self.order not in (1, 2):
+        if not is_whole(self.order) or self.order not in (1, 2):
             raise InputError(f"order is {shown(self.order)}, but must be 1 or 2.")
-        if not (_is_number(self.limit) and self.limit >= 1.0):
+        if self.limit != np.inf and (as_number(self.limit) or 0.0) < 1.0:
             raise InputError(f"limit is {shown(self.limit)}, but must be a number of at least 1.")
-        if not (_is_number(self.coefficient) and np.isfinite(self.coefficient) and self.coefficient >= 0.0):
+        coefficient = as_number(self.coefficient)
+        if coefficient is None or coefficient < 0.0:
             raise InputError(f"coefficient is {shown(self.coefficient)}, but must be a number of at least 0.")
 
     @property
@@ -114,7 +117,8 @@ class Damped(AdjointEstimator):
     """The estimator whose adjoint is filtered."""
 
     def __post_init__(self) -> None:
-        if not (_is_number(self.rate) and np.isfinite(self.rate) and self.rate >= 0.0):
+        rate = as_number(self.rate)
+        if rate is None or rate < 0.0:
             raise InputError(f"rate is {shown(self.rate)}, but must be a number of at least 0, in 1/s.")
 
     @property
@@ -134,7 +138,3 @@ class _DampedStep(Filtered):
 
     def filter(self, bar: State) -> None:
         self._drag(bar, self._parameters)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float, np.number))

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cortado.errors import InputError, shown
-from cortado.gradients.ensemble import EnsembleMean, joined, mean_and_error
+from cortado.arrays import is_whole
+from cortado.errors import ComputationError, InputError, shown
+from cortado.gradients.ensemble import EnsembleMean, joined, mean_and_error, require_pairs
 from cortado.gradients.ensemble_members import Ensemble, Sampler
 from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator, checked_estimator
 from cortado.gradients.filters import AdjointViscosity
@@ -26,14 +27,14 @@ class Guided(Ensemble):
 
         g = sum_k D_k p_k,   D_k = mean over samples of (L(u + r_k p_k) - L(u - r_k p_k)) / (2 r_k),   r_k = sqrt(N_k),
 
-    where N_k is how many numbers part k has; first positions are perturbed in the same way on both sides. So g is the
-    projection of the smoothed gradient on the span of the parts (guided evolution strategies, Maheswaranathan et al.
-    2019, without their search outside of the span).
+    where N_k is how many numbers of part k are not 0; first positions are perturbed in the same way on both sides. So g
+    is the projection of the smoothed gradient on the span of the parts (guided evolution strategies, Maheswaranathan
+    et al. 2019, without their search outside of the span).
 
     Bias: what the surrogate does not point at is missed; but sizes, over time too, are those of the smoothed loss.
     Noise: the ``standard_error`` of the `Estimate` is that of the D_k and of the directions p_k together, with degrees
-    of freedom by Welch and Satterthwaite. Cost: ``samples`` gradients of the surrogate and
-    2 K ``differences`` forward runs, however many numbers a parameter has.
+    of freedom by Welch and Satterthwaite. Cost: ``samples`` gradients of the surrogate and 1 + 2 K ``differences``
+    forward runs, however many numbers a parameter has.
     """
 
     samples: int = 4
@@ -47,9 +48,10 @@ class Guided(Ensemble):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        require_pairs(self.samples)
         for name, least in (("parts", 1), ("differences", 2)):
             value = getattr(self, name)
-            if type(value) is not int or value < least:
+            if not is_whole(value) or value < least:
                 raise InputError(f"{name} is {shown(value)}, but must be a whole number of at least {least}.")
         checked_estimator(self.surrogate)
 
@@ -59,7 +61,7 @@ class Guided(Ensemble):
             self.spread, self.samples, self.position_noise, self.seed, self.surrogate, executor=self.executor
         ).estimate(problem, parameters, observe)
         assert surrogate.standard_error is not None and surrogate.degrees_of_freedom is not None
-        ensemble = self.around(problem, parameters)
+        ensemble = self.around(problem, parameters, draw=1)
         parts, turns = self._parts(ensemble, surrogate.gradient, surrogate.standard_error)
         reach = [np.sqrt(np.count_nonzero(part)) for part in parts]
 
@@ -87,6 +89,13 @@ class Guided(Ensemble):
         firsts = np.cumsum([0, *(value.size for value in ensemble.values.values())])
         places += self.parts * np.repeat(np.arange(len(firsts) - 1), np.diff(firsts))
         whole, errors = (ensemble.spreads * joined(one, ensemble.values) for one in (gradient, error))
+        greatest = np.abs(whole).max()
+        if not np.isfinite(greatest):
+            raise ComputationError(
+                f"The gradient of {self.surrogate!r} is not finite, so that Guided has no direction; take another "
+                "surrogate, or fewer steps."
+            )
+        whole, errors = (one / (greatest or 1.0) for one in (whole, errors))  # so that no square overflows
         lengths = {k: np.linalg.norm(whole[places == k]) for k in np.unique(places)}
         parts, turns = (
             [np.where(places == k, one, 0.0) / length for k, length in lengths.items() if length]

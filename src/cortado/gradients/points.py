@@ -9,7 +9,14 @@ import numpy as np
 
 from cortado.errors import DivergedError, InputError
 from cortado.executors.executor import Executor, OnResult
-from cortado.gradients.estimator import AdjointEstimator, Batchable, Differentiable, Estimate, GradientEstimator
+from cortado.gradients.estimator import (
+    AdjointEstimator,
+    Batchable,
+    Differentiable,
+    Estimate,
+    GradientEstimator,
+    checked_estimate,
+)
 from cortado.parameters.values import Values
 from cortado.rollout import Observer
 
@@ -24,6 +31,11 @@ class Point:
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
         """The loss of a problem there, and its gradient, which is empty without an estimator."""
+        found = self.found(problem, observe)
+        return found if self.estimator is None else checked_estimate(found, self.values, problem.simulation.batch)
+
+    def found(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
+        """What the estimator says, unchecked."""
         if self.estimator is None:
             return Estimate(problem.value(self.values), {})
         return self.estimator.estimate(problem, self.values, observe)
@@ -34,9 +46,10 @@ class Sample(Point):
     """A point that an ensemble has drawn."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        """See `Point.evaluated`; an `InputError` says that the user did not choose this point."""
+        """See `Point.found`, as a gradient with respect to perturbed first positions need not be there; an `InputError`
+        says that the user did not choose this point."""
         try:
-            return super().evaluated(problem, observe)
+            return self.found(problem, observe)
         except InputError as error:
             advice = "Take a smaller spread, or a logarithm (cortado.optimisation.transforms)."
             raise InputError(f"A sample of the ensemble does not fit: {error} {advice}") from error

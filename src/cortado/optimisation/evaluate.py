@@ -40,20 +40,22 @@ def evaluate(
     estimator = None if gradient is None else checked_estimator(gradient)
     made = (Point(values, estimator) for values in points)
     if loss_if_diverged is not None:
-        made = (_Daring(point.values, point.estimator, loss_if_diverged) for point in made)
+        made = (Daring(point.values, point.estimator, loss_if_diverged) for point in made)
     return evaluated(problem, made, chosen, on_result=on_result)
 
 
 @dataclass(frozen=True)
-class _Daring(Point):
+class Daring(Point):
     """A point that may diverge."""
 
     loss_if_diverged: float = np.inf
+    errors: tuple[type[Exception], ...] = (DivergedError,)
+    """Those after which it has this loss."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
         try:
             return super().evaluated(problem, observe)
-        except DivergedError:
+        except self.errors:
             names = self.values if self.estimator is not None else ()
             nothing = {name: np.full(np.shape(self.values[name]), np.nan) for name in names}
             return Estimate(self.loss_if_diverged, nothing)

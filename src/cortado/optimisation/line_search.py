@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cortado.arrays import is_whole
 from cortado.errors import InputError
 from cortado.optimisation.replay_log import ParameterLayout, Vector
 from cortado.optimisation.search import (
@@ -25,8 +26,8 @@ class LineSearch:
     """Descent along the gradient, as far as the best of several lengths that are tried in one launch.
 
     For losses that are rough, and for gradients that have the right direction and not the right size, such as those of
-    long runs: a search steps over dents that are narrower than its trials, and never to where the run diverges. A trial
-    is a run without a gradient, and all trials of an update are one batch.
+    long runs: a search steps over dents that are narrower than its trials, and never to where the run diverges or
+    parameters are out of their range. A trial is a run without a gradient, and all trials of an update are one batch.
 
     Formula: with g the gradient times the scale, and unit(a) = a over its root mean square,
 
@@ -35,7 +36,8 @@ class LineSearch:
     over lengths s at even ratios from ``shortest`` to 1; P projects onto the bounds. The reach r is 1 at first, and
     then `GROWTH` times the length that was best, at most 1. Where no trial lowers the loss, at the bottom of a dent or
     of the valley, an update still takes the best one, and the reach is 1 again, by which the search leaves dents. So
-    the last iterate need not be the best. There is no test of convergence: all the iterations are made.
+    the last iterate need not be the best. Where every trial diverges, x stays, the momentum is dropped, and the reach
+    is ``shortest`` times what it was. There is no test of convergence: all the iterations are made.
 
     Raises InputError for settings out of range.
     """
@@ -53,7 +55,7 @@ class LineSearch:
         require_positive("scale", self.scale)
         require_fraction("momentum", self.momentum)
         require_fraction("shortest", self.shortest)
-        if type(self.trials) is not int or self.trials < 2 or self.shortest == 0.0:
+        if not is_whole(self.trials) or self.trials < 2 or self.shortest == 0.0:
             raise InputError(
                 f"trials is {self.trials!r} and shortest {self.shortest!r}, but must be at least 2 and greater than 0."
             )

@@ -14,10 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import as_numbers, as_one_number
-from cortado.errors import ComputationError, InputError, shown
+from cortado.arrays import as_numbers, as_one_number, is_whole
+from cortado.errors import ComputationError, DivergedError, InputError, shown
+from cortado.executors.executor import InProcess
+from cortado.gradients.points import evaluated
 from cortado.optimisation.differentiable import Differentiable, LossFunction, as_differentiable, loss_and_gradient
-from cortado.optimisation.evaluate import evaluate
+from cortado.optimisation.evaluate import Daring
 from cortado.optimisation.named_optimisers import as_optimiser
 from cortado.optimisation.replay_log import Evaluation, Log, MemoryLog, ParameterLayout, ReplayLog, Vector
 from cortado.optimisation.result import Parameters, Record, Result
@@ -25,6 +27,8 @@ from cortado.optimisation.search import Optimiser, Search
 
 GREATEST_GRADIENT = 1e150
 # Components beyond it are refused like infinite ones: their squares, which optimisers take, overflow.
+REFUSED = (DivergedError, InputError)
+# A trial with one of these is infinitely bad: the start had none, so the search has gone too far.
 
 
 def optimise(
@@ -136,25 +140,34 @@ class _Evaluator:
         return evaluation.loss, evaluation.gradient.copy()
 
     def losses(self, vectors: Sequence[Vector]) -> list[float]:
-        """The losses at vectors (size,), computed in one launch if the problem can; infinite for a run that diverges.
-        They are in the log, with a gradient of 0, and not in the history."""
+        """The losses at vectors (size,), computed in one launch if the problem can; infinite for a run that diverges,
+        and for parameters that cannot be. They are in the log, with a gradient of 0, and not in the history."""
         known = [self._replay(vector, k).loss for k, vector in enumerate(vectors[: len(self.log) - self.logged])]
         left = vectors[len(known) :]
         found: list[float] = []
 
-        def keep(loss: float) -> None:
-            self.log.append(Evaluation(left[len(found)].copy(), loss, np.zeros_like(left[0])))
-            found.append(loss)
+        def keep(loss: Any) -> None:
+            number = as_one_number("The problem's loss", loss)
+            self.log.append(Evaluation(left[len(found)].copy(), number, np.zeros_like(left[0])))
+            found.append(number)
 
         points, problem = [self.layout.unravel(vector) for vector in left], self.problem
-        if hasattr(problem, "value"):
+        if callable(getattr(problem, "value", None)):
             made: Any = problem
-            evaluate(made, points, loss_if_diverged=math.inf, on_result=lambda _, one: keep(float(one.loss)))
+            trials = [Daring(point, errors=REFUSED) for point in points]
+            evaluated(made, trials, InProcess(), on_result=lambda _, one: keep(one.loss))
         else:
             for point in points:
-                keep(as_one_number("The problem's loss", self._evaluated(point)[0]))
+                keep(self._loss(point))
         self.logged += len(vectors)
         return [loss if math.isfinite(loss) else math.inf for loss in (*known, *found)]
+
+    def _loss(self, parameters: dict[str, Any]) -> Any:
+        """The loss of a problem that always computes its gradient too."""
+        try:
+            return self._evaluated(parameters)[0]
+        except REFUSED:
+            return math.inf
 
     def _evaluated(self, parameters: dict[str, Any]) -> tuple[Any, Mapping[str, Any]]:
         """The loss and its gradient, as the problem returns them."""
@@ -311,7 +324,7 @@ def _require_within(vector: Vector, lower: Vector, upper: Vector, layout: Parame
 
 def _require_count(iterations: int) -> None:
     """Raise InputError unless the number of iterations is a positive integer."""
-    if not isinstance(iterations, int | np.integer) or isinstance(iterations, bool) or iterations < 1:
+    if not is_whole(iterations) or iterations < 1:
         raise InputError(f"The number of iterations must be an integer of at least 1, not {iterations!r}.")
 
 

@@ -21,7 +21,8 @@ class Search:
     evaluate: Callable[[Vector], tuple[float, Vector]]
     """Vector (size,) -> loss, gradient (size,)."""
     losses: Callable[[Sequence[Vector]], list[float]]
-    """Vectors (size,) -> the loss of each, infinite where the run diverges; cheaper than so many evaluations."""
+    """Vectors (size,) -> the loss of each, infinite where there can be no run, as it diverges or parameters
+    are out of range; cheaper than so many evaluations."""
     layout: ParameterLayout
     """Which components of the vectors belong to which parameter."""
     start: Vector

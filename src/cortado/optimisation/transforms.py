@@ -12,10 +12,10 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.special import softmax
 
-from cortado.arrays import as_numbers
-from cortado.errors import DivergedError, InputError
+from cortado.arrays import as_numbers, is_whole
+from cortado.errors import DivergedError, InputError, shown
 from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator, estimate
-from cortado.parameters.values import Arrays, Values
+from cortado.parameters.values import Arrays, Values, check_known
 from cortado.problem import Problem
 from cortado.rollout import BackwardStep, Observer
 
@@ -57,6 +57,8 @@ class Softmax:
     """p_k = exp(u_k) / sum_l exp(u_l), row by row: fractions (n, phases) that add up to 1."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
+        if np.ndim(u) != 2:
+            raise InputError(f"coordinates have shape {np.shape(u)}, but must have a row for each particle.")
         return softmax(u, axis=1)
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
@@ -75,6 +77,12 @@ class TimeInterpolation:
     steps: int
     knots: int
 
+    def __post_init__(self) -> None:
+        for name in ("steps", "knots"):
+            value = getattr(self, name)
+            if not is_whole(value) or value < 1:
+                raise InputError(f"{name} is {shown(value)}, but must be a whole number of at least 1.")
+
     @property
     def places(self) -> np.ndarray:
         """(k,) the steps at which the knots are, counted from 0; in between where the numbers do not fit."""
@@ -87,9 +95,11 @@ class TimeInterpolation:
         return np.maximum(1.0 - np.abs(places[:, None] - np.arange(self.knots)), 0.0)
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
+        _require_rows("knots", u, self.knots)
         return self._weights @ u
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
+        _require_rows("values over time", parameter, self.steps)
         return np.linalg.lstsq(self._weights, parameter, rcond=None)[0]
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
@@ -112,22 +122,31 @@ class Affine:
         return f"Affine({sha256(self.base.tobytes() + self.matrix.tobytes()).hexdigest()[:16]})"
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
-        return self.base + np.tensordot(self.matrix, u, np.ndim(u))
+        _require_shape("coordinates", u, self._shape)
+        return self.base + np.tensordot(self.matrix, u, len(self._shape))
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
         """The least of all u that come nearest to ``parameter``."""
-        shape = self.matrix.shape[self.base.ndim :]
+        _require_shape("values", parameter, self.base.shape)
         matrix = self.matrix.reshape(self.base.size, -1)
-        return np.linalg.lstsq(matrix, (parameter - self.base).ravel(), rcond=None)[0].reshape(shape)
+        return np.linalg.lstsq(matrix, (parameter - self.base).ravel(), rcond=None)[0].reshape(self._shape)
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
         return np.tensordot(bar, self.matrix, self.base.ndim)
+
+    @property
+    def _shape(self) -> tuple[int, ...]:
+        """Of u."""
+        return self.matrix.shape[self.base.ndim :]
 
 
 class Transformed:
     """A problem as a function of coordinates: those of the given bijectors, all other parameters as they are."""
 
     def __init__(self, problem: Problem, coordinates: Mapping[str, Bijector]):
+        """Raises `InputError` for coordinates of a parameter that the scene does not have."""
+        for name in coordinates:
+            check_known(name, problem.simulation.scene)
         self.problem, self.coordinates = problem, dict(coordinates)
         self.simulation = problem.simulation
 
@@ -194,6 +213,16 @@ class TransformedPass:
         """The gradient with respect to the coordinates."""
         gradient = self._pass.back(derivative, observe)
         return gradient | by_coordinates(self._coordinates, self._u, gradient)
+
+
+def _require_shape(what: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+    if np.shape(array) != shape:
+        raise InputError(f"{what} have shape {np.shape(array)}, but must have {shape}.")
+
+
+def _require_rows(what: str, array: np.ndarray, rows: int) -> None:
+    if not np.ndim(array) or len(array) != rows:
+        raise InputError(f"{what} have shape {np.shape(array)}, but must have {rows} rows.")
 
 
 def by_coordinates(coordinates: Mapping[str, Bijector], u: Mapping[str, Any], gradient: Arrays) -> Arrays:

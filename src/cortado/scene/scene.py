@@ -35,7 +35,8 @@ class Scene(SceneTables):
     def replaced(self, *overrides: str) -> "Scene":
         """The same scene with other values: ``scene.replaced("solver.time_step=0.002", "phase.oil.viscosity=2")``.
 
-        Raises `SceneError` as `load_scene` does, whose overrides these are.
+        The overrides are those of `load_scene`; a file that one names is looked for in the current folder. Raises
+        `SceneError` as `load_scene` does.
         """
         return Scene.from_json(self.to_json(), overrides, "the scene")
 
