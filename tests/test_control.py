@@ -5,16 +5,17 @@ from functools import partial
 
 import numpy as np
 import pytest
-from catalogue import TASKS, task
-from contenders import CONTENDERS, Descent
-from curves import curves
-from multiple_shooting import Gaps, MultipleShooting
-from objective import BACKWARD, BudgetSpent, Objective
-from records import Record, Records, Run
-from run import main
-from staged import Easier
 
-from cortado import CortadoWarning, InputError, Simulation, gradients
+from benchmarks.control.__main__ import main
+from benchmarks.control.catalogue import TASKS, task
+from benchmarks.control.contenders import CONTENDERS, Descent
+from benchmarks.control.curves import curves
+from benchmarks.control.multiple_shooting import Gaps, MultipleShooting
+from benchmarks.control.objective import BudgetSpent, Objective
+from benchmarks.control.records import Record, Records, Run
+from benchmarks.control.staged import Easier
+from benchmarks.counting import BACKWARD
+from cortado import CortadoWarning, DivergedError, InputError, Simulation, gradients
 from finite_differences import decades, distance
 
 SHORT = {
@@ -102,17 +103,17 @@ def test_steps_are_counted_alone_and_in_batches():
     def metered(estimator):
         objective = Objective(chosen, problem, 0, np.inf)
         objective.value_and_gradient(objective.named(objective.start), estimator)
-        assert objective.curve == [(objective.meter.steps, objective.best_loss)]
-        return objective.meter
+        assert objective.curve == [(objective.steps.cost, objective.best_loss)]
+        return objective.steps
 
     once = metered(gradients.Exact())
-    assert (once.forward, once.backward, once.steps) == (steps, steps, (1.0 + BACKWARD) * steps)
+    assert (once.forward, once.backward, once.cost) == (steps, steps, (1 + BACKWARD) * steps)
     mean = metered(gradients.EnsembleMean(0.05, 4, estimator=gradients.Exact()))
     assert (mean.forward, mean.backward) == (5 * steps, 4 * steps)
     objective = Objective(chosen, problem, 0, np.inf)
     points = np.random.default_rng(0).uniform(-1.0, 1.0, (3, chosen.controls.numbers))
     together = objective.values(list(points))
-    assert objective.meter.forward == 3 * steps and [at for at, _ in objective.curve] == [steps, 2 * steps, 3 * steps]
+    assert objective.steps.forward == 3 * steps and [at for at, _ in objective.curve] == [steps, 2 * steps, 3 * steps]
     assert together.tolist() == [objective.problem.value(objective.named(u)) for u in points]
 
 
@@ -179,7 +180,7 @@ def test_easier_problems_have_curves_and_parameters_of_their_own():
     thick = Easier(viscosity=16.0, share=0.5).of(objective, objective.start)
     assert thick.fixed["viscosity"].tolist() == [0.8, 0.8] and "viscosity" not in objective.fixed
     thick.values([thick.start])
-    assert (len(thick.curve), len(objective.curve)) == (1, 0) and objective.meter.forward == chosen.steps
+    assert (len(thick.curve), len(objective.curve)) == (1, 0) and objective.steps.forward == chosen.steps
     late = Easier(late=0.5).of(objective, objective.start)
     _, gradient = late.value_and_gradient(late.named(late.start), gradients.Exact())
     half = chosen.controls.numbers // 2
@@ -220,6 +221,35 @@ def test_what_is_done_is_not_repeated(tmp_path, capsys):
 def test_a_mistake_is_a_sentence(changed, said, tmp_path, capsys):
     assert main([*COMMAND, "--out", str(tmp_path), *changed]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_budget_below_one_run_is_a_sentence(tmp_path, capsys):
+    assert main([*COMMAND, "--seeds", "1", "--out", str(tmp_path), "--budget", "10"]) == 1
+    assert "The budget of 10 steps ends before the first evaluation" in capsys.readouterr().err
+    assert not Records(tmp_path / "runs.jsonl").read()
+
+
+def test_where_a_neighbour_diverges_the_run_itself_counts():
+    """The first one of an ensemble's runs diverges, and not that at the controls."""
+    objective = Objective(short("splash"), short("splash").problem(), seed=1, budget=np.inf)
+    u = objective.named(objective.start)
+    wanted = objective.value(u)
+
+    class Neighbours:
+        def estimate(self, problem, parameters, observe=None):
+            raise DivergedError(step=1, particle=0, advice="")
+
+    loss, gradient = objective.value_and_gradient(u, Neighbours())
+    assert loss == wanted == objective.curve[-1][1] and not gradient[next(iter(u))].any()
+    bad, _ = objective.value_and_gradient(u, Lost())
+    assert bad > wanted and objective.curve[-1][1] == np.inf
+
+
+class Lost(gradients.AdjointEstimator):
+    """In place of an estimator of one run, which diverges."""
+
+    def derivative(self, rollout):
+        raise DivergedError(step=1, particle=0, advice="")
 
 
 def test_a_file_of_something_else_is_a_sentence(tmp_path):

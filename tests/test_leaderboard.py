@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
+from benchmarks.counting import Counted, Steps
 from benchmarks.gradients import scenes
 from benchmarks.gradients.__main__ import main
 from benchmarks.gradients.cells import Cell
 from benchmarks.gradients.controls import CONTROLS, VelocityModes
-from benchmarks.gradients.counting import Counted, Steps
 from benchmarks.gradients.coverage import REFERENCE, Intervals, coverage, intervals
 from benchmarks.gradients.over_scenes import over_scenes
 from benchmarks.gradients.resolution import resolution
+from benchmarks.gradients.results import Results
 from benchmarks.gradients.table import ceiling, cosine, table
 from benchmarks.gradients.truth import DIRECTIONS, FEW, SAMPLES, directions, smoothed
-from cortado import Problem, Scene, Simulation
+from cortado import InputError, Problem, Scene, Simulation
 from cortado.gradients import EnsembleMean, Exact, RandomizedSmoothing
 from cortado.optimisation.transforms import Transformed
 
@@ -155,7 +156,24 @@ def test_steps_are_counted_in_batches_too(simulation):
     ):
         steps = Steps()
         estimator.estimate(Counted(problem, 3, steps), values)
-        assert (steps.forward, steps.reverse) == (3 * forward, 3 * reverse)
+        assert (steps.forward, steps.backward) == (3 * forward, 3 * reverse)
+
+
+def test_two_commands_do_not_write_one_file(tmp_path):
+    path = tmp_path / "results.jsonl"
+    record = {"scene": "s", "control": "c", "loss": "l", "horizon": 1, "seed": 1, "estimator": "one"}
+    first, second = Results(path), Results(path)
+    with first.adding({}, {}) as add:
+        add(record)
+        with pytest.raises(InputError, match="is being written by another command"), second.adding({}, {}):
+            pass
+    with pytest.raises(InputError, match="is being written"), second.adding({}, {}):  # as it has not seen the record
+        pass
+    with path.open("a") as file:
+        file.write('{"scene": "s", "cont')
+    with Results(path).adding({}, {}) as add:
+        add({**record, "seed": 2})
+    assert [line["seed"] for line in Results(path).records.values()] == [1, 2]
 
 
 def test_the_table_says_what_noise_leaves():
@@ -169,10 +187,12 @@ def test_the_table_says_what_noise_leaves():
         {**base, "estimator": "one", "seed": 2, "derivatives": None},
         *({**base, "estimator": "two", "seed": seed, "failed": "it did"} for seed in range(3)),
     ]
+    records += [{**base, **truth, "seed": 3, "derivatives": [0.0, 0.0]}]  # to which nothing has a direction
+    records += [{**base, "estimator": "one", "seed": 3, "derivatives": [1.0, 0.0]}]
     text = table(records)
-    assert "| one | 1.00 [1.00] 2, 1 without | 4 |" in text
+    assert "| one | 1.00 [1.00] 2, 1 without | 4 |" in text and "0.00" not in over_scenes(records, 0.1)
     assert "| two | - | - |" in text
-    assert "| *at most* | 0.80 [0.80] | |" in text
+    assert "| *at most* | 0.80 [0.00] | |" in text
 
 
 def test_scenes_and_seeds_are_put_together():

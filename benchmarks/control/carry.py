@@ -9,13 +9,14 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from task import GRAVITY, WATER, Controls, Score, Task, blocks_of, scene_of
 
 from cortado import Problem, Scene, Simulation
 from cortado.losses import Frames
 from cortado.losses.loss import Adjoint, Snapshot
 from cortado.optimisation.transforms import Affine
 from cortado.parameters.values import Arrays
+
+from .task import GRAVITY, WATER, Controls, Score, Task, blocks_of, scene_of
 
 FRAMES = 20
 """States on the way at which water above the rim is counted, and as many after the arrival."""

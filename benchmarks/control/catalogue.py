@@ -1,12 +1,12 @@
 """All tasks, by name and size."""
 
-from carry import Carry
-from latte import Latte, LatteDense
-from mix import Mix
-from splash import Splash
-from task import Task
-
 from cortado import InputError
+
+from .carry import Carry
+from .latte import Latte, LatteDense
+from .mix import Mix
+from .splash import Splash
+from .task import Task
 
 TASKS: dict[str, type[Task]] = {one.name: one for one in (Carry, Splash, Latte, LatteDense, Mix)}
 SIZES = ("small", "large")

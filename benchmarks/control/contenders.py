@@ -4,12 +4,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from descent import Descent
-from multiple_shooting import MultipleShooting
-from objective import BudgetSpent, Objective
-from staged import Easier, Staged
 
 from cortado import InputError, gradients, optimisers
+
+from .descent import Descent
+from .multiple_shooting import MultipleShooting
+from .objective import BudgetSpent, Objective
+from .staged import Easier, Staged
 
 
 class Contender(Protocol):

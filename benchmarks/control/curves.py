@@ -4,15 +4,16 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from catalogue import task
-from contenders import CONTENDERS
-from objective import first_positions
-from records import Record
 
 from cortado import DivergedError, InputError, Problem
 from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE, drawing
 from cortado.io.srgb import to_srgb
 from cortado.losses import Image
+
+from .catalogue import task
+from .contenders import CONTENDERS
+from .objective import first_positions
+from .records import Record
 
 POINTS = 400
 """Of a curve."""
@@ -44,7 +45,9 @@ def draw(name: str, size: str, records: list[Record], folder: Path) -> None:
 
 def _draw_curves(name: str, size: str, problem: Problem, records: list[Record], path: Path) -> None:
     chosen = task(name, size)
-    known = problem.value(chosen.controls.parameters(chosen.known))
+    known = -np.inf
+    with suppress(DivergedError):
+        known = problem.value(chosen.controls.parameters(chosen.known))
     least = min(min(one.so_far) for one in records)
     with drawing(path, 9.0, 5.2) as figure:
         axes = figure.subplots()

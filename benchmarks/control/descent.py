@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from objective import BudgetSpent, Objective
-
 from cortado import gradients, optimise, optimisers
+
+from .objective import BudgetSpent, Objective
 
 ADAM = optimisers.Adam(0.1)
 """For controls that go from -1 to 1."""

@@ -12,13 +12,14 @@ from hashlib import sha256
 from typing import Any, Self
 
 import numpy as np
-from task import COFFEE, MILK, Controls, NoLoss, Score, Task, scene_of
 
 from cortado import Problem, Scene, Simulation, image_losses
 from cortado.losses import Frames, Image, Loss
 from cortado.losses.loss import Adjoint, Snapshot
 from cortado.optimisation.transforms import Affine
 from cortado.parameters.values import Arrays
+
+from .task import COFFEE, MILK, Controls, NoLoss, Score, Task, scene_of
 
 LAG = 0.08
 """Of the pouring: in so long the nozzle comes nearer to where it is sent, by a factor of e."""

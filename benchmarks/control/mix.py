@@ -9,12 +9,13 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from task import COFFEE, GRAVITY, MILK, Controls, Score, Task, scene_of, shaken
 
 from cortado import Problem, Scene, Simulation
 from cortado.losses import Frames
 from cortado.losses.loss import Adjoint, Snapshot
 from cortado.parameters.values import Arrays
+
+from .task import COFFEE, GRAVITY, MILK, Controls, Score, Task, scene_of, shaken
 
 STRENGTH = 6.0
 """Greatest acceleration of the cup along an axis [m/s2]."""

@@ -5,14 +5,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from objective import BudgetSpent, Objective
-from task import GRAVITY
 
 from cortado import InputError, Problem, gradients, optimise, optimisers
 from cortado.errors import ComputationError, DivergedError
 from cortado.losses import Frames, Loss, Snapshot
 from cortado.losses.loss import Adjoint, by_field
 from cortado.parameters.values import Arrays
+
+from .objective import BudgetSpent, Objective
+from .task import GRAVITY
 
 SHORT_RUNS = gradients.AdjointViscosity()
 
@@ -84,7 +85,7 @@ class Gaps:
     def closed(self, u: np.ndarray) -> Arrays:
         """The states of a run with these controls, by which there are no gaps: (borders, n, d), in their units."""
         steps = [part.stop for part, _ in self._parts[:-1]]
-        self._objective.meter.forward += self._objective.task.steps
+        self._objective.steps.forward += self._objective.task.steps
         controls = self._objective.task.controls.parameters(u)
         states = self._objective.inner.states({**controls, **self._objective.fixed}, steps)
         return {
@@ -106,9 +107,9 @@ class Gaps:
             self._objective.require_budget()
             if k < len(self._borders):
                 self._borders[k].expect({name: parameters[name][k] for name in self._units}, self.penalty)
+            self._objective.steps.forward += problem.steps
+            self._objective.steps.backward += problem.steps
             one = problem.estimate({controls.parameter: over_time[part], **first}, self._estimator)
-            self._objective.meter.forward += problem.steps
-            self._objective.meter.backward += problem.steps
             total += one.loss
             bars.append(one.gradient[controls.parameter])
             for name, unit in self._units.items():

@@ -3,19 +3,18 @@
 import math
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from task import Task
 
 from cortado import DivergedError, Problem
-from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator
+from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator
 from cortado.optimisation.transforms import Transformed
 from cortado.parameters.values import Arrays, Values
 
-BACKWARD = 3.0
-"""Forward steps that a step back costs: it computes the step once more, and its adjoint (README.md)."""
+from ..counting import Counted, Steps
+from .task import Task
+
 POSITION_NOISE = 0.01
 """Of the first positions of a seed [spacings]."""
 GREATEST = 1e100
@@ -28,25 +27,12 @@ class BudgetSpent(Exception):
     """A search has simulated as many steps as it may; what it has evaluated beyond them does not count."""
 
 
-@dataclass
-class Meter:
-    """Counts simulated steps."""
-
-    forward: int = 0
-    backward: int = 0
-
-    @property
-    def steps(self) -> float:
-        """All of them, in forward steps."""
-        return self.forward + BACKWARD * self.backward
-
-
 class Objective:
     """The loss of a task from first positions of a seed's own, as a function of the numbers of its controls."""
 
     def __init__(self, task: Task, problem: Problem, seed: int, budget: float):
         """``budget``: simulated steps after which no further run begins."""
-        self.task, self.budget, self.meter = task, budget, Meter()
+        self.task, self.budget, self.steps = task, budget, Steps()
         self.inner = problem
         """Whose steps are not counted."""
         self._name = task.controls.parameter
@@ -59,8 +45,8 @@ class Objective:
         self.fixed = fixed
         """Parameters in the place of the scene's, such as the seed's first positions."""
         self._changed = np.arange(start.size) >= (1.0 - late) * start.size
-        self.metered = Metered(self.inner, fixed, self.meter)
-        self.problem = Transformed(self.metered, {self._name: self.task.controls.mapping})  # type: ignore[arg-type]
+        counted: Any = Counted(Fixed(self.inner, fixed), self.inner.steps, self.steps)
+        self.problem = Transformed(counted, {self._name: self.task.controls.mapping})
         self.curve: list[tuple[float, float]] = []
         """Simulated steps, and the loss of the run that they end with; infinite for one that diverged."""
         self.best, self.best_loss = start, math.inf
@@ -69,7 +55,7 @@ class Objective:
         """The same for a share of the budget and from another start, with a curve of its own: parameters of the scene
         are replaced by these, and only a share of the controls is changed, the last ones."""
         found = copy(self)
-        found.budget = min(self.meter.steps + share * self.budget, self.budget)
+        found.budget = min(self.steps.cost + share * self.budget, self.budget)
         found._begin(start, {**self.fixed, **fixed}, late)
         return found
 
@@ -85,12 +71,12 @@ class Objective:
         while len(found) < len(points):
             self.require_budget()
             part = [self.named(u) for u in points[len(found) : len(found) + room]]
-            before = self.meter.steps
+            before = self.steps.cost
             if room > 1:
                 losses = [_loss(one) for one in self.problem.together(part)]
             else:
                 losses = [self._value(one) for one in part]
-            each = (self.meter.steps - before) / len(part)
+            each = (self.steps.cost - before) / len(part)
             for k, (u, loss) in enumerate(zip(part, losses, strict=True), 1):
                 found.append(self._noted(u[self._name], loss, before + k * each))
         return np.array(found)
@@ -102,11 +88,12 @@ class Objective:
         u = parameters[self._name]
         try:
             found = self.problem.estimate(parameters, gradient)
-        except DivergedError:
-            return self._noted(u, math.inf, self.meter.steps), self.named(self._away_from_best(u))
+        except DivergedError:  # of this run, or of another one in an ensemble around it
+            loss = math.inf if isinstance(gradient, AdjointEstimator) else self._value(parameters)
+            return self._noted(u, loss, self.steps.cost), self.named(self._away_from_best(u))
         slopes = np.nan_to_num(found.gradient[self._name], nan=0.0, posinf=0.0, neginf=0.0)
         slopes = np.clip(np.where(self._changed, slopes, 0.0), -GREATEST, GREATEST)
-        return self._noted(u, found.loss, self.meter.steps), self.named(slopes)
+        return self._noted(u, found.loss, self.steps.cost), self.named(slopes)
 
     def value(self, parameters: Arrays) -> float:
         """As a line search asks."""
@@ -148,26 +135,22 @@ class Objective:
 
     def require_budget(self) -> None:
         """Raises `BudgetSpent`."""
-        if self.meter.steps >= self.budget:
+        if self.steps.cost >= self.budget:
             raise BudgetSpent
 
 
-class Metered:
-    """A problem whose steps are counted, forward and back, also those of several runs in one launch; if it has
-    parameters of its own, such as first positions, they replace those of the scene."""
+class Fixed:
+    """A problem some of whose parameters, first positions among them, replace those of the scene."""
 
-    def __init__(self, problem: Problem, fixed: Arrays, meter: Meter):
-        """``fixed``: parameters by their name, or nothing for those of the scene."""
-        self._problem, self._meter, self._fixed = problem, meter, fixed
-        self.simulation = _Simulation(problem, fixed["initial_positions"]) if fixed else problem.simulation
+    def __init__(self, problem: Problem, fixed: Arrays):
+        self._problem, self._fixed = problem, fixed
+        self.simulation = _Simulation(problem, fixed["initial_positions"])
 
     def value(self, parameters: Values) -> Any:
-        self._meter.forward += self._steps
         return self._problem.value(self._all(parameters))
 
-    def forward_pass(self, parameters: Values) -> "_MeteredPass":
-        self._meter.forward += self._steps
-        return _MeteredPass(self._problem.forward_pass(self._all(parameters)), self._steps, self._meter)
+    def forward_pass(self, parameters: Values) -> ForwardPass:
+        return self._problem.forward_pass(self._all(parameters))
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
         """See `Batchable.room`."""
@@ -177,41 +160,10 @@ class Metered:
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
         """See `Batchable.together`."""
-        if estimator is None:
-            self._meter.forward += self._steps * len(points)
-        inner: Any = None if estimator is None else _MeteredEstimator(estimator, self._meter)
-        return self._problem.together([self._all(point) for point in points], inner)
-
-    @property
-    def _steps(self) -> int:
-        """In one evaluation, of all scenes of a batch."""
-        return self._problem.steps * (self._problem.simulation.batch or 1)
+        return self._problem.together([self._all(point) for point in points], estimator)
 
     def _all(self, parameters: Values) -> Values:
         return {**self._fixed, **parameters}
-
-
-class _MeteredPass:
-    """A forward run whose reverse passes are counted."""
-
-    def __init__(self, forward_pass: Any, steps: int, meter: Meter):
-        self._pass, self._steps, self._meter = forward_pass, steps, meter
-        self.loss, self.rollout, self.derivative = forward_pass.loss, forward_pass.rollout, forward_pass.derivative
-
-    def back(self, derivative: Any, observe: Any = None) -> Arrays:
-        self._meter.backward += self._steps
-        return self._pass.back(derivative, observe)
-
-
-@dataclass(frozen=True)
-class _MeteredEstimator:
-    """An estimator that counts what it does to a batch."""
-
-    estimator: AdjointEstimator
-    meter: Meter
-
-    def estimate(self, problem: Any, parameters: Values, observe: Any = None) -> Estimate:
-        return self.estimator.estimate(Metered(problem, {}, self.meter), parameters, observe)
 
 
 class _Simulation:

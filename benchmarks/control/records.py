@@ -6,12 +6,13 @@ from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 
 import numpy as np
-from catalogue import task
-from contenders import contender
-from objective import Objective
 
 from cortado import InputError, __version__
 from cortado.io.files import write_atomically
+
+from .catalogue import task
+from .contenders import contender
+from .objective import Objective
 
 
 @dataclass(frozen=True)
@@ -63,14 +64,16 @@ def carried_out(run: Run) -> Record:
     problem = chosen.problem(run.device, run.precision)
     objective = Objective(chosen, problem, run.seed, run.budget)
     contender(run.contender).search(objective, run.seed)
+    if not objective.curve:
+        raise InputError(f"The budget of {run.budget:g} steps ends before the first evaluation; give a larger one.")
     return Record(
         run=run,
         steps=[steps for steps, _ in objective.curve],
         losses=[loss if np.isfinite(loss) else None for _, loss in objective.curve],
         best=objective.best.tolist(),
         score=objective.score(),
-        forward_steps=objective.meter.forward,
-        backward_steps=objective.meter.backward,
+        forward_steps=objective.steps.forward,
+        backward_steps=objective.steps.backward,
         seconds=round(time.perf_counter() - began, 1),
         cortado=__version__,
     )

@@ -5,11 +5,12 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from task import WATER, Controls, NoLoss, Score, Task, scene_of, shaken
 
 from cortado import Problem, Scene, Simulation, image_losses
 from cortado.losses import Image
 from cortado.parameters.values import Arrays
+
+from .task import WATER, Controls, NoLoss, Score, Task, scene_of, shaken
 
 STRENGTH = 12.0
 """Greatest acceleration of the box along an axis [m/s2]."""

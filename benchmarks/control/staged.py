@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from descent import Descent
-from objective import BudgetSpent, Objective
+
+from .descent import Descent
+from .objective import BudgetSpent, Objective
 
 
 @dataclass(frozen=True)

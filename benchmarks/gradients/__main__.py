@@ -52,16 +52,16 @@ def compute(given: argparse.Namespace, results: Results) -> None:
     """Compute the cells that the file lacks, and write each as it arrives."""
     bench = Bench(given.device, given.precision)
     settings = {"cortado": __version__, "device": given.device, "precision": given.precision}
-    results.begin({**settings, "samples": SAMPLES, "directions": DIRECTIONS}, environment())
     cells = [cell for cell in chosen(given) if cell not in results.records and bench.fits(cell)]
     kind = given.device.partition(":")[0]
     with (
+        results.adding({**settings, "samples": SAMPLES, "directions": DIRECTIONS}, environment()) as add,
         nullcontext(InProcess()) if given.workers is None else local_workers(given.workers, kind) as executor,
         track(sum(cell.horizon for cell in cells), "steps") as advance,
     ):
 
         def keep(number: int, record: dict[str, Any]) -> None:
-            results.add(record)
+            add(record)
             advance(cells[number].horizon)
 
         executor.map(bench, cells, keep)

@@ -12,8 +12,8 @@ from cortado import CortadoError, CortadoWarning, Problem, Simulation
 from cortado.losses import FinalPositions
 from cortado.optimisation.transforms import Transformed
 
+from ..counting import Counted, Steps
 from .controls import CONTROLS
-from .counting import Counted, Steps
 from .estimators import ESTIMATORS
 from .losses import LOSSES
 from .scenes import scene

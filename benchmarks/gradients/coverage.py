@@ -93,6 +93,8 @@ def main(words: Sequence[str]) -> int:
         "--out", help="a file to which the estimates and the ends of their intervals are written, as JSON"
     )
     chosen = parser.parse_args(words)
+    if chosen.seeds < 2:
+        parser.error(f"--seeds is {chosen.seeds}, but must be at least 2, to have a mean over the others")
     place = Cell(chosen.scene, "gravity-4", chosen.loss, chosen.horizon, chosen.place, TRUTH)
     found = _computed(place, range(chosen.seeds), chosen.workers)
     print(coverage(found))

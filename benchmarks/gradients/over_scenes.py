@@ -6,13 +6,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import median
 
-import numpy as np
-
 from cortado import InputError
 
 from .cells import TRUTH, Cell, Record
 from .results import Results
-from .table import ceiling, cosine
+from .table import ceiling, score
 
 ALL_LOSSES = "all of these"
 
@@ -26,18 +24,13 @@ def over_scenes(records: Iterable[Record], least_ceiling: float = 0.0) -> str:
     found: dict[str, dict[tuple[str, int, str], list[tuple[float, float]]]] = {}
     for cell, record in known.items():
         truth = known.get(cell.question, {})
-        if truth.get("derivatives") and record.get("derivatives") and ceiling(truth) >= least_ceiling:
+        judged = score(record, truth)
+        if judged is not None and ceiling(truth) >= least_ceiling:
             rows = found.setdefault(cell.control, {})
             for loss in (cell.loss, ALL_LOSSES):
-                rows.setdefault((loss, cell.horizon, cell.estimator), []).append(_score(record, truth))
+                own = judged if record is not truth else (ceiling(truth), 1.0)
+                rows.setdefault((loss, cell.horizon, cell.estimator), []).append(own)
     return "\n\n".join(f"**{control}**\n\n{_rows(found[control])}" for control in sorted(found))
-
-
-def _score(record: Record, truth: Record) -> tuple[float, float]:
-    if record is truth:
-        return ceiling(truth), 1.0
-    estimate, wanted = np.array(record["derivatives"]), np.array(truth["derivatives"])
-    return cosine(estimate, wanted), float(np.linalg.norm(estimate) / np.linalg.norm(wanted))
 
 
 def _rows(scores: dict[tuple[str, int, str], list[tuple[float, float]]]) -> str:

@@ -13,14 +13,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import median
 
-import numpy as np
-
 from cortado import InputError
 
 from .cells import TRUTH, Cell, Record
 from .results import Results
 from .scenes import scene
-from .table import cosine
+from .table import score
 
 USEFUL = 0.9
 """The median cosine to the smoothed gradient down to which a gradient counts as useful."""
@@ -37,11 +35,9 @@ def resolution(records: Iterable[Record]) -> str:
 def _table(estimator: str, known: dict[Cell, Record]) -> str:
     own: dict[str, dict[float, list[tuple[float, float]]]] = {}
     for cell, record in known.items():
-        truth = known.get(cell.question, {}).get("derivatives")
-        if cell.estimator == estimator and truth and record.get("derivatives"):
-            found, wanted = np.array(record["derivatives"]), np.array(truth)
-            score = cosine(found, wanted), float(np.linalg.norm(found) / np.linalg.norm(wanted))
-            own.setdefault(cell.scene, {}).setdefault(_time(cell), []).append(score)
+        judged = score(record, known.get(cell.question, {})) if cell.estimator == estimator else None
+        if judged is not None:
+            own.setdefault(cell.scene, {}).setdefault(_time(cell), []).append(judged)
     times = sorted({time for scores in own.values() for time in scores})
     lines = [
         "| spacing [mm] | " + " | ".join(f"{time:g} s" for time in times) + " | useful up to |",

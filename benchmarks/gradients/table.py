@@ -18,7 +18,16 @@ def cosine(a: np.ndarray, b: np.ndarray) -> float:
 def ceiling(truth: Record) -> float:
     """The cosine that the smoothed gradient itself would have to the truth, whose noise has a known size."""
     size, noise = (float(np.square(truth[name]).sum()) for name in ("derivatives", "standard_errors"))
-    return float(np.sqrt(max(1.0 - noise / max(size, np.finfo(float).tiny), 0.0)))
+    return float(np.sqrt(1.0 - noise / size)) if size > noise else 0.0
+
+
+def score(record: Record, truth: Record) -> tuple[float, float] | None:
+    """The cosine and the relative size of what a record has to a truth; None where one of them has no gradient, and
+    where the truth is 0, to which nothing has a direction."""
+    if not record.get("derivatives") or not any(truth.get("derivatives") or ()):
+        return None
+    found, wanted = np.array(record["derivatives"]), np.array(truth["derivatives"])
+    return cosine(found, wanted), float(np.linalg.norm(found) / np.linalg.norm(wanted))
 
 
 def table(records: Iterable[Record]) -> str:
@@ -41,7 +50,7 @@ def _rows(known: dict[Cell, Record]) -> str:
     ]
     for name in names:
         own = {cell: record for cell, record in known.items() if cell.estimator == name}
-        texts = [_score({c: r for c, r in own.items() if c.horizon == horizon}, known) for horizon in horizons]
+        texts = [_texts({c: r for c, r in own.items() if c.horizon == horizon}, known) for horizon in horizons]
         longest = max((cell.horizon for cell, record in own.items() if record.get("derivatives")), default=0)
         costs = [record["cost"] / longest for cell, record in own.items() if cell.horizon == longest]
         lines.append(f"| {name} | {' | '.join(texts)} | {f'{median(costs):.0f}' if costs else '-'} |")
@@ -49,19 +58,18 @@ def _rows(known: dict[Cell, Record]) -> str:
     return "\n".join([*lines, f"| *at most* | {' | '.join(texts)} | |"])
 
 
-def _score(own: dict[Cell, Record], known: dict[Cell, Record]) -> str:
+def _texts(own: dict[Cell, Record], known: dict[Cell, Record]) -> str:
     """Of one estimator at one horizon, over seeds."""
-    cosines, sizes, missing = [], [], 0
-    for cell, record in own.items():
-        truth = known.get(cell.question, {}).get("derivatives")
-        if truth is None or not record.get("derivatives"):
-            missing += truth is not None
-            continue
-        found, wanted = np.array(record["derivatives"]), np.array(truth)
-        cosines.append(cosine(found, wanted))
-        sizes.append(float(np.linalg.norm(found) / np.linalg.norm(wanted)))
-    none = f", {missing} without" if missing and cosines else ""
-    return f"{median(cosines):.2f} [{min(cosines):.2f}] {median(sizes):.2g}{none}" if cosines else "-"
+    truths = {cell: known.get(cell.question, {}) for cell in own}
+    judged = {
+        cell: score(record, truths[cell]) for cell, record in own.items() if any(truths[cell].get("derivatives") or ())
+    }
+    scores = [one for one in judged.values() if one is not None]
+    if not scores:
+        return "-"
+    cosines, sizes = zip(*scores, strict=True)
+    missing = len(judged) - len(scores)
+    return f"{median(cosines):.2f} [{min(cosines):.2f}] {median(sizes):.2g}{f', {missing} without' if missing else ''}"
 
 
 def _limit(truths: list[Record]) -> str:

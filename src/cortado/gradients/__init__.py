@@ -2,8 +2,9 @@
 
 `Exact` is the derivative of the discrete map by its own adjoint, `Tape` the same by Warp's automatic differentiation.
 Beyond the predictability horizon, where neighbouring trajectories diverge, that derivative is of little use, and others
-take its place: `AdjointViscosity`, `FrozenGeometry`, `Damped`, or the mean of their gradients over an ensemble,
-`EnsembleMean`. `RandomizedSmoothing`, which needs forward runs alone, is the reference that they are compared with.
+take its place: `AdjointViscosity`, `FrozenGeometry`, `Damped`, the mean of their gradients over an ensemble,
+`EnsembleMean`, or that mean with its sizes mended by differences, `Guided`. `RandomizedSmoothing`, which needs forward
+runs alone, is the reference that they are compared with.
 """
 
 from cortado.gradients.adjoint_filters import AdjointNorms

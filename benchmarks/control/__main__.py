@@ -1,4 +1,4 @@
-"""Control tasks: ``python benchmarks/control/run.py --task carry --contender adjoint_viscosity cma_es``; README.md.
+"""Control tasks: ``python -m benchmarks.control --task carry --contender adjoint_viscosity cma_es``; README.md.
 
 Every contender searches the controls of every task once for each seed. Runs are lines of a file; those that are there
 are skipped. ``--figures`` draws curves of the loss over simulated steps, and the last pictures of what was found.
@@ -12,20 +12,23 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
 
-from catalogue import SIZES, TASKS, task
-from contenders import CONTENDERS, contender
-from curves import draw, medians
-from records import Record, Records, Run, carried_out
-
 from cortado.errors import CortadoError, CortadoWarning, InputError
+from cortado.io.folder_lock import locked
 from cortado.io.progress import track
+
+from .catalogue import SIZES, TASKS, task
+from .contenders import CONTENDERS, contender
+from .curves import draw, medians
+from .records import Record, Records, Run, carried_out
 
 BUDGETS = {"small": 20_000.0, "large": 200_000.0}
 """Simulated steps of a search, by size."""
 
 
 def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Control tasks, and what searches their controls.")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.control", description="Control tasks, and what searches their controls."
+    )
     parser.add_argument("--task", nargs="+", default=list(TASKS), metavar="TASK", help=", ".join(TASKS))
     parser.add_argument("--contender", nargs="+", default=list(CONTENDERS), metavar="NAME", help=", ".join(CONTENDERS))
     parser.add_argument("--size", choices=SIZES, default="small")
@@ -94,15 +97,16 @@ def main(given: Sequence[str] | None = None) -> int:
             for who in asked.contender
         ]
         if not asked.figures:
-            return 0 if compute(runs, records, asked.processes) else 1
+            with locked(asked.out):
+                return 0 if compute(runs, records, asked.processes) else 1
         found = [record for record in records.read() if record.run in runs]
         for name in asked.task:
             draw(name, asked.size, [record for record in found if record.run.task == name], asked.out)
         print(medians(found))
         return 0
-    except InputError as error:
+    except CortadoError as error:
         print(error, file=sys.stderr)
-        return 2
+        return 2 if isinstance(error, InputError) else 1
 
 
 if __name__ == "__main__":

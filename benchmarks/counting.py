@@ -1,4 +1,4 @@
-"""What an estimate costs, in steps of one scene."""
+"""What estimates and searches cost, in steps of one scene."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,8 +8,8 @@ from cortado.gradients import AdjointEstimator, Estimate, ForwardPass
 from cortado.parameters.values import Arrays, Values
 from cortado.rollout import BackwardStep, Observer
 
-REVERSE = 3
-"""Forward steps that a step backward counts as: it computes the step once more, and has twice its neighbour sums."""
+BACKWARD = 3
+"""Forward steps that a step back counts as: it computes the step once more, and has twice its neighbour sums."""
 
 
 @dataclass
@@ -17,12 +17,12 @@ class Steps:
     """Counts simulated steps."""
 
     forward: int = 0
-    reverse: int = 0
+    backward: int = 0
 
     @property
     def cost(self) -> int:
         """In forward steps."""
-        return self.forward + REVERSE * self.reverse
+        return self.forward + BACKWARD * self.backward
 
 
 class Counted:
@@ -63,7 +63,7 @@ class CountedPass:
 
     def back(self, derivative: BackwardStep, observe: Observer | None = None) -> Arrays:
         """The gradient."""
-        self._steps.reverse += self._each
+        self._steps.backward += self._each
         return self._pass.back(derivative, observe)
 
 
