@@ -6,20 +6,19 @@ are skipped. ``--figures`` draws curves of the loss over simulated steps, and th
 
 import argparse
 import sys
-import warnings
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
 
-from cortado.errors import CortadoError, CortadoWarning, InputError
+from cortado.errors import CortadoError, InputError
 from cortado.io.folder_lock import locked
 from cortado.io.progress import track
 
 from .catalogue import SIZES, TASKS, task
 from .contenders import CONTENDERS, contender
 from .curves import draw, medians
-from .records import Record, Records, Run, carried_out
+from .records import Record, Records, Run, outcome
 
 BUDGETS = {"small": 20_000.0, "large": 200_000.0}
 """Simulated steps of a search, by size."""
@@ -66,16 +65,6 @@ def outcomes(runs: list[Run], processes: int):
         waiting = {pool.submit(outcome, run): run for run in runs}
         for done in as_completed(waiting):
             yield waiting[done], done.result()
-
-
-def outcome(run: Run) -> Record | str:
-    """A record, or a sentence that says why there is none."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CortadoWarning)  # of time steps that are long where a tank is shaken most
-        try:
-            return carried_out(run)
-        except CortadoError as error:
-            return str(error)
 
 
 def main(given: Sequence[str] | None = None) -> int:

@@ -2,12 +2,13 @@
 
 import json
 import time
+import warnings
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from cortado import InputError, __version__
+from cortado import CortadoError, CortadoWarning, InputError, __version__
 from cortado.io.files import write_atomically
 
 from .catalogue import task
@@ -77,6 +78,16 @@ def carried_out(run: Run) -> Record:
         seconds=round(time.perf_counter() - began, 1),
         cortado=__version__,
     )
+
+
+def outcome(run: Run) -> Record | str:
+    """A record, or a sentence that says why there is none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CortadoWarning)  # of time steps that are long where a tank is shaken most
+        try:
+            return carried_out(run)
+        except CortadoError as error:
+            return str(error)
 
 
 class Records:
