@@ -159,6 +159,47 @@ def test_a_run_ends_with_them(capsys):
     assert "time that a step took" in Path("runs/run/report.html").read_text()
 
 
+def test_what_went_over_the_rim_is_counted(folder, capsys):
+    """Where gravity points out of the cup, all of it."""
+    (folder / "cup.toml").write_text(
+        """
+        dimension = 3
+        [discretisation]
+        spacing = 0.01
+        [[phase]]
+        name = "coffee"
+        rest_density = 1000.0
+        viscosity = 0.1
+        [[fluid]]
+        shape = "box"
+        lower = [-0.015, 0.0, -0.015]
+        upper = [0.015, 0.02, 0.015]
+        phase = "coffee"
+        velocity = [0.5, 1.0, 0.0]
+        [container]
+        shape = "cylinder"
+        base = [0.0, 0.0, 0.0]
+        radius = 0.03
+        height = 0.02
+        lid = false
+        [forces]
+        gravity = [0.0, 9.81, 0.0]
+        [solver]
+        time_step = 0.004
+        """
+    )
+    words = ["run", "cup.toml", "--steps", "40", "--no-pictures"]
+    main([*words, "--out", "spilt"])
+    assert "Over the rim of the cup went 18 of 18 particles." in capsys.readouterr().out
+    assert json.loads(Path("spilt/result.json").read_text())["spilt"] == 18
+    assert "left the cup over its rim" in Path("spilt/report.html").read_text()
+    main([*words, "--out", "held", "--set", "forces.gravity=[0,-9.81,0]", "--set", "fluid.0.velocity=[0,0,0]"])
+    assert "Over the rim" not in capsys.readouterr().out
+    main(["describe", "cup.toml"])
+    size = "fluid in 0.03 x 0.02 x 0.03 m, in a container of 0.06 x 0.02 x 0.06 m; 0.018 kg of coffee"
+    assert f"{size}; gravity (0, 9.81, 0) m/s2" in capsys.readouterr().out
+
+
 def test_potential_energy_without_gravity_or_container():
     scene = plane(forces={"gravity": [0, 0]}, container={"shape": "none"})
     simulation = cortado.Simulation(scene)

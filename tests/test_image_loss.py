@@ -183,6 +183,13 @@ def test_a_target_of_another_size_is_a_sentence():
             losses.Image(renderer, target)
 
 
+@pytest.mark.parametrize("distance", ["pyramid", Pyramid, 3.0])
+def test_a_distance_that_is_none_is_a_sentence(distance):
+    _, renderer = case("plane")
+    with pytest.raises(InputError, match=r"^distance is .*, but must be an object such as cortado.image_lo"):
+        losses.Image(renderer, np.zeros((16, 20, 3)), distance)
+
+
 def test_fingerprints_tell_grids_of_one_view_apart():
     given = {"smoothing": CUBIC_SPLINE, "support": 0.2, "volume": 1e-3, "particles": 5, "phases": 1}
     view = TopView((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.1, (20, 16))

@@ -518,6 +518,23 @@ def test_parameters_that_a_search_comes_to_are_no_mistake_of_the_user(tmp_path):
         optimise(Walled(2.0), {"x": 1.0}, Adam(learning_rate=0.1), 10)
 
 
+def test_a_search_that_comes_to_a_run_that_diverges_says_where():
+    def steep(parameters):
+        if parameters["speed"][0] > 1.0:
+            raise DivergedError(step=3, particle=7, advice="try a smaller time step")
+        return 5.0 - parameters["speed"][0], {"speed": np.array([-1.0, 0.0])}
+
+    words = (
+        r"step 3: particle 7 was lost; try a smaller time step, a smaller learning rate or scale, or bounds on the "
+        r"parameters; the search had come to speed \[1.2 0. \]; the least loss before is 4.2 at speed \[0.8 0. \]\.$"
+    )
+    with pytest.raises(DivergedError, match=words) as caught:
+        optimise(steep, {"speed": [0.0, 0.0]}, GradientDescent(learning_rate=0.4), 10)
+    assert (caught.value.step, caught.value.particle) == (3, 7)
+    with pytest.raises(DivergedError, match=r"try a smaller time step\.$"):
+        optimise(steep, {"speed": [2.0, 0.0]}, GradientDescent(learning_rate=0.4), 10)
+
+
 # Wrong input
 
 

@@ -81,7 +81,7 @@ def test_a_rollout_takes_derivatives_of_its_own_alone():
 def test_parameters_are_a_table(given):
     simulation = Simulation(plane())
     problem = Problem(simulation, 3, losses.FinalPositions(simulation.positions))
-    with pytest.raises(InputError, match=r"parameters are .*, but must be a table of values by name"):
+    with pytest.raises(InputError, match=r"parameters are .*, but must be given by name, as \{'gravity': value\}"):
         problem.value(given)
 
 

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from bad_scenes import assert_one_sentence
+from cortado import CortadoWarning
 from cortado.errors import InputError
 from cortado.io.pictures import COFFEE, MILK, WHITE, heart, read_picture, rosetta, write_picture
 from cortado.io.srgb import from_srgb, to_srgb
@@ -205,3 +206,14 @@ def test_what_would_be_written_wrong_is_refused(tmp_path, name, image, wanted):
     with pytest.raises(InputError, match=wanted):
         write_picture(tmp_path / name, image)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_picture_that_is_cropped_says_so(tmp_path):
+    path = write_picture(tmp_path / "wide.png", np.zeros((54, 96, 3)))
+    with pytest.warns(CortadoWarning, match="96 x 54 pixels, but 8 x 8 are wanted: only its middle is taken, 56%"):
+        read_picture(path, 8)
+
+
+def test_values_of_a_file_are_no_light(tmp_path):
+    with pytest.raises(InputError, match="a value of 255, but must be linear light from 0 to 1"):
+        write_picture(tmp_path / "white.png", np.full((4, 4, 3), 255.0))

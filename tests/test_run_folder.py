@@ -94,6 +94,18 @@ def test_files_of_somebody_else_are_never_overwritten(tmp_path):
     assert os.listdir(tmp_path / "figures") == ["holiday.png"]
 
 
+def test_a_folder_of_several_runs_or_of_the_user_is_refused(tmp_path, monkeypatch):
+    new_run(tmp_path / "runs" / "a")
+    with pytest.raises(InputError, match="holds other runs, such as a; choose another --out"):
+        new_run(tmp_path / "runs", overwrite=True)
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    for path in (".", "", "..", tmp_path):
+        with pytest.raises(InputError, match="is the current folder, or one that it is in; choose another --out"):
+            new_run(path)
+    assert sorted(os.listdir(tmp_path)) == ["runs", "work"] and not os.listdir(tmp_path / "work")
+
+
 def test_resume_needs_the_same_scene_and_is_noted(tmp_path):
     folder = new_run(tmp_path / "a")
     with pytest.raises(InputError, match="begun with dimension = 2 and is now given dimension = 3; "):

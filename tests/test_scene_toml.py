@@ -36,6 +36,17 @@ def test_a_key_of_very_many_parts_is_refused_at_once(tmp_path, text):
     assert_one_sentence(str(caught.value))
 
 
+def test_a_mark_of_notepad_is_left_out(tmp_path):
+    (tmp_path / "scene.toml").write_bytes("name = 'Tasse à café'".encode("utf-8-sig"))
+    assert read_toml(tmp_path / "scene.toml") == {"name": "Tasse à café"}
+
+
+def test_a_table_that_is_an_entry_of_a_list_is_said(tmp_path):
+    (tmp_path / "scene.toml").write_text("[fluid]\nshape = 'box'\n[fluid]\nshape = 'box'\n")
+    with pytest.raises(SceneError, match=r"twice; entries of a list are written \[\[fluid\]\] \(at line 3"):
+        read_toml(tmp_path / "scene.toml")
+
+
 @pytest.mark.parametrize("text", ["# 1.2.3.4.5.6.7.8.9.10.11.12", 'x = "1.2.3.4.5.6.7.8.9.10.11.12"', "x = [1.5, 2.5]"])
 def test_dots_elsewhere_are_no_parts(tmp_path, text):
     (tmp_path / "fine.toml").write_text(text * 2 if text[0] == "#" else text)

@@ -196,6 +196,14 @@ def test_water_that_fills_a_cup_starts_nowhere_compressed(radius, lid, kernel, s
     assert (discrete.walls.weights > 0.0).all()
 
 
+@pytest.mark.parametrize("height", [2, 3])
+def test_a_saucer_has_walls_too(height):
+    """It is so shallow that there is no place within at which its walls could be judged."""
+    cup = {"shape": "cylinder", "base": [0, 0, 0], "radius": 5 * SPACING, "height": height * SPACING, "lid": False}
+    discrete = filled({**cup, "axis": "z"}, "cubic_spline", 2.0)
+    assert 0.9 < densities(discrete).max() < 1.003 and (discrete.walls.weights > 0.0).all()
+
+
 @KINDS
 def test_the_side_of_a_cup_stops_a_particle_alone(kernel, support):
     """As a flat wall does, between its wall particles and beside them."""

@@ -248,7 +248,7 @@ class Simulation:
         ``state``."""
         rollout = Rollout(self.solver, check_steps(steps))
         space = ParameterSpace(self, rollout.steps)
-        values = space.checked(controls or {})
+        values = space.checked({} if controls is None else controls)
         states = self._states(state)
         for one in states:
             space.check_restart(one, values)
@@ -296,6 +296,8 @@ class Simulation:
             SceneError: settings that do not fit.
             InputError: pysplashsurf is missing, for the surface of a liquid in 3-D.
         """
+        if not isinstance(frame, Frame):
+            raise InputError(f"frame is {shown(frame)}, but must be one frame of a trajectory, such as trajectory[-1].")
         given = {} if self.scene.picture is None else self.scene.picture.model_dump()
         table = Picture(**{**given, **settings}).in_dimension(self.dimension, ("picture",))
         scene = self.scene.model_copy(update={"picture": table})

@@ -19,6 +19,7 @@ from cortado.inverse.in_words import task_in_words
 from cortado.inverse.task import load_task
 from cortado.io.files import sentences
 from cortado.rollout import MEMORY_BUDGET, Rollout
+from cortado.scene.in_words import vector
 from cortado.scene.scene import load_scene
 from cortado.scene.stability import stability_limits
 from cortado.scene.toml import read_toml
@@ -81,7 +82,7 @@ def describe_scene(
 def _described(simulation: Simulation, steps: int) -> dict[str, Any]:
     scene = simulation.scene
     of_phase = Counter(np.argmax(simulation.mass_fractions, axis=1).tolist())
-    limits = stability_limits(scene)
+    limits, ends = stability_limits(scene), scene.container.extent()
     found: dict[str, Any] = {
         "name": scene.name,
         "dimension": scene.dimension,
@@ -89,6 +90,10 @@ def _described(simulation: Simulation, steps: int) -> dict[str, Any]:
         "particles_of_phase": {phase.name: of_phase[k] for k, phase in enumerate(scene.phase)},
         "particles_in_emitter": simulation.particles - simulation.free_particles,
         "wall_particles": len(simulation.walls),
+        "fluid_size_m": (np.ptp(simulation.positions, axis=0) + scene.discretisation.spacing).tolist(),
+        "container_size_m": None if ends is None else (ends[1] - ends[0]).tolist(),
+        "mass_of_phase_kg": _masses(simulation),
+        "gravity_m_s2": list(scene.forces.gravity),
         "spacing_m": scene.discretisation.spacing,
         "time_step_s": scene.solver.time_step,
         "time_step_limits_s": {name: limit if math.isfinite(limit) else None for name, limit in limits.items()},
@@ -99,6 +104,13 @@ def _described(simulation: Simulation, steps: int) -> dict[str, Any]:
         "simulated_time_s": steps * scene.solver.time_step,
     }
     return {**found, **_memory(simulation, steps), **_expected(simulation, steps)}
+
+
+def _masses(simulation: Simulation) -> dict[str, float]:
+    """By phase [kg]; in 2-D of a layer one metre thick."""
+    volumes = simulation.lattice.volume * simulation.mass_fractions.sum(axis=0)
+    phases = simulation.scene.phase
+    return {phase.name: float(phase.rest_density * volume) for phase, volume in zip(phases, volumes, strict=True)}
 
 
 def _expected(simulation: Simulation, steps: int) -> dict[str, Any]:
@@ -150,6 +162,7 @@ def _as_text(found: dict[str, Any]) -> str:
     rows = [
         ("particles", f"{found['particles']} of fluid ({phases}{waiting}), {found['wall_particles']} of walls"),
         ("spacing", f"{found['spacing_m']:g} m, in {found['dimension']}-D"),
+        ("size", _size(found)),
         ("time step", f"{found['time_step_s']:g} s; {allowed}"),
         (
             "memory",
@@ -167,6 +180,18 @@ def _as_text(found: dict[str, Any]) -> str:
     rows += [("search", " ".join(found["search"]))] if "search" in found else []
     rows += [("picture", found["picture"])] if "picture" in found else []
     return "\n".join([found["name"], *(f"{label:<12}{text}" for label, text in rows)])
+
+
+def _size(found: dict[str, Any]) -> str:
+    """Lengths and masses, by which one sees a wrong unit."""
+    fluid, held = (
+        " x ".join(f"{length:.3g}" for length in found[key] or ()) for key in ("fluid_size_m", "container_size_m")
+    )
+    masses = ", ".join(f"{mass:.3g} kg of {name}" for name, mass in found["mass_of_phase_kg"].items())
+    layer = " in a layer of 1 m" if found["dimension"] == 2 else ""
+    container = f", in a container of {held} m" if held else ""
+    gravity = vector(found["gravity_m_s2"])
+    return f"fluid in {fluid} m{container}; {masses}{layer}; gravity {gravity} m/s2"
 
 
 def _time(found: dict[str, Any]) -> str:

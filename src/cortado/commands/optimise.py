@@ -117,9 +117,7 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
         evaluations = len(folder.read_metrics())
         ended = Section("What came out", [f"The search ended early, in evaluation {evaluations}."], [error])
         write_report(folder, made.task.scene.name, [_asked(made), ended])
-        advice = f"{error.advice}, a smaller learning rate, or bounds on the parameters"
-        advice = "; ".join(filter(None, [advice, _kept(folder)]))
-        told = error.with_advice(advice)
+        told = error.with_advice("; ".join(filter(None, [error.advice, _kept(folder)])))
         folder.write_result(evaluations=evaluations, failures=[str(told)])
         raise told from error
     estimate = made.search.parameters(result.parameters)

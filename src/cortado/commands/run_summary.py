@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from cortado.device.state import State
+from cortado.lattice.region import TOLERANCE
 from cortado.rollout import Rollout
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
@@ -56,6 +57,10 @@ class RunSummary:
     """Whether gravity changed during the run, and potential energies are those of other gravities."""
     densities: tuple[float, float] | None
     """The least and the greatest at the end [kg/m3]; None of a solver without particles."""
+    spilt: int
+    """Particles beside or below an open cup at the end."""
+    particles: int
+    """That did not begin in an emitter."""
 
     @classmethod
     def of(cls, simulation: Simulation, rollout: Rollout, last: State, seconds: float) -> "RunSummary":
@@ -72,6 +77,8 @@ class RunSummary:
             last=Energy.of(simulation, rollout, last, rollout.steps - 1),
             turned=bool(np.ptp(rollout.parameters["gravity"].numpy()[0], axis=0).any()),
             densities=found,
+            spilt=_spilt(simulation, last),
+            particles=simulation.free_particles,
         )
 
     @property
@@ -83,7 +90,7 @@ class RunSummary:
         """What is the same in every run, by names."""
         energies = {"first": vars(self.first), "last": vars(self.last)}
         least, greatest = self.densities or (None, None)
-        return {"energy": energies, "density": {"least": least, "greatest": greatest}}
+        return {"energy": energies, "density": {"least": least, "greatest": greatest}, "spilt": self.spilt}
 
     def rows(self) -> list[tuple[object, ...]]:
         """(what, value, unit) of each row of a table."""
@@ -99,6 +106,7 @@ class RunSummary:
             ("time that a step took", f"{self.milliseconds:.3g}", "ms"),
             ("time that all steps took", f"{self.seconds:.3g}", "s"),
             *energies,
+            *([("particles that left the cup over its rim", self.spilt, "")] if self.spilt else []),
             *((f"{which} density at the end", f"{density:.4g}", "kg/m³") for which, density in densities),
         ]
 
@@ -111,6 +119,17 @@ class RunSummary:
         )
         if self.turned:
             text += " in the gravity of that time"
-        if self.densities is None:
-            return f"{text}."
-        return f"{text}; density {self.densities[0]:.4g} to {self.densities[1]:.4g} kg/m3."
+        if self.densities is not None:
+            text += f"; density {self.densities[0]:.4g} to {self.densities[1]:.4g} kg/m3"
+        if self.spilt:
+            text += f". Over the rim of the cup went {self.spilt} of {self.particles} particles"
+        return f"{text}."
+
+
+def _spilt(simulation: Simulation, state: State) -> int:
+    """How many particles that did not begin in an emitter are outside of a cup without a lid."""
+    region = simulation.scene.container.region(simulation.dimension)
+    if not np.isfinite(region.rim):
+        return 0
+    positions = state.numpy(simulation.dimension, only=["positions"])["positions"][: simulation.free_particles]
+    return int((~region.contains(positions, TOLERANCE * simulation.scene.discretisation.spacing)).sum())

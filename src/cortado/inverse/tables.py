@@ -244,7 +244,8 @@ class OptimiseTable(Table):
     optimiser: Annotated[str, OneOf(OPTIMISERS)] = "adam"
     """Name of the algorithm; the line search of "lbfgs" needs exact gradients."""
     learning_rate: Annotated[float, quantity("units of the parameters", gt=0.0)]
-    """In units of the parameters; for L-BFGS the size of its first step, for the line search its longest step."""
+    """For Adam about the size of its steps, in units of the parameters; for L-BFGS the size of its first step, for the
+    line search its longest step. For gradient descent the factor of the gradient."""
     tolerance: Annotated[float, quantity(gt=0.0, le=0.5)] | None = None
     """L-BFGS ends where the gradient is this part of the first one; if left out, where round-off stops it."""
     iterations: Annotated[int, count(1, 10_000_000)]

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cortado.errors import InputError
+from cortado.errors import CortadoWarning, InputError
 from cortado.io.files import write_atomically
 from cortado.io.input_files import reason, regular_file
-from cortado.io.srgb import from_srgb, to_srgb
+from cortado.io.srgb import MOST_LIGHT, from_srgb, to_srgb
 from cortado.render.cameras import check_resolution, positive, vector
 
 __all__ = ["COFFEE", "MILK", "WHITE", "heart", "read_picture", "rosetta", "write_picture"]
@@ -43,6 +43,8 @@ MOST_PIXELS = 2**26
 MOST_PIXELS_KEPT = 2**24
 """Of one that is not."""
 PIXELS_AT_ONCE = 2**20
+MOST_CROPPED = 0.8
+"""Of a picture: where less of it is taken, a warning says so."""
 LIGHT = from_srgb(np.arange(256, dtype=np.uint8))
 """Linear light of every value in a file."""
 
@@ -106,7 +108,7 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
                 _check_header(path, file, most)
                 file.load()
                 ImageOps.exif_transpose(file, in_place=True)
-                return _whole(file) if shape in (None, file.size) else _resampled(file, *shape)
+                picture = _whole(file) if shape in (None, file.size) else _resampled(file, *shape)
     except InputError:
         raise
     except Image.DecompressionBombError:
@@ -115,6 +117,17 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
         raise InputError(f"The picture {path} cannot be read: it is none of {', '.join(FORMATS)}.") from None
     except Exception as problem:  # of many types, where a file is damaged
         raise InputError(f"The picture {path} cannot be read: {reason(problem)}.") from problem
+    if shape is not None:
+        _warn_of_cropping(path, file.size, shape)
+    return picture
+
+
+def _warn_of_cropping(path: str | Path, size: tuple[int, int], shape: tuple[int, int]) -> None:
+    """Of a picture that is ``size`` pixels wide and high, whose proportions are to be those of ``shape``."""
+    share = min(size[0] / shape[0], size[1] / shape[1]) ** 2 * shape[0] * shape[1] / (size[0] * size[1])
+    if share < MOST_CROPPED:
+        found = f"The picture {path} has {size[0]} x {size[1]} pixels, but {shape[0]} x {shape[1]} are wanted"
+        warnings.warn(f"{found}: only its middle is taken, {share:.0%} of it.", CortadoWarning, stacklevel=3)
 
 
 def _check_header(path: str | Path, file: Any, most: int) -> None:
@@ -133,8 +146,8 @@ def write_picture(path: str | Path, image: ArrayLike) -> Path:
     """Writes a linear image (rows, columns, 3) as a PNG with 8 bits of sRGB, clipped to 0..1, and returns its path.
 
     Raises:
-        InputError: another shape, whole numbers, values that are not finite, a name that does not end in .png, or a
-            file that cannot be written.
+        InputError: another shape, whole numbers, values that are not finite or up to 255, a name that does not end in
+            .png, or a file that cannot be written.
     """
     from PIL import Image
 
@@ -142,6 +155,8 @@ def write_picture(path: str | Path, image: ArrayLike) -> Path:
         raise InputError(f"path is {str(path)!r}, but must be the name of a PNG file, such as picture.png.")
     if np.issubdtype(np.asarray(image).dtype, np.integer):
         raise InputError("The image is made of whole numbers, but must be linear light from 0 to 1.")
+    if np.max(image, initial=0.0) > MOST_LIGHT:
+        raise InputError(f"The image has a value of {np.max(image):g}, but must be linear light from 0 to 1.")
     content = BytesIO()
     Image.fromarray(to_srgb(image)).save(content, format="PNG")
     write_atomically(Path(path), content.getvalue())

@@ -217,6 +217,8 @@ class RunFolder:
         present = [name for name in (self.environment.name, *_FILES, *_FOLDERS) if (self.path / name).exists()]
         if present and not self._holds_run():
             raise InputError(f"{self.path} holds {', '.join(present)}, but no run of Cortado; choose another --out.")
+        if not present:
+            self._require_own()
         if present and not overwrite:
             resumable = kind == _RESUMABLE == _read_json(self.environment).get("kind")
             advice = ", or go on with it by --resume" if resumable else ""
@@ -226,6 +228,14 @@ class RunFolder:
         self._remove_unfinished()
         if present:
             self._remove_run()
+
+    def _require_own(self) -> None:
+        """Raises `InputError` for a folder that is not meant for one run."""
+        if Path.cwd().is_relative_to(self.path.resolve()):
+            raise InputError(f"{self.path} is the current folder, or one that it is in; choose another --out.")
+        runs = sorted(one.parent.name for one in self.path.glob(f"*/{self.environment.name}"))
+        if runs:
+            raise InputError(f"{self.path} holds other runs, such as {runs[0]}; choose another --out.")
 
     def _remove_run(self) -> None:
         """Removes what a run wrote, its mark last, and leaves what others put beside it."""

@@ -6,6 +6,9 @@ from numpy.typing import ArrayLike, NDArray
 from cortado.arrays import as_numbers
 from cortado.errors import InputError
 
+MOST_LIGHT = 2.0
+"""Of a picture that somebody gives: more is taken for values of a file, up to 255; noise may leave 0 to 1."""
+
 
 def to_srgb(image: ArrayLike) -> NDArray[np.uint8]:
     """(rows, columns, 3) in 0..255, of a linear image of that shape; light below 0 and above 1 is clipped.

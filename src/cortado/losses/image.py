@@ -8,12 +8,11 @@ import warp as wp
 
 from cortado.arrays import as_numbers
 from cortado.device.threads import WARP
-from cortado.errors import InputError
+from cortado.errors import InputError, shown
+from cortado.io.srgb import MOST_LIGHT
 from cortado.losses.image_losses import ImageLoss, SquaredDifference
 from cortado.losses.loss import Snapshot, SnapshotAdjoint
 
-MOST_LIGHT = 2.0
-"""Of a target, either way: more is taken for values of a file, which go up to 255; noise may leave 0 to 1."""
 LIGHT = "linear light from 0 to 1, as that of cortado.pictures.read_picture"
 
 
@@ -34,7 +33,7 @@ class Image:
         """``target`` (rows, columns, 3), linear RGB from 0 to 1; ``distance``:
         `cortado.image_losses.SquaredDifference`, the default, or `Pyramid`, whose gradient leads shapes to each other
         that do not overlap. Raises `InputError` for a target of another shape, or with values of a file up to 255."""
-        self.renderer, self.distance = renderer, SquaredDifference() if distance is None else distance
+        self.renderer, self.distance = renderer, _distance(distance)
         self.target = _target_image(target, getattr(renderer, "shape", None))
         self.target.setflags(write=False)
         parts = (self.distance.fingerprint, sha256(self.target.tobytes()).hexdigest())
@@ -57,6 +56,15 @@ class Image:
         wp.copy(bar.positions, found.positions)
         wp.copy(bar.mass_fractions, found.fractions)
         return self.distance.value(image, self.target), SnapshotAdjoint(bar, found.colours)
+
+
+def _distance(distance: Any) -> ImageLoss:
+    if distance is None:
+        return SquaredDifference()
+    if isinstance(distance, type) or not callable(getattr(distance, "adjoint", None)):
+        wanted = "an object such as cortado.image_losses.Pyramid()"
+        raise InputError(f"distance is {shown(distance)}, but must be {wanted}.")
+    return distance
 
 
 def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:

@@ -27,6 +27,8 @@ from cortado.optimisation.search import Optimiser, Search
 
 GREATEST_GRADIENT = 1e150
 # Components beyond it are refused like infinite ones: their squares, which optimisers take, overflow.
+FEW = 6
+# Numbers of all parameters that a sentence names at most.
 REFUSED = (DivergedError, InputError)
 # A trial with one of these is infinitely bad: the start had none, so the search has gone too far.
 
@@ -201,10 +203,26 @@ class _Evaluator:
                 f"smaller learning rate, or bounds on the parameters. The {len(self.history)} evaluations before "
                 f"{self.log.fate}."
             ) from error
+        except DivergedError as error:
+            if not self.history:
+                raise
+            raise error.with_advice(self._shorter(error.advice, vector)) from error
         evaluation = Evaluation(vector.copy(), as_one_number("The problem's loss", loss), self._ravelled(gradients))
         self._require_finite(evaluation)
         self.log.append(evaluation)
         return evaluation
+
+    def _shorter(self, advice: str, vector: Vector) -> str:
+        """The advice of a run that diverged during a search, with where the search had come to, and the best before."""
+        came = f"the search had come to {self._in_words(vector)}" if vector.size <= FEW else ""
+        best = min(self.history, key=lambda record: record.loss)
+        at = f" at {self._in_words(self.layout.ravel(best.parameters))}" if vector.size <= FEW else ""
+        told = [f"{advice}, a smaller learning rate or scale, or bounds on the parameters", came]
+        return "; ".join(filter(None, [*told, f"the least loss before is {best.loss:.4g}{at}"]))
+
+    def _in_words(self, vector: Vector) -> str:
+        found = {name: np.array2string(value, precision=4) for name, value in self.layout.unravel(vector).items()}
+        return ", ".join(f"{name} {' '.join(text.split())}" for name, text in found.items())
 
     def _ravelled(self, gradients: Mapping[str, Any]) -> Vector:
         """The gradient as one vector, after a check of its names and shapes."""

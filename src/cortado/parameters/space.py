@@ -34,7 +34,7 @@ class ParameterSpace:
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
         """Values as float64 arrays; raises `InputError` in a sentence. A ``what`` of "direction" may be negative."""
         if not isinstance(values, Mapping):
-            raise InputError(f"{what}s are {shown(values)}, but must be a table of values by name.")
+            raise InputError(f"{what}s are {shown(values)}, but must be given by name, as {{'gravity': value}}.")
         if "tilt" in values and "gravity" in values:
             raise InputError(f"{what} gravity is given, but must be left out, as the tilt says where it points.")
         found = {name: self._checked(name, value, what) for name, value in values.items()}

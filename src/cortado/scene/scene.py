@@ -19,6 +19,9 @@ from cortado.scene.sentences import sentences
 from cortado.scene.stability import broken_limit
 from cortado.scene.toml import put_in, read_toml
 
+LIGHTEST = 50.0
+"""Rest density below which a scene warns [kg/m3]: liquid hydrogen has 71, mercury 13.5 g/cm3."""
+
 
 class Scene(SceneTables):
     """Everything that a simulation starts from: `SceneTables` that fit each other."""
@@ -26,6 +29,10 @@ class Scene(SceneTables):
     @model_validator(mode="after")
     def _check(self) -> Self:
         check_scene(self)
+        for phase in self.phase:
+            if phase.rest_density < LIGHTEST:
+                found = f"the rest_density of {phase.name} is {phase.rest_density:g} kg/m3"
+                warnings.warn(f"{found}, less than any liquid has: is it in g/cm3?", CortadoWarning, stacklevel=2)
         time_step = self.solver.time_step
         if broken := broken_limit(self, {}, time_step):
             found = f"solver.time_step is {time_step:g} s, but the limit of stability is about {broken[1]:.3g} s"

@@ -21,6 +21,7 @@ _ASIDE = re.compile(
 )
 """Comments and quoted texts, unfinished ones too."""
 _TOO_DEEP = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_PARTS}}}[\w-]++")
+_TWICE = re.compile(r"Cannot declare \('(fluid|phase)',\) twice")
 _KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
 
 
@@ -33,14 +34,15 @@ def read_toml(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> di
     """
     file = os.fspath(path)
     try:
-        text = content(path, MOST_BYTES).decode("utf-8")
+        text = content(path, MOST_BYTES).decode("utf-8-sig")
         _require_shallow(text, file)
         data = tomllib.loads(text)
     except UnicodeDecodeError as problem:
         line = problem.object[: problem.start].count(b"\n") + 1
         raise _unreadable(file, f"is not text in UTF-8 (at line {line}).") from None
     except (ValueError, RecursionError) as problem:  # among them TOMLDecodeError, which names the line
-        raise _unreadable(file, f"is not valid TOML: {reason(problem)}.") from None
+        said = _TWICE.sub(r"\g<0>; entries of a list are written [[\1]]", reason(problem))
+        raise _unreadable(file, f"is not valid TOML: {said}.") from None
     except OSError as problem:
         beside = f"{file}.toml"
         there = f"; did you mean {beside}?" if os.path.isfile(beside) else "."
@@ -98,7 +100,8 @@ def _apply(data: dict[str, Any], override: str, file: str) -> None:
         if isinstance(place, list):
             found = _entry(place, part)
             if found is None:
-                raise SceneError(file, field, part, _entries(place))
+                entry = ".".join(parts[: depth + 1])
+                raise SceneError(file, entry if len(entry) <= LONGEST else shown(entry), part, _entries(place))
             index = found
         elif not isinstance(place, dict):
             raise SceneError(

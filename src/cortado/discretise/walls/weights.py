@@ -86,14 +86,14 @@ class Surface:
         twice that of the fluid that is missing.
         """
         from scipy.optimize import lsq_linear
-        from scipy.sparse import identity, vstack
+        from scipy.sparse import eye_array, vstack
 
         count = len(self.walls)
         if not count:
             return np.zeros(0)
         chunks = range(0, len(places.points), CHUNK)
         demands = [self._demands(places.some(slice(start, start + CHUNK))) for start in chunks]
-        sums = vstack([*(part for part, _ in demands), STIFFNESS * identity(count)]).tocsr()
+        sums = vstack([*(part for part, _ in demands), STIFFNESS * eye_array(count)]).tocsr()
         wanted = np.concatenate([*(part for _, part in demands), STIFFNESS * np.ones(count)])
         changes = lsq_linear(sums, wanted - sums.sum(axis=1), bounds=(-1.0, np.inf), lsq_solver="lsmr", tol=1e-10).x
         return np.asarray(self.flat * (1.0 + changes), dtype=np.float64)
