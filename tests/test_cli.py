@@ -330,7 +330,15 @@ def test_a_search_of_a_long_run_that_comes_to_nothing_says_what_to_try(cortado_c
     options = [word for one in (*short, "optimise.learning_rate=1e-9") for word in ("--set", one)]
     code, out, _ = cortado_command("optimise", "task.toml", "--out", "found", "--no-pictures", *options)
     assert code == 1 and ("The loss hardly fell. Over 100 steps the exact gradient may mean nothing" in out) is told
-    assert ("The loss hardly fell" in Path("found/report.html").read_text()) is told
+    report = Path("found/report.html").read_text()
+    assert ("The loss hardly fell. Over 100 steps" in report) is told
+    assert ("The loss hardly fell: try an optimise.learning_rate that is 10 times as large" in report) is not told
+
+
+def test_a_search_that_ends_on_its_bounds_says_so(cortado_command):
+    bounds = ["--set", "optimise.bounds.gravity=[[0.9,-9.9],[1.0,-9.7]]", "--set", "optimise.start.gravity=[0.95,-9.8]"]
+    _, out, _ = cortado_command("optimise", "task.toml", "--out", "found", "--no-pictures", *bounds)
+    assert "The search of gravity ended on its bounds: what is best may lie beyond them." in out
 
 
 def test_an_optimisation_that_falls_short_fails_and_keeps_its_files(cortado_command):

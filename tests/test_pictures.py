@@ -107,6 +107,7 @@ def test_pictures_are_resampled_in_linear_light(tmp_path):
     assert read_picture(path, 2) == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.filterwarnings("ignore:.*only its middle")
 def test_the_middle_of_a_picture_is_read(tmp_path):
     stripes = np.zeros((8, 24, 3))
     stripes[:, :8, 0] = stripes[:, 8:16, 1] = stripes[:, 16:, 2] = 1.0
@@ -173,6 +174,7 @@ def test_only_regular_files_of_known_formats_are_read(tmp_path):
             read_picture(tmp_path / f"{name}.png")
 
 
+@pytest.mark.filterwarnings("ignore:.*only its middle")
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "P"])
 def test_bands_of_rows_make_the_same_picture(tmp_path, monkeypatch, mode):
     noise = np.random.default_rng(1).integers(0, 256, (37, 53, 4), dtype=np.uint8)

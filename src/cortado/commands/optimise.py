@@ -131,7 +131,7 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
     lines = [
         _summary(made, estimate, result, verdict),
         *found_lines(made, estimate, knots),
-        *_advice(made.task, verdict),
+        *_advice(made, result, verdict),
     ]
     announce("\n".join(lines))
     with keeping(lambda: f"the search has ended, and is in {folder.checkpoint}; --resume draws its pictures"):
@@ -250,16 +250,27 @@ def _for_machines(
     return found if verdict.psnr is None else {**found, "psnr": verdict.psnr}
 
 
-def _advice(task: Task, verdict: Verdict) -> list[str]:
-    """What to try where a search in a long run came to next to nothing."""
-    steps = task.problem.steps
-    if verdict.reduction >= LITTLE or steps < LONG or task.optimise.gradient.name != "exact":
-        return []
+def _advice(made: Setup, result: Result, verdict: Verdict) -> list[str]:
+    """What to try where a search came to next to nothing, and which of its bounds it ended on."""
+    met = [name for name, value in result.parameters.items() if _on_bound(value, *made.bounds.get(name, (None, None)))]
+    found = [f"The search of {name} ended on its bounds: what is best may lie beyond them." for name in met]
+    task, steps = made.task, made.task.problem.steps
+    if verdict.reduction >= LITTLE:
+        return found
+    if steps < LONG or task.optimise.gradient.name != "exact":
+        return [*found, "The loss hardly fell: try an optimise.learning_rate that is 10 times as large, or as small."]
     return [
+        *found,
         f"The loss hardly fell. Over {steps} steps the exact gradient may mean nothing: cortado gradients check says "
         'up to which step it is of use. Beyond it set optimise.gradient.name = "adjoint_viscosity" and '
-        'optimise.optimiser = "line_search".'
+        'optimise.optimiser = "line_search".',
     ]
+
+
+def _on_bound(value: Any, lower: Any, upper: Any) -> bool:
+    """Whether a number of a parameter's coordinates is as small or as large as it may be."""
+    below, above = (None if bound is None else np.asarray(bound) for bound in (lower, upper))
+    return bool((below is not None and (value <= below).any()) or (above is not None and (value >= above).any()))
 
 
 def _summary(made: Setup, estimate: Mapping[str, np.ndarray], result: Result, verdict: Verdict) -> str:
@@ -280,7 +291,7 @@ def found_in_words(error: float) -> str:
     """How well a parameter is found, by its distance from the true value relative to it."""
     if error > MOST_ERROR:
         why = "the search is too short, it ended in a wrong valley of the loss, or other values do as well"
-        return f"not found, {100 * error:.2g}% off: {why}"
+        return f"not found, {100 * error:.3g}% off: {why}"
     return f"found with an error of {100 * error:.2g}%"
 
 
@@ -303,7 +314,7 @@ def _sections(
         _asked(made),
         Section(
             "What was found",
-            [_summary(made, estimate, result, verdict), *_advice(made.task, verdict)],
+            [_summary(made, estimate, result, verdict), *_advice(made, result, verdict)],
             verdict.failures,
             figures.found,
         ),

@@ -19,6 +19,8 @@ def draw_run(run: Path, frame: int, as_film: bool, out: Path | None, overrides: 
         if not override.startswith("picture."):
             raise InputError(f"--set is {override}, but must begin with picture., as the run is there already.")
     scene = Scene.from_json(folder.scene.read_text(encoding="utf-8"), overrides)
+    if not folder.trajectory.exists():
+        raise InputError(f"{folder.path} has no trajectory; the pictures of a search are in {folder.figures}.")
     trajectory = Trajectory.load(folder.trajectory)
     missing = lacking(scene)
     if missing:
