@@ -201,6 +201,8 @@ def test_unwritable_pictures_are_sentences(tmp_path):
     ("name", "image", "wanted"),
     [
         ("a.foo", np.zeros((2, 2, 3)), "must be the name of a PNG file"),
+        ("a.png", "heart", "must be a number or an array of real numbers"),
+        ("a.png", [[1, 2], [3]], "must be a number or an array of real numbers"),
         ("a.png", np.zeros((2, 2, 3), np.uint8), "made of whole numbers, but must be linear light from 0 to 1"),
     ],
 )

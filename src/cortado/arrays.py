@@ -16,6 +16,8 @@ REFUSED = {
     "m": "spans of time",
 }
 """What an array holds whose entries are not real numbers, by the kind of its type."""
+GREATEST_NUMBER = 10**18
+"""Of steps: within a 64-bit number."""
 
 
 def as_numbers(what: str, value: Any) -> np.ndarray:
@@ -50,6 +52,28 @@ def as_one_number(what: str, value: Any) -> float:
 def is_whole(value: object) -> bool:
     """Whether a value is a whole number, of Python or of NumPy; a truth value is none."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def require_whole(what: str, value: object, least: int) -> None:
+    """Raises `InputError`, in a sentence that begins with ``what``, unless a value is a whole number of at least so
+    much."""
+    if not is_whole(value) or value < least:  # type: ignore[operator]
+        raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
+
+
+def whole_number(what: str, value: Any, least: int) -> int:
+    """A whole number of at least so much, also if it is a float, or an `InputError` in a sentence."""
+    whole = isinstance(value, (int, np.integer)) or (isinstance(value, (float, np.floating)) and value.is_integer())
+    if not whole or value < least:
+        raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
+    if value > GREATEST_NUMBER:
+        raise InputError(f"{what} is {shown(value)}, but must be at most {GREATEST_NUMBER:g}.")
+    return int(value)
+
+
+def check_steps(steps: int, least: int = 1) -> int:
+    """The number of steps, or an `InputError` in a sentence."""
+    return whole_number("steps", steps, least)
 
 
 def _is_masked(value: Any) -> bool:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from cortado.arrays import check_steps, whole_number
 from cortado.device.memory import require
 from cortado.device.state import State
 from cortado.device.threads import Turn, in_turn
@@ -20,7 +21,7 @@ from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import NAMES, OVER_TIME, UNITS, Arrays, Values
 from cortado.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
-from cortado.simulation import Simulation, check_steps, whole_number
+from cortado.simulation import Simulation
 from cortado.words import counted
 
 __all__ = ["NAMES", "UNITS", "Problem"]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.arrays import check_steps, whole_number
 from cortado.device.compiling import begin_headers
 from cortado.device.driver import why_no_gpu
 from cortado.device.kernel_cache import start_warp
@@ -21,12 +22,13 @@ from cortado.device.reduction import sum_and_maximum_kernel
 from cortado.device.state import State
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.discretise.discrete_scene import DiscreteScene, discretise
-from cortado.errors import CortadoWarning, DivergedError, InputError, shown
+from cortado.errors import CortadoWarning, InputError, shown
 from cortado.figures.particle_sets import particles
 from cortado.io.notebook import with_picture
 from cortado.io.trajectory import Frame, Trajectory
 from cortado.io.trajectory_batch import TrajectoryBatch
 from cortado.lattice.calibration import diffusion_limit
+from cortado.outcome import lost_sentence, not_converged_sentence
 from cortado.parameters.checks import check_sizes
 from cortado.parameters.scene_parameters import SceneParameters
 from cortado.parameters.space import ParameterSpace
@@ -48,8 +50,6 @@ MOST_SUBSTEPS = 10_000
 """Explicit steps of diffusion in a time step; beyond it the mobility is taken for a mistake."""
 WORTH = {"cpu": 16_000, "cuda": 1_000_000}
 """Particles of all scenes in one launch, beyond which more of them are no faster."""
-GREATEST_NUMBER = 10**18
-"""Of steps: within a 64-bit number."""
 
 
 class Simulation:
@@ -358,47 +358,6 @@ def _made_again(
             "of points that its scene names has changed. Restore it, or make the simulation anew."
         )
     return simulation
-
-
-def check_steps(steps: int, least: int = 1) -> int:
-    """The number of steps, or an `InputError` in a sentence."""
-    return whole_number("steps", steps, least)
-
-
-def whole_number(what: str, value: Any, least: int) -> int:
-    """A whole number of at least so much, also if it is a float, or an `InputError` in a sentence."""
-    whole = isinstance(value, (int, np.integer)) or (isinstance(value, (float, np.floating)) and value.is_integer())
-    if not whole or value < least:
-        raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
-    if value > GREATEST_NUMBER:
-        raise InputError(f"{what} is {shown(value)}, but must be at most {GREATEST_NUMBER:g}.")
-    return int(value)
-
-
-def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
-    """What to say of steps that ended above the tolerance."""
-    advice = "try a smaller time step, more iterations or a larger tolerance."
-    if _waits_in_a_wall(scene):
-        advice = (
-            "the column that waits in the emitter is not all inside the container, whose walls press on it. Shorten "
-            "emitter.length, or make the container larger."
-        )
-    return f"the pressure did not converge in {np.count_nonzero(~converged)} of {converged.size} steps: {advice}"
-
-
-def _waits_in_a_wall(scene: Scene) -> bool:
-    """Whether particles of the emitter start in a wall of the container, or outside of it."""
-    spacing = scene.discretisation.spacing
-    return bool(
-        scene.emitter is not None
-        and not scene.container.contains(scene.emitter.particles(spacing), -0.25 * spacing).all()
-    )
-
-
-def lost_sentence(lost: Mapping[int, DivergedError], batch: int) -> str:
-    """What to say of the scenes of a batch that lost a particle."""
-    first = min(lost, key=lambda b: lost[b].step)
-    return f"{len(lost)} of {counted(batch, 'scene')} of the batch were lost. First scene {first}: {lost[first]}"
 
 
 def _device(name: str) -> Any:

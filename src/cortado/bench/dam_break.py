@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.arrays import check_steps
 from cortado.bench.memory import ESTIMATED, MEASURED, estimated_bytes, memory_high
 from cortado.bench.passes import Pass, PassTimer
 from cortado.bench.scene import ITERATIONS, dam_break, search_of
@@ -15,7 +16,7 @@ from cortado.device.launching import CapturedGraph
 from cortado.losses import FinalPositions
 from cortado.problem import Problem
 from cortado.rollout import Rollout
-from cortado.simulation import Simulation, check_steps
+from cortado.simulation import Simulation
 
 Row = dict[str, Any]
 

@@ -3,9 +3,9 @@
 from typing import Any
 
 from cortado import reference
+from cortado.arrays import check_steps
 from cortado.bench.scene import ITERATIONS, dam_break
 from cortado.bench.timing import median_seconds
-from cortado.simulation import check_steps
 
 
 def measure_reference(particles: int, steps: int, precision: str, repeats: int) -> dict[str, Any]:

@@ -4,13 +4,14 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from cortado.arrays import check_steps
 from cortado.certificate import Certificate, certify
 from cortado.errors import ComputationError, InputError, shown
 from cortado.io.terminal import tell
 from cortado.losses import CentreOfMass, FinalPositions, Image, Loss
 from cortado.problem import Problem
 from cortado.scene.scene import load_scene
-from cortado.simulation import Simulation, check_steps
+from cortado.simulation import Simulation
 
 LOSSES = ("positions", "centre-of-mass", "image")
 

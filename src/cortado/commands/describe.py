@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.arrays import check_steps
 from cortado.bench.memory import estimated_bytes
 from cortado.device.memory import frame_parts, step_parts
 from cortado.errors import DivergedError, InputError
@@ -24,7 +25,7 @@ from cortado.scene.scene import load_scene
 from cortado.scene.stability import stability_limits
 from cortado.scene.toml import read_toml
 from cortado.shading.painter import colours_of
-from cortado.simulation import Simulation, check_steps
+from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 
 FIRST, MOST, ENOUGH = 4, 100, 0.5

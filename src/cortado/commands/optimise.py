@@ -128,17 +128,14 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
     first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
     verdict = judge(made.task, result, estimate, noise, first)
     knots = knot_values(made, result.parameters, estimate)
-    lines = [
-        _summary(made, estimate, result, verdict),
-        *found_lines(made, estimate, knots),
-        *_advice(made, result, verdict),
-    ]
-    announce("\n".join(lines))
+    summary, advice = _summary(made, estimate, result, verdict), _advice(made, result, verdict)
+    said = [summary, *advice]
+    announce("\n".join([summary, *found_lines(made, estimate, knots), *advice]))
     with keeping(lambda: f"the search has ended, and is in {folder.checkpoint}; --resume draws its pictures"):
         shaded = _shaded(made, result, folder.figures, pictures)
         figures = shaded + task_figures(made, result, folder.figures)
         rows = found_rows(made, estimate, knots, verdict.errors)
-        write_report(folder, made.task.scene.name, _sections(made, estimate, result, verdict, figures, rows))
+        write_report(folder, made.task.scene.name, _sections(made, estimate, result, verdict, said, figures, rows))
         folder.write_result(**_for_machines(result, estimate, verdict, knots))
     if verdict.failures:
         raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
@@ -252,7 +249,7 @@ def _for_machines(
 
 def _advice(made: Setup, result: Result, verdict: Verdict) -> list[str]:
     """What to try where a search came to next to nothing, and which of its bounds it ended on."""
-    met = [name for name, value in result.parameters.items() if _on_bound(value, *made.bounds.get(name, (None, None)))]
+    met = [name for name, pair in made.bounds.items() if _on_bound(result.parameters[name], *pair)]
     found = [f"The search of {name} ended on its bounds: what is best may lie beyond them." for name in met]
     task, steps = made.task, made.task.problem.steps
     if verdict.reduction >= LITTLE:
@@ -269,8 +266,8 @@ def _advice(made: Setup, result: Result, verdict: Verdict) -> list[str]:
 
 def _on_bound(value: Any, lower: Any, upper: Any) -> bool:
     """Whether a number of a parameter's coordinates is as small or as large as it may be."""
-    below, above = (None if bound is None else np.asarray(bound) for bound in (lower, upper))
-    return bool((below is not None and (value <= below).any()) or (above is not None and (value >= above).any()))
+    least, most = np.asarray(-np.inf if lower is None else lower), np.asarray(np.inf if upper is None else upper)
+    return bool(((value <= least) | (value >= most)).any())
 
 
 def _summary(made: Setup, estimate: Mapping[str, np.ndarray], result: Result, verdict: Verdict) -> str:
@@ -305,16 +302,17 @@ def _sections(
     estimate: dict[str, np.ndarray],
     result: Result,
     verdict: Verdict,
+    told: list[str],
     figures: Chapters,
     rows: Rows,
 ) -> list[Section]:
-    """The report, in the order in which one would tell it."""
+    """The report, in the order in which one would tell it; ``told``: what was found, in words."""
     head = ("", "unit", "first guess", "found", "hidden", "error")
     return [
         _asked(made),
         Section(
             "What was found",
-            [_summary(made, estimate, result, verdict), *_advice(made, result, verdict)],
+            told,
             verdict.failures,
             figures.found,
         ),

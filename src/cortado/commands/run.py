@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cortado.arrays import check_steps
 from cortado.commands.run_report import write_run_report
 from cortado.commands.run_summary import RunSummary
 from cortado.device.compiling import compile_ahead
@@ -19,9 +20,10 @@ from cortado.io.progress import announce, track
 from cortado.io.report import Section
 from cortado.io.run_folder import RunFolder
 from cortado.io.trajectory import append_frame, frame_writer
+from cortado.outcome import not_converged_sentence
 from cortado.rollout import Rollout
 from cortado.scene.scene import load_scene
-from cortado.simulation import Simulation, check_steps, not_converged_sentence
+from cortado.simulation import Simulation
 
 
 def run_scene(

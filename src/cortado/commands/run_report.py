@@ -12,12 +12,13 @@ from cortado.io.run_folder import RunFolder
 from cortado.io.terminal import say
 from cortado.io.trajectory import Trajectory
 from cortado.io.video import MOST_FRAMES, write_video
+from cortado.outcome import not_converged_sentence
 from cortado.rollout import Rollout
 from cortado.scene.in_words import scene_in_words
 from cortado.scene.scene import Scene
 from cortado.shading.film import lacking, run_pictures
 from cortado.shading.scene_view import trajectory_view
-from cortado.simulation import Simulation, not_converged_sentence
+from cortado.simulation import Simulation
 
 
 def write_run_report(

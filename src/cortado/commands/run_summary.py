@@ -128,8 +128,8 @@ class RunSummary:
 
 def _spilt(simulation: Simulation, state: State) -> int:
     """How many particles that did not begin in an emitter are outside of a cup without a lid."""
-    region = simulation.scene.container.region(simulation.dimension)
-    if not np.isfinite(region.rim):
+    scene, container = simulation.scene, simulation.scene.container
+    if not np.isfinite(container.region(simulation.dimension).rim):
         return 0
     positions = state.numpy(simulation.dimension, only=["positions"])["positions"][: simulation.free_particles]
-    return int((~region.contains(positions, TOLERANCE * simulation.scene.discretisation.spacing)).sum())
+    return int((~container.contains(positions, TOLERANCE * scene.discretisation.spacing)).sum())

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from cortado.arrays import check_steps
 from cortado.commands.executor import HERE, Where
 from cortado.commands.optimise import optimise_task, search_settings
 from cortado.commands.run import run_scene, run_settings
@@ -16,7 +17,6 @@ from cortado.io.progress import track, untracked
 from cortado.io.run_folder import RunFolder
 from cortado.scene.scene import load_scene
 from cortado.scene.toml import read_toml
-from cortado.simulation import check_steps
 from cortado.sweep.combinations import Combination, combinations
 from cortado.sweep.table import NAME, failed, write_table
 from cortado.words import counted

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cortado.arrays import as_numbers, is_whole
+from cortado.arrays import as_numbers, is_whole, require_whole
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
 from cortado.executors.executor import Executor, InProcess, checked_executor
@@ -43,8 +43,7 @@ class Ensemble:
             raise InputError(
                 f"position_noise is {shown(self.position_noise)}, but must be a number of at least 0, in spacings."
             )
-        if not is_whole(self.seed) or self.seed < 0:
-            raise InputError(f"seed is {shown(self.seed)}, but must be a whole number of at least 0.")
+        require_whole("seed", self.seed, 0)
         for name, spread in self.spread.items() if isinstance(self.spread, Mapping) else [("parameters", self.spread)]:
             _checked_spread(name, spread)
         checked_executor(self.executor)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cortado.arrays import is_whole
-from cortado.errors import ComputationError, InputError, shown
+from cortado.arrays import require_whole
+from cortado.errors import ComputationError
 from cortado.gradients.ensemble import EnsembleMean, joined, mean_and_error, require_pairs
 from cortado.gradients.ensemble_members import Ensemble, Sampler
 from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator, checked_estimator
@@ -49,10 +49,8 @@ class Guided(Ensemble):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_pairs(self.samples)
-        for name, least in (("parts", 1), ("differences", 2)):
-            value = getattr(self, name)
-            if not is_whole(value) or value < least:
-                raise InputError(f"{name} is {shown(value)}, but must be a whole number of at least {least}.")
+        require_whole("parts", self.parts, 1)
+        require_whole("differences", self.differences, 2)
         checked_estimator(self.surrogate)
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:

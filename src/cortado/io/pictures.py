@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from cortado.errors import CortadoWarning, InputError
 from cortado.io.files import write_atomically
 from cortado.io.input_files import reason, regular_file
-from cortado.io.srgb import MOST_LIGHT, from_srgb, to_srgb
+from cortado.io.srgb import check_light, from_srgb, to_srgb
 from cortado.render.cameras import check_resolution, positive, vector
 
 __all__ = ["COFFEE", "MILK", "WHITE", "heart", "read_picture", "rosetta", "write_picture"]
@@ -124,10 +124,19 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
 
 def _warn_of_cropping(path: str | Path, size: tuple[int, int], shape: tuple[int, int]) -> None:
     """Of a picture that is ``size`` pixels wide and high, whose proportions are to be those of ``shape``."""
-    share = min(size[0] / shape[0], size[1] / shape[1]) ** 2 * shape[0] * shape[1] / (size[0] * size[1])
+    left, top, right, bottom = _middle(size, shape)
+    share = (right - left) * (bottom - top) / (size[0] * size[1])
     if share < MOST_CROPPED:
         found = f"The picture {path} has {size[0]} x {size[1]} pixels, but {shape[0]} x {shape[1]} are wanted"
         warnings.warn(f"{found}: only its middle is taken, {share:.0%} of it.", CortadoWarning, stacklevel=3)
+
+
+def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom of the largest part in the middle of a picture that has these proportions."""
+    (width, height), (columns, rows) = size, shape
+    scale = min(width / columns, height / rows)
+    left, top = 0.5 * (width - scale * columns), 0.5 * (height - scale * rows)
+    return left, top, width - left, height - top
 
 
 def _check_header(path: str | Path, file: Any, most: int) -> None:
@@ -153,12 +162,9 @@ def write_picture(path: str | Path, image: ArrayLike) -> Path:
 
     if Path(path).suffix.lower() != ".png":
         raise InputError(f"path is {str(path)!r}, but must be the name of a PNG file, such as picture.png.")
-    if np.issubdtype(np.asarray(image).dtype, np.integer):
-        raise InputError("The image is made of whole numbers, but must be linear light from 0 to 1.")
-    if np.max(image, initial=0.0) > MOST_LIGHT:
-        raise InputError(f"The image has a value of {np.max(image):g}, but must be linear light from 0 to 1.")
-    content = BytesIO()
-    Image.fromarray(to_srgb(image)).save(content, format="PNG")
+    pixels, content = to_srgb(image), BytesIO()
+    check_light("The image", image)
+    Image.fromarray(pixels).save(content, format="PNG")
     write_atomically(Path(path), content.getvalue())
     return Path(path)
 
@@ -243,10 +249,7 @@ def _resampled(picture: Any, columns: int, rows: int) -> Picture:
     """(rows, columns, 3) from the largest part in the middle that has these proportions."""
     from PIL import Image
 
-    width, height = picture.size
-    scale = min(width / columns, height / rows)
-    left, top = 0.5 * (width - scale * columns), 0.5 * (height - scale * rows)
-    box = (left, top, width - left, height - top)
+    box = _middle(picture.size, (columns, rows))
     small, light = np.empty((rows, columns, 3)), LIGHT.astype(np.float32)
     for k in range(3):
         channel = Image.new("F", picture.size)

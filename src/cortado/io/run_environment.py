@@ -54,8 +54,7 @@ def require_same(former: Any, given: Any, folder: Path, field: str = "") -> None
     elif former != given:
         raise InputError(
             f"The run in {folder} was begun with {field} = {_written(former)} and is now given {field} = "
-            f"{_written(given)}; "
-            f"give the former, or choose another --out."
+            f"{_written(given)}; give the former, or choose another --out."
         )
 
 

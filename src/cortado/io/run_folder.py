@@ -215,11 +215,11 @@ class RunFolder:
 
     def _make_room(self, kind: str, overwrite: bool) -> None:
         present = [name for name in (self.environment.name, *_FILES, *_FOLDERS) if (self.path / name).exists()]
-        if present and not self._holds_run():
-            raise InputError(f"{self.path} holds {', '.join(present)}, but no run of Cortado; choose another --out.")
         if not present:
             self._require_own()
-        if present and not overwrite:
+        elif not self._holds_run():
+            raise InputError(f"{self.path} holds {', '.join(present)}, but no run of Cortado; choose another --out.")
+        elif not overwrite:
             resumable = kind == _RESUMABLE == _read_json(self.environment).get("kind")
             advice = ", or go on with it by --resume" if resumable else ""
             raise InputError(

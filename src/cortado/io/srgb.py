@@ -8,6 +8,18 @@ from cortado.errors import InputError
 
 MOST_LIGHT = 2.0
 """Of a picture that somebody gives: more is taken for values of a file, up to 255; noise may leave 0 to 1."""
+LIGHT = "linear light from 0 to 1, as that of cortado.pictures.read_picture"
+
+
+def check_light(what: str, image: ArrayLike) -> None:
+    """Raises `InputError`, in a sentence that begins with ``what``, for a picture of numbers with the values of a
+    file."""
+    if np.asarray(image).dtype.kind in "iu":
+        raise InputError(f"{what} is made of whole numbers, but must be {LIGHT}.")
+    light = as_numbers(what, image)
+    furthest = light.flat[np.abs(light).argmax()]
+    if abs(furthest) > MOST_LIGHT:
+        raise InputError(f"{what} has a value of {furthest:g}, but must be {LIGHT}.")
 
 
 def to_srgb(image: ArrayLike) -> NDArray[np.uint8]:

@@ -9,11 +9,9 @@ import warp as wp
 from cortado.arrays import as_numbers
 from cortado.device.threads import WARP
 from cortado.errors import InputError, shown
-from cortado.io.srgb import MOST_LIGHT
+from cortado.io.srgb import check_light
 from cortado.losses.image_losses import ImageLoss, SquaredDifference
 from cortado.losses.loss import Snapshot, SnapshotAdjoint
-
-LIGHT = "linear light from 0 to 1, as that of cortado.pictures.read_picture"
 
 
 class Pictures(Protocol):
@@ -70,15 +68,11 @@ def _distance(distance: Any) -> ImageLoss:
 def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:
     """A copy (rows, columns, 3) in float64, or an `InputError`; ``shape``: of the renderer's pictures, if known."""
     image = as_numbers("target", target).copy()
-    if np.asarray(target).dtype.kind in "iu":
-        raise InputError(f"target is made of whole numbers, but must be {LIGHT}.")
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"target has shape {image.shape}, but must be a picture (rows, columns, 3).")
     if shape is not None and image.shape != shape:
         raise InputError(f"target has shape {image.shape}, but must have that of the renderer's pictures, {shape}.")
     if not np.isfinite(image).all():
         raise InputError("target has a value that is not finite, but must be made of finite numbers.")
-    furthest = image.flat[np.abs(image).argmax()]
-    if abs(furthest) > MOST_LIGHT:
-        raise InputError(f"target has a value of {furthest:g}, but must be {LIGHT}.")
+    check_light("target", target)
     return image

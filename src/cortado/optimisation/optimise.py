@@ -214,15 +214,13 @@ class _Evaluator:
 
     def _shorter(self, advice: str, vector: Vector) -> str:
         """The advice of a run that diverged during a search, with where the search had come to, and the best before."""
-        came = f"the search had come to {self._in_words(vector)}" if vector.size <= FEW else ""
         best = min(self.history, key=lambda record: record.loss)
-        at = f" at {self._in_words(self.layout.ravel(best.parameters))}" if vector.size <= FEW else ""
-        told = [f"{advice}, a smaller learning rate or scale, or bounds on the parameters", came]
-        return "; ".join(filter(None, [*told, f"the least loss before is {best.loss:.4g}{at}"]))
-
-    def _in_words(self, vector: Vector) -> str:
-        found = {name: np.array2string(value, precision=4) for name, value in self.layout.unravel(vector).items()}
-        return ", ".join(f"{name} {' '.join(text.split())}" for name, text in found.items())
+        told = [f"{advice}, a smaller learning rate or scale, or bounds on the parameters"]
+        least = f"the least loss before is {best.loss:.4g}"
+        if vector.size <= FEW:
+            told.append(f"the search had come to {_in_words(self.layout.unravel(vector))}")
+            least = f"{least} at {_in_words(best.parameters)}"
+        return "; ".join([*told, least])
 
     def _ravelled(self, gradients: Mapping[str, Any]) -> Vector:
         """The gradient as one vector, after a check of its names and shapes."""
@@ -344,6 +342,12 @@ def _require_count(iterations: int) -> None:
     """Raise InputError unless the number of iterations is a positive integer."""
     if not is_whole(iterations) or iterations < 1:
         raise InputError(f"The number of iterations must be an integer of at least 1, not {iterations!r}.")
+
+
+def _in_words(parameters: Parameters) -> str:
+    """Their names and values."""
+    found = {name: np.array2string(np.asarray(value), precision=4) for name, value in parameters.items()}
+    return ", ".join(f"{name} {' '.join(text.split())}" for name, text in found.items())
 
 
 def _as_given(parameters: Mapping[str, Vector], start: Mapping[str, Any]) -> Parameters:

@@ -12,8 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.special import softmax
 
-from cortado.arrays import as_numbers, is_whole
-from cortado.errors import DivergedError, InputError, shown
+from cortado.arrays import as_numbers, require_whole
+from cortado.errors import DivergedError, InputError
 from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator, estimate
 from cortado.parameters.values import Arrays, Values, check_known
 from cortado.problem import Problem
@@ -78,10 +78,8 @@ class TimeInterpolation:
     knots: int
 
     def __post_init__(self) -> None:
-        for name in ("steps", "knots"):
-            value = getattr(self, name)
-            if not is_whole(value) or value < 1:
-                raise InputError(f"{name} is {shown(value)}, but must be a whole number of at least 1.")
+        require_whole("steps", self.steps, 1)
+        require_whole("knots", self.knots, 1)
 
     @property
     def places(self) -> np.ndarray:
