@@ -33,7 +33,7 @@ LAYERS = """
     device.candidates device.neighbours
     scene.overlaps scene.checks scene.scene scene.in_words
     parameters.checks
-    discretise.sampling discretise.discrete_scene
+    discretise.bodies discretise.packing discretise.sampling discretise.discrete_scene
     sph sph.density sph.free_energy sph.integration sph.order sph.materials sph.emitter_kernels sph.pair_forces
     sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
     sph.gravity sph.mixture sph.surface_tension sph.viscosity

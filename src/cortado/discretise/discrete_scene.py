@@ -4,11 +4,13 @@ It is the same for every device, every precision and every engine.
 """
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from cortado.discretise.bodies import Surroundings
+from cortado.discretise.packing import Packing
 from cortado.discretise.sampling import FluidSample, fluid_particles, period, wall_particles
 from cortado.discretise.walls.layers import WallLayers, wall_layers
 from cortado.discretise.walls.weights import RestLattice, Surface
@@ -115,8 +117,20 @@ def discretise(scene: Scene) -> DiscreteScene:
     fluid = fluid_particles(scene)
     if any(isinstance(body, PointsFluid) for body in scene.fluid):
         _check_packing(scene, fluid.positions, kernel, lattice)
-    walls = _walls(scene, layers, RestLattice(kernel, spacing, support))
+    at_rest = RestLattice(kernel, spacing, support)
+    walls = _walls(scene, layers, at_rest)
+    fluid = replace(fluid, positions=_packed(fluid, walls, at_rest, *period(scene)))
     return DiscreteScene(kernel, lattice, fluid, layers, walls, period(scene)[1])
+
+
+def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Points, lengths: Points) -> Points:
+    """(n, d) first positions [m], with those of round bodies where they fill them at the rest density."""
+    if not fluid.bodies:
+        return fluid.positions
+    stays = ~fluid.is_packed
+    air, shares = Surroundings(fluid.bodies, fluid.positions[stays], lower, lengths).air(lattice.support)
+    fixed, weights = np.concatenate([air, walls.positions]), np.append(shares, walls.weights)
+    return Packing(lattice, fixed, weights, len(air), lower, lengths).packed(fluid.positions, stays)
 
 
 def _walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:

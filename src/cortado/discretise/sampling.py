@@ -6,9 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.discretise.bodies import CutBody
 from cortado.errors import InputError
 from cortado.lattice.shapes import Points
 from cortado.scene.emitter import EmitterSample
+from cortado.scene.fluids import RoundFluid
 from cortado.scene.scene import Scene
 
 
@@ -22,6 +24,10 @@ class FluidSample:
     """(n, d) [m/s]"""
     phase: NDArray[np.int64]
     """(n,) index into the scene's phases"""
+    bodies: tuple[CutBody, ...]
+    """Those whose particles are to be packed, in the order of the particles."""
+    is_packed: NDArray[np.bool_]
+    """(n,) whether a particle is of one of these."""
     emitter: EmitterSample | None
     """The last of the particles once more, in the same order, as they are along the emitter; None without one."""
 
@@ -33,17 +39,18 @@ class FluidSample:
 
 
 def fluid_particles(scene: Scene) -> FluidSample:
-    """The fluid of a scene. Raises `InputError` if a file with points is gone since the scene was read, or if walls
-    leave no room for any particle of a fluid."""
+    """The fluid of a scene, before particles of round bodies are packed. Raises `InputError` if a file with points is
+    gone since the scene was read, or if walls leave no room for any particle of a fluid."""
     spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
     room = scene.container.region(scene.dimension).opened(period(scene)[1])
-    positions = [fluid.particles_in(room, spacing) for fluid in scene.fluid]
-    for index, particles in enumerate(positions):
+    bodies = [CutBody(fluid, room, spacing) if isinstance(fluid, RoundFluid) else None for fluid in scene.fluid]
+    positions = [
+        fluid.particles_in(room, spacing) if body is None else body.particles()
+        for fluid, body in zip(scene.fluid, bodies, strict=True)
+    ]
+    for index, (particles, body) in enumerate(zip(positions, bodies, strict=True)):
         if not len(particles):
-            raise InputError(
-                f"fluid.{index} has no particle that is half a spacing, {0.5 * spacing:g} m, or more from all walls: "
-                f"it must be larger, or further from them."
-            )
+            raise InputError(f"fluid.{index} has no particle{_why_none(body, spacing)}.")
     velocities = [np.tile(fluid.velocity, (len(x), 1)) for fluid, x in zip(scene.fluid, positions, strict=True)]
     phases = [names.index(fluid.phase) for fluid in scene.fluid]
     emitted = None
@@ -52,12 +59,27 @@ def fluid_particles(scene: Scene) -> FluidSample:
         positions.append(emitted.positions)
         velocities.append(emitted.velocities)
         phases.append(names.index(scene.emitter.phase))
+        bodies.append(None)
+    sizes = [len(x) for x in positions]
     return FluidSample(
         positions=np.concatenate(positions),
         velocities=np.concatenate(velocities),
-        phase=np.repeat(phases, [len(x) for x in positions]),
+        phase=np.repeat(phases, sizes),
+        bodies=tuple(body for body in bodies if body is not None),
+        is_packed=np.repeat([body is not None for body in bodies], sizes),
         emitter=emitted,
     )
+
+
+def _why_none(body: CutBody | None, spacing: float) -> str:
+    """Why a body of fluid has no particles, and what to do, as the end of a sentence."""
+    if body is None:
+        return (
+            f" that is half a spacing, {0.5 * spacing:g} m, or more from all walls: it must be larger, or further "
+            "from them"
+        )
+    cells = body.volume() / spacing ** len(body.room.lower)
+    return f", as the volume that walls leave it is {cells:.2g} of that of a particle: it must be larger"
 
 
 def wall_particles(scene: Scene, depths: Sequence[float]) -> list[Points]:

@@ -1,4 +1,5 @@
-"""Where fluid may be: in a box, whose sides may be infinitely far, and in a cylinder, which may be open on top."""
+"""Where fluid may be: in a box, whose sides may be infinitely far, and in a cylinder, which may be open on top, or a
+sphere."""
 
 from dataclasses import dataclass
 
@@ -22,9 +23,10 @@ class Region:
     base: Points
     """(d,) a point on the axis of the cylinder [m]"""
     across: Points
-    """(d,) 1 for the axes of space that lie across the cylinder, 0 for the one along it; all 0 without a cylinder"""
+    """(d,) 1 for the axes of space that lie across the cylinder, 0 for the one along it; all 0 without a cylinder, and
+    all 1 for a sphere, whose middle ``base`` then is"""
     radius: float = np.inf
-    """Of the cylinder [m]."""
+    """Of the cylinder or the sphere [m]."""
     rim: float = np.inf
     """Where the open end of a cylinder is along its axis [m], infinite if it has a lid."""
 
@@ -37,6 +39,27 @@ class Region:
     def everywhere(cls, dimension: int) -> "Region":
         """All of space."""
         return cls.between(np.full(dimension, -np.inf), np.full(dimension, np.inf))
+
+    @classmethod
+    def ball(cls, centre: Points, radius: float) -> "Region":
+        """A sphere, or a disc in 2-D."""
+        everywhere = cls.everywhere(len(centre))
+        return cls(everywhere.lower, everywhere.upper, centre, np.ones(len(centre)), radius)
+
+    @classmethod
+    def cylinder(cls, base: Points, radius: float, height: float, axis: int) -> "Region":
+        """A cylinder that stands on its base along an axis of space."""
+        across = np.where(np.arange(len(base)) == axis, 0.0, 1.0)
+        lower, upper = base - radius * across, base + radius * across
+        upper[axis] += height
+        return cls(lower, upper, base, across, radius)
+
+    def distance(self, points: Points) -> Points:
+        """(n,) how far points (n, d) [m] are outside of the region, negative inside [m]; beyond an edge or a corner it
+        is the distance from the nearer face, which is less."""
+        from_axis = np.linalg.norm((points - self.base) * self.across, axis=1)
+        from_faces = np.maximum(self.lower - points, points - self.upper).max(axis=1)
+        return np.asarray(np.maximum(from_faces, from_axis - self.radius))
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
         """(n,) whether points (n, d) [m] are within, or outside by no more than the tolerance [m]."""

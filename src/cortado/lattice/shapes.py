@@ -35,6 +35,10 @@ class Block:
         """The first and the last point, each (d,) [m]."""
         return self.first, self.first + (self.counts - 1.0) * self.spacing
 
+    def grown(self, cells: int) -> "Block":
+        """The same lattice with so many cells more on every side."""
+        return Block(self.first - cells * self.spacing, self.counts + 2 * cells, self.spacing)
+
     def points(self) -> Points:
         """(n, d) [m], the last axis fastest."""
         return grid([x + self.spacing * np.arange(int(n)) for x, n in zip(self.first, self.counts, strict=True)])

@@ -1,6 +1,7 @@
 """The shapes that a container may have, each with its walls."""
 
 from abc import abstractmethod
+from dataclasses import replace
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -133,12 +134,12 @@ class CylinderContainer(Container):
         return lower, upper
 
     def region(self, dimension: int) -> Region:
-        axis, (lower, upper) = INDEX_OF_AXIS[self.axis], self.extent()
-        across, rim = np.ones(3), float(upper[axis])
-        across[axis] = 0.0
-        if not self.lid:
-            upper[axis] = np.inf
-        return Region(lower, upper, np.array(self.base), across, self.radius, np.inf if self.lid else rim)
+        axis = INDEX_OF_AXIS[self.axis]
+        closed = Region.cylinder(np.array(self.base), self.radius, self.height, axis)
+        if self.lid:
+            return closed
+        is_along = np.arange(3) == axis
+        return replace(closed, upper=np.where(is_along, np.inf, closed.upper), rim=float(closed.upper[axis]))
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         upright = cup_walls(self.radius, self.height, self.lid, spacing, depth)

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from cortado.lattice.region import Region
-from cortado.lattice.shapes import ROUND_OFF, Block, Points, block_about, block_between, corners
+from cortado.lattice.shapes import ROUND_OFF, Block, Points, block_about, block_between, corners, grid
 from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
 from cortado.scene.points import read_points
 from cortado.scene.tables import Table
@@ -61,10 +61,6 @@ class LatticeFluid(Fluid):
     def block(self, spacing: float) -> Block:
         """The lattice in the box around the shape."""
 
-    def inside(self, points: Points) -> Points:
-        """Those of the points (n, d) [m] that are in the shape."""
-        return points
-
     def count(self, spacing: float) -> float:
         return self.block(spacing).size
 
@@ -72,7 +68,7 @@ class LatticeFluid(Fluid):
         return self.block(spacing).extent
 
     def particles(self, spacing: float) -> Points:
-        return self.inside(self.block(spacing).points())
+        return self.block(spacing).points()
 
     def particles_in(self, region: Region, spacing: float) -> Points:
         """(n, d) [m] those that are half a spacing or more from all walls, where they would be compressed otherwise."""
@@ -101,7 +97,25 @@ class BoxFluid(LatticeFluid):
         return self.corners(spacing)
 
 
-class SphereFluid(LatticeFluid):
+class RoundFluid(LatticeFluid):
+    """A body whose surface cuts through cells of the lattice: its particles are packed before a run begins
+    (`cortado.discretise.packing`), and ``particles`` are whole cells, which tell roughly where they are."""
+
+    @abstractmethod
+    def region(self) -> Region:
+        """What it fills."""
+
+    def lattice(self, spacing: float, reach: float) -> Points:
+        """(n, d) [m] points of a lattice in the box around the shape and as far as ``reach`` [m] beyond it, one for
+        each cell of the spacing's volume, with whole layers between faces that are flat."""
+        return self.block(spacing).grown(int(np.ceil(reach / spacing))).points()
+
+    def particles(self, spacing: float) -> Points:
+        points = self.block(spacing).points()
+        return points[self.region().contains(points, 0.0)]
+
+
+class SphereFluid(RoundFluid):
     """A sphere, or a disc in 2-D."""
 
     shape: Literal["sphere"] = "sphere"
@@ -113,11 +127,11 @@ class SphereFluid(LatticeFluid):
     def block(self, spacing: float) -> Block:
         return block_about(self.centre, np.full(len(self.centre), self.radius), spacing)
 
-    def inside(self, points: Points) -> Points:
-        return points[np.linalg.norm(points - self.centre, axis=1) <= self.radius]
+    def region(self) -> Region:
+        return Region.ball(np.array(self.centre), self.radius)
 
 
-class CylinderFluid(LatticeFluid):
+class CylinderFluid(RoundFluid):
     """A cylinder, in 3-D."""
 
     shape: Literal["cylinder"] = "cylinder"
@@ -142,9 +156,19 @@ class CylinderFluid(LatticeFluid):
         standing = np.where(np.arange(3) == axis, base + 0.5 * spacing, block.first)
         return Block(standing, block.counts, spacing)
 
-    def inside(self, points: Points) -> Points:
-        from_axis = np.delete(points - self.base, INDEX_OF_AXIS[self.axis], axis=1)
-        return points[np.linalg.norm(from_axis, axis=1) <= self.radius]
+    def region(self) -> Region:
+        return Region.cylinder(np.array(self.base), self.radius, self.height, INDEX_OF_AXIS[self.axis])
+
+    def lattice(self, spacing: float, reach: float) -> Points:
+        """Stretched along the axis, so that whole layers fill the height, and narrowed across it by as much."""
+        layers = max(round(self.height / spacing), 1)
+        along = self.height / layers
+        across = np.sqrt(spacing**3 / along)
+        axis, base, cells = INDEX_OF_AXIS[self.axis], np.array(self.base), int(np.ceil(reach / min(along, across)))
+        round_it = block_about(np.zeros(1), [self.radius], across).grown(cells).points()[:, 0]
+        axes = [centre + round_it for centre in base]
+        axes[axis] = base[axis] + along * (np.arange(-cells, layers + cells) + 0.5)
+        return grid(axes)
 
 
 class PointsFluid(Fluid):

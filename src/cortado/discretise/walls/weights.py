@@ -7,7 +7,7 @@ import numpy as np
 
 from cortado.discretise.walls.places import Places
 from cortado.lattice.calibration import lattice_offsets
-from cortado.lattice.pairs import pairs_within
+from cortado.lattice.pairs import apart, pairs_within
 from cortado.lattice.region import Region
 from cortado.lattice.shapes import Points
 from cortado.lattice.smoothing import SmoothingKernel
@@ -103,10 +103,9 @@ class Surface:
         from scipy.sparse import coo_array, vstack
 
         place, wall, _ = pairs_within(places.points, self.walls, self.lattice.support, self.lower, self.lengths)
-        apart = places.points[place] - self.walls[wall]
-        apart -= self.lengths * np.rint(apart / np.where(self.lengths > 0.0, self.lengths, np.inf))
+        separations = apart(places.points[place] - self.walls[wall], self.lengths)
         shape, indices = (len(places.points), len(self.walls)), (place.astype(np.int32), wall.astype(np.int32))
-        seen = self.flat[wall, None] * self.lattice.sums(apart)
+        seen = self.flat[wall, None] * self.lattice.sums(separations)
         densities, *gradients = (coo_array((part, indices), shape=shape).tocsr() for part in seen.T)
         missing = self.lattice.missing(places, self.region)
         near = ~self.region.contains(places.points, -self.lattice.spacing)
