@@ -1,5 +1,7 @@
 """``cortado view``: a run, a task, or a scene that runs meanwhile, in the browser."""
 
+import atexit
+import gc
 from functools import cache
 from pathlib import Path
 
@@ -22,6 +24,7 @@ def view(path: Path, overrides: list[str], device: str, precision: str, port: in
     """Show a run folder, or run a task or a scene, until Ctrl-C ends it."""
     shown = opened(path, overrides, device, precision, port)
     say(f"{shown.window.address} shows it; Ctrl-C ends it.")
+    atexit.register(gc.freeze)  # Python would look through all that is there once more, which takes as long as the rest
     try:
         with keeping(lambda: ""):
             while True:
