@@ -3,7 +3,10 @@ foreign page in one are in test_browser.py."""
 
 import http.client
 import math
+import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -355,6 +358,22 @@ def test_it_ends_within_a_second_while_pages_are_connected(tmp_path, monkeypatch
     assert took < 1.0
     with pytest.raises(OSError):
         socket.create_connection(("127.0.0.1", PORT), timeout=1.0)
+
+
+def test_ctrl_c_ends_the_command_while_a_page_is_connected(tmp_path):
+    (tmp_path / "scene.toml").write_text(TINY_SCENE)
+    words = [sys.executable, "-m", "cortado", "view", str(tmp_path / "scene.toml"), "--port", str(PORT)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as command:
+        assert command.stderr is not None
+        line = next(line for line in command.stderr if "shows it" in line)
+        parts = urlsplit(line.split()[0])
+        page = joined(parts.port, parts.path, max_queue=1)
+        say(page, CAMERA)
+        time.sleep(0.5)
+        command.send_signal(signal.SIGINT)
+        out, err = command.communicate(timeout=3.0)  # of which Python needs most to end, on a busy machine
+        page.socket.close()
+        assert (command.returncode, out, err) == (0, "", "")
 
 
 def test_a_viser_that_cannot_be_guarded_is_not_started(tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from cortado.io.interruption import keeping
 from cortado.io.run_folder import RunFolder
 from cortado.io.terminal import say
 from cortado.io.trajectory import Trajectory
-from cortado.scene.scene import Scene, load_scene
+from cortado.scene.scene import load_scene
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 
@@ -52,6 +52,6 @@ def opened(
     folder = RunFolder.open(path)
     if not folder.trajectory.exists():
         raise InputError(f"{path} has no trajectory, but must be the folder of `cortado run`, or a scene file.")
-    scene = Scene.from_json(folder.scene.read_text(encoding="utf-8"))
+    scene = folder.read_scene()
     simulation = cache(lambda: Simulation(scene, device))
     return RecordedView(scene, Trajectory.load(folder.trajectory), simulation, port)
