@@ -1,11 +1,14 @@
 """Pages in Chromium without a window: the particles of a report, and ``cortado view``. Nothing may go wrong in their
-console, particles are seen, and play, scrub and buttons do what they say."""
+console, particles are seen, and play, scrub and buttons do what they say. Foreign pages get nothing of a viewer."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from pathlib import Path
+from threading import Thread
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -208,3 +211,93 @@ def test_a_gradient_step_is_made_in_the_viewer(page, look):
     assert shown.loss < first and page.get_by_role("cell", name="gravity y").is_visible()
     choose(page, PULL)
     until(page, shown, page.get_by_text(f"{PULL} [m²/m]").is_visible)
+
+
+def test_a_viewer_is_loaded_again_and_looked_at_twice(browser, page, look):
+    shown = look(TINY_SCENE)
+    page.reload()
+    until(page, shown, lambda: coloured(scene_of(page)) > 0.01)
+    other = browser.new_page(viewport={"width": 1000, "height": 800})
+    other.goto(shown.window.address)
+    until(page, shown, lambda: coloured(scene_of(other)) > 0.01)
+    other.get_by_text("Run", exact=True).click()
+    until(page, shown, lambda: not shown.running.value)
+    until(page, shown, lambda: not page.get_by_label("Run", exact=True).is_checked())
+    other.close()
+    page.get_by_text("Run", exact=True).click()
+    until(page, shown, lambda: shown.running.value)
+
+
+@pytest.fixture
+def foreign() -> Iterator[tuple[str, list[Any]]]:
+    """The address of a page of somebody else's on this machine, and the headers with which it was asked for."""
+    asked: list[Any] = []
+
+    class Page(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append(self.headers)
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(b"<!doctype html><title>foreign</title>")
+
+        def log_message(self, *_: Any) -> None:
+            """Says nothing."""
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Page)
+    Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}/", asked
+    server.shutdown()
+    server.server_close()
+
+
+JOIN = """([address, version]) => new Promise((done) => {
+    const socket = new WebSocket(address, ["viser-v" + version]);
+    socket.onopen = () => done("open");
+    socket.onerror = () => done("refused");
+})"""
+"""What a foreign page does to drive a viewer: the address of a websocket, and the version of viser, are public."""
+FETCH = """(address) => fetch(address).then((found) => found.text()).catch(() => "refused")"""
+EMBED = """(address) => new Promise((done) => {
+    const frame = document.createElement("iframe");
+    frame.onload = () => done();
+    frame.src = address;
+    document.body.append(frame);
+})"""
+
+
+@pytest.mark.parametrize("place", ["another port", "another name", "a file", "a sandbox"])
+def test_a_foreign_page_gets_nothing_of_a_viewer(browser, look, foreign, place, tmp_path):
+    """Neither without the token nor, if it had leaked, with it."""
+    import viser
+
+    shown, page = look(TINY_SCENE), browser.new_page()
+    parts = urlsplit(shown.window.address)
+    (tmp_path / "evil.html").write_text("<!doctype html><title>a file</title>")
+    own = f"evil.localhost:{parts.port}"  # a name that leads to this machine, as DNS rebinding makes one
+    pages = {"another port": foreign[0], "another name": f"http://{own}/", "a file": (tmp_path / "evil.html").as_uri()}
+    page.goto(pages.get(place, foreign[0]))
+    frame = page.main_frame
+    if place == "a sandbox":
+        page.set_content('<iframe sandbox="allow-scripts" srcdoc="<!doctype html>"></iframe>')
+        frame = page.frames[1]
+    hosts = [parts.netloc, f"localhost:{parts.port}", *([own] if place == "another name" else [])]
+    for host in hosts:
+        for path in ("/", parts.path, parts.path.rstrip("/")):
+            assert frame.evaluate(JOIN, [f"ws://{host}{path}", viser.__version__]) == "refused", (host, path)
+            assert "<html" not in frame.evaluate(FETCH, f"http://{host}{path}"), (host, path)
+    clients, running = len(shown.window.server.get_clients()), shown.running.value
+    if place != "a sandbox":
+        page.evaluate(EMBED, shown.window.address)
+        page.wait_for_timeout(1000)
+    assert len(shown.window.server.get_clients()) == clients == 1 and shown.running.value == running
+    page.close()
+
+
+def test_a_viewer_keeps_its_token_from_other_pages(page, look, foreign):
+    shown = look(TINY_SCENE)
+    address, asked = foreign
+    page.evaluate("(address) => { location.href = address; }", address)
+    page.wait_for_url(address)
+    token = urlsplit(shown.window.address).path.strip("/")
+    assert asked[0]["Referer"] is None and not any(token in str(headers) for headers in asked)

@@ -87,8 +87,8 @@ LAYERS = """
     commands.examples commands.figure commands.new commands.optimise commands.overview commands.picture
     commands.run_summary commands.run_report commands.run
     commands.schema commands.study
-    commands.sweep commands.view_window commands.view_quantities commands.view_recorded commands.view_live
-    commands.view_task commands.view
+    commands.sweep commands.view_door commands.view_messages commands.view_server commands.view_window
+    commands.view_quantities commands.view_recorded commands.view_live commands.view_task commands.view
     cli.command cli.arguments cli.parsing cli.gradient_commands cli.commands cli.process cli
     __main__
 """

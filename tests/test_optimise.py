@@ -384,10 +384,11 @@ def test_a_foreign_file_is_refused(tmp_path, content):
         rosenbrock(Adam(0.05), 5, checkpoint=tmp_path, resume=True)
 
 
-def test_a_log_that_is_no_file_is_refused(tmp_path):
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_log_that_is_no_file_is_refused(tmp_path, resume):
     os.mkfifo(tmp_path / FILE_NAME)
     with pytest.raises(InputError, match="no regular file"):
-        rosenbrock(Adam(0.05), 5, checkpoint=tmp_path, resume=True)
+        rosenbrock(Adam(0.05), 5, checkpoint=tmp_path, resume=resume)
 
 
 def test_other_settings_are_refused_and_leave_the_log(tmp_path):

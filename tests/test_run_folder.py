@@ -6,12 +6,14 @@ import itertools
 import json
 import os
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import cortado.io.run_folder
+from bad_tasks import TINY_SCENE
 from cortado.errors import InputError
 from cortado.io.files import unfinished
 from cortado.io.particle_view import Cloud, particle_view, thinned
@@ -304,3 +306,68 @@ def test_progress_on_a_terminal_is_a_bar_with_fields(monkeypatch):
         advance(4, loss=0.123456)
     assert "optimise" in terminal.getvalue() and "4/4" in terminal.getvalue()
     assert "loss 0.1235" in terminal.getvalue()
+
+
+def torn(path):
+    path.write_text(path.read_text()[:100])
+
+
+def huge(path):
+    path.write_bytes(b"{}")
+    os.truncate(path, 2**40)
+
+
+def another(make):
+    """Something else in the place of a file."""
+
+    def replace(path):
+        path.unlink()
+        make(path)
+
+    return replace
+
+
+NO_SCENES = {
+    "pipe": (another(os.mkfifo), "it is a pipe, but must be a regular file"),
+    "endless": (another(lambda path: path.symlink_to("/dev/zero")), "it is a device, but must be a regular file"),
+    "folder": (another(os.mkdir), "it is a directory, but must be a regular file"),
+    "missing": (Path.unlink, "No such file"),
+    "huge": (huge, "but must have at most"),
+    "torn": (torn, "is not valid JSON"),
+    "bytes": (lambda path: path.write_bytes(b"\xff\xfe{"), "is not valid JSON"),
+    "deep": (lambda path: path.write_text("[" * 100_000), "is not valid JSON"),
+    "list": (lambda path: path.write_text("[]"), "must be"),
+    "field": (lambda path: path.write_text(path.read_text().replace('"dimension": 2', '"dimension": 7')), "dimension"),
+}
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, cortado_command):
+    """The scene of a run that is there."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(TINY_SCENE)
+    cortado_command("run", "scene.toml", "--steps", "1", "--out", "a", "--no-pictures")
+    return tmp_path / "a" / "scene.json"
+
+
+@pytest.mark.parametrize("damage", NO_SCENES)
+@pytest.mark.parametrize("command", [["picture", "a"], ["view", "a"]], ids=["picture", "view"])
+def test_a_run_whose_scene_cannot_be_read_is_a_sentence(run, cortado_command, command, damage):
+    make, words = NO_SCENES[damage]
+    make(run)
+    code, out, err = cortado_command(*command)
+    assert (code, out) == (2, "") and len(err.splitlines()) == 1
+    assert str(run) in err and words in err
+
+
+def test_a_run_that_is_there_is_not_warned_of_again(run, cortado_command):
+    text = run.with_name("scene.json").read_text()
+    run.write_text(text.replace('"time_step": 0.0021', '"time_step": 0.05'))
+    with pytest.warns(cortado.CortadoWarning, match="limit of stability"):
+        cortado.Scene.from_json(run.read_text())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = RunFolder.open(run.parent).read_scene(["picture.width=100"])
+    assert scene.solver.time_step == 0.05 and scene.picture.width == 100
+    code, _, err = cortado_command("picture", "a", "--set", "picture.width=96")
+    assert code == 0 and "Warning" not in err

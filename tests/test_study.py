@@ -1,5 +1,7 @@
 """The study's own tools: tables, experiment files, comparisons, and every source of gradients against another."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -61,6 +63,9 @@ def test_a_file_that_is_no_table_is_refused(tmp_path):
     (tmp_path / "ragged.csv").write_text("a,b\n1,2\n3\n")
     with pytest.raises(InputError, match="longer or shorter"):
         Table.read_csv(tmp_path / "ragged.csv")
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(InputError, match=r"pipe.csv cannot be read: it is a pipe, but must be a regular file\."):
+        Table.read_csv(tmp_path / "pipe.csv")
 
 
 # ---- scenes and comparisons --------------------------------------------------------------------------------------

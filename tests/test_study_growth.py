@@ -1,5 +1,7 @@
 """The measuring parts of the study's own experiments, on cases whose answers are known."""
 
+import json
+import os
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -238,6 +240,21 @@ def test_an_experiment_measures_draws_and_judges(name, tmp_path):
     sentences = results.measure(replace(experiment, settings=settings))
     assert results.picture.stat().st_size > 20_000
     assert sentences and "nan" not in " ".join(sentences)
+
+
+@pytest.mark.parametrize("damage", ["pipe", "list", "torn", "no verdict"])
+def test_a_damaged_record_is_no_result(tmp_path, damage):
+    experiment = load_experiment(EXPERIMENTS / "wrong_adjoints.toml", reduced=True)
+    results = Results(tmp_path)
+    record = {"kind": experiment.type.name, "settings": experiment.settings.identity()}
+    results.record.write_text(json.dumps({**record, "verdict": ["It is so."]}))
+    assert results.has(experiment) and results.verdict() == ["It is so."]
+    results.record.unlink()
+    if damage == "pipe":
+        os.mkfifo(results.record)
+    else:
+        results.record.write_text({"list": "[1]", "torn": "{", "no verdict": json.dumps(record)}[damage])
+    assert not results.has(experiment)
 
 
 def test_one_kernel_loops_are_wrong_only_where_the_sum_is_used_non_linearly():

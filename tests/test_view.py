@@ -74,6 +74,15 @@ def test_gravity_follows_its_sliders(live):
     assert np.asarray(live._state["velocities"])[:, 1].mean() > 0.0
 
 
+def test_what_cannot_be_computed_is_said_and_the_window_goes_on(live):
+    live.gravity[1].value = float("nan")
+    live.tick()
+    assert not live.running.value and "gravity" in live._told.content and "Begin again." in live._told.content
+    live._wish_to_begin = live.running.value = True
+    live.tick()
+    assert live._state.clock.steps == live.steps and live.gravity[1].value == -9.81
+
+
 def test_a_nozzle_follows_its_sliders(scene):
     scene.write_text(TINY_SCENE + NOZZLE)
     shown = opened(scene, [], "cpu", "float32", PORT + 2)

@@ -7,7 +7,6 @@ from cortado.io.pictures import write_picture
 from cortado.io.run_folder import RunFolder
 from cortado.io.trajectory import Trajectory
 from cortado.scene.picture import Picture
-from cortado.scene.scene import Scene
 from cortado.shading.film import film, lacking, run_page
 
 
@@ -18,7 +17,7 @@ def draw_run(run: Path, frame: int, as_film: bool, out: Path | None, overrides: 
     for override in overrides:
         if not override.startswith("picture."):
             raise InputError(f"--set is {override}, but must begin with picture., as the run is there already.")
-    scene = Scene.from_json(folder.scene.read_text(encoding="utf-8"), overrides)
+    scene = folder.read_scene(overrides)
     if not folder.trajectory.exists():
         raise InputError(f"{folder.path} has no trajectory; the pictures of a search are in {folder.figures}.")
     trajectory = Trajectory.load(folder.trajectory)

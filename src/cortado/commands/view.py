@@ -1,5 +1,7 @@
 """``cortado view``: a run, a task, or a scene that runs meanwhile, in the browser."""
 
+import atexit
+import gc
 from functools import cache
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from cortado.io.interruption import keeping
 from cortado.io.run_folder import RunFolder
 from cortado.io.terminal import say
 from cortado.io.trajectory import Trajectory
-from cortado.scene.scene import Scene, load_scene
+from cortado.scene.scene import load_scene
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 
@@ -22,6 +24,7 @@ def view(path: Path, overrides: list[str], device: str, precision: str, port: in
     """Show a run folder, or run a task or a scene, until Ctrl-C ends it."""
     shown = opened(path, overrides, device, precision, port)
     say(f"{shown.window.address} shows it; Ctrl-C ends it.")
+    atexit.register(gc.freeze)  # Python would look through all that is there once more, which takes as long as the rest
     try:
         with keeping(lambda: ""):
             while True:
@@ -49,6 +52,6 @@ def opened(
     folder = RunFolder.open(path)
     if not folder.trajectory.exists():
         raise InputError(f"{path} has no trajectory, but must be the folder of `cortado run`, or a scene file.")
-    scene = Scene.from_json(folder.scene.read_text(encoding="utf-8"))
+    scene = folder.read_scene()
     simulation = cache(lambda: Simulation(scene, device))
     return RecordedView(scene, Trajectory.load(folder.trajectory), simulation, port)

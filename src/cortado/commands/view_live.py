@@ -8,7 +8,7 @@ import numpy as np
 
 from cortado.commands.view_quantities import HEIGHT_UNITS, pull_on_height, quantities_of
 from cortado.commands.view_window import Shown, Window
-from cortado.errors import CortadoWarning, DivergedError
+from cortado.errors import CortadoError, CortadoWarning
 from cortado.restart import RestartState
 from cortado.shading.painter import colours_of
 from cortado.simulation import Simulation
@@ -55,7 +55,7 @@ class LiveView:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", CortadoWarning)  # there would be one for each picture
                 found = self.simulation.run(self.steps, self._controls(), self.steps, self._state)
-        except DivergedError as error:
+        except CortadoError as error:
             self.running.value = False
             self._told.content = f"{error} Begin again."
             return

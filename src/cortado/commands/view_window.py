@@ -1,10 +1,8 @@
 """A window in the browser with particles, the container around them, and what they are coloured by."""
 
 from collections.abc import Callable, Mapping
-from contextlib import redirect_stdout
 from dataclasses import dataclass
 from html import escape
-from io import StringIO
 from typing import Any
 
 import numpy as np
@@ -59,12 +57,14 @@ class Window:
         """``units``: of the quantities that colours may show, by their names, `PULL` among them; "phase" is there
         without."""
         try:
-            import viser
+            import viser  # noqa: F401  for the sentence
+
+            from cortado.commands.view_server import GuardedServer
         except ImportError:
             raise InputError("viser is not installed, which shows it: pip install 'cortado-sph[view]'.") from None
         self.scene = scene
-        with redirect_stdout(StringIO()):  # it draws a box
-            self.server: Any = viser.ViserServer("127.0.0.1", port, f"Cortado: {scene.name}", verbose=False)
+        self._guarded = GuardedServer(port, f"Cortado: {scene.name}")
+        self.server: Any = self._guarded.viser
         self._turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
         self._units = units
         self._cloud: Any = None
@@ -84,13 +84,12 @@ class Window:
 
     @property
     def address(self) -> str:
-        """Where a browser finds it."""
-        return f"http://127.0.0.1:{self.server.get_port()}"
+        """Where a browser finds it, with the token that lets it in."""
+        return self._guarded.address
 
     def close(self) -> None:
         """Nobody can see it from now on."""
-        with redirect_stdout(StringIO()):
-            self.server.stop()
+        self._guarded.close()
 
     def show(self, shown: Shown) -> None:
         """Draw particles in the place of those before."""

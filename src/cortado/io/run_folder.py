@@ -5,18 +5,20 @@ from __future__ import annotations
 import json
 import math
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from cortado.errors import InputError
+from cortado.errors import CortadoWarning, InputError, SceneError
 from cortado.io.files import UNFINISHED, parsed_json, sentences, write_atomically
 from cortado.io.input_files import content, reason
 from cortado.io.run_environment import as_json, plain, require_same, session
 from cortado.optimisation.replay_log import FILE_NAME
 from cortado.parameters.values import NAMES
+from cortado.scene.scene import Scene
 
 _RESUMABLE = "optimise"
 """The command that has --resume."""
@@ -172,6 +174,20 @@ class RunFolder:
     def result(self) -> Path:
         """What came out, for machines; it is there when the run has ended."""
         return self.path / "result.json"
+
+    def read_scene(self, overrides: Sequence[str] = ()) -> Scene:
+        """The scene, with replacements as for `load_scene`; what there is to warn of was said when it ran.
+
+        Raises:
+            InputError: the file is damaged; `SceneError` where what it says, or a replacement, does not fit.
+        """
+        text = _bytes_of(self.scene)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CortadoWarning)
+            try:
+                return Scene.from_json(text, overrides)
+            except SceneError as error:
+                raise error.in_file(str(self.scene)) from None
 
     def write_result(self, **values: Any) -> None:
         """Writes result.json, by which a run is known to have ended; takes NumPy values too. A number that is not

@@ -151,12 +151,12 @@ class ReplayLog:
         self._record_size = 8 + 8 * (1 + 2 * layout.size) + 4
         shapes = [list(shape) for shape in layout.shapes]
         header = {"format": FORMAT, "names": list(layout.names), "shapes": shapes, **settings}
+        if self._path.exists() and not self._path.is_file():
+            raise InputError(f"'{self._path}' is no regular file; give another checkpoint folder.")
         if not resume:
             _require_unused(self._path)
         if not resume or not self._path.exists():
             _begin(self._path, header)
-        if not self._path.is_file():
-            raise InputError(f"'{self._path}' is no regular file; give another checkpoint folder.")
         with sentences(self._path):
             self._file: BinaryIO = open(self._path, "r+b", buffering=0)  # noqa: SIM115 closed by close()
         try:

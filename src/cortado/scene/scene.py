@@ -56,7 +56,7 @@ class Scene(SceneTables):
         return json.dumps(self.model_dump(mode="json", exclude={"picture"}), indent=2)
 
     @classmethod
-    def from_json(cls, text: str, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":
+    def from_json(cls, text: str | bytes, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":
         """The scene that `to_json` wrote to a file, with replacements as for `load_scene`."""
         try:
             data = json.loads(text)

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from cortado.errors import InputError
-from cortado.io.files import write_atomically
+from cortado.io.files import parsed_json, write_atomically
+from cortado.io.input_files import content
 from cortado.io.progress import track
 from cortado.study.canvas import save
 from cortado.study.experiment import Experiment
-from cortado.study.tables import Table
+from cortado.study.tables import MOST_BYTES, Table
 
 
 class Results:
@@ -40,7 +41,8 @@ class Results:
     def has(self, experiment: Experiment) -> bool:
         """Whether the experiment was measured here with the same settings."""
         recorded = self._recorded()
-        return {key: recorded.get(key) for key in ("kind", "settings")} == _identity(experiment)
+        same = {key: recorded.get(key) for key in ("kind", "settings")} == _identity(experiment)
+        return same and "verdict" in recorded
 
     def verdict(self) -> list[str]:
         """The verdict that was written before."""
@@ -64,9 +66,10 @@ class Results:
 
     def _recorded(self) -> dict[str, Any]:
         try:
-            return json.loads(self.record.read_text(encoding="utf-8"))
+            recorded = parsed_json(content(self.record, MOST_BYTES))
         except (OSError, ValueError):
             return {}
+        return recorded if isinstance(recorded, dict) else {}
 
 
 def _identity(experiment: Experiment) -> dict[str, Any]:

@@ -15,6 +15,10 @@ from numpy.typing import NDArray
 
 from cortado.errors import InputError
 from cortado.io.files import write_atomically
+from cortado.io.input_files import content, reason
+
+MOST_BYTES = 2**30
+"""Of a file of results that is read again."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -85,10 +89,10 @@ class Table:
     def read_csv(cls, path: str | os.PathLike[str]) -> Table:
         """The table that `write_csv` wrote."""
         try:
-            with open(path, encoding="utf-8", newline="") as file:
-                header, *rows = csv.reader(file)
+            text = content(path, MOST_BYTES).decode("utf-8")
+            header, *rows = csv.reader(io.StringIO(text, newline=""))
         except (OSError, ValueError, csv.Error) as problem:
-            raise InputError(f"The table {path} cannot be read: {problem}.") from problem
+            raise InputError(f"The table {path} cannot be read: {reason(problem)}.") from problem
         if any(len(row) != len(header) for row in rows):
             raise InputError(f"The table {path} has rows that are longer or shorter than its first line.")
         columns = list(zip(*rows, strict=True)) or [()] * len(header)
