@@ -21,14 +21,16 @@ class Scheduler:
         self._processes = []
         self._start("dask_scheduler", "--port", "0", "--scheduler-file", self._file, *LOOPBACK)
         self.address = self._address()
-        self.workers = [
-            self._start("dask_worker", self.address, "--nthreads", "1", "--no-nanny", *LOOPBACK) for _ in range(workers)
-        ]
+        self.workers = [self.start_worker() for _ in range(workers)]
 
     @property
     def process(self):
         """That of the scheduler itself."""
         return self._processes[0]
+
+    def start_worker(self):
+        """One worker more."""
+        return self._start("dask_worker", self.address, "--nthreads", "1", "--no-nanny", *LOOPBACK)
 
     def stop(self):
         for process in self._processes:

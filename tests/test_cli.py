@@ -356,6 +356,22 @@ def test_an_optimisation_that_diverges_says_so(cortado_command):
     assert len(metrics("found")) == 1
 
 
+def test_a_search_goes_on_past_runs_that_diverge_and_says_so(cortado_command):
+    """Also where it is resumed, with the same bits."""
+    far = ["--no-pictures", "--set", "optimise.learning_rate=1e4"]
+    code, out, _ = cortado_command("optimise", "task.toml", "--out", "found", *far)
+    cortado_command("optimise", "task.toml", "--out", "part", *far, "--set", "optimise.iterations=1")
+    cortado_command("optimise", "task.toml", "--out", "part", *far, "--resume")
+    refused = json.loads(Path("found/result.json").read_text())["refused"]
+    assert code == 1 and refused > 0  # as it did not find what the task asks for
+    assert f" in 7 evaluations and {refused} more that diverged and were refused" in out
+    assert "The loss hardly fell: try an optimise.learning_rate that is 10 times as small" in out
+    assert [row["refused"] for row in metrics("found")] == [0, *[refused] * 6]
+    assert f"It refused {refused} steps, as the run there diverged." in Path("found/report.html").read_text()
+    for file in ("metrics.jsonl", "result.json", "checkpoint/replay.log"):
+        assert Path("part", file).read_bytes() == Path("found", file).read_bytes()
+
+
 @pytest.mark.parametrize("optimiser", ["lbfgs", "adam"])
 def test_progress_counts_updates_and_not_evaluations(cortado_command, monkeypatch, optimiser):
     shown = []

@@ -7,7 +7,17 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado import ComputationError, InputError, Problem, Simulation, evaluate, gradients, losses
+from cortado import (
+    ComputationError,
+    CortadoWarning,
+    DivergedError,
+    InputError,
+    Problem,
+    Simulation,
+    evaluate,
+    gradients,
+    losses,
+)
 from cortado.gradients import AdjointEstimator, Estimate, Filtered
 from cortado.gradients.adjoint_filters import EddyViscosity
 from reference import complex_step
@@ -607,6 +617,123 @@ def test_guided_differences_and_their_directions_draw_other_random_numbers():
     both = [np.round(abs(array), 9) for array in drawn]
     assert len(drawn) == 4 + 2 * 2 * 3
     assert not np.isin(both[0], both[-1]).any() and np.isin(both[-1], both[-2]).all()
+
+
+class Diverging:
+    """A function, or an estimator, some of whose calls diverge, by their numbers."""
+
+    def __init__(self, inner, *numbers):
+        self.inner, self.numbers, self.called = inner, numbers, 0
+
+    def _count(self):
+        self.called += 1
+        if self.called - 1 in self.numbers:
+            raise DivergedError(3, self.called - 1, "try less")
+
+    def __call__(self, parameters):
+        self._count()
+        return self.inner(parameters)
+
+    def estimate(self, problem, parameters, observe=None):
+        self._count()
+        return self.inner.estimate(problem, parameters, observe)
+
+
+LEFT_OUT = r"^{} of the ensemble diverged, by which {} are left out of the average\. The first: The simulation diverged"
+
+
+def test_differences_that_diverge_are_left_out_and_the_others_stand_for_them():
+    """Of 4 samples of 5 differences, a side of two."""
+    stub = Stub(Diverging(quadratic, 4, 17), simulation_of("2-D"))
+    with pytest.warns(CortadoWarning, match=LEFT_OUT.format("2 of 40 runs", "2 of 20 differences")):
+        found = gradients.RandomizedSmoothing(0.5, samples=4).estimate(stub, POINT)
+    assert (found.left_out, found.degrees_of_freedom, len(stub.calls)) == (4, 3, 41)
+    assert "4 runs left out" in repr(found)
+    u = np.array([np.append(p["gravity"], p["viscosity"]) for p in stub.calls[1:]]).reshape(4, 5, 2, 5)
+    middle = np.append(POINT["gravity"], POINT["viscosity"])
+    rows = []
+    for sample, left in zip(u, ([0, 2, 3, 4], [0, 1, 2, 4], range(5), range(5)), strict=True):
+        assert not left or np.allclose(sample.mean(axis=1), middle)
+        ends = [[quadratic({"gravity": x[:4].reshape(2, 2), "viscosity": x[4]}) for x in sample[k]] for k in left]
+        along = [(sample[k][0] - middle) / np.linalg.norm(sample[k][0] - middle) for k in left]
+        h = 0.5 * np.sqrt(5.0)
+        slopes = [(a - b) / (2.0 * h) * q for (a, b), q in zip(ends, along, strict=True)]
+        rows.append(np.sum(slopes, axis=0) * 5 / len(slopes))
+    wanted, error = np.mean(rows, axis=0), np.std(rows, axis=0, ddof=1) / 2.0
+    np.testing.assert_allclose(found.gradient["gravity"].ravel(), wanted[:4], rtol=1e-10)
+    np.testing.assert_allclose(found.standard_error["gravity"].ravel(), error[:4], rtol=1e-10)
+
+
+def test_a_sample_without_any_difference_is_left_out():
+    """One number has one difference a sample; that of a quadratic is exact."""
+    stub = Stub(Diverging(lambda p: p["viscosity"] ** 2, 2), simulation_of("2-D"))
+    with pytest.warns(CortadoWarning, match="1 of 4 differences"):
+        found = gradients.RandomizedSmoothing(0.5, samples=4).estimate(stub, {"viscosity": 0.7})
+    assert found.gradient["viscosity"] == pytest.approx(1.4) and found.degrees_of_freedom == 2
+    assert found.standard_error["viscosity"] < 1e-12
+
+
+def test_a_sample_that_diverges_leaves_its_antithetic_pair_out():
+    """The mean of what is linear about the parameters stays exact."""
+    inner = Diverging(slopes_of_quadratic(), 3)
+    mean = gradients.EnsembleMean(0.5, samples=8, estimator=inner)
+    with pytest.warns(CortadoWarning, match=LEFT_OUT.format("1 of 8 runs", "1 of 4 antithetic pairs")):
+        found = mean.estimate(Stub(quadratic, simulation_of("2-D")), POINT)
+    assert (found.left_out, found.degrees_of_freedom, inner.called) == (2, 2, 8)
+    np.testing.assert_allclose(found.gradient["gravity"], [[6.0, -0.5], [2.0, 1.4]], rtol=1e-12)
+
+
+def test_guided_differences_leave_samples_out_that_diverge():
+    """The first run is that at the parameters; then there are 4 samples of 3 differences."""
+    made = gradients.Guided(0.5, samples=8, differences=4, surrogate=Diverging(slopes_of_quadratic(), 0))
+    stub = Stub(Diverging(quadratic, 8), simulation_of("2-D"))
+    with pytest.warns(CortadoWarning) as said:
+        found = made.estimate(stub, POINT)
+    assert ["antithetic pairs" in str(one.message) for one in said] == [True, False]
+    assert "1 of 4 samples of the differences" in str(said[1].message)
+    assert found.left_out == 2 + 6
+    np.testing.assert_allclose(found.gradient["gravity"], [[6.0, -0.5], [2.0, 1.4]], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("made", "calls", "words"),
+    [
+        (gradients.RandomizedSmoothing(0.5, samples=2), range(3, 9), "6 of 20 runs .* 3 of 10 differences"),
+        (gradients.EnsembleMean(0.5, samples=4, estimator=gradients.RandomizedSmoothing(1e-3)), [1], "1 of 4 runs"),
+    ],
+)
+def test_an_average_of_too_few_is_refused(made, calls, words):
+    """The parameters themselves can be run."""
+    if isinstance(made, gradients.EnsembleMean):
+        made, function = replace(made, estimator=Diverging(slopes_of_quadratic(), *calls)), quadratic
+    else:
+        function = Diverging(quadratic, *calls)
+    words = f"^{words}.* cannot be averaged, but at most a quarter may be left out: take .* The first: The simulation"
+    with pytest.raises(DivergedError, match=words):
+        made.estimate(Stub(function, simulation_of("2-D")), POINT)
+
+
+def test_a_run_at_the_parameters_themselves_that_diverges_ends_an_average():
+    stub = Stub(Diverging(quadratic, 0), simulation_of("2-D"))
+    with pytest.raises(DivergedError, match=r"^The simulation diverged in step 3: particle 0"):
+        gradients.RandomizedSmoothing(0.5).estimate(stub, POINT)
+
+
+@pytest.mark.parametrize("make", [gradients.RandomizedSmoothing, gradients.EnsembleMean, gradients.Guided])
+def test_an_ensemble_that_is_too_large_is_refused_before_anything_is_run(make, monkeypatch):
+    with pytest.raises(InputError, match=r"samples is 1000000000000, but must be at most 100,000"):
+        make(samples=10**12)
+    monkeypatch.setattr("cortado.device.memory.available", lambda device=None: 1e6)
+    stub = Stub(quadratic, simulation_of("2-D"))
+    with pytest.raises(InputError, match=r"^This needs about .* of memory, most of it for .* samples.*; take fewer"):
+        make(0.5, samples=100_000).estimate(stub, POINT)
+    assert not stub.calls
+
+
+def test_guided_differences_and_parts_have_a_limit():
+    for name in ("differences", "parts"):
+        with pytest.raises(InputError, match=rf"{name} is 1000000000000, but must be at most 100,000"):
+            gradients.Guided(**{name: 10**12})
 
 
 class Flat:

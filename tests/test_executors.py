@@ -8,6 +8,7 @@ import threading
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -15,10 +16,12 @@ import pytest
 
 import cortado
 from cortado import ComputationError, CortadoWarning, DivergedError, InputError, Problem, SceneError, Simulation
+from cortado.commands.executor import Where
 from cortado.device.cores import usable_cores
+from cortado.errors import CortadoError
 from cortado.executors import Distributed, InProcess, calls, local, local_workers
 from cortado.executors import distributed as of_dask
-from cortado.gradients import EnsembleMean, Exact, RandomizedSmoothing
+from cortado.gradients import EnsembleMean, Estimate, Exact, RandomizedSmoothing
 from dask_processes import PATIENCE, scheduler
 from scenes import plane
 from work_for_workers import FarFromHome, SlowValue, gpu_and_process, process, square
@@ -151,6 +154,33 @@ def test_a_worker_that_lacks_the_function_says_so(monkeypatch):
     assert calls.call(payload, item).result == calls.call(payload.mention, item).result == 9
 
 
+@pytest.mark.parametrize(
+    ("leave", "words"),
+    [
+        (lambda _: sys.exit(3), r"^An item ended its process, by SystemExit: 3; what is computed may not do so\.$"),
+        (lambda _: sys.exit(), r"^An item ended its process, by SystemExit; what is"),
+        (lambda _: signal.raise_signal(signal.SIGINT), "by KeyboardInterrupt; what is"),
+    ],
+)
+def test_an_item_that_ends_its_process_is_an_error(leave, words):
+    answer = calls.call(calls.Payload.of(leave), calls.pickled(0, "The item"))
+    assert isinstance(answer.error, ComputationError)
+    with pytest.raises(ComputationError, match=words):
+        raise answer.error
+
+
+def test_a_result_that_cannot_be_sent_is_an_error():
+    class Exits:
+        def __reduce__(self):
+            sys.exit(1)
+
+    sent = "The result cannot be sent to another process: TypeError: cannot pickle"
+    for make, words in ((lambda _: threading.Lock(), sent), (lambda _: Exits(), "by SystemExit: 1; what is computed")):
+        answer = calls.call(calls.Payload.of(make), calls.pickled(0, "The item"))
+        with pytest.raises(CortadoError, match=words):
+            raise answer.error
+
+
 def test_an_executor_is_asked_for_by_its_type():
     with ThreadPoolExecutor(1) as pool, pytest.raises(InputError, match="executor is of the type ThreadPoolExecutor"):
         EnsembleMean(executor=pool)
@@ -226,13 +256,36 @@ def test_the_error_of_the_first_item_that_has_one_is_raised(workers):
 
 
 @pytest.mark.filterwarnings("ignore:time_step is")
+@pytest.mark.parametrize("gradient", [None, Exact()])
+@pytest.mark.parametrize("where", ["here", "workers"])
+def test_what_diverges_is_nan_and_the_others_are_there(problem, request, gradient, where):
+    """Points that are launched together too."""
+    executor = request.getfixturevalue("workers") if where == "workers" else InProcess()
+    at_rest, far = (np.full_like(problem.simulation.positions, size) for size in (0.0, 1e5))
+    points = [{"initial_velocities": velocities} for velocities in (at_rest, far, at_rest, far)]
+    told = {}
+    words = r"^2 of 4 points diverged, and their losses are NaN\. The first of them is point 1: The simulation diverged"
+    with pytest.warns(CortadoWarning, match=words):
+        found = cortado.evaluate(problem, points, gradient, executor, on_result=told.__setitem__)
+    wanted = [problem.estimate(point, gradient) if gradient else problem.value(point) for point in points[::2]]
+    for one, own in zip(found[::2], wanted, strict=True):
+        assert one.diverged is None and (bits(one) == bits(own) if gradient else one.loss == own)
+    for one in found[1::2]:
+        assert np.isnan(one.loss) and isinstance(one.diverged, DivergedError)
+        assert all(np.isnan(value).all() for value in one.gradient.values()) and len(one.gradient) == bool(gradient)
+    assert sorted(told) == [0, 1, 2, 3] and np.isnan(told[1].loss)
+
+
+@pytest.mark.filterwarnings("ignore:time_step is")
 def test_what_diverges_may_have_a_loss(problem, workers):
     far = {"initial_velocities": np.full_like(problem.simulation.positions, 1e5)}
-    with pytest.raises(DivergedError):
-        cortado.evaluate(problem, [POINTS[0], far], executor=workers)
-    one, other = cortado.evaluate(problem, [POINTS[0], far], Exact(), workers, loss_if_diverged=np.inf)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "1 of 2 points diverged")
+        one, other = cortado.evaluate(problem, [POINTS[0], far], Exact(), workers, loss_if_diverged=np.inf)
     assert one.loss == problem.value(POINTS[0]) and other.loss == np.inf
     assert np.isnan(other.gradient["initial_velocities"]).all()
+    with pytest.raises(InputError, match="loss_if_diverged is 'inf', but must be a number"):
+        cortado.evaluate(problem, POINTS, loss_if_diverged="inf")
 
 
 def test_warnings_of_workers_are_heard(workers):
@@ -317,6 +370,44 @@ def test_without_distributed_there_is_one_sentence(monkeypatch):
         pass
 
 
+def test_points_wait_for_the_first_worker(problem, tmp_path):
+    """None is there when the points are asked for."""
+    with scheduler(tmp_path, workers=0) as processes, Distributed(processes.address) as executor:
+        assert executor.threads() == 0
+        later = threading.Timer(1.5, processes.start_worker)
+        later.start()
+        found = cortado.evaluate(problem, POINTS, executor=executor)
+        later.join()
+    assert [one.loss for one in found] == [problem.value(point) for point in POINTS]
+
+
+def test_what_is_launched_at_a_time_follows_the_workers():
+    """An executor of one's own may have none at first."""
+
+    class Growing(InProcess):
+        there = -1
+
+        def threads(self):
+            self.there += 1
+            return min(self.there, 2)
+
+    class Roomy:
+        def room(self, estimator=None):
+            return 4
+
+        def together(self, points, estimator=None):
+            sizes.append(len(points))
+            return [Estimate(0.0, {}) for _ in points]
+
+        def value(self, point):
+            sizes.append(1)
+            return 0.0
+
+    sizes = []
+    cortado.evaluate(Roomy(), POINTS, executor=Growing())
+    assert sizes == [4, 4, 2]
+
+
 # ---- local workers -----------------------------------------------------------------------------------------------
 
 
@@ -339,6 +430,36 @@ def test_each_process_has_one_gpu_also_when_it_is_started_again(monkeypatch):
     assert first["3"] != second["3"] and first["GPU-5f1c"] == second["GPU-5f1c"]
 
 
+def ended(way):
+    """Each of the first two items ends its process in this way, all times that it is computed."""
+
+    def end(number):
+        if number < 2:
+            {
+                "exit": lambda: sys.exit(number),
+                "killed": lambda: os.kill(os.getpid(), signal.SIGKILL),
+                "asked to end": lambda: (os.kill(os.getpid(), signal.SIGTERM), time.sleep(5.0)),
+            }[way]()
+        return number
+
+    return end
+
+
+@pytest.mark.filterwarnings("ignore:The worker .* was lost")
+def test_worker_processes_are_there_again_however_they_ended():
+    """One after the other, and one that is told to end without a next item."""
+    with local_workers(1) as executor:
+        for way in ("exit", "killed", "asked to end"):
+            with pytest.raises(ComputationError, match=r"ended its process|was given up, as 4 workers were lost"):
+                executor.map(ended(way), range(3))
+            assert executor.map(square, range(3)) == [0, 1, 4]
+        for code in (signal.SIGTERM, signal.SIGKILL):
+            (pid,) = set(executor.map(process, range(2)))
+            os.kill(pid, code)
+            assert executor.map(square, range(3)) == [0, 1, 4]
+            assert set(executor.map(process, range(2))).isdisjoint({pid})
+
+
 def test_cores_are_shared_out(monkeypatch):
     monkeypatch.setattr("cortado.executors.local.usable_cores", lambda: 8)
     environments = local._environments
@@ -347,9 +468,33 @@ def test_cores_are_shared_out(monkeypatch):
     assert environments(9, "cpu") == [{"CORTADO_CORES": "1"}] * 9
 
 
+def test_no_more_processes_than_items(monkeypatch):
+    """Nor than make sense on this machine, whatever there is to compute."""
+    monkeypatch.setattr("cortado.executors.local.usable_cores", lambda: 2)
+    started = []
+
+    @contextmanager
+    def local_workers(number, device):
+        started.append((number, device))
+        yield InProcess()
+
+    monkeypatch.setattr("cortado.commands.executor.local_workers", local_workers)
+    for workers, items in ((40, 1), (3, 8), (2, 0)):
+        with Where(workers=workers).executor("cuda:0", items):
+            pass
+    assert started == [(1, "cuda"), (3, "cuda"), (1, "cuda")]
+    words = r"^--workers is {}, but must be at most 64, as this machine has 2 cores: more processes than cores"
+    for workers in (65, 10**6):
+        with pytest.raises(InputError, match=words.format(workers)):
+            Where(workers=workers)
+    with pytest.raises(InputError, match="--workers is 0"):
+        Where(workers=0)
+
+
 @pytest.mark.parametrize(
     "number, device, words",
     [
+        (10**6, "cpu", r"number is 1000000, but must be at most \d+, as this machine has \d+ core"),
         (0, "cpu", "number is 0"),
         (1.5, "cpu", "number is 1.5"),
         (None, "cuda:1", "device is 'cuda:1'"),

@@ -50,8 +50,8 @@ LAYERS = """
     losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
     losses.positions losses.recorded losses losses.checked
     gradients.estimator gradients.points gradients.ensemble_members gradients.exact
-    gradients.filter_kernels gradients.adjoint_filters gradients.filters gradients.ensemble gradients.guided
-    gradients
+    gradients.filter_kernels gradients.adjoint_filters gradients.filters gradients.left_out gradients.ensemble
+    gradients.guided gradients
     render.cameras render.colour_field render.interpolation render.phase_colours render.fields render.rays
     render.absorption render.views render.marching render.renderer render.scene_renderer render
     io.pictures
@@ -68,8 +68,9 @@ LAYERS = """
     certificate.horizon
     certificate.consistency certificate.text certificate.certificate certificate certificate.figure
     optimisation optimisation.evaluate optimisation.differentiable optimisation.replay_log optimisation.search
-    optimisation.line_search optimisation.optimisers
-    optimisation.named_optimisers optimisation.result_page optimisation.result optimisation.optimise
+    optimisation.iterate optimisation.line_search optimisation.optimisers
+    optimisation.named_optimisers optimisation.result_page optimisation.result
+    optimisation.start optimisation.evaluator optimisation.optimise
     optimisation.transforms
     io.run_folder io.report
     inverse inverse.tables inverse.file_schema inverse.task inverse.in_words inverse.setup inverse.knots
@@ -84,7 +85,8 @@ LAYERS = """
     bench.reference_engine bench.text
     sweep sweep.combinations sweep.table
     commands commands.executor commands.found commands.bench commands.check commands.compare commands.describe
-    commands.examples commands.figure commands.new commands.optimise commands.overview commands.picture
+    commands.examples commands.figure commands.new commands.verdict commands.optimise_report commands.optimise
+    commands.overview commands.picture
     commands.run_summary commands.run_report commands.run
     commands.schema commands.study
     commands.sweep commands.view_door commands.view_messages commands.view_server commands.view_window

@@ -1,6 +1,7 @@
 """The optimisers against closed forms and plain twins, and resuming bit for bit."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -519,21 +520,133 @@ def test_parameters_that_a_search_comes_to_are_no_mistake_of_the_user(tmp_path):
         optimise(Walled(2.0), {"x": 1.0}, Adam(learning_rate=0.1), 10)
 
 
-def test_a_search_that_comes_to_a_run_that_diverges_says_where():
-    def steep(parameters):
-        if parameters["speed"][0] > 1.0:
-            raise DivergedError(step=3, particle=7, advice="try a smaller time step")
-        return 5.0 - parameters["speed"][0], {"speed": np.array([-1.0, 0.0])}
+def steep(parameters):
+    """Leads to where all runs diverge, beyond a speed of 1."""
+    if parameters["speed"][0] > 1.0:
+        raise DivergedError(step=3, particle=7, advice="try a smaller time step")
+    return 5.0 - parameters["speed"][0], {"speed": np.array([-1.0, 0.0])}
 
+
+def test_a_search_that_comes_to_a_run_that_diverges_says_where(tmp_path):
+    """After the step was halved 10 times; also where it is resumed."""
     words = (
         r"step 3: particle 7 was lost; try a smaller time step, a smaller learning rate or scale, or bounds on the "
-        r"parameters; the search had come to speed \[1.2 0. \]; the least loss before is 4.2 at speed \[0.8 0. \]\.$"
+        r"parameters; the search had come to speed \[1\.0002 0\. +\]; the least loss before is 4 at speed "
+        r"\[1\. 0\.\]\.$"
     )
-    with pytest.raises(DivergedError, match=words) as caught:
-        optimise(steep, {"speed": [0.0, 0.0]}, GradientDescent(learning_rate=0.4), 10)
-    assert (caught.value.step, caught.value.particle) == (3, 7)
+    records = []
+    for _ in range(2):
+        with pytest.raises(DivergedError, match=words) as caught:
+            optimise(
+                steep,
+                {"speed": [0.0, 0.0]},
+                GradientDescent(learning_rate=0.25),
+                10,
+                checkpoint=tmp_path,
+                resume=True,
+                on_iteration=records.append,
+            )
+        assert (caught.value.step, caught.value.particle) == (3, 7)
+    assert [record.replayed for record in records] == [False] * 5 + [True] * 5
     with pytest.raises(DivergedError, match=r"try a smaller time step\.$"):
         optimise(steep, {"speed": [2.0, 0.0]}, GradientDescent(learning_rate=0.4), 10)
+
+
+class Cliff:
+    """A bowl, beyond whose bottom a cliff is where runs diverge; a call may be interrupted."""
+
+    def __init__(self, fail_at=None):
+        self.calls, self.lost, self.fail_at = 0, 0, fail_at
+
+    def value_and_gradient(self, parameters, gradient=None):
+        if self.calls == self.fail_at:
+            raise Interrupted
+        self.calls += 1
+        x = parameters["x"]
+        if x[0] > 1.3:
+            self.lost += 1
+            raise DivergedError(step=1, particle=0, advice="try less")
+        offset = x - [1.0, 0.5]
+        return float(offset @ (offset * [1.0, 3.0])), {"x": 2.0 * offset * [1.0, 3.0]}
+
+
+TOO_FAR = [Adam(0.9), GradientDescent(0.3, momentum=0.6), LBFGS(scale=4.0), LineSearch(scale=3.0)]
+"""Each comes to the cliff on its way."""
+
+
+@pytest.mark.parametrize("optimiser", TOO_FAR, ids=lambda optimiser: type(optimiser).__name__)
+def test_a_search_goes_on_past_runs_that_diverge(optimiser, tmp_path):
+    """And goes on from any interruption with the same bits."""
+
+    def search(cliff, **options):
+        return optimise(cliff, {"x": np.array([-1.0, 0.4])}, optimiser, 20, **options)
+
+    whole = Cliff()
+    found = search(whole)
+    assert whole.lost > 0 and found.updates >= 8 and found.loss < 1e-2
+    assert found.evaluations == len(found.history) and all(np.isfinite(one.loss) for one in found.history)
+    if not isinstance(optimiser, LineSearch):  # whose trials are no evaluations
+        assert found.refused == found.history[-1].refused == whole.lost
+        assert found.history[0].refused == 0 and whole.calls == found.evaluations + found.refused
+        assert re.search(rf" It refused {found.refused} steps?, as the run there diverged\.$", found.message)
+    for calls in range(0, whole.calls, 4):
+        folder = tmp_path / str(calls)
+        with pytest.raises(Interrupted):
+            search(Cliff(fail_at=calls), checkpoint=folder)
+        rest = Cliff()
+        again = search(rest, checkpoint=folder, resume=True)
+        assert bits(again) == bits(found) and rest.calls == whole.calls - calls
+        assert (again.message, again.refused) == (found.message, found.refused)
+
+
+def test_a_step_that_is_refused_is_halved_and_the_learning_rate_with_it():
+    """Along x = 0, 0.25 the whole step of 0.5 leads to 0.75, where runs diverge."""
+
+    def slope(parameters):
+        asked.append(float(parameters["x"]))
+        if parameters["x"] >= 0.75:
+            raise DivergedError(step=1, particle=0, advice="try less")
+        return -parameters["x"], {"x": -1.0}
+
+    asked = []
+    found = optimise(slope, {"x": 0.0}, GradientDescent(learning_rate=0.5), 3)
+    assert asked == [0.0, 0.5, 1.0, 0.75, 0.625, 0.75, 0.6875]
+    assert [(one.updates, one.refused) for one in found.history] == [(0, 0), (1, 0), (2, 2), (3, 3)]
+    assert found.parameters == found.last_parameters == {"x": 0.6875}
+
+
+def test_refused_steps_leave_what_lbfgs_knows_of_the_curvature():
+    """A quadratic of many numbers takes hardly more evaluations with a cliff beyond its bottom than without one."""
+    sizes = np.geomspace(1.0, 50.0, 12)
+
+    def search(farthest):
+        def bowl(parameters):
+            if (parameters["x"] > farthest).any():
+                raise DivergedError(step=1, particle=0, advice="try less")
+            offset = parameters["x"] - 1.0
+            return float(offset**2 @ sizes), {"x": 2.0 * offset * sizes}
+
+        return optimise(bowl, {"x": np.zeros(12)}, LBFGS(scale=3.0), 60)
+
+    free, bounded = search(np.inf), search(1.05)
+    assert bounded.loss < 1e-6 and bounded.refused > 0
+    assert bounded.evaluations + bounded.refused < 2 * free.evaluations
+
+
+def test_an_ensemble_too_much_of_which_diverges_is_refused_too():
+    """The trials of a line search do not diverge, but the members of the ensemble about the best of them."""
+
+    class Problem:
+        def value_and_gradient(self, parameters, gradient=None):
+            if parameters["x"] > 0.97:
+                raise DivergedError(1, 0, "try less").among_others("5 of 8 runs of the ensemble diverged:")
+            return self.value(parameters), {"x": -1.0}
+
+        def value(self, parameters):
+            return float(-parameters["x"])
+
+    found = optimise(Problem(), {"x": 0.0}, LineSearch(scale=0.4), 10, bounds={"x": (None, 2.0)})
+    assert found.refused > 0 and 0.9 < found.parameters["x"] <= 0.97
 
 
 # Wrong input
@@ -553,6 +666,9 @@ def test_a_search_that_comes_to_a_run_that_diverges_says_where():
         lambda: GradientDescent(learning_rate=np.inf),
         lambda: GradientDescent(0.1, momentum=1.0),
         lambda: LBFGS(memory=0),
+        lambda: LBFGS(memory=10**9),
+        lambda: LineSearch(trials=1),
+        lambda: LineSearch(trials=10**9),
         lambda: LBFGS(tolerance=-1.0),
         lambda: LBFGS(scale=0.0),
     ],
@@ -597,6 +713,7 @@ def test_wrong_settings_are_refused(make):
         ({"optimiser": LBFGS(scale={})}, "scale is given for none"),
         ({"iterations": 0}, "number of iterations"),
         ({"iterations": 2.5}, "number of iterations"),
+        ({"iterations": 10**12}, "number of iterations must be .* at most 10,000,000, not 1000000000000"),
         ({"bounds": {"y": (0.0, 1.0)}}, "Bounds are given for 'y'"),
         ({"bounds": {"x": (2.0, 3.0)}}, "start of 'x' is outside of its bounds in 2 of 2"),
         ({"bounds": {"x": (3.0, 2.0)}}, "lower bound of 'x' must not exceed"),
@@ -610,6 +727,15 @@ def test_wrong_input_is_refused_before_anything_is_evaluated(change, message):
     call = {"start": {"x": np.ones(2)}, "optimiser": Adam(0.1), "iterations": 3} | change
     with pytest.raises(InputError, match=message):
         optimise(problem, **call)
+    assert not problem.seen
+
+
+@pytest.mark.parametrize("optimiser", [LineSearch(trials=1000), LBFGS(memory=1000)])
+def test_what_does_not_fit_into_memory_is_refused_before_anything_is_evaluated(optimiser, monkeypatch):
+    monkeypatch.setattr("cortado.device.memory.available", lambda device=None: 1e7)
+    problem = Quadratic({"x": np.zeros(2000)})
+    with pytest.raises(InputError, match=r"^This needs about .* of memory, most of it for .*; take fewer"):
+        optimise(problem, {"x": np.ones(2000)}, optimiser, 3)
     assert not problem.seen
 
 

@@ -6,6 +6,7 @@ import json
 import signal
 import threading
 import time
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from bad_tasks import GOOD_TASK, TINY_SCENE
 from compiling_notice import without_compiling
 from cortado import InputError
 from cortado.cli import main
-from cortado.executors import Distributed
+from cortado.executors import Distributed, InProcess
 from cortado.executors import distributed as of_dask
 from cortado.io.interruption import Interrupted
 from cortado.sweep.combinations import combinations
@@ -236,6 +237,21 @@ def test_wrong_arguments_are_refused(sweep, folder, monkeypatch, arguments, word
     assert (code, out) == (2, "") and words in err
     assert_one_sentence(err.removesuffix("\n"))
     assert not (folder / "all").exists()
+
+
+def test_a_sweep_has_no_more_processes_than_combinations(sweep, monkeypatch):
+    numbers = []
+
+    @contextmanager
+    def local_workers(number, device):
+        numbers.append(number)
+        yield InProcess()
+
+    monkeypatch.setattr("cortado.commands.executor.local_workers", local_workers)
+    one = ("task.toml", "--set", "problem.steps=4", "--out", "all")
+    assert sweep(*one, "--workers", 40)[0] == 0 and numbers == [1]
+    code, out, err = sweep(*one, "--workers", 10**6)
+    assert (code, out) == (2, "") and err.startswith("--workers is 1000000, but must be at most ")
 
 
 # ---- on workers --------------------------------------------------------------------------------------------------

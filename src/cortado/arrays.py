@@ -61,6 +61,12 @@ def require_whole(what: str, value: object, least: int) -> None:
         raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
 
 
+def require_at_most(what: str, value: Any, most: int) -> None:
+    """Raises `InputError`, in a sentence that begins with ``what``, where a number is greater."""
+    if value > most:
+        raise InputError(f"{what} is {shown(value)}, but must be at most {most:,}.")
+
+
 def whole_number(what: str, value: Any, least: int) -> int:
     """A whole number of at least so much, also if it is a float, or an `InputError` in a sentence."""
     whole = isinstance(value, (int, np.integer)) or (isinstance(value, (float, np.floating)) and value.is_integer())

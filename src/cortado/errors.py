@@ -56,8 +56,10 @@ class ComputationError(CortadoError):
 class DivergedError(ComputationError):
     """A particle was lost: it left its container, or its position is not finite or too far away."""
 
-    def __init__(self, step: int, particle: int, advice: str, where: str = "was lost", others: int = 0):
-        super().__init__(step, particle, advice, where, others)
+    def __init__(
+        self, step: int, particle: int, advice: str, where: str = "was lost", others: int = 0, preface: str = ""
+    ):
+        super().__init__(step, particle, advice, where, others, preface)
         self.step = step
         """The first bad step, counted from 1."""
         self.particle = particle
@@ -68,16 +70,21 @@ class DivergedError(ComputationError):
         """What became of the particle, and where it was at the end of that step, in words."""
         self.others = others
         """How many particles more were lost in the same step."""
+        self.preface = preface
+        """Of one run among several: what became of them together, in a sentence."""
 
     def with_advice(self, advice: str) -> "DivergedError":
         """The same error with another advice."""
-        return DivergedError(self.step, self.particle, advice, self.where, self.others)
+        return DivergedError(self.step, self.particle, advice, self.where, self.others, self.preface)
+
+    def among_others(self, preface: str) -> "DivergedError":
+        """The same error as the first of several, after a sentence about all of them."""
+        return DivergedError(self.step, self.particle, self.advice, self.where, self.others, preface)
 
     def __str__(self) -> str:
         more = f" (and {self.others} more)" if self.others else ""
-        return (
-            f"The simulation diverged in step {self.step}: particle {self.particle}{more} {self.where}; {self.advice}."
-        )
+        said = f"The simulation diverged in step {self.step}: particle {self.particle}{more} {self.where}"
+        return " ".join(filter(None, [self.preface, f"{said}; {self.advice}."]))
 
 
 def shown(value: Any) -> str:

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 from cortado.errors import InputError
 from cortado.executors import Distributed, Executor, InProcess, local_workers
+from cortado.executors.local import require_processes
 
 
 @dataclass(frozen=True)
 class Where:
-    """The options of a command; raises `InputError` for both of them."""
+    """The options of a command; raises `InputError` for both of them, and for more processes than make sense."""
 
     scheduler: str | None = None
     """The address of a scheduler of Dask's."""
@@ -20,6 +21,8 @@ class Where:
     def __post_init__(self) -> None:
         if self.scheduler is not None and self.workers is not None:
             raise InputError("--scheduler and --workers are both given, but only one of them can be meant.")
+        if self.workers is not None:
+            require_processes("--workers", self.workers)
 
     @property
     def option(self) -> str | None:
@@ -27,13 +30,14 @@ class Where:
         return "--scheduler" if self.scheduler is not None else None if self.workers is None else "--workers"
 
     @contextmanager
-    def executor(self, device: str) -> Iterator[Executor]:
-        """This process unless workers are asked for, which end with the block; on a GPU each has one of its own."""
+    def executor(self, device: str, items: int) -> Iterator[Executor]:
+        """This process unless workers are asked for, which end with the block; on a GPU each has one of its own. There
+        are no more processes than ``items`` that are computed at a time."""
         if self.scheduler is not None:
             with Distributed(self.scheduler) as there:
                 yield there
         elif self.workers is not None:
-            with local_workers(self.workers, device.partition(":")[0]) as here:
+            with local_workers(min(self.workers, max(items, 1)), device.partition(":")[0]) as here:
                 yield here
         else:
             yield InProcess()

@@ -129,7 +129,7 @@ def run_sweep(
         advance(failed=sum(map(failed, done.values())))
 
     with (
-        (where if left else HERE).executor(device) as executor,
+        (where if left else HERE).executor(device, len(left)) as executor,
         locked(out),
         keeping(kept),
         track(len(left), "sweep") as advance,

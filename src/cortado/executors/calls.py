@@ -17,7 +17,7 @@ from importlib import metadata
 from typing import Any
 
 from cortado import __version__
-from cortado.errors import CortadoError, InputError
+from cortado.errors import ComputationError, CortadoError, InputError
 
 KEPT = 2
 """Functions that a worker process keeps, the last ones used. Each may hold a problem with all its memory."""
@@ -58,12 +58,18 @@ class Lacking:
 class Answer:
     """What a call came to in a worker process."""
 
-    result: Any = None
+    content: bytes = b""
+    """The result, pickled where it was made: what goes wrong with that is an error of the call."""
     error: BaseException | None = None
     traceback: str = ""
     """Of an error that is none of Cortado's own."""
     warnings: tuple[tuple[str, type[Warning]], ...] = ()
     """(text, category) of each warning."""
+
+    @property
+    def result(self) -> Any:
+        """What the function returned."""
+        return pickle.loads(self.content)
 
 
 def pickled(value: Any, what: str) -> bytes:
@@ -85,18 +91,24 @@ def versions() -> str:
 def call(payload: Payload, item: bytes) -> Answer | Lacking:
     """Call the function for an item, in a worker process. One call at a time: threads of a worker wait.
 
-    What the function raises is part of the answer, so that it is raised again where the function came from.
+    What the function raises is part of the answer, so that it is raised again where the function came from. So is that
+    it wants to end the process, which would take the worker with it.
     """
     with _one_at_a_time, warnings.catch_warnings(record=True) as caught:
         if payload.content is None and payload.digest not in _functions:
             return Lacking()
         warnings.simplefilter("always")
         try:
-            answer = Answer(_function(payload)(_unpickled(item)))
+            answer = Answer(pickled(_function(payload)(_unpickled(item)), "The result"))
         except Exception as error:
             answer = Answer(error=_sendable(error), traceback="" if _is_ours(error) else traceback.format_exc())
+        except BaseException as error:  # sys.exit, or KeyboardInterrupt
+            how = in_words(error)
+            answer = Answer(
+                error=ComputationError(f"An item ended its process, by {how}; what is computed may not do so.")
+            )
     said = tuple((str(warning.message), warning.category) for warning in caught)
-    return Answer(answer.result, answer.error, answer.traceback, said)
+    return replace(answer, warnings=said)
 
 
 def _function(payload: Payload) -> Callable[[Any], Any]:
@@ -144,4 +156,4 @@ def _sendable(error: Exception) -> BaseException:
 def in_words(error: BaseException) -> str:
     """An error in words, on one line, without the full stop."""
     text = " ".join(str(error).split()).rstrip(".")
-    return text if isinstance(error, CortadoError) else f"{type(error).__name__}: {text}"
+    return text if isinstance(error, CortadoError) else ": ".join(filter(None, [type(error).__name__, text]))

@@ -21,6 +21,8 @@ REACHED = 10.0
 """[s] within which a scheduler answers."""
 LOOK = 1.0
 """[s] without a result after which the scheduler is looked at."""
+WAIT = 0.1
+"""[s] after which the first worker is looked for again."""
 AHEAD = 2
 """Items at a time for each thread of a worker: one that is computed and others that wait, so that none is idle."""
 
@@ -70,8 +72,8 @@ class Distributed(Executor):
     ) -> list[Result]:
         """See `Executor.map`. ``function``, items and results are pickled.
 
-        Raises `InputError` for what cannot be pickled, `ComputationError` where the scheduler or all workers are lost
-        for good.
+        Waits for the first worker. Raises `InputError` for what cannot be pickled, `ComputationError` where the
+        scheduler or all workers are lost for good, or an item ends its process.
         """
         return _Map(self, Payload.of(function), on_result).results(items)
 
@@ -84,9 +86,19 @@ class Distributed(Executor):
         except OSError as error:
             raise self.lost() from error
 
+    def mend(self) -> None:
+        """Called now and then while there is something to compute: start workers that are lost, where that is ours."""
+
     def lost(self) -> ComputationError:
         """What to say where the scheduler is not there any more."""
         return ComputationError(f"The scheduler {self.address} was lost, and what is computed there with it.")
+
+    def deserted(self, seconds: float) -> ComputationError:
+        """What to say where there was no worker for so long [s]."""
+        return ComputationError(
+            f"The scheduler {self.address} has had no worker for {seconds:.0f} s; start some, such as by "
+            f"`dask worker {self.address} --nthreads 1`."
+        )
 
 
 class _Map:
@@ -143,6 +155,9 @@ class _Map:
     def _fill(self, left: Iterator[tuple[int, Any]]) -> bool:
         """Send as many items as workers need, none after an error; whether there is anything to wait for."""
         self._look(LOOK)
+        while not self._room and not self._sent:  # how much an item asks for may depend on how many workers there are
+            time.sleep(WAIT)
+            self._look(WAIT)
         while len(self._sent) < self._room and self._failed is None and (pair := next(left, None)):
             number, item = pair
             self._send(self._payload.mention, number, pickled(item, f"Item {number}"))
@@ -161,14 +176,12 @@ class _Map:
         if now - self._looked < interval:
             return
         self._looked = now
+        self._executor.mend()
         threads = self._executor.threads()
-        self._room = AHEAD * max(threads, 1)
+        self._room = AHEAD * threads
         self._manned = now if threads else self._manned
         if now - self._manned > self._executor.patience:
-            raise ComputationError(
-                f"The scheduler {self._executor.address} has had no worker for {now - self._manned:.0f} s; start some, "
-                f"such as by `dask worker {self._executor.address} --nthreads 1`."
-            )
+            raise self._executor.deserted(now - self._manned)
 
     def _take(self) -> None:
         """Wait for one result, or for the news that a worker was lost."""
@@ -198,9 +211,11 @@ class _Map:
     def _answer(self, future: Any, number: int) -> Answer | Lacking:
         """Of a call that has ended; raises `ComputationError` where there is none."""
         try:
-            answer = future.result()
+            answer = self._fetched(future)
         except CancelledError:
             raise self._executor.lost() from None
+        except ComputationError:  # as there is no worker left
+            raise
         except distributed_module().KilledWorker as error:
             raise ComputationError(
                 f"Item {number} was given up, as {error.allowed_failures + 1} workers were lost one after the other "
@@ -210,6 +225,16 @@ class _Map:
             raise ComputationError(f"Item {number} could not be computed by a worker: {in_words(error)}.") from error
         assert isinstance(answer, (Answer, Lacking))
         return answer
+
+    def _fetched(self, future: Any) -> Any:
+        """What a worker has. It may be lost with the worker before it is here, and is computed again once there is
+        another one: waits are longer and longer, as a large result takes long too."""
+        wait = LOOK
+        while True:
+            with suppress(TimeoutError):
+                return future.result(timeout=wait)
+            self._look(0.0)
+            wait *= 2.0
 
     def _fail(self, number: int, error: BaseException) -> None:
         """Note an error; only items before it are still of interest."""

@@ -10,6 +10,7 @@ from cortado.errors import InputError, shown
 from cortado.gradients.ensemble_members import Ensemble
 from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator, checked_estimate, checked_estimator
 from cortado.gradients.filters import AdjointViscosity
+from cortado.gradients.left_out import remaining
 from cortado.gradients.points import Point
 from cortado.parameters.values import Arrays, Values
 from cortado.rollout import Observer
@@ -34,6 +35,10 @@ class RandomizedSmoothing(Ensemble):
     Bias: features of the loss that are narrower than the spread are averaged out, as intended. Noise: the
     ``standard_error`` of the `Estimate`. Cost: 2 N forward runs a sample, so that it is for a few dozen numbers at
     most.
+
+    Runs that diverge: their differences are left out, up to a quarter of all, and the sum over the others of the sample
+    is scaled by N over their number. So the mean keeps its size, and has no bias from this as long as no direction
+    diverges more often than others.
     """
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
@@ -45,6 +50,7 @@ class RandomizedSmoothing(Ensemble):
                 f"the parameters are {numbers} numbers, but must be at most {MOST_NUMBERS}, as the simulation "
                 "is run twice for each: take fewer, such as one gravity for all steps, or another estimator."
             )
+        self.require_memory(2 * numbers * self.samples, numbers)
         directions, r = [], np.sqrt(numbers)
 
         def points() -> Iterator[Point]:
@@ -56,12 +62,16 @@ class RandomizedSmoothing(Ensemble):
                     yield ensemble.sample(r * q, displacement)
                     yield ensemble.sample(-r * q, displacement)
 
-        loss, *losses = (one.loss for one in self.evaluated(problem, points(), None))
+        at_them, *runs = self.evaluated(problem, points(), None)
+        kept = remaining(runs, len(directions), "differences")
         found = np.zeros((self.samples, numbers))
-        for k, q in enumerate(directions):
-            found[k // numbers] += (losses[2 * k] - losses[2 * k + 1]) / (2.0 * r) * q
+        for k in np.flatnonzero(kept):
+            found[k // numbers] += (runs[2 * k].loss - runs[2 * k + 1].loss) / (2.0 * r) * directions[k]
+        counts = kept.reshape(self.samples, numbers).sum(axis=1)
+        found = found[counts > 0] * (numbers / counts[counts > 0, None])
         gradient, error = (ensemble.named(one / ensemble.spreads) for one in mean_and_error(found))
-        return Estimate(loss, gradient, error, self.samples - 1)
+        left_out = 2 * int(np.count_nonzero(~kept))
+        return Estimate(at_them.loss, gradient, error, len(found) - 1, left_out)
 
 
 @dataclass(frozen=True)
@@ -75,6 +85,9 @@ class EnsembleMean(Ensemble):
     Bias: that of the estimator; and where the loss is as small as the effect of the perturbed first positions, that
     effect. Noise: the ``standard_error`` of the `Estimate`. Cost: ``samples`` times that of the estimator, and a
     forward run.
+
+    Samples that diverge: they are left out with the other one of their antithetic pair, up to a quarter of all pairs,
+    so that what remains is as symmetric about the parameters as before; half a pair would shift the mean to its side.
     """
 
     samples: int = 4
@@ -90,6 +103,8 @@ class EnsembleMean(Ensemble):
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         """``observe`` is called with the adjoints of one sample after the other."""
         ensemble = self.around(problem, parameters)
+        displaced = ensemble.start.size if self.position_noise else 0
+        self.require_memory(self.samples, 2 * len(ensemble.spreads) + displaced)
 
         def points() -> Iterator[Point]:
             yield Point(ensemble.values)
@@ -99,10 +114,11 @@ class EnsembleMean(Ensemble):
                 yield ensemble.sample(-u, -displacement, self.estimator)
 
         at_them, *samples = self.evaluated(problem, points(), observe)
-        checked = [checked_estimate(one, ensemble.values) for one in samples]
+        kept = np.repeat(remaining(samples, self.samples // 2, "antithetic pairs"), 2)
+        checked = [checked_estimate(samples[k], ensemble.values) for k in np.flatnonzero(kept)]
         numbers = np.array([joined(one.gradient, ensemble.values) for one in checked])
         gradient, error = (ensemble.named(one) for one in self.combined(numbers))
-        return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1)
+        return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1, len(samples) - len(checked))
 
     def combined(self, gradients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The average (numbers,) of the gradients of the samples (samples, numbers), and its standard error: that of

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cortado.arrays import as_numbers, is_whole, require_whole
+from cortado.arrays import as_numbers, is_whole, require_at_most, require_whole
+from cortado.device.memory import require
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
 from cortado.executors.executor import Executor, InProcess, checked_executor
@@ -14,6 +15,11 @@ from cortado.gradients.points import Point, Sample, evaluated
 from cortado.parameters.values import Arrays, Values
 from cortado.rollout import Observer
 from cortado.scene.fields import as_number
+
+MOST_SAMPLES = 100_000
+"""Samples of an ensemble; more are taken for a mistake."""
+_RUN = 1000.0
+"""[bytes] of what is kept of a run besides numbers."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +35,7 @@ class Ensemble:
     """Width of the ensemble in each parameter, in its units, one for all or by name. It is sqrt((N + 2) / N) times the
     standard deviation of a component."""
     samples: int = 8
+    """At most 100,000; all their results are kept until they are averaged, for which there has to be memory."""
     position_noise: float = 0.01
     """Standard deviation of the perturbations of first positions [spacings]; 0 for none."""
     seed: int = 0
@@ -38,6 +45,7 @@ class Ensemble:
     def __post_init__(self) -> None:
         if not is_whole(self.samples) or self.samples < 2:
             raise InputError(f"samples is {shown(self.samples)}, but must be at least 2, to know how they scatter.")
+        require_at_most("samples", self.samples, MOST_SAMPLES)
         position_noise = as_number(self.position_noise)
         if position_noise is None or position_noise < 0.0:
             raise InputError(
@@ -72,6 +80,10 @@ class Ensemble:
         the states that it is called with."""
         executor = self.executor if observe is None else InProcess()
         return evaluated(problem, points, executor, observe)
+
+    def require_memory(self, runs: int, numbers: int) -> None:
+        """Raises `InputError` unless there is memory for what so many runs leave, so many numbers each."""
+        require({f"{runs:,} runs of {self.samples:,} samples": runs * (_RUN + 8.0 * numbers)}, "take fewer samples")
 
     def _spread(self, name: str) -> float:
         if isinstance(self.spread, Mapping) and name not in self.spread:

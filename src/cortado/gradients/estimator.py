@@ -13,7 +13,7 @@ from cortado.errors import DivergedError, InputError
 from cortado.parameters.values import Arrays, Values
 from cortado.rollout import BackwardStep, Observer, Rollout
 from cortado.solvers.solver import Counts
-from cortado.words import sized
+from cortado.words import counted, sized
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,10 @@ class Estimate:
     """Of every component of the gradient, where it is an average (`RandomizedSmoothing`, `EnsembleMean`, `Guided`)."""
     degrees_of_freedom: float | None = None
     """Of the standard error: the number of independent samples less one; of `Guided` those of its two parts."""
+    left_out: int = 0
+    """Runs of an ensemble that the average leaves out, as they diverged, or the runs that they belong to did."""
+    diverged: Exception | None = None
+    """Why there was no run, of a point of `cortado.evaluate`; its loss and its gradient are then no numbers."""
 
     def interval(self, confidence: float = 0.95) -> tuple[Arrays, Arrays]:
         """The lower and the upper end, by parameter, of an interval for each component of the gradient.
@@ -59,7 +63,8 @@ class Estimate:
     def __repr__(self) -> str:
         error = "" if self.standard_error is None else ", with its standard error"
         loss = f"losses {self.loss.shape}" if np.ndim(self.loss) else f"loss {self.loss:.6g}"
-        return f"Estimate({loss}, gradient of {sized(self.gradient)}{error})"
+        out = f", {counted(self.left_out, 'run')} left out" if self.left_out else ""
+        return f"Estimate({loss}, gradient of {sized(self.gradient)}{error}{out})"
 
 
 class ForwardPass(Protocol):

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cortado.arrays import require_whole
+from cortado.arrays import require_at_most, require_whole
 from cortado.errors import ComputationError
 from cortado.gradients.ensemble import EnsembleMean, joined, mean_and_error, require_pairs
-from cortado.gradients.ensemble_members import Ensemble, Sampler
+from cortado.gradients.ensemble_members import MOST_SAMPLES, Ensemble, Sampler
 from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator, checked_estimator
 from cortado.gradients.filters import AdjointViscosity
+from cortado.gradients.left_out import remaining
 from cortado.gradients.points import Point
 from cortado.parameters.values import Arrays, Values
 from cortado.rollout import Observer
@@ -35,6 +36,9 @@ class Guided(Ensemble):
     Noise: the ``standard_error`` of the `Estimate` is that of the D_k and of the directions p_k together, with degrees
     of freedom by Welch and Satterthwaite. Cost: ``samples`` gradients of the surrogate and 1 + 2 K ``differences``
     forward runs, however many numbers a parameter has.
+
+    Runs that diverge: as in `EnsembleMean` for the surrogate's; a sample of the differences is left out as a whole, up
+    to a quarter of them, so that all D_k are means over the same samples. With fewer than 4 none can be left out.
     """
 
     samples: int = 4
@@ -51,6 +55,8 @@ class Guided(Ensemble):
         require_pairs(self.samples)
         require_whole("parts", self.parts, 1)
         require_whole("differences", self.differences, 2)
+        for name in ("parts", "differences"):
+            require_at_most(name, getattr(self, name), MOST_SAMPLES)
         checked_estimator(self.surrogate)
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
@@ -61,6 +67,7 @@ class Guided(Ensemble):
         assert surrogate.standard_error is not None and surrogate.degrees_of_freedom is not None
         ensemble = self.around(problem, parameters, draw=1)
         parts, turns = self._parts(ensemble, surrogate.gradient, surrogate.standard_error)
+        self.require_memory(2 * self.differences * len(parts), 0)
         reach = [np.sqrt(np.count_nonzero(part)) for part in parts]
 
         def points() -> Iterator[Point]:
@@ -70,15 +77,17 @@ class Guided(Ensemble):
                     yield ensemble.sample(r * part, displacement)
                     yield ensemble.sample(-r * part, displacement)
 
-        losses = np.array([one.loss for one in self.evaluated(problem, points(), None)])
-        pairs = losses.reshape(self.differences, len(parts), 2)
+        runs = self.evaluated(problem, points(), None)
+        kept = remaining(runs, self.differences, "samples of the differences")
+        pairs = np.array([one.loss for one in runs]).reshape(self.differences, len(parts), 2)[kept]
         slopes = (pairs[..., 0] - pairs[..., 1]) / (2.0 * np.array(reach))
         sizes, size_errors = mean_and_error(slopes)
         along, across = (np.reshape(rows, (-1, len(ensemble.spreads))) for rows in (parts, turns))
         errors = np.array([size_errors @ np.abs(along), np.abs(sizes) @ across])
         gradient, error = (ensemble.named(one / ensemble.spreads) for one in (sizes @ along, np.hypot(*errors)))
-        freedom = _freedom(errors, (self.differences - 1, surrogate.degrees_of_freedom))
-        return Estimate(surrogate.loss, gradient, error, freedom)
+        freedom = _freedom(errors, (len(pairs) - 1, surrogate.degrees_of_freedom))
+        left_out = surrogate.left_out + len(runs) // self.differences * int(np.count_nonzero(~kept))
+        return Estimate(surrogate.loss, gradient, error, freedom, left_out)
 
     def _parts(self, ensemble: Sampler, gradient: Arrays, error: Arrays) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """(numbers,) each, of length 1, in spreads: the gradient on one part of one parameter, 0 elsewhere; and its

@@ -1,6 +1,6 @@
 """Points of the space of parameters at which a problem is evaluated, each on its own, wherever an executor computes."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import groupby, islice
 from typing import Any
@@ -40,16 +40,38 @@ class Point:
             return Estimate(problem.value(self.values), {})
         return self.estimator.estimate(problem, self.values, observe)
 
+    def without_a_run(self, why: Exception, loss: float = np.nan) -> Estimate:
+        """What there is to say where no run is possible: a gradient that is no number."""
+        names = self.values if self.estimator is not None else ()
+        return Estimate(loss, {name: np.full(np.shape(self.values[name]), np.nan) for name in names}, diverged=why)
+
+
+@dataclass(frozen=True)
+class Daring(Point):
+    """A point that may diverge."""
+
+    loss_if_diverged: float = np.nan
+    errors: tuple[type[Exception], ...] = (DivergedError,)
+    """Those after which it has this loss."""
+
+    def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
+        try:
+            return super().evaluated(problem, observe)
+        except self.errors as error:
+            return self.without_a_run(error, self.loss_if_diverged)
+
 
 @dataclass(frozen=True)
 class Sample(Point):
-    """A point that an ensemble has drawn."""
+    """A point that an ensemble has drawn, which may diverge."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
         """See `Point.found`, as a gradient with respect to perturbed first positions need not be there; an `InputError`
         says that the user did not choose this point."""
         try:
             return self.found(problem, observe)
+        except DivergedError as error:
+            return self.without_a_run(error)
         except InputError as error:
             advice = "Take a smaller spread, or a logarithm (cortado.optimisation.transforms)."
             raise InputError(f"A sample of the ensemble does not fit: {error} {advice}") from error
@@ -81,14 +103,14 @@ class Evaluation:
             for one, point in zip(found, group, strict=True)
         ]
 
-    def groups(self, points: Iterable[Point], share: int) -> Iterator[Group]:
-        """The points in their order, as many at a time as one launch of the problem takes, shared out among so many
-        threads of workers."""
+    def groups(self, points: Iterable[Point], threads: Callable[[], int]) -> Iterator[Group]:
+        """The points in their order, as many at a time as one launch of the problem takes, shared out among the threads
+        of workers that there are when a group is asked for."""
         for (estimator, _), alike in groupby(points, _kind):
             room = 1
             if isinstance(self.problem, Batchable) and isinstance(estimator, AdjointEstimator | None):
-                room = max(self.problem.room(estimator) // share, 1)
-            while group := tuple(islice(alike, room)):
+                room = self.problem.room(estimator)
+            while group := tuple(islice(alike, max(room // max(threads(), 1), 1))):
                 yield group
 
 
@@ -103,7 +125,7 @@ def evaluated(
     evaluation, firsts = Evaluation(problem, observe), [0]
 
     def groups() -> Iterator[Group]:
-        for group in evaluation.groups(points, executor.threads()):
+        for group in evaluation.groups(points, executor.threads):
             firsts.append(firsts[-1] + len(group))
             yield group
 

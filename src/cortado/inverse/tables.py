@@ -23,6 +23,7 @@ from cortado.executors import Executor, InProcess
 from cortado.gradients import AdjointEstimator, AdjointViscosity, EnsembleMean, Exact, FrozenGeometry, GradientEstimator
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch, Optimiser
+from cortado.optimisation.start import MOST_ITERATIONS
 from cortado.parameters.values import NAMES, UNITS
 from cortado.scene.fields import MISSING, OneOf, Several, Text, as_number, count, field_error, quantity
 from cortado.scene.sentences import wanted
@@ -248,7 +249,7 @@ class OptimiseTable(Table):
     line search its longest step. For gradient descent the factor of the gradient."""
     tolerance: Annotated[float, quantity(gt=0.0, le=0.5)] | None = None
     """L-BFGS ends where the gradient is this part of the first one; if left out, where round-off stops it."""
-    iterations: Annotated[int, count(1, 10_000_000)]
+    iterations: Annotated[int, count(1, MOST_ITERATIONS)]
     """Updates at most, of each search."""
     gradient: GradientTable = GradientTable()
     """The gradient that the search follows."""

@@ -1,17 +1,18 @@
 """`cortado.evaluate`: a problem at many points that do not depend on one another, such as a population of a search."""
 
+import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
-from cortado.errors import DivergedError
+from cortado.arrays import as_one_number
+from cortado.errors import CortadoWarning
 from cortado.executors.executor import Executor, InProcess, OnResult, checked_executor
 from cortado.gradients import Estimate, GradientEstimator
 from cortado.gradients.estimator import Differentiable, checked_estimator
-from cortado.gradients.points import Point, evaluated
+from cortado.gradients.points import Daring, evaluated
 from cortado.parameters.values import Values
-from cortado.rollout import Observer
+from cortado.words import counted
 
 
 def evaluate(
@@ -30,32 +31,24 @@ def evaluate(
         gradient: how the gradient is computed at each point, such as `gradients.Exact()`; left out, the ``gradient`` of
             each `Estimate` is empty, and points are run forward only.
         executor: where they are computed, see `cortado.executors`; one after the other in this process if left out.
-        loss_if_diverged: the loss of a point whose run diverges, such as infinity for a search that then leaves it
-            aside; its gradient is not a number. Left out, such a point ends all with a `DivergedError`.
+        loss_if_diverged: the loss of a point whose run diverges, such as infinity for a search that leaves it aside.
+            Left out, it is NaN, and a `CortadoWarning` says how many points diverged, and what became of the first of
+            them. The gradient of such a point is NaN, and its `Estimate.diverged` has the error.
         on_result: called with the number of a point and its `Estimate` as they arrive, in whatever order.
 
-    Raises the error of the first point that has one.
+    Raises the error of the first point that has another one.
     """
     chosen = checked_executor(InProcess() if executor is None else executor)
     estimator = None if gradient is None else checked_estimator(gradient)
-    made = (Point(values, estimator) for values in points)
-    if loss_if_diverged is not None:
-        made = (Daring(point.values, point.estimator, loss_if_diverged) for point in made)
-    return evaluated(problem, made, chosen, on_result=on_result)
-
-
-@dataclass(frozen=True)
-class Daring(Point):
-    """A point that may diverge."""
-
-    loss_if_diverged: float = np.inf
-    errors: tuple[type[Exception], ...] = (DivergedError,)
-    """Those after which it has this loss."""
-
-    def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        try:
-            return super().evaluated(problem, observe)
-        except self.errors:
-            names = self.values if self.estimator is not None else ()
-            nothing = {name: np.full(np.shape(self.values[name]), np.nan) for name in names}
-            return Estimate(self.loss_if_diverged, nothing)
+    loss = np.nan if loss_if_diverged is None else as_one_number("loss_if_diverged", loss_if_diverged)
+    made = (Daring(values, estimator, loss) for values in points)
+    found = evaluated(problem, made, chosen, on_result=on_result)
+    lost = [number for number, one in enumerate(found) if one.diverged is not None]
+    if lost and loss_if_diverged is None:
+        warnings.warn(
+            f"{len(lost)} of {counted(len(found), 'point')} diverged, and their losses are NaN. The first of them is "
+            f"point {lost[0]}: {found[lost[0]].diverged}",
+            CortadoWarning,
+            stacklevel=2,
+        )
+    return found

@@ -4,19 +4,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cortado.arrays import is_whole
+from cortado.arrays import is_whole, require_at_most
+from cortado.device.memory import require
 from cortado.errors import InputError
+from cortado.optimisation.iterate import Iterate
 from cortado.optimisation.replay_log import ParameterLayout, Vector
 from cortado.optimisation.search import (
     Outcome,
     PerParameter,
     Search,
-    all_updates_made,
     require_fraction,
     require_names,
     require_positive,
 )
 
+MOST_TRIALS = 1_000
+"""Trials of an update; more are taken for a mistake, as each is a run."""
 GROWTH = 3.0
 """How much longer than the best length the longest one may be at the next update."""
 
@@ -37,7 +40,9 @@ class LineSearch:
     then `GROWTH` times the length that was best, at most 1. Where no trial lowers the loss, at the bottom of a dent or
     of the valley, an update still takes the best one, and the reach is 1 again, by which the search leaves dents. So
     the last iterate need not be the best. Where every trial diverges, x stays, the momentum is dropped, and the reach
-    is ``shortest`` times what it was. There is no test of convergence: all the iterations are made.
+    is ``shortest`` times what it was. Where the gradient of the best one diverges, as that of an ensemble may, x moves
+    a part of the way, and the reach is that part of what it would be. There is no test of convergence: all the
+    iterations are made.
 
     Raises InputError for settings out of range.
     """
@@ -45,7 +50,7 @@ class LineSearch:
     scale: PerParameter = 1.0
     """The longest change worth trying, one number or one per parameter by name [unit of the parameter]."""
     trials: int = 5
-    """Lengths that are tried at a time."""
+    """Lengths that are tried at a time, at most 1,000."""
     shortest: float = 1.0 / 64.0
     """Of these lengths, over the longest."""
     momentum: float = 0.5
@@ -60,27 +65,30 @@ class LineSearch:
                 f"trials is {self.trials!r} and shortest {self.shortest!r}, but must be at least 2 and greater than 0."
             )
 
+        require_at_most("trials", self.trials, MOST_TRIALS)
+
     def check(self, layout: ParameterLayout) -> None:
-        """Raise InputError if the scales are not those of these parameters."""
+        """Raise InputError if the scales are not those of these parameters, or there is no memory for the trials."""
         require_names("scale", self.scale, layout)
+        require({f"{self.trials:,} trials": 16.0 * self.trials * layout.size}, "take fewer trials")
 
     def minimise(self, search: Search) -> Outcome:
         """Make at most `search.iterations` updates, of one gradient and some trials each; evaluate the last iterate."""
-        scale, x, reach = search.layout.spread(self.scale), search.start, 1.0
-        along = np.zeros_like(x)
+        scale, at, reach = search.layout.spread(self.scale), Iterate(search), 1.0
+        along = np.zeros_like(at.x)
         for _ in range(search.iterations):
-            loss, gradient = search.evaluate(x)
-            along = unit(self.momentum * along - unit(gradient * scale))
+            along = unit(self.momentum * along - unit(at.gradient * scale))
             lengths = reach * np.geomspace(self.shortest, 1.0, self.trials)
-            tried = [search.project(x + length * scale * along) for length in lengths]
+            tried = [search.project(at.x + length * scale * along) for length in lengths]
             losses = search.losses(tried)
             best = int(np.argmin(losses))
             if np.isfinite(losses[best]):
-                x, reach = tried[best], min(GROWTH * lengths[best], 1.0) if losses[best] < loss else 1.0
+                reach = min(GROWTH * lengths[best], 1.0) if losses[best] < at.loss else 1.0
+                reach *= at.move(tried[best])
             else:
-                along, reach = np.zeros_like(x), reach * self.shortest
-            search.updated()
-        return all_updates_made("The line search", search, x)
+                along, reach = np.zeros_like(at.x), reach * self.shortest
+                at.move(at.x)
+        return at.outcome("The line search")
 
 
 def unit(vector: Vector) -> Vector:

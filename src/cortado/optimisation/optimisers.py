@@ -9,7 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cortado.arrays import require_at_most
+from cortado.device.memory import require
 from cortado.errors import InputError
+from cortado.optimisation.iterate import Iterate
 from cortado.optimisation.line_search import LineSearch
 from cortado.optimisation.replay_log import ParameterLayout, Vector
 from cortado.optimisation.search import (
@@ -17,11 +20,13 @@ from cortado.optimisation.search import (
     Outcome,
     PerParameter,
     Search,
-    all_updates_made,
     require_fraction,
     require_names,
     require_positive,
 )
+
+MOST_MEMORY = 1_000
+"""Past updates that L-BFGS keeps; more are taken for a mistake, as some ten of them do."""
 
 __all__ = ["LBFGS", "Adam", "GradientDescent", "LineSearch", "Optimiser", "Outcome", "Search"]
 
@@ -31,7 +36,9 @@ class Adam:
     """Adam: steps along the mean of recent gradients, divided by the root of the mean of their squares.
 
     A step changes a component by at most about its learning rate, whatever the size of the gradient. Bounds
-    are kept by projection after each update. There is no test of convergence: all the iterations are made.
+    are kept by projection after each update. Where a step leads to a run that diverges, it is halved until it does not,
+    at most 10 times, and the learning rate with it for all that follow; the means begin anew, as they would lead there
+    again. There is no test of convergence: all the iterations are made.
 
     Source: D. P. Kingma and J. Ba, "Adam: a method for stochastic optimization", ICLR 2015, Algorithm 1.
     Raises InputError for settings out of range.
@@ -59,24 +66,28 @@ class Adam:
     def minimise(self, search: Search) -> Outcome:
         """Make `search.iterations` updates; one gradient each, and one evaluation of the last iterate."""
         learning_rate = search.layout.spread(self.learning_rate)
-        theta = search.start
-        m, v = np.zeros_like(theta), np.zeros_like(theta)
-        for t in range(1, search.iterations + 1):
-            _, g = search.evaluate(theta)
+        theta = Iterate(search)
+        m, v, t = np.zeros_like(theta.x), np.zeros_like(theta.x), 0
+        for _ in range(search.iterations):
+            g, t = theta.gradient, t + 1
             m = self.beta1 * m + (1.0 - self.beta1) * g
             v = self.beta2 * v + (1.0 - self.beta2) * g**2
             m_hat = m / (1.0 - self.beta1**t)
             v_hat = v / (1.0 - self.beta2**t)
-            theta = search.project(theta - learning_rate * m_hat / (np.sqrt(v_hat) + self.epsilon))
-            search.updated()
-        return all_updates_made("Adam", search, theta)
+            new_theta = search.project(theta.x - learning_rate * m_hat / (np.sqrt(v_hat) + self.epsilon))
+            part = theta.move(new_theta)
+            if part < 1.0:
+                learning_rate, m, v, t = part * learning_rate, np.zeros_like(m), np.zeros_like(v), 0
+        return theta.outcome("Adam")
 
 
 @dataclass(frozen=True)
 class GradientDescent:
     """Gradient descent with a heavy ball: x_{k+1} = P(x_k - learning_rate g_k + momentum (x_k - x_{k-1})).
 
-    P projects onto the bounds. There is no test of convergence: all the iterations are made.
+    P projects onto the bounds. Where a step leads to a run that diverges, it is halved until it does not, at most 10
+    times, and the learning rate with it for all that follow; the ball stops. There is no test of convergence: all the
+    iterations are made.
 
     Source: B. T. Polyak, "Some methods of speeding up the convergence of iteration methods", USSR
     Computational Mathematics and Mathematical Physics 4(5), 1964; plain gradient descent with momentum 0.
@@ -99,12 +110,12 @@ class GradientDescent:
     def minimise(self, search: Search) -> Outcome:
         """Make `search.iterations` updates; one gradient each, and one evaluation of the last iterate."""
         learning_rate = search.layout.spread(self.learning_rate)
-        before = x = search.start
+        at, before = Iterate(search), search.start
         for _ in range(search.iterations):
-            _, g = search.evaluate(x)
-            x, before = search.project(x - learning_rate * g + self.momentum * (x - before)), x
-            search.updated()
-        return all_updates_made("Gradient descent", search, x)
+            x, g = at.x, at.gradient
+            part = at.move(search.project(x - learning_rate * g + self.momentum * (x - before)))
+            learning_rate, before = part * learning_rate, x if part == 1.0 else at.x
+        return at.outcome("Gradient descent")
 
 
 @dataclass(frozen=True)
@@ -116,6 +127,10 @@ class LBFGS:
     gradient in these coordinates, so that the first trial step is at most about `scale` long, whatever the
     unit of the loss.
 
+    Where a trial leads to a run that diverges, the line search is told the loss and the slope there of the parabola
+    that has those of the last iterate, and rises where its slope promised to fall: its next trial is then about a
+    quarter as long, and the approximate Hessian knows nothing of it.
+
     Its sums over components are BLAS's: beyond some 10^4 components their last bits, and with them resuming
     bit for bit, depend on the number of BLAS threads. A resumed run that comes out otherwise is refused.
 
@@ -125,7 +140,7 @@ class LBFGS:
     """
 
     memory: int = 10
-    """Number of past updates that make up the approximate Hessian."""
+    """Number of past updates that make up the approximate Hessian, at most 1,000."""
     tolerance: float = 0.0
     """Converged when the greatest component of the projected gradient is this fraction of the first one [-]."""
     scale: PerParameter = 1.0
@@ -134,12 +149,15 @@ class LBFGS:
     def __post_init__(self) -> None:
         if not isinstance(self.memory, int) or self.memory < 1:
             raise InputError(f"The memory of L-BFGS must be an integer of at least 1, not {self.memory!r}.")
+        require_at_most("The memory of L-BFGS", self.memory, MOST_MEMORY)
         require_fraction("The tolerance of L-BFGS", self.tolerance)
         require_positive("scale", self.scale)
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise InputError if the scales are not those of these parameters."""
+        """Raise InputError if the scales are not those of these parameters, or there is no memory for the updates."""
         require_names("scale", self.scale, layout)
+        numbers = 2.0 * self.memory * layout.size + 11.0 * self.memory**2
+        require({f"{self.memory:,} past updates": 8.0 * numbers}, "take fewer of them, by memory")
 
     def minimise(self, search: Search) -> Outcome:
         """Make at most `search.iterations` updates, of one or more evaluations each."""
@@ -154,10 +172,23 @@ class LBFGS:
         def physical(y: Vector) -> Vector:
             return search.project(search.start + scale * y)
 
-        def scaled(y: Vector) -> tuple[float, Vector]:
-            known = not y.any()
-            loss, gradient = (loss_start, gradient_start) if known else search.evaluate(physical(y))
+        def in_units(loss: float, gradient: Vector) -> tuple[float, Vector]:
             return loss / unit, scale * gradient / unit
+
+        base = tried = _Trial(np.zeros_like(search.start), *in_units(loss_start, gradient_start))
+
+        def scaled(y: Vector) -> tuple[float, Vector]:
+            nonlocal tried
+            found = search.attempt(physical(y)) if y.any() else (loss_start, gradient_start)
+            if found is None:
+                return base.rising(y)
+            tried = _Trial(y.copy(), *in_units(*found))
+            return tried.loss, tried.gradient
+
+        def updated(_: Vector) -> None:
+            nonlocal base
+            base = tried
+            search.updated()
 
         found = minimize(
             scaled,
@@ -165,7 +196,7 @@ class LBFGS:
             jac=True,
             method="L-BFGS-B",
             bounds=_scaled_bounds(search, scale),
-            callback=lambda _: search.updated(),
+            callback=updated,
             options={
                 "maxcor": self.memory,
                 "ftol": 0.0,
@@ -175,6 +206,20 @@ class LBFGS:
             },
         )
         return Outcome(physical(found.x), found.status == 0, _LBFGS_MESSAGES[found.status].format(found.nit))
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A point of L-BFGS's coordinates (size,), with its loss and its gradient (size,)."""
+
+    y: Vector
+    loss: float
+    gradient: Vector
+
+    def rising(self, y: Vector) -> tuple[float, Vector]:
+        """A loss and a gradient at y, which has none. Along the way from here they are those of the parabola
+        f + s t - 2 s t^2 at t = 1, where f is the loss here and s < 0 its slope; its minimum is at t = 1 / 4."""
+        return self.loss - float(self.gradient @ (y - self.y)), -3.0 * self.gradient
 
 
 _LBFGS_MESSAGES = {

@@ -25,6 +25,8 @@ class Record:
     """At which the loss was evaluated."""
     replayed: bool
     """Whether it was read from the checkpoint."""
+    refused: int = 0
+    """Evaluations before it that diverged, so that the steps to them were refused."""
 
     def __repr__(self) -> str:
         return f"Record(iteration {self.iteration}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g})"
@@ -45,11 +47,13 @@ class Result:
     updates: int
     """That the optimiser made, with those replayed from the checkpoint."""
     evaluations: int
-    """How many the optimiser asked for, with those replayed from the checkpoint."""
+    """How many there are in the history, with those replayed from the checkpoint."""
     message: str
     """How it ended, a sentence."""
     converged: bool
     """Whether the optimiser's own test was met; Adam and gradient descent have none."""
+    refused: int = 0
+    """Evaluations that diverged, so that the steps to them were refused; they are not in the history."""
     problem: Any = field(default=None, repr=False)
     """The `Problem` that was solved, or one in other coordinates, whose runs a notebook shows; None for other problems,
     and in a result that was pickled."""

@@ -19,7 +19,9 @@ class Search:
     """The problem that an optimiser is given, as a function of one vector."""
 
     evaluate: Callable[[Vector], tuple[float, Vector]]
-    """Vector (size,) -> loss, gradient (size,)."""
+    """Vector (size,) -> loss, gradient (size,); raises DivergedError where the run diverges, which ends the search."""
+    attempt: Callable[[Vector], tuple[float, Vector] | None]
+    """The same, but None where the run diverges, which is counted, and the search goes on."""
     losses: Callable[[Sequence[Vector]], list[float]]
     """Vectors (size,) -> the loss of each, infinite where there can be no run, as it diverges or parameters
     are out of range; cheaper than so many evaluations."""
@@ -62,12 +64,6 @@ class Optimiser(Protocol):
 
     def minimise(self, search: Search) -> Outcome:
         """Lower the loss by at most `search.iterations` updates."""
-
-
-def all_updates_made(name: str, search: Search, last: Vector) -> Outcome:
-    """The outcome of an optimiser that does not test convergence; evaluates the last iterate."""
-    search.evaluate(last)
-    return Outcome(last, False, f"{name} made all its {search.iterations} updates.")
 
 
 def _values(values: PerParameter) -> Iterator[object]:

@@ -1,0 +1,221 @@
+"""A problem as the function of one vector that an optimiser sees, which replays the log of a former run."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from cortado.arrays import as_numbers, as_one_number
+from cortado.errors import ComputationError, DivergedError, InputError
+from cortado.executors.executor import InProcess
+from cortado.gradients.points import Daring, evaluated
+from cortado.optimisation.differentiable import Differentiable, loss_and_gradient
+from cortado.optimisation.replay_log import Evaluation, Log, ParameterLayout, Vector
+from cortado.optimisation.result import Parameters, Record
+
+GREATEST_GRADIENT = 1e150
+"""Components beyond it are refused like infinite ones: their squares, which optimisers take, overflow."""
+FEW = 6
+"""Numbers of all parameters that a sentence names at most."""
+REFUSED = (DivergedError, InputError)
+"""A trial with one of these is infinitely bad: the start had none, so the search has gone too far."""
+
+
+@dataclass
+class Evaluator:
+    """The function of one vector that the optimiser sees; replays the log, then computes and adds to it."""
+
+    problem: Differentiable
+    estimator: Any
+    layout: ParameterLayout
+    start: Mapping[str, Any]
+    log: Log
+    on_iteration: Callable[[Record], None] | None
+    history: list[Record] = field(default_factory=list)
+    updates: int = 0
+    """Made by the optimiser so far."""
+    refused: int = 0
+    """Evaluations that diverged so far, after which the search went on."""
+    logged: int = 0
+    """Entries of the log that this run has come to: evaluations, and losses that were tried."""
+
+    def count_update(self) -> None:
+        """Called by the optimiser after each update."""
+        self.updates += 1
+
+    def __call__(self, vector: Vector) -> tuple[float, Vector]:
+        """The loss and its gradient (size,) at a vector (size,)."""
+        if self.logged < len(self.log):
+            return self._noted(self._replay(vector), replayed=True)
+        return self._noted(self._kept(self._compute(vector)), replayed=False)
+
+    def attempt(self, vector: Vector) -> tuple[float, Vector] | None:
+        """The same, or None where the run diverges: in the log its loss is infinite, and its gradient 0."""
+        replayed = self.logged < len(self.log)
+        if replayed:
+            evaluation = self._replay(vector)
+        else:
+            try:
+                evaluation = self._kept(self._compute(vector))
+            except DivergedError:
+                evaluation = self._kept(Evaluation(vector.copy(), math.inf, np.zeros_like(vector)))
+        if math.isfinite(evaluation.loss):
+            return self._noted(evaluation, replayed)
+        self.logged += 1
+        self.refused += 1
+        return None
+
+    def _kept(self, evaluation: Evaluation) -> Evaluation:
+        """The evaluation, which is in the log from now on."""
+        self.log.append(evaluation)
+        return evaluation
+
+    def _noted(self, evaluation: Evaluation, replayed: bool) -> tuple[float, Vector]:
+        """The loss and its gradient (size,), which are in the history from now on."""
+        self.logged += 1
+        record = Record(
+            iteration=len(self.history),
+            updates=self.updates,
+            loss=evaluation.loss,
+            gradient_norm=math.sqrt(np.sum(evaluation.gradient**2)),
+            parameters=as_given(self.layout.unravel(evaluation.parameters), self.start),
+            replayed=replayed,
+            refused=self.refused,
+        )
+        self.history.append(record)
+        if self.on_iteration is not None:
+            self.on_iteration(record)
+        return evaluation.loss, evaluation.gradient.copy()
+
+    def losses(self, vectors: Sequence[Vector]) -> list[float]:
+        """The losses at vectors (size,), computed in one launch if the problem can; infinite for a run that diverges,
+        and for parameters that cannot be. They are in the log, with a gradient of 0, and not in the history."""
+        known = [self._replay(vector, k).loss for k, vector in enumerate(vectors[: len(self.log) - self.logged])]
+        left = vectors[len(known) :]
+        found: list[float] = []
+
+        def keep(loss: Any) -> None:
+            number = as_one_number("The problem's loss", loss)
+            self.log.append(Evaluation(left[len(found)].copy(), number, np.zeros_like(left[0])))
+            found.append(number)
+
+        points, problem = [self.layout.unravel(vector) for vector in left], self.problem
+        if callable(getattr(problem, "value", None)):
+            made: Any = problem
+            trials = [Daring(point, loss_if_diverged=math.inf, errors=REFUSED) for point in points]
+            evaluated(made, trials, InProcess(), on_result=lambda _, one: keep(one.loss))
+        else:
+            for point in points:
+                keep(self._loss(point))
+        self.logged += len(vectors)
+        return [loss if math.isfinite(loss) else math.inf for loss in (*known, *found)]
+
+    def _loss(self, parameters: dict[str, Any]) -> Any:
+        """The loss of a problem that always computes its gradient too."""
+        try:
+            return self._evaluated(parameters)[0]
+        except REFUSED:
+            return math.inf
+
+    def _evaluated(self, parameters: dict[str, Any]) -> tuple[Any, Mapping[str, Any]]:
+        """The loss and its gradient, as the problem returns them."""
+        return loss_and_gradient(self.problem.value_and_gradient(parameters, gradient=self.estimator))
+
+    def _replay(self, vector: Vector, ahead: int = 0) -> Evaluation:
+        """The logged evaluation, or the one so many ahead of it, if it is the one asked for."""
+        evaluation = self.log.read(self.logged + ahead)
+        changed = vector.view(np.uint64) != evaluation.parameters.view(np.uint64)
+        if changed.any():
+            raise InputError(
+                f"This run asks for evaluation {len(self.history)} at another {self._names_of(changed)} than "
+                "the run being resumed, so that its start, bounds, optimiser, machine or number of "
+                "threads differ; give the former ones, or another checkpoint folder. "
+                f"The former run's evaluations {self.log.fate}."
+            )
+        return evaluation
+
+    def _compute(self, vector: Vector) -> Evaluation:
+        """Evaluate the problem, and return the evaluation if it is finite.
+
+        A first evaluation that is refused has a wrong start; later ones, parameters to which the search has come.
+        """
+        try:
+            loss, gradients = self._evaluated(self.layout.unravel(vector))
+        except InputError as error:
+            if not self.history:
+                raise
+            raise ComputationError(
+                f"In evaluation {len(self.history)} the search came to parameters that cannot be: {error} Try a "
+                f"smaller learning rate, or bounds on the parameters. The {len(self.history)} evaluations before "
+                f"{self.log.fate}."
+            ) from error
+        except DivergedError as error:
+            if not self.history:
+                raise
+            raise error.with_advice(self._shorter(error.advice, vector)) from error
+        evaluation = Evaluation(vector.copy(), as_one_number("The problem's loss", loss), self._ravelled(gradients))
+        self._require_finite(evaluation)
+        return evaluation
+
+    def _shorter(self, advice: str, vector: Vector) -> str:
+        """The advice of a run that diverged during a search, with where the search had come to, and the best before."""
+        best = min(self.history, key=lambda record: record.loss)
+        told = [f"{advice}, a smaller learning rate or scale, or bounds on the parameters"]
+        least = f"the least loss before is {best.loss:.4g}"
+        if vector.size <= FEW:
+            told.append(f"the search had come to {_in_words(self.layout.unravel(vector))}")
+            least = f"{least} at {_in_words(best.parameters)}"
+        return "; ".join([*told, least])
+
+    def _ravelled(self, gradients: Mapping[str, Any]) -> Vector:
+        """The gradient as one vector, after a check of its names and shapes."""
+        wanted = dict(zip(self.layout.names, self.layout.shapes, strict=True))
+        found = {name: np.shape(gradient) for name, gradient in gradients.items()}
+        if found != wanted:
+            raise InputError(
+                f"The problem gave gradients of shapes {found} for parameters of shapes {wanted}; a gradient "
+                "has the names and the shapes of the parameters."
+            )
+        return self.layout.ravel({name: as_numbers(f"The gradient of '{name}'", gradients[name]) for name in wanted})
+
+    def _require_finite(self, evaluation: Evaluation) -> None:
+        """Raise ComputationError, with advice, if an evaluation cannot be used."""
+        broken = ~(np.abs(evaluation.gradient) <= GREATEST_GRADIENT)
+        if math.isfinite(evaluation.loss) and not broken.any():
+            return
+        if math.isfinite(evaluation.loss):
+            what = (
+                f"the gradient with respect to {self._names_of(broken)} is not finite or beyond {GREATEST_GRADIENT:g}"
+            )
+        else:
+            names = self._names_of(np.ones_like(broken))
+            what = f"the loss is {evaluation.loss} as a function of {names}"
+        if not self.history:
+            raise ComputationError(
+                f"At the start {what}; begin elsewhere, look at the loss, or take a shorter horizon."
+            )
+        raise ComputationError(
+            f"In evaluation {len(self.history)} {what}; try a smaller learning rate, bounds on the "
+            f"parameters, or a shorter horizon. The {len(self.history)} evaluations before {self.log.fate}."
+        )
+
+    def _names_of(self, components: np.ndarray) -> str:
+        """The parameters to which the marked components (size,) of the vector belong, for a message."""
+        marked = self.layout.unravel(components.astype(np.float64))
+        return ", ".join(f"'{name}'" for name, marks in marked.items() if marks.any())
+
+
+def _in_words(parameters: Parameters) -> str:
+    """Their names and values."""
+    found = {name: np.array2string(np.asarray(value), precision=4) for name, value in parameters.items()}
+    return ", ".join(f"{name} {' '.join(text.split())}" for name, text in found.items())
+
+
+def as_given(parameters: Mapping[str, Vector], start: Mapping[str, Any]) -> Parameters:
+    """Parameters with a float wherever the user's start has a number."""
+    return {
+        name: float(value) if value.ndim == 0 and not isinstance(start[name], np.ndarray) else value
+        for name, value in parameters.items()
+    }
