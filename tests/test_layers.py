@@ -13,6 +13,7 @@ ROOT = Path(cortado.__file__).parent
 
 LAYERS = """
     errors
+    fixed
     words
     arrays
     restart

@@ -24,6 +24,7 @@ from cortado.device.threads import WARP, Turn, in_turn
 from cortado.discretise.discrete_scene import DiscreteScene, discretise
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.figures.particle_sets import particles
+from cortado.fixed import fixed
 from cortado.io.notebook import with_picture
 from cortado.io.trajectory import Frame, Trajectory
 from cortado.io.trajectory_batch import TrajectoryBatch
@@ -52,6 +53,7 @@ WORTH = {"cpu": 16_000, "cuda": 1_000_000}
 """Particles of all scenes in one launch, beyond which more of them are no faster."""
 
 
+@fixed
 class Simulation:
     """A scene made ready to run: particles sampled, masses calibrated, kernels chosen.
 
@@ -108,7 +110,7 @@ class Simulation:
         """The first state on the device."""
         first = SceneParameters(self, 0).first(self.parameters())
         self.state.set(first if self.batch is None else {name: [a] * self.batch for name, a in first.items()})
-        for array in (self.positions, self.velocities, self.mass_fractions):
+        for array in (self.positions, self.velocities, self.mass_fractions, self.walls):
             array.setflags(write=False)
         check_sizes(self.parameters(), self.precision)
 

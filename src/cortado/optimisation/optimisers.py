@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cortado.errors import InputError
+from cortado.fixed import keep_own
 from cortado.optimisation.line_search import LineSearch
 from cortado.optimisation.replay_log import ParameterLayout, Vector
 from cortado.optimisation.search import (
@@ -48,6 +49,7 @@ class Adam:
 
     def __post_init__(self) -> None:
         require_positive("learning_rate", self.learning_rate)
+        keep_own(self, "learning_rate")
         require_fraction("beta1", self.beta1)
         require_fraction("beta2", self.beta2)
         require_positive("epsilon", self.epsilon)
@@ -90,6 +92,7 @@ class GradientDescent:
 
     def __post_init__(self) -> None:
         require_positive("learning_rate", self.learning_rate)
+        keep_own(self, "learning_rate")
         require_fraction("momentum", self.momentum)
 
     def check(self, layout: ParameterLayout) -> None:
@@ -136,6 +139,7 @@ class LBFGS:
             raise InputError(f"The memory of L-BFGS must be an integer of at least 1, not {self.memory!r}.")
         require_fraction("The tolerance of L-BFGS", self.tolerance)
         require_positive("scale", self.scale)
+        keep_own(self, "scale")
 
     def check(self, layout: ParameterLayout) -> None:
         """Raise InputError if the scales are not those of these parameters."""
