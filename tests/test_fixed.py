@@ -41,9 +41,19 @@ def made(simulation):
     return {type(one).__name__: one for one in objects}
 
 
-NAMES = (
-    "Affine CentreOfMass CentreOfMassAlong FinalPositions Frames Image Problem Recorded Renderer Simulation Transformed"
-).split()
+NAMES = [
+    "Affine",
+    "CentreOfMass",
+    "CentreOfMassAlong",
+    "FinalPositions",
+    "Frames",
+    "Image",
+    "Problem",
+    "Recorded",
+    "Renderer",
+    "Simulation",
+    "Transformed",
+]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -64,8 +64,8 @@ class FixedDict(dict[Any, Any]):
     def _refuse(self, *arguments: Any, **named: Any) -> NoReturn:
         raise InputError("A setting cannot be changed within an object that was made with it; make another object.")
 
-    __setitem__ = __delitem__ = __ior__ = _refuse  # type: ignore[assignment]
-    clear = pop = popitem = setdefault = update = _refuse  # type: ignore[assignment]
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    clear = pop = popitem = setdefault = update = _refuse
 
 
 def keep_own(made: object, name: str) -> None:

@@ -168,8 +168,9 @@ class Simulation:
         ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity, its schedule included; so
         does any other parameter of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same
         scene, the run goes on from there, with the same bits as if it had not stopped; a parameter over time is then
-        one of the steps to come. A batch goes on from one state for each scene. Warns when the pressure did not
-        converge; raises `DivergedError` when a particle is lost, where a batch warns, and goes on without the scene.
+        one of the steps to come, and a rest density that the earlier run was given is given again. A batch goes on from
+        one state for each scene. Warns when the pressure did not converge; raises `DivergedError` when a particle is
+        lost, where a batch warns, and goes on without the scene.
         """
         return self.collect(self.rollout(steps, controls, state), record_every)
 
@@ -213,6 +214,7 @@ class Simulation:
                 others=own,
                 constants={name: array[at[1:]] for name, array in constants.items()},
                 substeps=rollout.substeps,
+                origin=rollout.origins[number],
             )
 
         if self.batch is None:
@@ -252,8 +254,7 @@ class Simulation:
         space = ParameterSpace(self, rollout.steps)
         values = space.checked({} if controls is None else controls)
         states = self._states(state)
-        for one in states:
-            space.check_restart(one, values)
+        space.check_restarts(states, values)
         space.begin(rollout, values, states=states)
         return rollout
 

@@ -9,11 +9,12 @@ import numpy as np
 from cortado.device.state import Parameters, State
 from cortado.device.threads import WARP
 from cortado.errors import CortadoWarning, InputError, shown
-from cortado.parameters.checks import check_places, check_sizes, check_state, unstable_sentence
+from cortado.parameters.checks import check_places, check_sizes, unstable_sentence
 from cortado.parameters.registry import Role, names
+from cortado.parameters.restarts import check_state, origin_of
 from cortado.parameters.scene_parameters import DENSITY, RUN, SceneParameters, Simulated
 from cortado.parameters.values import OVER_TIME, Arrays, Values, check_known, checked_value, scene_values
-from cortado.restart import Clock, RestartState
+from cortado.restart import Clock, Origin, RestartState
 from cortado.rollout import Rollout
 from cortado.scene.stability import divergence_advice
 
@@ -82,6 +83,8 @@ class ParameterSpace:
             for own, clock in zip(members, clocks, strict=True)
         ]
         rollout.time_steps[:] = [one["time_step"] for one in chosen]
+        origins = [self._origin(one["rest_density"]) for one in chosen]
+        rollout.origins = origins * (len(rollout.clocks) // len(origins))
         each = members * (len(rollout.clocks) // len(members))
 
         def advice(member: int) -> str:
@@ -98,15 +101,22 @@ class ParameterSpace:
         several = len(simulation.scene.phase) > 1
         rollout.substeps = max(*substeps, 1) if "mobility" in varied and several else max(substeps)
 
-    def check_restart(self, state: RestartState, values: Arrays) -> None:
-        """Whether a state is one of this simulation, and ``values`` go with it; raises `InputError`."""
-        for name in (*STATE, "rest_density"):
+    def check_restarts(self, states: Sequence[RestartState], values: Arrays) -> None:
+        """Whether states, one for each scene, are of this simulation, and ``values`` go with them; raises
+        `InputError`."""
+        for name in STATE if states else ():
             if name in values:
                 raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
         simulation = self._simulation
         sizes = len(simulation.positions), simulation.dimension, len(simulation.scene.phase)
         shapes = {field.name: field.shape(*sizes) for field in simulation.state.fields}
-        check_state(state, shapes, simulation.scene, simulation.free_particles)
+        for state, own in zip(states, self.members(values), strict=False):
+            origin = self._origin(np.atleast_1d(own.get("rest_density", self._one.values["rest_density"])))
+            check_state(state, shapes, origin, simulation)
+
+    def _origin(self, rest_density: np.ndarray) -> Origin:
+        """Of the particles of a run with these rest densities (phases,)."""
+        return origin_of(self._simulation, rest_density)
 
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
