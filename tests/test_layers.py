@@ -47,7 +47,7 @@ LAYERS = """
     reference.digits reference.engine reference.histories reference.losses reference.simulation reference
     executors.executor executors.calls executors.distributed executors.worker_process executors.local executors
     rollout
-    parameters.scene_parameters parameters.restarts parameters.space
+    parameters.scene_parameters parameters.first_positions parameters.restarts parameters.space
     losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
     losses.positions losses.recorded losses losses.checked
     gradients.estimator gradients.points gradients.ensemble_members gradients.exact

@@ -11,7 +11,7 @@ from cortado.lattice.region import TOLERANCE
 from cortado.parameters.registry import BY_NAME, Range
 from cortado.parameters.values import Arrays
 from cortado.scene.scene import Scene
-from cortado.scene.stability import broken_limit
+from cortado.scene.stability import broken_limits
 
 CROWDED = 0.5
 """Of the room that their fluid fills: particles with less for all of them cannot be pushed apart."""
@@ -43,19 +43,22 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
         path, opening = np.atleast_2d(values["nozzle_path"]), scene.emitter.opening(spacing) - scene.emitter.outlet
         for step in outside(scene, (path[:, None] + opening).reshape(-1, scene.dimension))[:1] // len(opening):
             raise InputError(
-                f"parameter nozzle_path is at {place_in_words(path[step])} in step {step + 1}, but must be where all of "
-                "the opening is inside the container."
+                f"parameter nozzle_path is at {place_in_words(path[step])} in step {step + 1}, but must be where all "
+                "of the opening is inside the container."
             )
 
 
-def unstable_sentence(values: Arrays, scene: Scene) -> str | None:
-    """What to say of a time step beyond the limit of stability under these parameters; None if there is nothing."""
+def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | None:
+    """What to say of a time step beyond limits of stability under these parameters, of which the least counts that was
+    not told; None if there is nothing. All of them are told then."""
     time_step = float(values.get("time_step", scene.solver.time_step))
-    broken = broken_limit(scene, values, time_step)
-    if broken is None:
+    broken = [(name, limit) for name, limit in broken_limits(scene, values, time_step) if name not in told]
+    if not broken:
         return None
-    found = f"time_step is {time_step:g} s, but the limit of stability with these parameters is about {broken[1]:.3g} s"
-    return f"{found}, which comes from {broken[0]}."
+    told.update(name for name, _ in broken)
+    name, limit = broken[0]
+    found = f"time_step is {time_step:g} s, but the limit of stability with these parameters is about {limit:.3g} s"
+    return f"{found}, which comes from {name}."
 
 
 def _check_room(positions: np.ndarray, spacing: float) -> None:

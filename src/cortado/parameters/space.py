@@ -10,6 +10,7 @@ from cortado.device.state import Parameters, State
 from cortado.device.threads import WARP
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.parameters.checks import check_places, check_sizes, unstable_sentence
+from cortado.parameters.first_positions import FirstPositions
 from cortado.parameters.registry import Role, names
 from cortado.parameters.restarts import check_state, origin_of
 from cortado.parameters.scene_parameters import DENSITY, RUN, SceneParameters, Simulated
@@ -30,7 +31,9 @@ class ParameterSpace:
     def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._batch, self._steps = simulation, simulation.batch, steps
         self._one = SceneParameters(simulation, steps)
-        self._warned = False
+        self._first_positions = FirstPositions(simulation)
+        self._told: set[str] = set()
+        """The limits of stability that were warned of."""
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
         """Values as float64 arrays; raises `InputError` in a sentence. A ``what`` of "direction" may be negative."""
@@ -184,21 +187,21 @@ class ParameterSpace:
         return [shared | {name: value[b] for name, value in each.items()} for b in members]
 
     def _check(self, values: Arrays, number: int) -> None:
-        """Whether the values of one scene make sense for it; a time step beyond the limit of stability is warned of
-        once."""
+        """Whether the values of one scene make sense for it; once there is a warning of each limit of stability that the
+        time step is beyond, and of first positions that are crowded."""
         simulation = self._simulation
         if self._steps == 0:
             return
         try:
             check_places(values, simulation.scene, simulation.free_particles)
+            crowded = self._first_positions.check(values, number)
         except InputError as error:
             if self._batch is None:
                 raise
             raise InputError(f"In scene {number} of the batch, {error}") from error
         upright = self._one.upright(values)
-        sentence = unstable_sentence(upright, simulation.scene) if values and not self._warned else None
-        if sentence is not None:
-            self._warned = True
+        unstable = unstable_sentence(upright, simulation.scene, self._told) if values else None
+        for sentence in filter(None, (crowded, unstable)):
             warnings.warn(sentence, CortadoWarning, stacklevel=4)
 
     def _together(self, fields: list[Arrays]) -> Arrays:
