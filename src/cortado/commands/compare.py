@@ -134,7 +134,7 @@ def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
         if pair is None:
             return {
                 **found,
-                "unlike": "these are different times, and no later frames are at the same time",
+                "unlike": "these are different times, and no frames are at the same time",
                 "fields": {},
             }
         frames = [run[k] for run, k in zip(runs, pair, strict=True)]

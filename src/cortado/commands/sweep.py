@@ -79,7 +79,7 @@ class Member:
 
     def time_step(self, combination: Combination) -> float:
         """Of the scene [s]."""
-        return load_scene(self.file, combination.overrides).solver.time_step
+        return _time_step(self.file, combination)
 
     def steps(self, combination: Combination) -> int:
         """How many of them come nearest to the duration; at least one."""
@@ -183,9 +183,14 @@ def _duration(file: Path, chosen: list[Combination], steps: int | None, time: fl
             raise InputError(f"--time is {time:g}, but must be a number of seconds greater than 0.")
         return time
     number = check_steps(STEPS if steps is None else steps)
+    return number * min(_time_step(file, one) for one in chosen)
+
+
+def _time_step(file: Path, combination: Combination) -> float:
+    """Of a scene [s]; what there is to warn of is said when it is run."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
-        return number * min(load_scene(file, one.overrides).solver.time_step for one in chosen)
+        return load_scene(file, combination.overrides).solver.time_step
 
 
 def _record_every(steps: int) -> int:
@@ -197,9 +202,7 @@ def _warn_of_times(member: Member, done: list[Combination]) -> None:
     """Say where runs end at different times, as no whole number of their time steps is the duration."""
     if member.duration is None or not done:
         return
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CortadoWarning)
-        ends = [member.steps(one) * member.time_step(one) for one in done]
+    ends = [member.steps(one) * member.time_step(one) for one in done]
     off = max(ends, key=lambda end: abs(end - member.duration))
     if abs(off - member.duration) > SAME_TIME * member.duration:
         last = done[ends.index(off)].name

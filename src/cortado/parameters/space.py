@@ -187,8 +187,8 @@ class ParameterSpace:
         return [shared | {name: value[b] for name, value in each.items()} for b in members]
 
     def _check(self, values: Arrays, number: int) -> None:
-        """Whether the values of one scene make sense for it; warns, once, of each limit of stability that the time step is
-        beyond, and of first positions that are crowded."""
+        """Whether the values of one scene make sense for it. It warns, once, of each limit of stability that the time
+        step is beyond, and of first positions that are crowded."""
         simulation = self._simulation
         if self._steps == 0:
             return
