@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 from numpy.typing import NDArray
 
@@ -48,8 +49,9 @@ class Origin:
     @classmethod
     def from_json(cls, text: str) -> "Origin":
         """What `to_json` wrote; raises `ValueError` or `TypeError` for anything else."""
-        read = {name: tuple(value) if isinstance(value, list) else value for name, value in json.loads(text).items()}
-        return cls(**read)
+        read: dict[str, Any] = json.loads(text)
+        values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in read.items()}
+        return cls(**values)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

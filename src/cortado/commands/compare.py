@@ -37,11 +37,11 @@ def _compared(one: RunFolder, other: RunFolder) -> dict[str, Any]:
     scenes = [_json(folder.scene) for folder in (one, other)]
     found: dict[str, Any] = {
         "runs": [str(one.path), str(other.path)],
-        "scene": _differences(*scenes),
+        "scene": _differences(scenes[0], scenes[1]),
         "settings": _differences(settings[0], settings[1]),
         "environment": _differences(environments[0], environments[1]),
         "result": _differences(one.read_result() or {}, other.read_result() or {}),
-        "metrics": _other_steps(*settings, scenes) or _metrics(one, other),
+        "metrics": _other_steps(settings, scenes) or _metrics(one, other),
         "last_state": _last_states(one, other),
     }
     return {"equal": _is_equal(found), **found}
@@ -93,11 +93,11 @@ def _has_tables(values: list[Any]) -> bool:
     return any(isinstance(value, Mapping) for value in values)
 
 
-def _other_steps(one: Mapping[str, Any], other: Mapping[str, Any], scenes: list[dict[str, Any]]) -> dict[str, Any]:
+def _other_steps(settings: list[dict[str, Any]], scenes: list[dict[str, Any]]) -> dict[str, Any]:
     """What to say of the metrics of two runs, of which line k is at another time in each; empty where it is at the
     same."""
     steps = [_table(scene.get("solver")).get("time_step") for scene in scenes]
-    if steps[0] == steps[1] or not one["kind"] == other["kind"] == "run":
+    if steps[0] == steps[1] or any(table["kind"] != "run" for table in settings):
         return {}
     return {"unlike": f"time steps of {steps[0]} s and {steps[1]} s cannot be compared one by one"}
 

@@ -200,14 +200,15 @@ def _record_every(steps: int) -> int:
 
 def _warn_of_times(member: Member, done: list[Combination]) -> None:
     """Say where runs end at different times, as no whole number of their time steps is the duration."""
-    if member.duration is None or not done:
+    duration = member.duration
+    if duration is None or not done:
         return
     ends = [member.steps(one) * member.time_step(one) for one in done]
-    off = max(ends, key=lambda end: abs(end - member.duration))
-    if abs(off - member.duration) > SAME_TIME * member.duration:
+    off = max(ends, key=lambda end: abs(end - duration))
+    if abs(off - duration) > SAME_TIME * duration:
         last = done[ends.index(off)].name
         warnings.warn(
-            f"not all combinations end at {member.duration:g} s, which is no whole number of their time steps: {last} "
+            f"not all combinations end at {duration:g} s, which is no whole number of their time steps: {last} "
             f"ends at {off:g} s. Choose a --time that is a multiple of every time step.",
             CortadoWarning,
             stacklevel=2,

@@ -31,7 +31,7 @@ class Packing:
 
     positions: Points
     """(n, d) [m]"""
-    densities: NDArray[np.float64]
+    densities: NDArray
     """(n,) number density over that on the rest lattice."""
 
     @property
@@ -84,7 +84,7 @@ def check_apart(what: str, positions: Points, spacing: float, period: tuple[Poin
         )
 
 
-def nearest(positions: Points) -> NDArray[np.float64]:
+def nearest(positions: Points) -> NDArray:
     """(n,) the distance [m] from each of two or more particles (n, d) [m] to the nearest other one."""
     from scipy.spatial import cKDTree
 

@@ -109,8 +109,8 @@ ADVICE = {"rest_density": "; a rest density that a run was given is to be given 
 def _is_same(one: object, other: object) -> bool:
     if isinstance(one, str) or isinstance(other, str):
         return one == other
-    numbers = [np.asarray(value, dtype=np.float64) for value in (one, other)]
-    return numbers[0].shape == numbers[1].shape and np.allclose(*numbers, rtol=SAME, atol=0.0)
+    some, others = (np.asarray(value, dtype=np.float64) for value in (one, other))
+    return some.shape == others.shape and np.allclose(some, others, rtol=SAME, atol=0.0)
 
 
 def _listed(value: object) -> str:
