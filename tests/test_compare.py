@@ -132,3 +132,53 @@ def test_mistakes_are_sentences(capsys, arguments, words):
     out, err = capsys.readouterr()
     assert_one_sentence(err.removesuffix("\n"))
     assert out == "" and words in err
+
+
+# ---- times -------------------------------------------------------------------------------------------------------
+
+
+def positions_at(name, time):
+    trajectory = Trajectory.load(f"{name}/trajectory.vtkhdf")
+    (k,) = np.flatnonzero(np.isclose(trajectory.times, time))
+    return trajectory.positions[k].astype(float)
+
+
+def test_states_of_other_times_are_not_subtracted(capsys):
+    """The last ones that are at the same time are compared, and it is said at which."""
+    run("longer", "--steps", "6")
+    found = compared(capsys, "one", "longer")["last_state"]
+    assert found["times_s"] == pytest.approx([0.0084, 0.0126]) and found["compared_at_s"] == pytest.approx(0.0084)
+    assert found["fields"]["positions"]["greatest"] == 0.0
+    main(["compare", "one", "longer"])
+    out = capsys.readouterr().out
+    assert "last state at 0.0084 s | 0.0126 s, compared at 0.0084 s: positions the same bit for bit" in out
+    assert out.endswith("The two runs differ.\n")
+
+
+def test_runs_with_other_time_steps_are_compared_at_the_same_time(capsys):
+    run("halved", "--steps", "7", "--set", "solver.time_step=0.00105")
+    found = compared(capsys, "one", "halved")
+    state = found["last_state"]
+    assert state["compared_at_s"] == pytest.approx(0.0063)
+    apart = np.linalg.norm(positions_at("one", 0.0063) - positions_at("halved", 0.0063), axis=1)
+    assert state["fields"]["positions"]["greatest"] == pytest.approx(apart.max())
+    assert found["metrics"] == {"unlike": "time steps of 0.0021 s and 0.00105 s cannot be compared one by one"}
+    main(["compare", "one", "halved"])
+    assert "metrics: time steps of 0.0021 s and 0.00105 s cannot be compared" in capsys.readouterr().out
+
+
+def test_runs_without_a_common_time_are_not_compared(capsys):
+    run("other_times", "--steps", "3", "--set", "solver.time_step=0.0013")
+    found = compared(capsys, "one", "other_times")
+    assert not found["last_state"]["fields"] and "different times" in found["last_state"]["unlike"]
+    assert found["equal"] is False
+    main(["compare", "one", "other_times"])
+    assert "last state at 0.0084 s | 0.0039 s: these are different times" in capsys.readouterr().out
+
+
+def test_as_many_steps_of_other_lengths_may_end_at_the_same_time(capsys):
+    run("halved", "--steps", "8", "--set", "solver.time_step=0.00105")
+    state = compared(capsys, "one", "halved")["last_state"]
+    assert state["compared_at_s"] == pytest.approx(0.0084) and state["fields"]["positions"]["greatest"] > 0.0
+    main(["compare", "one", "halved"])
+    assert "last state at 0.0084 s: positions apart by" in capsys.readouterr().out

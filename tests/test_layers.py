@@ -13,6 +13,7 @@ ROOT = Path(cortado.__file__).parent
 
 LAYERS = """
     errors
+    fixed
     words
     arrays
     restart
@@ -32,7 +33,7 @@ LAYERS = """
     device.neighbourhood device.arrays device.fields device.launching device.state device.cells
     device.candidates device.neighbours
     scene.overlaps scene.checks scene.scene scene.in_words
-    parameters.checks
+    discretise.crowding parameters.checks
     discretise.bodies discretise.packing discretise.sampling discretise.discrete_scene
     sph sph.density sph.free_energy sph.integration sph.order sph.materials sph.emitter_kernels sph.pair_forces
     sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
@@ -46,7 +47,7 @@ LAYERS = """
     reference.digits reference.engine reference.histories reference.losses reference.simulation reference
     executors.executor executors.calls executors.distributed executors.worker_process executors.local executors
     rollout
-    parameters.scene_parameters parameters.space
+    parameters.scene_parameters parameters.first_positions parameters.restarts parameters.space
     losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
     losses.positions losses.recorded losses losses.checked
     gradients.estimator gradients.points gradients.ensemble_members gradients.exact

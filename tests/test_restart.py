@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cortado import InputError, Simulation, Trajectory
+from cortado import InputError, Scene, Simulation, Trajectory
+from cortado.restart import Clock
 from scenes import jet, plane, plane_of_three, pour, two_layers
 
 FIRST, REST = 17, 24
@@ -97,3 +98,149 @@ def test_a_run_goes_on_from_a_frame_on_the_way():
     np.testing.assert_array_equal(again.positions, whole[3:].positions)
     with pytest.raises(InputError, match=r"^The trajectory has no frame"):
         _ = whole[7:].last_state
+
+
+# ---- what a state belongs to -------------------------------------------------------------------------------------
+
+
+def spread_out(factor):
+    """A plane of as many particles, with a spacing so many times as large."""
+    scene = plane()
+    box = scene.fluid[0].model_copy(update={"upper": tuple(factor * x for x in scene.fluid[0].upper)})
+    wall = scene.container.model_copy(update={"upper": tuple(3.0 * x for x in scene.container.upper)})
+    cut = {"spacing": factor * scene.discretisation.spacing}
+    return Scene(
+        **{
+            **scene.model_dump(exclude_none=True),
+            "fluid": [box.model_dump()],
+            "container": wall.model_dump(exclude_none=True),
+            "discretisation": {**scene.discretisation.model_dump(), **cut},
+        }
+    )
+
+
+def refused(simulation, state, controls=None):
+    with pytest.raises(InputError) as caught:
+        simulation.run(2, controls, state=state)
+    sentence = str(caught.value)
+    assert sentence.startswith("state ") and sentence.endswith(".") and "\n" not in sentence
+    return sentence
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+@pytest.mark.parametrize("factor", [0.5, 1.6])
+@pytest.mark.parametrize("known", [True, False])
+def test_a_state_of_another_spacing_is_refused(factor, known):
+    """Also where it does not say what it is of."""
+    simulation, other = Simulation(plane()), Simulation(spread_out(factor))
+    assert simulation.particles == other.particles
+    state = other.run(2).last_state
+    sentence = refused(simulation, state if known else replace(state, origin=None))
+    assert ("spacing of" if known else "another spacing") in sentence
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        (
+            "phase.0.rest_density=900",
+            "a rest density of 900 kg/m3, but must be of one with a rest density of 1000 kg/m3",
+        ),
+        ('discretisation.kernel="wendland_c2"', "the kernel wendland_c2"),
+        ("discretisation.support=2.5", "a support of 2.5 spacings"),
+        ("container.periodic=[true,false]", "periods of"),
+    ],
+)
+def test_a_state_of_other_particles_is_refused(override, words, tmp_path):
+    scene = plane()
+    trajectory = Simulation(scene.replaced(override)).run(2)
+    trajectory.save(tmp_path / "other.vtkhdf")
+    for state in (trajectory.last_state, Trajectory.load(tmp_path / "other.vtkhdf").last_state):
+        assert words in refused(Simulation(scene), state)
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("make", [plane, two_layers, plane_of_three, pour])
+@pytest.mark.parametrize("factor", [0.5, 0.9, 1.2])
+def test_reference_densities_of_other_fluid_are_refused(make, factor, known):
+    simulation = Simulation(make())
+    state = simulation.run(2).last_state
+    wrong = replace(state, fields={**state.fields, "reference_density": factor * state["reference_density"]})
+    sentence = refused(simulation, wrong if known else replace(wrong, origin=None))
+    assert "reference_density" in sentence
+
+
+@pytest.mark.parametrize("make", [plane, two_layers])
+def test_a_run_with_a_rest_density_goes_on_with_it_and_not_without(make):
+    simulation = Simulation(make(), precision="float64")
+    controls = {"rest_density": 0.9 * simulation.parameters()["rest_density"]}
+    whole = simulation.run(12, controls)
+    state = simulation.run(5, controls).last_state
+    rest = simulation.run(7, controls, state=state)
+    assert rest.positions.tobytes() == whole.positions[5:].tobytes()
+    assert "to be given again where it goes on" in refused(simulation, state)
+    refused(simulation, replace(state, origin=None))
+    refused(simulation, simulation.run(5).last_state, controls)
+
+
+def test_two_particles_of_a_state_at_one_place_are_refused():
+    simulation = Simulation(plane())
+    state = simulation.run(2).last_state
+    state["positions"][7] = state["positions"][3]
+    assert "particles 3 and 7 at one place" in refused(simulation, state)
+
+
+@pytest.mark.parametrize(
+    ("clock", "words"),
+    [
+        (Clock(3, np.nan), "finite time of at least 0 s"),
+        (Clock(3, np.inf), "finite time of at least 0 s"),
+        (Clock(3, -5.0), "is at -5.0 s"),
+        (Clock(-1, 0.0), "has -1 steps"),
+        (Clock(2.5, 0.0), "has 2.5 steps"),
+        (0.1, "must be a Clock"),
+    ],
+)
+def test_a_clock_that_cannot_be_is_refused(clock, words):
+    simulation = Simulation(plane())
+    state = replace(simulation.run(2).last_state, clock=clock)
+    sentence = refused(simulation, state)
+    assert sentence.startswith("state clock") and words in sentence
+
+
+def test_a_state_is_of_its_own():
+    trajectory = Simulation(plane()).run(2)
+    state, before = trajectory.last_state, trajectory.positions.copy()
+    state["positions"][:] = 0.0
+    state["reference_density"][:] = 0.0
+    np.testing.assert_array_equal(trajectory.positions, before)
+    assert trajectory.constants["reference_density"].all()
+    state = trajectory.last_state
+    trajectory.positions[:] = 0.0
+    np.testing.assert_array_equal(state["positions"], before[-1])
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_a_state_goes_on_with_other_forces_time_steps_and_precisions():
+    state = Simulation(plane()).run(4).last_state
+    for simulation, controls in [
+        (Simulation(plane(), precision="float64"), {}),
+        (Simulation(plane().replaced("forces.gravity=[1,-5]", "phase.0.viscosity=0.3")), {}),
+        (Simulation(plane().replaced("solver.time_step=0.0005")), {"gravity": [0.0, 2.0]}),
+        (Simulation(plane().replaced("container.upper=[3,3]")), {"time_step": 0.0003}),
+    ]:
+        assert simulation.run(2, controls, state=state).steps.tolist() == [4, 5, 6]
+
+
+def test_a_file_without_an_origin_can_still_be_read(tmp_path):
+    """As earlier versions wrote it: such a state is judged by its densities and distances alone."""
+    simulation = Simulation(plane())
+    first = simulation.run(4)
+    replace(first, origin=None).save(tmp_path / "old.vtkhdf")
+    loaded = Trajectory.load(tmp_path / "old.vtkhdf")
+    assert loaded.origin is None and loaded.last_state.origin is None
+    found = simulation.run(3, state=loaded.last_state)
+    assert found.positions.tobytes() == simulation.run(7).positions[4:].tobytes()
+    first.save(tmp_path / "new.vtkhdf")
+    assert Trajectory.load(tmp_path / "new.vtkhdf").origin == first.origin == first[1:3].origin
+    assert first.origin.spacing == plane().discretisation.spacing

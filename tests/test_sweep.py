@@ -21,6 +21,7 @@ from cortado.cli import main
 from cortado.executors import Distributed, InProcess
 from cortado.executors import distributed as of_dask
 from cortado.io.interruption import Interrupted
+from cortado.io.trajectory import Trajectory
 from cortado.sweep.combinations import combinations
 from cortado.sweep.table import write_table
 from dask_processes import PATIENCE, scheduler
@@ -293,3 +294,50 @@ def test_a_search_with_an_ensemble_has_the_same_bits_on_workers(folder, capfd):
     assert end.value.code == 2 and not Path("more").exists()
     wanted = "--workers is given, but must be left out, as optimise.gradient.samples is 1.\n"
     assert without_compiling(capfd.readouterr().err) == wanted
+
+
+# ---- several time steps ------------------------------------------------------------------------------------------
+
+
+def ends(folder):
+    return {path.parent.name: float(Trajectory.load(path).times[-1]) for path in Path(folder).glob("*/*.vtkhdf")}
+
+
+@pytest.mark.parametrize("values", ["0.001,0.002,0.0005", "0.002,0.0005,0.001"])
+def test_runs_of_several_time_steps_end_at_the_same_time(sweep, values):
+    """So many steps of the smallest one; the order of the values changes nothing."""
+    code, _, err = sweep("scene.toml", "--set", f"solver.time_step={values}", "--steps", 8, "--out", "runs")
+    assert (code, err) == (0, "")
+    assert sorted(int(row["steps"]) for row in rows("runs")) == [2, 4, 8]
+    assert list(ends("runs").values()) == pytest.approx([0.004] * 3)
+
+
+def test_a_sweep_may_be_given_a_time(sweep):
+    several = ("--set", "solver.time_step=0.001,0.002")
+    assert sweep("scene.toml", *several, "--time", 0.006, "--out", "runs")[0] == 0
+    assert list(ends("runs").values()) == pytest.approx([0.006] * 2)
+    code, out, _ = sweep("scene.toml", *several, "--steps", 6, "--out", "runs")  # the same
+    assert code == 0 and "2 of them there already" in out
+
+
+def test_times_that_cannot_be_the_same_are_said(sweep):
+    code, _, err = sweep("scene.toml", "--set", "solver.time_step=0.001,0.0015", "--steps", 4, "--out", "runs")
+    assert code == 0
+    assert err.startswith("Warning: not all combinations end at 0.004 s") and "0.0015 ends at 0.0045 s" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            ["scene.toml", "--set", "solver.time_step=0.001", "--steps", "3", "--time", "0.1"],
+            "--time is given, but must",
+        ),
+        (["scene.toml", "--set", "solver.time_step=0.001", "--time", "0"], "--time is 0, but must be a number of sec"),
+        (["scene.toml", "--set", "solver.time_step=0.001", "--time", "inf"], "--time is inf, but must be a number of"),
+        (["task.toml", *RATES, "--time", "0.1"], "--time is given, but must be left out, as the task says"),
+    ],
+)
+def test_a_time_that_cannot_be_is_refused(sweep, arguments, words):
+    code, out, err = sweep(*arguments, "--out", "runs")
+    assert (code, out) == (2, "") and words in err

@@ -41,6 +41,13 @@ def as_numbers(what: str, value: Any) -> np.ndarray:
     raise InputError(f"{what} is {shown(found)}, but must be a number or an array of real numbers.")
 
 
+def read_only(what: str, value: Any) -> np.ndarray:
+    """The same as an array of its own that cannot be changed."""
+    array = as_numbers(what, value).copy()
+    array.setflags(write=False)
+    return array
+
+
 def as_one_number(what: str, value: Any) -> float:
     """A real number, or an `InputError` in a sentence that begins with ``what``; an array of shape () is one."""
     array = as_numbers(what, value)

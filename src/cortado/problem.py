@@ -13,6 +13,7 @@ from cortado.device.memory import require
 from cortado.device.state import State
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import CortadoWarning, DivergedError, InputError
+from cortado.fixed import fixed
 from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator, estimate
 from cortado.io.trajectory import noted
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch, batch, fingerprint
@@ -30,6 +31,7 @@ KEPT = 2
 """Batches of a problem, of different sizes, that are kept for the next evaluation."""
 
 
+@fixed
 class Problem:
     """A simulation of a number of steps, judged by a loss.
 

@@ -1,7 +1,9 @@
 """What a run needs to go on from where another one stopped, bit for bit: a state, and when it is."""
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 from numpy.typing import NDArray
 
@@ -23,6 +25,35 @@ class Clock:
         return (self.time - self.steps * time_step) + (self.steps + steps) * time_step
 
 
+@dataclass(frozen=True)
+class Origin:
+    """Of which particles a state is: what is the same in every run that goes on from it."""
+
+    spacing: float
+    """[m]"""
+    support: float
+    """[spacings]"""
+    kernel: str
+    """Name of the smoothing kernel."""
+    periods: tuple[float, ...]
+    """(d,) lengths [m], 0 along an axis that is not periodic."""
+    waiting: int
+    """How many particles, the last ones, are an emitter's."""
+    rest_density: tuple[float, ...]
+    """(phases,) that the run had [kg/m3]."""
+
+    def to_json(self) -> str:
+        """To be read by `from_json`."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> "Origin":
+        """What `to_json` wrote; raises `ValueError` or `TypeError` for anything else."""
+        read: dict[str, Any] = json.loads(text)
+        values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in read.items()}
+        return cls(**values)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class RestartState(Brief):
     """The state at the end of a step, whole: `Trajectory.last_state` gives it and `Simulation.run` takes it."""
@@ -34,6 +65,8 @@ class RestartState(Brief):
     carries from step to step, of which PCISPH has nothing."""
     clock: Clock = field(default_factory=Clock)
     """When the state is."""
+    origin: Origin | None = None
+    """Of which particles it is; None of one that was made by hand, or that an earlier version wrote."""
 
     def __getitem__(self, name: str) -> NDArray:
         return self.fields[name]

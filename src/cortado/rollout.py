@@ -18,7 +18,7 @@ from cortado.device.memory import require, step_parts, within
 from cortado.device.state import Parameters, State, StateSeries
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
-from cortado.restart import Clock
+from cortado.restart import Clock, Origin
 from cortado.solvers.containment import Lost
 from cortado.solvers.solver import Counts, Solver
 
@@ -80,6 +80,8 @@ class Rollout:
         """What to try where a member diverged, in words."""
         self.clocks = [Clock()] * solver.layout.members
         """Of the first state of each scene of a batch."""
+        self.origins: list[Origin] = []
+        """Of the particles of each scene of a batch."""
         self.lost: dict[int, DivergedError] = {}
         """The scenes of a batch that lost a particle in the last forward run, by number. What stands in their states
         after the step before means nothing."""

@@ -24,6 +24,7 @@ from cortado.device.threads import WARP, Turn, in_turn
 from cortado.discretise.discrete_scene import DiscreteScene, discretise
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.figures.particle_sets import particles
+from cortado.fixed import fixed
 from cortado.io.notebook import with_picture
 from cortado.io.trajectory import Frame, Trajectory
 from cortado.io.trajectory_batch import TrajectoryBatch
@@ -52,6 +53,7 @@ WORTH = {"cpu": 16_000, "cuda": 1_000_000}
 """Particles of all scenes in one launch, beyond which more of them are no faster."""
 
 
+@fixed
 class Simulation:
     """A scene made ready to run: particles sampled, masses calibrated, kernels chosen.
 
@@ -108,7 +110,7 @@ class Simulation:
         """The first state on the device."""
         first = SceneParameters(self, 0).first(self.parameters())
         self.state.set(first if self.batch is None else {name: [a] * self.batch for name, a in first.items()})
-        for array in (self.positions, self.velocities, self.mass_fractions):
+        for array in (self.positions, self.velocities, self.mass_fractions, self.walls):
             array.setflags(write=False)
         check_sizes(self.parameters(), self.precision)
 
@@ -166,8 +168,9 @@ class Simulation:
         ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity, its schedule included; so
         does any other parameter of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same
         scene, the run goes on from there, with the same bits as if it had not stopped; a parameter over time is then
-        one of the steps to come. A batch goes on from one state for each scene. Warns when the pressure did not
-        converge; raises `DivergedError` when a particle is lost, where a batch warns, and goes on without the scene.
+        one of the steps to come, and a rest density that the earlier run was given is given again. A batch goes on from
+        one state for each scene. Warns when the pressure did not converge; raises `DivergedError` when a particle is
+        lost, where a batch warns, and goes on without the scene.
         """
         return self.collect(self.rollout(steps, controls, state), record_every)
 
@@ -211,6 +214,7 @@ class Simulation:
                 others=own,
                 constants={name: array[at[1:]] for name, array in constants.items()},
                 substeps=rollout.substeps,
+                origin=rollout.origins[number],
             )
 
         if self.batch is None:
@@ -250,8 +254,7 @@ class Simulation:
         space = ParameterSpace(self, rollout.steps)
         values = space.checked({} if controls is None else controls)
         states = self._states(state)
-        for one in states:
-            space.check_restart(one, values)
+        space.check_restarts(states, values)
         space.begin(rollout, values, states=states)
         return rollout
 

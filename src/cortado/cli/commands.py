@@ -213,6 +213,7 @@ def sweep(
     file: Annotated[Positional[Path], arg(metavar="FILE.toml")],
     sets: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE,VALUE")] = (),
     steps: int | None = None,
+    time: float | None = None,
     out: Path = Path("runs/sweep"),
     device: str = "cpu",
     precision: str = "float32",
@@ -225,7 +226,9 @@ def sweep(
     Args:
         file: The scene file, or the task file.
         sets: What changes, such as solver.time_step=0.001,0.002; may be given again, for every combination.
-        steps: Number of time steps of a scene, 200 if left out; a task says its own.
+        steps: Number of time steps of a scene, 200 if left out, with the smallest time step of the sweep; with longer
+            ones as many fewer as reach the same time. A task says its own.
+        time: Seconds that a scene is simulated, in the place of steps.
         out: Folder of the sweep, with a folder for each combination and a table of them all.
         device: "cpu", or "cuda:0" for the first GPU, of each worker.
         precision: "float32" or "float64".
@@ -235,7 +238,7 @@ def sweep(
     from cortado.commands.executor import Where
     from cortado.commands.sweep import run_sweep
 
-    return partial(run_sweep, file, as_text(sets), steps, out, device, precision, Where(scheduler, workers))
+    return partial(run_sweep, file, as_text(sets), steps, time, out, device, precision, Where(scheduler, workers))
 
 
 @command(app, answers=True)

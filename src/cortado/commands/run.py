@@ -96,9 +96,9 @@ def _write_trajectory(simulation: Simulation, rollout: Rollout, folder: RunFolde
     steps = rollout.steps
     recorded = np.array([*range(0, steps, record_every), steps])
     times, first = rollout.clocks[0].times(recorded, rollout.time_steps[0]), simulation.frame(rollout.initial)
-    constants = simulation.constants(rollout)
+    constants, origin = simulation.constants(rollout), rollout.origins[0]
     with (
-        frame_writer(folder.trajectory, times, first, constants, steps, rollout.diagnostics) as writer,
+        frame_writer(folder.trajectory, times, first, constants, steps, rollout.diagnostics, origin) as writer,
         track(steps, "run") as advance,
     ):
 

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from cortado.words import counted
 
 STEPS = 200
 """Of a scene, where nothing else is asked for."""
+SAME_TIME = 1e-9
+"""Relative: times that differ by less are the same."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +34,8 @@ class Member:
 
     file: Path
     """The scene or the task."""
-    steps: int | None
-    """Of a scene; None for a task, which says itself."""
+    duration: float | None
+    """Of a scene [s]; None for a task, which says itself."""
     out: Path
     """The folder of the sweep."""
     device: str
@@ -57,12 +60,12 @@ class Member:
         """What came out of a combination; None where it has not ended. Raises `InputError` where its scene or task is
         wrong, or another one than that in its folder."""
         overrides = combination.overrides
-        if self.steps is None:
+        if self.duration is None:
             task = load_task(self.file, overrides)
             scene, kind, settings = task.scene, "optimise", search_settings(task, self.precision)
         else:
-            scene, kind = load_scene(self.file, overrides), "run"
-            settings = run_settings(self.steps, self.precision, self._record_every)
+            scene, kind, steps = load_scene(self.file, overrides), "run", self.steps(combination)
+            settings = run_settings(steps, self.precision, _record_every(steps))
         folder = self._folder(combination)
         if folder is None:
             return None
@@ -74,10 +77,14 @@ class Member:
         path = self.out / combination.name
         return RunFolder.open(path) if (path / "environment.json").exists() else None
 
-    @property
-    def _record_every(self) -> int:
-        """About a hundred frames."""
-        return max((self.steps or 0) // 100, 1)
+    def time_step(self, combination: Combination) -> float:
+        """Of the scene [s]."""
+        return _time_step(self.file, combination)
+
+    def steps(self, combination: Combination) -> int:
+        """How many of them come nearest to the duration; at least one."""
+        assert self.duration is not None
+        return check_steps(max(round(self.duration / self.time_step(combination)), 1))
 
     def _computed(self, combination: Combination) -> dict[str, Any]:
         """Compute a combination, or go on with it; what fails is said in the result."""
@@ -87,13 +94,14 @@ class Member:
         words += ["--device", self.device, "--precision", self.precision]
         try:
             with untracked():
-                if self.steps is None:
+                if self.duration is None:
                     command = ["cortado", "optimise", *words]
                     optimise_task(self.file, out, overrides, self.device, self.precision, begun, False, command)
                 else:
-                    every = self._record_every
-                    command = ["cortado", "run", *words, "--steps", str(self.steps), "--record-every", str(every)]
-                    run_scene(self.file, self.steps, out, overrides, self.device, self.precision, every, begun, command)
+                    steps = self.steps(combination)
+                    every = _record_every(steps)
+                    command = ["cortado", "run", *words, "--steps", str(steps), "--record-every", str(every)]
+                    run_scene(self.file, steps, out, overrides, self.device, self.precision, every, begun, command)
         except Interrupted as stop:  # what is kept of one combination says less than the sweep does
             raise Interrupted(stop.args[0]) from None
         except CortadoError as error:
@@ -108,6 +116,7 @@ def run_sweep(
     file: Path,
     options: list[str],
     steps: int | None,
+    time: float | None,
     out: Path,
     device: str,
     precision: str,
@@ -115,7 +124,8 @@ def run_sweep(
 ) -> str:
     """Compute what is not there yet; returns a sentence that says where the table is. Raises `ComputationError` where
     some combinations failed."""
-    chosen, member = combinations(options), _member(file, steps, out, device, precision)
+    chosen = combinations(options)
+    member = Member(file.absolute(), _duration(file, chosen, steps, time), out.absolute(), device, precision)
     done = _there(member, chosen)
     left = [number for number in range(len(chosen)) if number not in done]
     there = len(done)
@@ -137,6 +147,7 @@ def run_sweep(
         write_table(out, chosen, done)
         executor.map(member, [chosen[number] for number in left], note)
     failures = sum(map(failed, done.values()))
+    _warn_of_times(member, [chosen[number] for number in done if not failed(done[number])])
     all_of_them = f"Of {counted(len(chosen), 'combination')}{f', {there} of them there already,' if there else ''}"
     table = f"table is {out.absolute() / NAME}, beside a folder for each."
     if failures:
@@ -157,15 +168,48 @@ def _there(member: Member, chosen: list[Combination]) -> dict[int, dict[str, Any
     return {number: result for number, result in found.items() if result is not None}
 
 
-def _member(file: Path, steps: int | None, out: Path, device: str, precision: str) -> Member:
-    """Of a task where the file has the table [optimise], else of a scene."""
-    is_task = "optimise" in read_toml(file)
-    if is_task and steps is not None:
-        raise InputError("--steps is given, but must be left out, as the task says problem.steps.")
-    return Member(
-        file.absolute(),
-        None if is_task else check_steps(STEPS if steps is None else steps),
-        out.absolute(),
-        device,
-        precision,
-    )
+def _duration(file: Path, chosen: list[Combination], steps: int | None, time: float | None) -> float | None:
+    """How long a scene is simulated [s]: so many steps of the smallest time step are, or the time itself. None for a
+    task, which is a file with the table [optimise]."""
+    if "optimise" in read_toml(file):
+        for name, value in (("steps", steps), ("time", time)):
+            if value is not None:
+                raise InputError(f"--{name} is given, but must be left out, as the task says problem.steps.")
+        return None
+    if time is not None and steps is not None:
+        raise InputError("--time is given, but must be left out, as --steps says how long the scene is simulated.")
+    if time is not None:
+        if not 0.0 < time < inf:
+            raise InputError(f"--time is {time:g}, but must be a number of seconds greater than 0.")
+        return time
+    number = check_steps(STEPS if steps is None else steps)
+    return number * min(_time_step(file, one) for one in chosen)
+
+
+def _time_step(file: Path, combination: Combination) -> float:
+    """Of a scene [s]; what there is to warn of is said when it is run."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CortadoWarning)
+        return load_scene(file, combination.overrides).solver.time_step
+
+
+def _record_every(steps: int) -> int:
+    """About a hundred frames."""
+    return max(steps // 100, 1)
+
+
+def _warn_of_times(member: Member, done: list[Combination]) -> None:
+    """Say where runs end at different times, as no whole number of their time steps is the duration."""
+    duration = member.duration
+    if duration is None or not done:
+        return
+    ends = [member.steps(one) * member.time_step(one) for one in done]
+    off = max(ends, key=lambda end: abs(end - duration))
+    if abs(off - duration) > SAME_TIME * duration:
+        last = done[ends.index(off)].name
+        warnings.warn(
+            f"not all combinations end at {duration:g} s, which is no whole number of their time steps: {last} "
+            f"ends at {off:g} s. Choose a --time that is a multiple of every time step.",
+            CortadoWarning,
+            stacklevel=2,
+        )

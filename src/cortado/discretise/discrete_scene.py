@@ -10,34 +10,23 @@ from functools import cached_property
 import numpy as np
 
 from cortado.discretise.bodies import Surroundings
+from cortado.discretise.crowding import check_crowding, crowding_of
 from cortado.discretise.packing import Packing
 from cortado.discretise.sampling import FluidSample, fluid_particles, period, wall_particles
 from cortado.discretise.walls.layers import WallLayers, wall_layers
 from cortado.discretise.walls.weights import RestLattice, Surface
-from cortado.errors import CortadoWarning, InputError
+from cortado.errors import CortadoWarning
 from cortado.lattice.calibration import (
     lattice_laplacian_correction,
     pressure_stiffness,
     rest_volume,
     wall_response,
 )
-from cortado.lattice.pairs import pairs_within
 from cortado.lattice.region import Region
 from cortado.lattice.shapes import Points
 from cortado.lattice.smoothing import SmoothingKernel, smoothing_kernel
 from cortado.scene.fluids import PointsFluid
 from cortado.scene.scene import Scene
-
-MOST_AVERAGE_COMPRESSION = 0.1
-"""Of the first particles, the mean of (n - 1)+ where n is the number density: a lattice that is squeezed by more
-bursts."""
-MOST_DENSITY = 1.5
-"""Greatest number density of a first particle; on a disturbed lattice with all particles half a spacing apart it is
-1.4."""
-NOTED_COMPRESSION = 0.03
-"""Average compression that is warned of; a lattice whose points are disturbed by a tenth of a spacing has 0.02."""
-NOTED_DENSITY = 0.5
-"""Where no particle has more, there is no fluid to speak of."""
 
 
 @dataclass(frozen=True)
@@ -115,11 +104,14 @@ def discretise(scene: Scene) -> DiscreteScene:
     layers = wall_layers(kernel, spacing, support, dimension)
     lattice = Lattice.of(kernel, spacing, support, dimension)
     fluid = fluid_particles(scene)
-    if any(isinstance(body, PointsFluid) for body in scene.fluid):
-        _check_packing(scene, fluid.positions, kernel, lattice)
     at_rest = RestLattice(kernel, spacing, support)
     walls = _walls(scene, layers, at_rest)
     fluid = replace(fluid, positions=_packed(fluid, walls, at_rest, *period(scene)))
+    if any(isinstance(body, PointsFluid) for body in scene.fluid):
+        crowding = crowding_of(fluid.positions, kernel, lattice.support, lattice.volume, period(scene))
+        told = check_crowding(crowding, spacing, "the points of the fluid")
+        if told is not None:
+            warnings.warn(told, CortadoWarning, stacklevel=3)
     return DiscreteScene(kernel, lattice, fluid, layers, walls, period(scene)[1])
 
 
@@ -140,35 +132,3 @@ def _walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     places = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
     region = scene.container.region(scene.dimension).opened(lengths)
     return Walls(positions, Surface(positions, flat, lattice, region, lower, lengths).weights(places))
-
-
-def _check_packing(scene: Scene, positions: Points, kernel: SmoothingKernel, lattice: Lattice) -> None:
-    """Points of a file may have any density: fluid that starts compressed flies apart, and points that do not touch
-    each other are no fluid. Raises `InputError`, or warns where it may be meant."""
-    point, _, distances = pairs_within(positions, positions, lattice.support, *period(scene))
-    seen = kernel.weight(distances, scene.dimension, lattice.support)
-    densities = lattice.volume * np.bincount(point, seen, minlength=len(positions))
-    average, greatest = np.maximum(densities - 1.0, 0.0).mean(), densities.max()
-    spacing, inside = scene.discretisation.spacing, float(np.quantile(densities, 0.75))  # away from the surface
-    fit = spacing * inside ** (-1.0 / scene.dimension)
-    advice = f"discretisation.spacing is {spacing:g} m, and these points would fit one of {fit:.3g} m"
-    if average > MOST_AVERAGE_COMPRESSION or greatest > MOST_DENSITY:
-        place = ", ".join(f"{x:g}" for x in positions[densities.argmax()])
-        raise InputError(
-            f"The points of the fluid have {greatest:.3g} times the rest density at ({place}) m and are compressed by "
-            f"{average:.0%} on average, but must have at most {MOST_DENSITY:g} times and be compressed by at most "
-            f"{MOST_AVERAGE_COMPRESSION:.0%}: {advice}."
-        )
-    if average > NOTED_COMPRESSION:
-        warnings.warn(
-            f"the points of the fluid are compressed by {average:.0%} on average, and will fly apart: {advice}.",
-            CortadoWarning,
-            stacklevel=4,
-        )
-    if greatest < NOTED_DENSITY:
-        warnings.warn(
-            f"the points of the fluid have {greatest:.2g} times the rest density at most, and hardly touch each other: "
-            f"{advice}.",
-            CortadoWarning,
-            stacklevel=4,
-        )

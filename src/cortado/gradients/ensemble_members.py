@@ -10,6 +10,7 @@ from cortado.device.memory import require
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
 from cortado.executors.executor import Executor, InProcess, checked_executor
+from cortado.fixed import keep_own
 from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator
 from cortado.gradients.points import Point, Sample, evaluated
 from cortado.parameters.values import Arrays, Values
@@ -55,6 +56,7 @@ class Ensemble:
         for name, spread in self.spread.items() if isinstance(self.spread, Mapping) else [("parameters", self.spread)]:
             _checked_spread(name, spread)
         checked_executor(self.executor)
+        keep_own(self, "spread")
 
     def around(self, problem: Differentiable, parameters: Values, draw: int = 0) -> "Sampler":
         """The ensemble around these parameters of a problem; another ``draw`` has other samples, independent of these.

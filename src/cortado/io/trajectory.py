@@ -15,7 +15,7 @@ from cortado.errors import InputError, shown
 from cortado.io import vtkhdf
 from cortado.io.notebook import as_text, with_view
 from cortado.io.particle_view import Cloud, particle_view, thinned
-from cortado.restart import Clock, RestartState
+from cortado.restart import Clock, Origin, RestartState
 from cortado.words import counted
 
 IN_A_NOTEBOOK = 1_000_000
@@ -72,6 +72,8 @@ class Trajectory:
     [kg/m3], and with one phase ``mass_fractions`` (n, 1)"""
     substeps: int = 0
     """[-] explicit steps of diffusion within each step"""
+    origin: Origin | None = None
+    """of which particles it is; None where nothing is known of it"""
 
     def __post_init__(self) -> None:
         frames = {len(self.times), len(self.steps), len(self.positions), len(self.velocities)}
@@ -189,15 +191,16 @@ class Trajectory:
 
     @property
     def last_state(self) -> RestartState:
-        """The state of the last frame, from which `Simulation.run` goes on bit for bit.
+        """The state of the last frame, from which `Simulation.run` goes on bit for bit, in arrays of its own.
 
         Raises:
             InputError: there is no frame.
         """
         if not len(self):
             raise InputError("The trajectory has no frame, but must have one to go on from.")
-        last = {name: array[-1] for name, array in self._fields.items()}
-        return RestartState({**last, **self.constants}, Clock(int(self.steps[-1]), float(self.times[-1])))
+        last = {**{name: array[-1] for name, array in self._fields.items()}, **self.constants}
+        own = {name: array.copy() for name, array in last.items()}
+        return RestartState(own, Clock(int(self.steps[-1]), float(self.times[-1])), self.origin)
 
     def save(self, path: str | Path) -> None:
         """Writes a VTKHDF file, which ParaView opens; a file of that name is replaced.
@@ -211,7 +214,8 @@ class Trajectory:
             raise InputError(f"path is {str(path)!r}, but {wanted}.")
         frames = self._fields
         first = {name: array[0] if len(array) else array for name, array in frames.items()}
-        with frame_writer(path, self.times, first, self.constants, len(self.converged), self.diagnostics) as writer:
+        steps = len(self.converged)
+        with frame_writer(path, self.times, first, self.constants, steps, self.diagnostics, self.origin) as writer:
             writer.append_steps(**self.diagnostics)
             for k, step in enumerate(self.steps):
                 append_frame(writer, {name: array[k] for name, array in frames.items()}, int(step))
@@ -227,7 +231,11 @@ class Trajectory:
         names = ("times", "steps", "positions", "velocities", "diagnostics", "others", "constants")
         phases = sum(name.startswith(FRACTION) for name in arrays)
         fractions = np.stack([arrays[name] for name in _fraction_names(phases)], axis=-1) if phases else None
-        return cls(**{name: arrays[name] for name in names}, mass_fractions=fractions)
+        try:
+            origin = Origin.from_json(arrays["origin"]) if arrays["origin"] else None
+        except (ValueError, TypeError, AttributeError) as problem:
+            raise InputError(f"{path} is damaged: of which particles it is cannot be read: {problem}.") from problem
+        return cls(**{name: arrays[name] for name in names}, mass_fractions=fractions, origin=origin)
 
 
 def _spacing(positions: NDArray[Any]) -> float:
@@ -258,9 +266,10 @@ def frame_writer(
     constants: Mapping[str, NDArray[Any]],
     steps: int,
     diagnostics: Mapping[str, NDArray[Any]],
+    origin: Origin | None,
 ) -> vtkhdf.TrajectoryWriter:
     """A file with room for frames at ``times`` (frames,) [s] that hold the same fields as the first, and for what is
-    noted of so many steps, which have the names and types of ``diagnostics``."""
+    noted of so many steps, which have the names and types of ``diagnostics``; all of it of particles of an origin."""
     particles, dimension = first["positions"].shape[-2:]
     single = first["positions"].dtype == np.float32
     return vtkhdf.TrajectoryWriter(
@@ -274,6 +283,7 @@ def frame_writer(
         others=_others(first),
         constants=constants,
         diagnostics={name: column.dtype for name, column in diagnostics.items()},
+        origin="" if origin is None else origin.to_json(),
     )
 
 

@@ -43,6 +43,7 @@ class TrajectoryWriter:
         others: further arrays of every frame by name, as they are in the first: their types and shapes are kept.
         constants: arrays by name that hold for the whole run.
         diagnostics: the type of each number that `append_steps` will be told of a step, by name.
+        origin: what the particles are of, as a text of JSON.
 
     Raises:
         InputError: a size that makes no sense, or a path that cannot be written.
@@ -62,6 +63,7 @@ class TrajectoryWriter:
         others: Mapping[str, ArrayLike] | None = None,
         constants: Mapping[str, ArrayLike] | None = None,
         diagnostics: Mapping[str, DTypeLike] | None = None,
+        origin: str = "",
     ) -> None:
         moments = np.array(times, dtype=np.float64, ndmin=1)
         if len(moments) < 1 or particles < 1 or dimension not in (2, 3) or steps < 0:
@@ -81,6 +83,7 @@ class TrajectoryWriter:
             {name: np.asarray(value) for name, value in (others or {}).items()},
             {name: np.asarray(value) for name, value in (constants or {}).items()},
             {name: np.dtype(dtype) for name, dtype in (diagnostics or {}).items()},
+            origin,
         )
         self._unfinished = unfinished(self.path)
         with sentences(self.path):
@@ -216,7 +219,7 @@ def read(path: str | Path) -> dict[str, Any]:
     Returns:
         times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s],
         under its own name every scalar field (frames, n); by name others, further arrays of every frame, constants,
-        what holds for the whole run, and diagnostics, (steps,) each.
+        what holds for the whole run, and diagnostics, (steps,) each; and origin, a text.
 
     Raises:
         InputError: the file is missing, damaged, or none of Cortado's trajectories.
@@ -262,7 +265,8 @@ def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
 
     fields = points | others
     kinds = {name: (field.dtype, field.shape[1:]) for name, field in fields.items()}
-    checksum = frames_seed((particles, dimension), kinds, constants)
+    origin = str(own.attrs.get("origin", ""))
+    checksum = frames_seed((particles, dimension), kinds, constants, origin)
     for k in range(frames):
         checksum = _frame_checksum(checksum, times[k], numbers[k], [field[k].tobytes() for field in fields.values()])
     records = _records(diagnostics, record) if record.names else np.zeros(0)
@@ -272,7 +276,7 @@ def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
     arrays["velocities"] = np.ascontiguousarray(arrays.pop("velocity")[..., :dimension])
     arrays["positions"] = np.ascontiguousarray(arrays.pop("Points")[..., :dimension])
     named = {"others": others, "constants": constants, "diagnostics": diagnostics}
-    return arrays | {"times": times, "steps": numbers, **named}
+    return arrays | {"times": times, "steps": numbers, "origin": origin, **named}
 
 
 def _frame_checksum(checksum: int, time: Any, number: Any, rows: Iterable[bytes]) -> int:

@@ -51,6 +51,8 @@ class Layout:
     """Arrays of any shape that hold for the whole run."""
     diagnostics: Mapping[str, np.dtype[Any]]
     """Numbers of every step."""
+    origin: str
+    """What the particles are of, in JSON; empty where nothing is known."""
 
     @property
     def rows(self) -> dict[str, tuple[int, ...]]:
@@ -69,7 +71,7 @@ class Layout:
         particles = self.shape[0]
         kinds = {name: (self.dtype, (particles, *row)) for name, row in self.rows.items()}
         kinds |= {name: (array.dtype, array.shape) for name, array in sorted(self.others.items())}
-        return frames_seed(self.shape, kinds, self.constants)
+        return frames_seed(self.shape, kinds, self.constants, self.origin)
 
     @property
     def size(self) -> int:
@@ -92,6 +94,8 @@ class Layout:
 
     def _create_own(self, own: Any) -> dict[str, int]:
         own.attrs["format"], own.attrs["dimension"] = FORMAT, self.shape[1]
+        if self.origin:
+            own.attrs["origin"] = self.origin
         group = own.create_group("constants")
         for name, array in self.constants.items():
             group[name] = array
@@ -136,12 +140,13 @@ def frames_seed(
     shape: tuple[int, int],
     kinds: Mapping[str, tuple[np.dtype[Any], tuple[int, ...]]],
     constants: Mapping[str, NDArray[Any]],
+    origin: str,
 ) -> int:
     """The checksum that those of the frames begin with: it changes with whatever says how to read them, and with what
     holds for all of them. ``kinds``: type and shape of each field of a frame."""
     fixed = [(name, array.dtype.str, array.shape, array.tobytes()) for name, array in sorted(constants.items())]
     varying = [(name, dtype.str, sizes) for name, (dtype, sizes) in kinds.items()]
-    return zlib.crc32(repr((shape, varying, fixed)).encode())
+    return zlib.crc32(origin.encode(), zlib.crc32(repr((shape, varying, fixed)).encode()))
 
 
 def steps_seed(records: np.dtype[Any]) -> int:

@@ -5,11 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import as_numbers
+from cortado.arrays import read_only
 from cortado.errors import InputError
+from cortado.fixed import fixed
 from cortado.losses.loss import Adjoint, Snapshot
 
 
+@fixed
 class CentreOfMass:
     """Squared distance of the centre of mass to a target [m2]."""
 
@@ -32,6 +34,7 @@ class CentreOfMass:
         return _shares(self._weights, end) @ end.positions - self.target
 
 
+@fixed
 class CentreOfMassAlong:
     """Component of the centre of mass along a direction [m]: its gradient is that of the centre of mass itself."""
 
@@ -55,10 +58,9 @@ class CentreOfMassAlong:
 
 def _finite(what: str, value: Any, dimensions: int) -> np.ndarray:
     """A read-only copy in float64, or an `InputError`."""
-    array = as_numbers(what, value).copy()
+    array = read_only(what, value)
     if array.ndim != dimensions or not np.isfinite(array).all():
         raise InputError(f"{what} has shape {array.shape}, but must have {dimensions} dimension and be finite.")
-    array.setflags(write=False)
     return array
 
 

@@ -6,9 +6,10 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
-from cortado.arrays import as_numbers
+from cortado.arrays import read_only
 from cortado.device.threads import WARP
 from cortado.errors import InputError, shown
+from cortado.fixed import fixed
 from cortado.io.srgb import check_light
 from cortado.losses.image_losses import ImageLoss, SquaredDifference
 from cortado.losses.loss import Snapshot, SnapshotAdjoint
@@ -24,6 +25,7 @@ class Pictures(Protocol):
         """``positions``, ``fractions`` and ``colours``: derivatives of a function of the last picture."""
 
 
+@fixed
 class Image:
     """How far the picture of a state is from a target picture."""
 
@@ -33,7 +35,6 @@ class Image:
         that do not overlap. Raises `InputError` for a target of another shape, or with values of a file up to 255."""
         self.renderer, self.distance = renderer, _distance(distance)
         self.target = _target_image(target, getattr(renderer, "shape", None))
-        self.target.setflags(write=False)
         parts = (self.distance.fingerprint, sha256(self.target.tobytes()).hexdigest())
         self.fingerprint = " ".join((*parts, getattr(renderer, "fingerprint", "")))
         """Tells one target, or one view of it, from another, for checkpoints."""
@@ -67,7 +68,7 @@ def _distance(distance: Any) -> ImageLoss:
 
 def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:
     """A copy (rows, columns, 3) in float64, or an `InputError`; ``shape``: of the renderer's pictures, if known."""
-    image = as_numbers("target", target).copy()
+    image = read_only("target", target)
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"target has shape {image.shape}, but must be a picture (rows, columns, 3).")
     if shape is not None and image.shape != shape:

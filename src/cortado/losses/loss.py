@@ -10,6 +10,7 @@ import numpy as np
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.device.state import State
 from cortado.errors import InputError, shown
+from cortado.fixed import FixedDict, fixed
 from cortado.words import counted
 
 
@@ -98,6 +99,7 @@ class Loss(Protocol):
         """The loss and its derivatives, in one call as they often share work."""
 
 
+@fixed
 class Frames:
     """The sum of losses of several states on the way, by the number of steps before each."""
 
@@ -105,7 +107,7 @@ class Frames:
         """``losses`` {number of steps: loss}; 0 is the first state."""
         if not isinstance(losses, Mapping) or not losses:
             raise InputError(f"losses is {shown(losses)}, but must be a table with a loss for at least one frame.")
-        self.losses = dict(losses)
+        self.losses = FixedDict(losses)
 
     @property
     def fingerprint(self) -> str:

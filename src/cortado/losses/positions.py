@@ -6,26 +6,27 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.arrays import as_numbers
+from cortado.arrays import read_only
 from cortado.device.arrays import to_device
 from cortado.device.launching import TreeReduction, launch, sum_of
 from cortado.device.state import State
 from cortado.device.threads import WARP
 from cortado.errors import InputError
+from cortado.fixed import fixed
 from cortado.losses.batch import SnapshotBatch
 from cortado.losses.loss import Snapshot
 from cortado.losses.matching import matching_kernels
 
 
+@fixed
 class FinalPositions:
     """Mean over particles of the squared distance to their targets [m2]."""
 
     def __init__(self, target: np.ndarray):
         """``target`` (n, d) [m], in the scene's order."""
-        self.target = as_numbers("target", target).copy()
+        self.target = read_only("target", target)
         if self.target.ndim != 2 or not np.isfinite(self.target).all():
             raise InputError(f"target has shape {self.target.shape}, but must be (particles, dimension) and finite.")
-        self.target.setflags(write=False)
         self.fingerprint = sha256(self.target.tobytes()).hexdigest()
         """Tells one target from another, for checkpoints."""
         self._on_device: dict[Any, tuple[wp.array, TreeReduction]] = {}

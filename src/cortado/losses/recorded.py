@@ -7,11 +7,13 @@ import numpy as np
 import warp as wp
 
 from cortado.device.threads import WARP
+from cortado.fixed import fixed
 from cortado.losses.loss import Adjoint, Snapshot
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
 
 
+@fixed
 class Recorded:
     """A loss that is any function of Warp arrays, differentiated by Warp's tape.
 

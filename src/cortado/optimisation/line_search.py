@@ -7,6 +7,7 @@ import numpy as np
 from cortado.arrays import is_whole, require_at_most
 from cortado.device.memory import require
 from cortado.errors import InputError
+from cortado.fixed import keep_own
 from cortado.optimisation.iterate import Iterate
 from cortado.optimisation.replay_log import ParameterLayout, Vector
 from cortado.optimisation.search import (
@@ -58,6 +59,7 @@ class LineSearch:
 
     def __post_init__(self) -> None:
         require_positive("scale", self.scale)
+        keep_own(self, "scale")
         require_fraction("momentum", self.momentum)
         require_fraction("shortest", self.shortest)
         if not is_whole(self.trials) or self.trials < 2 or self.shortest == 0.0:

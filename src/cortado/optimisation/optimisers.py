@@ -12,6 +12,7 @@ import numpy as np
 from cortado.arrays import require_at_most
 from cortado.device.memory import require
 from cortado.errors import InputError
+from cortado.fixed import keep_own
 from cortado.optimisation.iterate import Iterate
 from cortado.optimisation.line_search import LineSearch
 from cortado.optimisation.replay_log import ParameterLayout, Vector
@@ -55,6 +56,7 @@ class Adam:
 
     def __post_init__(self) -> None:
         require_positive("learning_rate", self.learning_rate)
+        keep_own(self, "learning_rate")
         require_fraction("beta1", self.beta1)
         require_fraction("beta2", self.beta2)
         require_positive("epsilon", self.epsilon)
@@ -101,6 +103,7 @@ class GradientDescent:
 
     def __post_init__(self) -> None:
         require_positive("learning_rate", self.learning_rate)
+        keep_own(self, "learning_rate")
         require_fraction("momentum", self.momentum)
 
     def check(self, layout: ParameterLayout) -> None:
@@ -152,6 +155,7 @@ class LBFGS:
         require_at_most("The memory of L-BFGS", self.memory, MOST_MEMORY)
         require_fraction("The tolerance of L-BFGS", self.tolerance)
         require_positive("scale", self.scale)
+        keep_own(self, "scale")
 
     def check(self, layout: ParameterLayout) -> None:
         """Raise InputError if the scales are not those of these parameters, or there is no memory for the updates."""

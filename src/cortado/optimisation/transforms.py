@@ -12,8 +12,9 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.special import softmax
 
-from cortado.arrays import as_numbers, require_whole
+from cortado.arrays import as_numbers, read_only, require_whole
 from cortado.errors import DivergedError, InputError
+from cortado.fixed import FixedDict, fixed
 from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator, estimate
 from cortado.parameters.values import Arrays, Values, check_known
 from cortado.problem import Problem
@@ -104,13 +105,14 @@ class TimeInterpolation:
         return self._weights.T @ bar
 
 
+@fixed
 class Affine:
     """p = base + matrix u: such as accelerations after which a tank always stands where it shall, or a nozzle that
     follows commands with a lag."""
 
     def __init__(self, base: Any, matrix: Any):
         """``base`` of the parameter's shape, in its unit; ``matrix`` of that shape followed by the shape of u."""
-        self.base, self.matrix = as_numbers("base", base), as_numbers("matrix", matrix)
+        self.base, self.matrix = read_only("base", base), read_only("matrix", matrix)
         if self.matrix.shape[: self.base.ndim] != self.base.shape or self.matrix.ndim == self.base.ndim:
             wanted = f"{self.base.shape}, the shape of base, followed by the shape of the coordinates"
             raise InputError(f"matrix has shape {self.matrix.shape}, but must have {wanted}.")
@@ -138,6 +140,7 @@ class Affine:
         return self.matrix.shape[self.base.ndim :]
 
 
+@fixed
 class Transformed:
     """A problem as a function of coordinates: those of the given bijectors, all other parameters as they are."""
 
@@ -145,7 +148,7 @@ class Transformed:
         """Raises `InputError` for coordinates of a parameter that the scene does not have."""
         for name in coordinates:
             check_known(name, problem.simulation.scene)
-        self.problem, self.coordinates = problem, dict(coordinates)
+        self.problem, self.coordinates = problem, FixedDict(coordinates)
         self.simulation = problem.simulation
 
     @property

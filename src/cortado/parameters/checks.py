@@ -1,20 +1,17 @@
 """Whether parameters make sense for a scene: numbers that a precision holds, places inside of the container, and time
 steps below the limit of stability."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from cortado.arrays import as_numbers
 from cortado.device.precision import Precision
-from cortado.errors import InputError, shown
+from cortado.errors import InputError
 from cortado.lattice.region import TOLERANCE
 from cortado.parameters.registry import BY_NAME, Range
 from cortado.parameters.values import Arrays
-from cortado.restart import RestartState
 from cortado.scene.scene import Scene
-from cortado.scene.stability import broken_limit
+from cortado.scene.stability import broken_limits
 
 CROWDED = 0.5
 """Of the room that their fluid fills: particles with less for all of them cannot be pushed apart."""
@@ -38,49 +35,30 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
     spacing = scene.discretisation.spacing
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
-        for particle in _outside(scene, positions[:free])[:1]:
-            place = _place(positions[particle])
+        for particle in outside(scene, positions[:free])[:1]:
+            place = place_in_words(positions[particle])
             raise InputError(f"parameter initial_positions has particle {particle} at {place}, outside the container.")
         _check_room(positions[:free], spacing)
     if "nozzle_path" in values and scene.emitter is not None:
         path, opening = np.atleast_2d(values["nozzle_path"]), scene.emitter.opening(spacing) - scene.emitter.outlet
-        for step in _outside(scene, (path[:, None] + opening).reshape(-1, scene.dimension))[:1] // len(opening):
+        for step in outside(scene, (path[:, None] + opening).reshape(-1, scene.dimension))[:1] // len(opening):
             raise InputError(
-                f"parameter nozzle_path is at {_place(path[step])} in step {step + 1}, but must be where all of the "
-                "opening is inside the container."
+                f"parameter nozzle_path is at {place_in_words(path[step])} in step {step + 1}, but must be where all "
+                "of the opening is inside the container."
             )
 
 
-def check_state(state: RestartState, shapes: Mapping[str, tuple[int, ...]], scene: Scene, free: int) -> None:
-    """A state to go on from is one of the scene, whose fields have these shapes; raises `InputError`. Only the first
-    ``free`` particles never waited in the emitter."""
-    if not isinstance(state, RestartState):
-        raise InputError(f"state is {shown(state)}, but must be a RestartState, such as trajectory.last_state.")
-    if state.fields.keys() != shapes.keys():
-        raise InputError(f"state has {', '.join(state.fields)}, but must have {', '.join(shapes)} in this scene.")
-    for name, wanted in shapes.items():
-        array = as_numbers(f"state {name}", state[name])
-        if array.shape != wanted:
-            raise InputError(f"state {name} has shape {array.shape}, but must be {wanted}.")
-        if not np.isfinite(array).all():
-            raise InputError(f"state {name} has a value that is not finite, but must be numbers.")
-    if (np.asarray(state["reference_density"]) <= 0.0).any():
-        raise InputError("state reference_density must be greater than 0.")
-    held = scene.forces.pressure and np.isinf(scene.container.region(scene.dimension).rim)
-    positions = np.asarray(state["positions"])
-    for particle in _outside(scene, positions[:free])[:1] if held else ():
-        place = _place(positions[particle])
-        raise InputError(f"state positions has particle {particle} at {place}, outside the container of this scene.")
-
-
-def unstable_sentence(values: Arrays, scene: Scene) -> str | None:
-    """What to say of a time step beyond the limit of stability under these parameters; None if there is nothing."""
+def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | None:
+    """What to say of a time step beyond limits of stability under these parameters, of which the least counts that was
+    not told; None if there is nothing. All of them are told then."""
     time_step = float(values.get("time_step", scene.solver.time_step))
-    broken = broken_limit(scene, values, time_step)
-    if broken is None:
+    broken = [(name, limit) for name, limit in broken_limits(scene, values, time_step) if name not in told]
+    if not broken:
         return None
-    found = f"time_step is {time_step:g} s, but the limit of stability with these parameters is about {broken[1]:.3g} s"
-    return f"{found}, which comes from {broken[0]}."
+    told.update(name for name, _ in broken)
+    name, limit = broken[0]
+    found = f"time_step is {time_step:g} s, but the limit of stability with these parameters is about {limit:.3g} s"
+    return f"{found}, which comes from {name}."
 
 
 def _check_room(positions: np.ndarray, spacing: float) -> None:
@@ -95,11 +73,11 @@ def _check_room(positions: np.ndarray, spacing: float) -> None:
         )
 
 
-def _outside(scene: Scene, points: Any) -> np.ndarray:
+def outside(scene: Scene, points: Any) -> np.ndarray:
     """The numbers of the points (n, d) [m] that are outside of the container; along a period nothing is."""
     walled = scene.container.region(scene.dimension).opened(scene.container.periods(scene.dimension)[1])
     return np.flatnonzero(~walled.contains(points, TOLERANCE * scene.discretisation.spacing))
 
 
-def _place(point: np.ndarray) -> str:
+def place_in_words(point: np.ndarray) -> str:
     return f"({', '.join(f'{x:g}' for x in point)}) m"

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from cortado.device.fields import first_values
 from cortado.device.precision import Precision
 from cortado.device.state import State
+from cortado.discretise.discrete_scene import Lattice
 from cortado.errors import InputError
+from cortado.lattice.smoothing import SmoothingKernel
 from cortado.parameters.reference_density import (
     reference_density,
     reference_density_adjoint,
@@ -44,6 +46,14 @@ class Simulated(Source, Protocol):
     @property
     def precision(self) -> Precision:
         """Of the device's arrays."""
+
+    @property
+    def smoothing(self) -> SmoothingKernel:
+        """The smoothing kernel W."""
+
+    @property
+    def lattice(self) -> Lattice:
+        """Constants of the lattice of particles at rest."""
 
     @property
     def free_particles(self) -> int:

@@ -9,11 +9,13 @@ import numpy as np
 from cortado.device.state import Parameters, State
 from cortado.device.threads import WARP
 from cortado.errors import CortadoWarning, InputError, shown
-from cortado.parameters.checks import check_places, check_sizes, check_state, unstable_sentence
+from cortado.parameters.checks import check_places, check_sizes, unstable_sentence
+from cortado.parameters.first_positions import FirstPositions
 from cortado.parameters.registry import Role, names
+from cortado.parameters.restarts import check_state, origin_of
 from cortado.parameters.scene_parameters import DENSITY, RUN, SceneParameters, Simulated
 from cortado.parameters.values import OVER_TIME, Arrays, Values, check_known, checked_value, scene_values
-from cortado.restart import Clock, RestartState
+from cortado.restart import Clock, Origin, RestartState
 from cortado.rollout import Rollout
 from cortado.scene.stability import divergence_advice
 
@@ -29,7 +31,9 @@ class ParameterSpace:
     def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._batch, self._steps = simulation, simulation.batch, steps
         self._one = SceneParameters(simulation, steps)
-        self._warned = False
+        self._first_positions = FirstPositions(simulation)
+        self._told: set[str] = set()
+        """The limits of stability that were warned of."""
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
         """Values as float64 arrays; raises `InputError` in a sentence. A ``what`` of "direction" may be negative."""
@@ -82,6 +86,8 @@ class ParameterSpace:
             for own, clock in zip(members, clocks, strict=True)
         ]
         rollout.time_steps[:] = [one["time_step"] for one in chosen]
+        origins = [self._origin(one["rest_density"]) for one in chosen]
+        rollout.origins = origins * (len(rollout.clocks) // len(origins))
         each = members * (len(rollout.clocks) // len(members))
 
         def advice(member: int) -> str:
@@ -98,15 +104,22 @@ class ParameterSpace:
         several = len(simulation.scene.phase) > 1
         rollout.substeps = max(*substeps, 1) if "mobility" in varied and several else max(substeps)
 
-    def check_restart(self, state: RestartState, values: Arrays) -> None:
-        """Whether a state is one of this simulation, and ``values`` go with it; raises `InputError`."""
-        for name in (*STATE, "rest_density"):
+    def check_restarts(self, states: Sequence[RestartState], values: Arrays) -> None:
+        """Whether states, one for each scene, are of this simulation, and ``values`` go with them; raises
+        `InputError`."""
+        for name in STATE if states else ():
             if name in values:
                 raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
         simulation = self._simulation
         sizes = len(simulation.positions), simulation.dimension, len(simulation.scene.phase)
         shapes = {field.name: field.shape(*sizes) for field in simulation.state.fields}
-        check_state(state, shapes, simulation.scene, simulation.free_particles)
+        for state, own in zip(states, self.members(values), strict=False):
+            origin = self._origin(np.atleast_1d(own.get("rest_density", self._one.values["rest_density"])))
+            check_state(state, shapes, origin, simulation)
+
+    def _origin(self, rest_density: np.ndarray) -> Origin:
+        """Of the particles of a run with these rest densities (phases,)."""
+        return origin_of(self._simulation, rest_density)
 
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
@@ -174,21 +187,21 @@ class ParameterSpace:
         return [shared | {name: value[b] for name, value in each.items()} for b in members]
 
     def _check(self, values: Arrays, number: int) -> None:
-        """Whether the values of one scene make sense for it; a time step beyond the limit of stability is warned of
-        once."""
+        """Whether the values of one scene make sense for it. It warns, once, of each limit of stability that the time
+        step is beyond, and of first positions that are crowded."""
         simulation = self._simulation
         if self._steps == 0:
             return
         try:
             check_places(values, simulation.scene, simulation.free_particles)
+            crowded = self._first_positions.check(values, number)
         except InputError as error:
             if self._batch is None:
                 raise
             raise InputError(f"In scene {number} of the batch, {error}") from error
         upright = self._one.upright(values)
-        sentence = unstable_sentence(upright, simulation.scene) if values and not self._warned else None
-        if sentence is not None:
-            self._warned = True
+        unstable = unstable_sentence(upright, simulation.scene, self._told) if values else None
+        for sentence in filter(None, (crowded, unstable)):
             warnings.warn(sentence, CortadoWarning, stacklevel=4)
 
     def _together(self, fields: list[Arrays]) -> Arrays:

@@ -7,6 +7,7 @@ import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number
 from cortado.errors import InputError, shown
+from cortado.fixed import keep_own
 
 Vector = tuple[float, ...]
 
@@ -51,6 +52,7 @@ class Camera:
         if np.linalg.norm(np.cross(sight, self.up)) <= 1e-9 * np.linalg.norm(sight) * np.linalg.norm(self.up):
             raise InputError(f"up is {shown(self.up)}, but must not be zero or along the view.")
         check_resolution(self.resolution)
+        keep_own(self, "resolution")
         if self.far is None:
             object.__setattr__(self, "far", 2.0 * float(np.linalg.norm(sight)))
         near, far = as_one_number("near", self.near), as_one_number("far", self.far)

@@ -13,6 +13,7 @@ from cortado.device.kernel_cache import start_warp
 from cortado.device.precision import Precision, precision_named
 from cortado.device.threads import WARP
 from cortado.errors import InputError, shown
+from cortado.fixed import fixed
 from cortado.lattice.smoothing import SmoothingKernel
 from cortado.render.cameras import positive, vector
 from cortado.render.fields import ColourField
@@ -38,6 +39,7 @@ class RenderAdjoint:
     """(3,) with respect to a rotation vector that turns the camera about its position [1 / rad]."""
 
 
+@fixed
 class Renderer:
     """Renders a fixed number of particles into pictures of one view, on one device; pictures are linear RGB.
 
@@ -89,10 +91,11 @@ class Renderer:
                 f"periods is {shown(turns.tolist())}, but must be 0 or greater than two support radii, "
                 f"{2.0 * support:g} m."
             )
+        own_colours = None if colours is None else _of_shape("colours", colours, (phases, 3)).copy()
         self.view = view
         self._settings: dict[str, Any] = {
-            "lower": lower,
-            "upper": upper,
+            "lower": tuple(low),
+            "upper": tuple(high),
             "smoothing": smoothing,
             "support": support,
             "volume": volume,
@@ -101,12 +104,12 @@ class Renderer:
             "device": device,
             "dimension": dimension,
             "cell": cell,
-            "periods": periods,
-            "colours": colours,
+            "periods": tuple(turns),
+            "colours": own_colours,
         }
         self._particles, self._phases, self._precision = particles, phases, precision
         self._dimension, self._device = dimension, wp.get_device(device)
-        self._colours = None if colours is None else _of_shape("colours", colours, (phases, 3))
+        self._colours = own_colours
         self._field = ColourField(
             low, high, turns, cell, smoothing, support, volume, particles, phases, precision, self._device
         )

@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from cortado.errors import InputError, shown
+from cortado.fixed import keep_own
 from cortado.render.cameras import Camera, Orthographic, Vector, check_resolution, positive, vector
 
 WHITE = (1.0, 1.0, 1.0)
@@ -74,6 +75,7 @@ class TopView:
             object.__setattr__(self, name, (*corner, 0.0)[:3])
         object.__setattr__(self, "background", vector("background", self.background))
         check_resolution(self.resolution)
+        keep_own(self, "resolution")
         positive("spacing", self.spacing)
         positive("opacity", self.opacity)
         if self.up_axis not in (0, 1, 2):

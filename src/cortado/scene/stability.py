@@ -34,8 +34,14 @@ def stability_limit(scene: SceneTables, values: Arrays | None = None) -> float:
 
 def broken_limit(scene: SceneTables, values: Arrays, time_step: float) -> tuple[str, float] | None:
     """The smallest of the `stability_limits`, what it is of and the limit [s], if a time step is beyond it."""
-    name, limit = min(stability_limits(scene, values).items(), key=lambda item: item[1])
-    return (name, limit) if time_step > limit * (1.0 + 1e-9) else None
+    return next(iter(broken_limits(scene, values, time_step)), None)
+
+
+def broken_limits(scene: SceneTables, values: Arrays, time_step: float) -> list[tuple[str, float]]:
+    """Those of the `stability_limits` that a time step is beyond, the smallest first: what each is of, and the limit
+    [s]."""
+    limits = sorted(stability_limits(scene, values).items(), key=lambda item: item[1])
+    return [(name, limit) for name, limit in limits if time_step > limit * (1.0 + 1e-9)]
 
 
 def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> str:
