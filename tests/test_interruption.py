@@ -9,6 +9,9 @@ import pytest
 
 STOPPED = "print('here', flush=True); time.sleep(60)"
 SLOW_IMPORT = f"import time; {STOPPED}"
+NEEDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that a process must not ignore to be interrupted; it ignores those that its parent does, as shells make
+background jobs ignore Ctrl-C, and nohup the end of the terminal."""
 START = "import time; from cortado.io import interruption; interruption.leave_at_once(); "
 KEEPING = f"""{START}
 class Late:
@@ -25,6 +28,12 @@ except KeyboardInterrupt as stop:
 """
 
 
+def listen() -> None:
+    """What a child does before its program begins."""
+    for number in NEEDED:
+        signal.signal(number, signal.SIG_DFL)
+
+
 def stopped(number: int, *arguments: str, **environment: str) -> tuple[int, str]:
     """Exit code and what a Python process says that gets a signal when it says 'here'."""
     process = subprocess.Popen(
@@ -33,6 +42,7 @@ def stopped(number: int, *arguments: str, **environment: str) -> tuple[int, str]
         stderr=subprocess.STDOUT,
         env={**os.environ, **environment},
         text=True,
+        preexec_fn=listen,
     )
     assert process.stdout is not None and process.stdout.readline() == "here\n"
     process.send_signal(number)
@@ -59,6 +69,16 @@ def test_a_silenced_stderr_does_not_swallow_the_sentence():
 def test_what_is_kept_is_said(number, work):
     found = stopped(number, "-c", KEEPING.replace("WORK", work))
     assert found == (128 + number, "Interrupted; two frames are in runs.\n")
+
+
+def test_the_tests_themselves_may_run_where_signals_are_ignored():
+    """As jobs in the background of a script do, and under nohup."""
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in NEEDED}
+    try:
+        assert stopped(signal.SIGINT, "-c", f"{START} {STOPPED}") == (130, "Interrupted.\n")
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def test_a_signal_that_is_ignored_stays_so():
