@@ -26,6 +26,28 @@ except KeyboardInterrupt as stop:
     print(stop)
     raise SystemExit(stop.code)
 """
+WORKERS = f"""{START}
+import os, signal
+from multiprocessing.context import SpawnProcess
+from cortado.commands.executor import Where
+
+start, begun = SpawnProcess.start, []
+
+def begin(process):
+    start(process)
+    begun.append(process)
+    if len(begun) == 2:
+        os.NUMBER  # while workers are still being imported
+        os.NUMBER
+
+SpawnProcess.start = begin
+try:
+    with Where(workers=2).executor("cpu") as executor:
+        print("too late")
+except KeyboardInterrupt as stop:
+    print(stop)
+    raise SystemExit(stop.code)
+"""
 
 
 def listen() -> None:
@@ -69,6 +91,17 @@ def test_a_silenced_stderr_does_not_swallow_the_sentence():
 def test_what_is_kept_is_said(number, work):
     found = stopped(number, "-c", KEEPING.replace("WORK", work))
     assert found == (128 + number, "Interrupted; two frames are in runs.\n")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_workers_that_begin_are_interrupted_in_one_sentence(number):
+    """Ctrl-C goes to all processes of a terminal, also to those that are still being imported; a second one too."""
+    sent = "killpg(0, signal.SIGINT)" if number == signal.SIGINT else "kill(os.getpid(), signal.SIGTERM)"
+    program = [sys.executable, "-c", WORKERS.replace("NUMBER", sent)]
+    done = subprocess.run(
+        program, capture_output=True, text=True, timeout=120, start_new_session=True, preexec_fn=listen
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "Interrupted.\n", "")
 
 
 def test_the_tests_themselves_may_run_where_signals_are_ignored():

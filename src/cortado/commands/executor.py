@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from cortado.errors import InputError
 from cortado.executors import Distributed, Executor, InProcess, local_workers
+from cortado.io.interruption import keeping
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Where:
             with Distributed(self.scheduler) as there:
                 yield there
         elif self.workers is not None:
-            with local_workers(self.workers, device.partition(":")[0]) as here:
+            with keeping(lambda: ""), local_workers(self.workers, device.partition(":")[0]) as here:
                 yield here
         else:
             yield InProcess()

@@ -2,14 +2,16 @@
 
 import logging
 import os
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from cortado.device.cores import VARIABLE as CORES
 from cortado.device.cores import usable_cores
 from cortado.errors import InputError, shown
 from cortado.executors.distributed import Distributed, distributed_module
+from cortado.io.interruption import Hold
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 """The environment variable that says which GPUs a process has."""
@@ -41,11 +43,24 @@ def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Di
     }
     somewhere = {"host": LOOPBACK, "port": 0, "dashboard_address": f"{LOOPBACK}:0", "dashboard": False}
     scheduler = {"cls": module.Scheduler, "options": somewhere}
-    with (
-        module.SpecCluster(workers, scheduler, silence_logs=logging.CRITICAL) as cluster,
-        module.Client(cluster, set_as_default=False) as client,
-    ):
+    hold = Hold()
+    with ExitStack() as stack:
+        _start_tracker()
+        hold.begin()
+        stack.callback(hold.end)
+        cluster = stack.enter_context(module.SpecCluster(workers, scheduler, silence_logs=logging.CRITICAL))
+        client = stack.enter_context(module.Client(cluster, set_as_default=False))
+        stack.callback(hold.begin)  # first of all that is done at the end, as a second Ctrl-C would leave workers behind
+        hold.end()
         yield Distributed(client)
+
+
+def _start_tracker() -> None:
+    """The process that removes semaphores which workers leave behind: a thread that starts it hears Ctrl-C again."""
+    if sys.platform != "win32":
+        from multiprocessing import resource_tracker
+
+        resource_tracker.ensure_running()
 
 
 def _environments(number: int | None, device: str) -> list[dict[str, str]]:
