@@ -63,7 +63,7 @@ def require_whole(what: str, value: object, least: int) -> None:
 
 def whole_number(what: str, value: Any, least: int) -> int:
     """A whole number of at least so much, also if it is a float, or an `InputError` in a sentence."""
-    whole = isinstance(value, (int, np.integer)) or (isinstance(value, (float, np.floating)) and value.is_integer())
+    whole = is_whole(value) or (isinstance(value, (float, np.floating)) and value.is_integer())
     if not whole or value < least:
         raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
     if value > GREATEST_NUMBER:

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from cortado.arrays import is_whole
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.device.state import State
 from cortado.errors import InputError, shown
@@ -105,6 +106,9 @@ class Frames:
         """``losses`` {number of steps: loss}; 0 is the first state."""
         if not isinstance(losses, Mapping) or not losses:
             raise InputError(f"losses is {shown(losses)}, but must be a table with a loss for at least one frame.")
+        for step in losses:
+            if not is_whole(step) and not (isinstance(step, float) and step.is_integer()):
+                raise InputError(f"losses has the frame {shown(step)}, but must have whole numbers of steps.")
         self.losses = dict(losses)
 
     @property

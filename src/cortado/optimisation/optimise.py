@@ -18,6 +18,7 @@ from cortado.arrays import as_numbers, as_one_number, is_whole
 from cortado.errors import ComputationError, DivergedError, InputError, shown
 from cortado.executors.executor import InProcess
 from cortado.gradients.points import evaluated
+from cortado.io.input_files import as_path
 from cortado.optimisation.differentiable import Differentiable, LossFunction, as_differentiable, loss_and_gradient
 from cortado.optimisation.evaluate import Daring
 from cortado.optimisation.named_optimisers import as_optimiser
@@ -68,6 +69,10 @@ def optimise(
     Raises InputError for a start, bounds or settings that do not fit, and for a checkpoint of another run;
     ComputationError if the loss or its gradient is not finite; what came before is in the checkpoint.
     """
+    if checkpoint is not None:
+        checkpoint = as_path("checkpoint", checkpoint)
+    if on_iteration is not None and not callable(on_iteration):
+        raise InputError(f"on_iteration is {shown(on_iteration)}, but must be a function that takes a Record.")
     algorithm, differentiable = as_optimiser(optimiser, settings), as_differentiable(problem)
     values = _checked_start(start)
     layout = ParameterLayout.of(values)
