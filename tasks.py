@@ -24,7 +24,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "slow": ("pytest", "-m", "slow"),
     "fuzz": ("python", "-m", "fuzz"),
     "docs": tuple(f"sphinx-build {DOCS} --quiet docs build/docs".split()),
-    "docs-links": tuple("sphinx-build --builder linkcheck --quiet docs build/docs-links".split()),
+    "docs-links": ("sphinx-build", "--builder", "linkcheck", "--quiet", "docs", "build/docs-links"),
     "docs-browser": ("python", "docs/site/look.py", "build/docs"),
 }
 """By name, as the Makefile has them."""

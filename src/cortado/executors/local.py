@@ -50,7 +50,7 @@ def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Di
         stack.callback(hold.end)
         cluster = stack.enter_context(module.SpecCluster(workers, scheduler, silence_logs=logging.CRITICAL))
         client = stack.enter_context(module.Client(cluster, set_as_default=False))
-        stack.callback(hold.begin)  # first of all that is done at the end, as a second Ctrl-C would leave workers behind
+        stack.callback(hold.begin)  # first of all at the end, as a second Ctrl-C would leave workers behind
         hold.end()
         yield Distributed(client)
 

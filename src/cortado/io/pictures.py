@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cortado.arrays import is_whole
 from cortado.errors import CortadoWarning, InputError
 from cortado.io.files import write_atomically
-from cortado.io.input_files import reason, regular_file
+from cortado.io.input_files import as_path, reason, regular_file
 from cortado.io.srgb import check_light, from_srgb, to_srgb
 from cortado.render.cameras import check_resolution, positive, vector
 
@@ -101,7 +102,7 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
     most = MOST_PIXELS_KEPT if resolution is None else MOST_PIXELS
     shape = None if resolution is None else _columns_and_rows(resolution)
     try:
-        regular_file(path, MOST_BYTES)
+        regular_file(as_path("path", path), MOST_BYTES)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow warns of large pictures, which are judged here
             with Image.open(path, formats=FORMATS) as file:
@@ -160,7 +161,7 @@ def write_picture(path: str | Path, image: ArrayLike) -> Path:
     """
     from PIL import Image
 
-    if Path(path).suffix.lower() != ".png":
+    if Path(as_path("path", path)).suffix.lower() != ".png":
         raise InputError(f"path is {str(path)!r}, but must be the name of a PNG file, such as picture.png.")
     pixels, content = to_srgb(image), BytesIO()
     check_light("The image", image)
@@ -219,7 +220,7 @@ def _in_rosetta(x: Any, y: Any) -> Any:
 
 
 def _columns_and_rows(resolution: Resolution) -> tuple[int, int]:
-    found = (resolution, resolution) if isinstance(resolution, int) else resolution
+    found = (resolution, resolution) if is_whole(resolution) else resolution
     check_resolution(found)
     return found
 

@@ -96,7 +96,8 @@ class Loss(Protocol):
         """The loss."""
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """The loss and its derivatives, in one call as they often share work."""
+        """The loss and its derivatives, in one call as they often share work: a tuple of NumPy arrays, or a `State` of
+        Warp arrays, which ``end.state.like()`` makes, all 0, and ``set({"positions": array})`` of it fills."""
 
 
 class Frames:

@@ -1,11 +1,12 @@
 """`cortado.evaluate`: a problem at many points that do not depend on one another, such as a population of a search."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from cortado.errors import DivergedError
+from cortado.arrays import as_one_number, require_function
+from cortado.errors import DivergedError, InputError, shown
 from cortado.executors.executor import Executor, InProcess, OnResult, checked_executor
 from cortado.gradients import Estimate, GradientEstimator
 from cortado.gradients.estimator import Differentiable, checked_estimator
@@ -36,12 +37,25 @@ def evaluate(
 
     Raises the error of the first point that has one.
     """
+    require_function("on_result", on_result)
+    if not callable(getattr(problem, "value", None)):
+        raise InputError(f"problem is {shown(problem)}, but must be a cortado.Problem.")
+    if not isinstance(points, Iterable) or isinstance(points, (str, bytes, Mapping)):
+        raise InputError(f"points is {shown(points)}, but must be a list of parameters by name.")
+    if loss_if_diverged is not None:
+        loss_if_diverged = as_one_number("loss_if_diverged", loss_if_diverged)
     chosen = checked_executor(InProcess() if executor is None else executor)
     estimator = None if gradient is None else checked_estimator(gradient)
-    made = (Point(values, estimator) for values in points)
+    made = (Point(_by_name(values), estimator) for values in points)
     if loss_if_diverged is not None:
         made = (Daring(point.values, point.estimator, loss_if_diverged) for point in made)
     return evaluated(problem, made, chosen, on_result=on_result)
+
+
+def _by_name(point: Values) -> Values:
+    if not isinstance(point, Mapping):
+        raise InputError(f"a point is {shown(point)}, but must be parameters by name, as {{'gravity': value}}.")
+    return point
 
 
 @dataclass(frozen=True)

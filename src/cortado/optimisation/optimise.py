@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import as_numbers, as_one_number, is_whole
+from cortado.arrays import as_numbers, as_one_number, is_whole, require_function
 from cortado.errors import ComputationError, DivergedError, InputError, shown
 from cortado.executors.executor import InProcess
 from cortado.gradients.points import evaluated
@@ -71,13 +71,12 @@ def optimise(
     """
     if checkpoint is not None:
         checkpoint = as_path("checkpoint", checkpoint)
-    if on_iteration is not None and not callable(on_iteration):
-        raise InputError(f"on_iteration is {shown(on_iteration)}, but must be a function that takes a Record.")
+    require_function("on_iteration", on_iteration)
     algorithm, differentiable = as_optimiser(optimiser, settings), as_differentiable(problem)
     values = _checked_start(start)
     layout = ParameterLayout.of(values)
     vector = layout.ravel(values)
-    lower, upper = _checked_bounds(bounds or {}, layout)
+    lower, upper = _checked_bounds({} if bounds is None else bounds, layout)
     _require_within(vector, lower, upper, layout)
     algorithm.check(layout)
     _require_count(iterations)
@@ -302,7 +301,9 @@ def _checked_value(what: str, value: Any) -> Vector:
 
 def _checked_bounds(bounds: Mapping[str, tuple[Any, Any]], layout: ParameterLayout) -> tuple[Vector, Vector]:
     """Lower and upper bounds as vectors (size,), or InputError if they do not fit the parameters."""
-    unknown = sorted(set(bounds) - set(layout.names))
+    if not isinstance(bounds, Mapping):
+        raise InputError(f"bounds is {shown(bounds)}, but must be by name, as {{'gravity': (lower, upper)}}.")
+    unknown = sorted(set(bounds) - set(layout.names), key=str)
     if unknown:
         raise InputError(
             f"Bounds are given for {', '.join(map(repr, unknown))}, which the start does not name; the "

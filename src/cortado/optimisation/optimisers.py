@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cortado.arrays import is_whole
 from cortado.errors import InputError
 from cortado.optimisation.line_search import LineSearch
 from cortado.optimisation.replay_log import ParameterLayout, Vector
@@ -132,7 +133,7 @@ class LBFGS:
     """A change worth trying, one number or one per parameter by name [unit of the parameter]."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.memory, int) or self.memory < 1:
+        if not is_whole(self.memory) or self.memory < 1:
             raise InputError(f"The memory of L-BFGS must be an integer of at least 1, not {self.memory!r}.")
         require_fraction("The tolerance of L-BFGS", self.tolerance)
         require_positive("scale", self.scale)

@@ -12,8 +12,9 @@ def scene_in_words(scene: Scene, particles: int) -> str:
     )
     emitter = " of which an emitter gives some," if scene.emitter is not None else ""
     return (
-        f"{counted(particles, 'particle')} of {phases} in {scene.dimension}-D,{emitter} {scene.discretisation.spacing:g} m "
-        f"apart at rest, {_held(scene)}, under gravity {vector(scene.forces.gravity)} m/s²{_scheduled(scene)}."
+        f"{counted(particles, 'particle')} of {phases} in {scene.dimension}-D,{emitter} "
+        f"{scene.discretisation.spacing:g} m apart at rest, {_held(scene)}, "
+        f"under gravity {vector(scene.forces.gravity)} m/s²{_scheduled(scene)}."
     )
 
 

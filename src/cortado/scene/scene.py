@@ -64,7 +64,8 @@ class Scene(SceneTables):
             data = json.loads(text)
         except (ValueError, RecursionError) as problem:
             raise SceneError(None, "", sentence=f"is not valid JSON: {problem}.") from None
-        if overrides and isinstance(data, dict):
+        given = not isinstance(overrides, Sequence) or len(overrides) > 0
+        if given and isinstance(data, dict):
             data = put_in(_given(data), overrides, file)
         return scene_from_dict(data)
 
