@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cortado.arrays import is_whole
 from cortado.errors import CortadoWarning, InputError
 from cortado.io.files import write_atomically
 from cortado.io.input_files import as_path, reason, regular_file
@@ -220,7 +219,7 @@ def _in_rosetta(x: Any, y: Any) -> Any:
 
 
 def _columns_and_rows(resolution: Resolution) -> tuple[int, int]:
-    found = (resolution, resolution) if is_whole(resolution) else resolution
+    found = (resolution, resolution) if isinstance(resolution, int) else resolution
     check_resolution(found)
     return found
 

@@ -108,7 +108,7 @@ class Frames:
         if not isinstance(losses, Mapping) or not losses:
             raise InputError(f"losses is {shown(losses)}, but must be a table with a loss for at least one frame.")
         for step in losses:
-            if not is_whole(step) and not (isinstance(step, float) and step.is_integer()):
+            if not is_whole(step) and not (isinstance(step, float) and float(step).is_integer()):
                 raise InputError(f"losses has the frame {shown(step)}, but must have whole numbers of steps.")
         self.losses = dict(losses)
 
