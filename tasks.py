@@ -1,4 +1,7 @@
-"""What ``make`` does, for machines without it, such as Windows: ``python -m tasks test``."""
+"""What ``make`` does, for machines without it, such as Windows: ``python -m tasks test``.
+
+``make sanitize`` needs GCC or Clang, and ``make clean`` removes folders; they have no part in it.
+"""
 
 import subprocess
 import sys
@@ -6,10 +9,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent
 VENV = ROOT / ".venv"
-STAMPS = {"test": VENV / ".ready", "pictures,view": VENV / ".demo"}
+STAMPS = {"test": VENV / ".ready", "pictures,view": VENV / ".demo", "docs": VENV / ".docs"}
 """What says that extras are installed."""
 BIN = VENV / ("Scripts" if sys.platform == "win32" else "bin")
 INSTALL = ("python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--editable")
+DOCS = "--fresh-env --write-all --fail-on-warning --keep-going"
 COMMANDS: dict[str, tuple[str, ...]] = {
     "demo": ("cortado", "optimise", "examples/latte_art_small.toml", "--out", "runs/demo", "--overwrite"),
     "lint": ("ruff", "check", "."),
@@ -19,9 +23,21 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "validation": ("pytest", "-m", "validation"),
     "slow": ("pytest", "-m", "slow"),
     "fuzz": ("python", "-m", "fuzz"),
+    "docs": tuple(f"sphinx-build {DOCS} --quiet docs build/docs".split()),
+    "docs-links": ("sphinx-build", "--builder", "linkcheck", "--quiet", "docs", "build/docs-links"),
+    "docs-browser": ("python", "docs/site/look.py", "build/docs"),
 }
 """By name, as the Makefile has them."""
-SEVERAL = {"setup": (), "test": ("lint", "types", "tests"), **{name: (name,) for name in COMMANDS}}
+SEVERAL = {
+    "setup": (),
+    "test": ("lint", "types", "tests"),
+    **{name: (name,) for name in COMMANDS},
+    "docs-browser": ("docs", "docs-browser"),
+}
+EXTRAS = {"demo": ("pictures,view",), **{name: ("test", "docs") for name in COMMANDS if name.startswith("docs")}}
+"""What a task needs; all others need what tests do."""
+MADE = {"docs": "build/docs/index.html"}
+"""What a task says at its end."""
 
 
 def main(arguments: list[str]) -> int:
@@ -30,21 +46,24 @@ def main(arguments: list[str]) -> int:
     if name not in SEVERAL:
         print(f"python -m tasks TASK, one of: {', '.join(SEVERAL)}", file=sys.stderr)
         return 2
-    set_up("pictures,view" if name == "demo" else "test")
-    steps = [COMMANDS[part] for part in SEVERAL[name]]
-    for number, step in enumerate(steps, 1):
-        code = run((*step, *options) if number == len(steps) else step)
+    for extra in EXTRAS.get(name, ("test",)):
+        set_up(extra)
+    for part in SEVERAL[name]:
+        code = run((*COMMANDS[part], *(options if part == SEVERAL[name][-1] else ())))
         if code:
             return code
+        if part in MADE:
+            print(MADE[part])
     return 0
 
 
 def set_up(extra: str) -> None:
     """Make the virtual environment, and install Cortado in it with what extras have, unless nothing has changed since
-    that, or since all that tests need was installed."""
+    that, or since all that tests need was installed, which is more than a demo does."""
     sources = [ROOT / "pyproject.toml", *(path for path in (ROOT / "cpp").rglob("*") if path.is_file())]
     changed, stamp = max(path.stat().st_mtime for path in sources), STAMPS[extra]
-    if any(done.exists() and done.stat().st_mtime >= changed for done in {stamp, STAMPS["test"]}):
+    enough = {stamp} if extra == "docs" else {stamp, STAMPS["test"]}
+    if any(done.exists() and done.stat().st_mtime >= changed for done in enough):
         return
     print(f"Installing Cortado in {VENV.name}, once: some minutes.")
     if not BIN.exists():

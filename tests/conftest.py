@@ -103,6 +103,7 @@ SLOW_TESTS = {
         "test_gradient_equals_tangent_and_differences",
         "test_the_whole_chain_from_gravity_to_the_picture",
     },
+    "test_interruption": {"test_workers_that_begin_are_interrupted_in_one_sentence"},
     "test_lanes": {"test_kernels_for_lanes_compile_for_a_gpu_that_is_not_there"},
     "test_layers": {
         "test_the_discretisation_is_without_warp",
@@ -127,6 +128,7 @@ SLOW_TESTS = {
         "test_any_number_of_threads_gives_the_same_bits",
     },
     "test_public_face": {
+        "test_what_documents_name_is_there_as_an_attribute_and_to_import",
         "test_types_are_checked_where_cortado_is_used",
     },
     "test_reference": {

@@ -9,6 +9,9 @@ import pytest
 
 STOPPED = "print('here', flush=True); time.sleep(60)"
 SLOW_IMPORT = f"import time; {STOPPED}"
+NEEDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that a process must not ignore to be interrupted; it ignores those that its parent does, as shells make
+background jobs ignore Ctrl-C, and nohup the end of the terminal."""
 START = "import time; from cortado.io import interruption; interruption.leave_at_once(); "
 KEEPING = f"""{START}
 class Late:
@@ -23,6 +26,34 @@ except KeyboardInterrupt as stop:
     print(stop)
     raise SystemExit(stop.code)
 """
+WORKERS = f"""{START}
+import os, signal
+from multiprocessing.context import SpawnProcess
+from cortado.commands.executor import Where
+
+start, begun = SpawnProcess.start, []
+
+def begin(process):
+    start(process)
+    begun.append(process)
+    if len(begun) == 2:
+        os.NUMBER  # while workers are still being imported
+        os.NUMBER
+
+SpawnProcess.start = begin
+try:
+    with Where(workers=2).executor("cpu") as executor:
+        print("too late")
+except KeyboardInterrupt as stop:
+    print(stop)
+    raise SystemExit(stop.code)
+"""
+
+
+def listen() -> None:
+    """What a child does before its program begins."""
+    for number in NEEDED:
+        signal.signal(number, signal.SIG_DFL)
 
 
 def stopped(number: int, *arguments: str, **environment: str) -> tuple[int, str]:
@@ -33,6 +64,7 @@ def stopped(number: int, *arguments: str, **environment: str) -> tuple[int, str]
         stderr=subprocess.STDOUT,
         env={**os.environ, **environment},
         text=True,
+        preexec_fn=listen,
     )
     assert process.stdout is not None and process.stdout.readline() == "here\n"
     process.send_signal(number)
@@ -59,6 +91,27 @@ def test_a_silenced_stderr_does_not_swallow_the_sentence():
 def test_what_is_kept_is_said(number, work):
     found = stopped(number, "-c", KEEPING.replace("WORK", work))
     assert found == (128 + number, "Interrupted; two frames are in runs.\n")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_workers_that_begin_are_interrupted_in_one_sentence(number):
+    """Ctrl-C goes to all processes of a terminal, also to those that are still being imported; a second one too."""
+    sent = "killpg(0, signal.SIGINT)" if number == signal.SIGINT else "kill(os.getpid(), signal.SIGTERM)"
+    program = [sys.executable, "-c", WORKERS.replace("NUMBER", sent)]
+    done = subprocess.run(
+        program, capture_output=True, text=True, timeout=120, start_new_session=True, preexec_fn=listen
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "Interrupted.\n", "")
+
+
+def test_the_tests_themselves_may_run_where_signals_are_ignored():
+    """As jobs in the background of a script do, and under nohup."""
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in NEEDED}
+    try:
+        assert stopped(signal.SIGINT, "-c", f"{START} {STOPPED}") == (130, "Interrupted.\n")
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def test_a_signal_that_is_ignored_stays_so():

@@ -12,6 +12,7 @@ import cortado
 ROOT = Path(cortado.__file__).parent
 
 LAYERS = """
+    lazy
     errors
     fixed
     words
@@ -49,13 +50,13 @@ LAYERS = """
     rollout
     parameters.scene_parameters parameters.first_positions parameters.restarts parameters.space
     losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
-    losses.positions losses.recorded losses losses.checked
+    losses.positions losses.recorded losses losses.checked image_losses
     gradients.estimator gradients.points gradients.ensemble_members gradients.exact
     gradients.filter_kernels gradients.adjoint_filters gradients.filters gradients.left_out gradients.ensemble
     gradients.guided gradients
     render.cameras render.colour_field render.interpolation render.phase_colours render.fields render.rays
     render.absorption render.views render.marching render.renderer render.scene_renderer render
-    io.pictures
+    io.pictures pictures
     figures.canvas figures.panels figures.particle_sets figures.side_by_side
     io.trajectory io.trajectory_batch
     shading shading.surface shading.stage shading.shadow shading.surroundings shading.glass shading.meeting
@@ -72,7 +73,7 @@ LAYERS = """
     optimisation.iterate optimisation.line_search optimisation.optimisers
     optimisation.named_optimisers optimisation.result_page optimisation.result
     optimisation.start optimisation.evaluator optimisation.optimise
-    optimisation.transforms
+    optimisation.transforms optimisers
     io.run_folder io.report
     inverse inverse.tables inverse.file_schema inverse.task inverse.in_words inverse.setup inverse.knots
     inverse.chapters inverse.figures inverse.shaded
@@ -97,7 +98,7 @@ LAYERS = """
 """
 """From the foundations to the command line; ``package.*`` stands for modules that do not import one another.
 
-The package itself, ``cortado``, has no place in it: it imports nothing of its own before a name is used.
+The package itself, ``cortado``, has no place in it: it imports only ``lazy`` before a name is used.
 """
 ORDER = LAYERS.split()
 

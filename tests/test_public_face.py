@@ -1,13 +1,59 @@
 """What a user sees who asks for the names of the package and of its public modules."""
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import cortado
 
 MODULES = ("executors", "gradients", "image_losses", "losses", "optimisers", "pictures", "render")
+ROOT = Path(__file__).parents[1]
+NAMED = {
+    name
+    for path in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").glob("*.py"))
+    for name in re.findall(r"\bcortado(?:\.[A-Za-z_]\w*)+", path.read_text(encoding="utf-8"))
+} | {f"cortado.{name}" for name in cortado.__all__}
+"""Dotted names in the documents, and those of the package."""
+ALONE = """
+import importlib, sys
+
+def by_import(name):
+    parts = name.split(".")
+    for end in range(len(parts), 0, -1):
+        module = ".".join(parts[:end])
+        try:
+            found = importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            if not module.startswith(error.name):
+                raise
+            continue
+        for part in parts[end:]:
+            found = getattr(found, part)
+        return found
+
+def by_attribute(name):
+    import cortado
+
+    found = cortado
+    for part in name.split(".")[1:]:
+        found = getattr(found, part)
+    return found
+
+def forget():
+    for name in [name for name in sys.modules if name.split(".")[0] == "cortado"]:
+        del sys.modules[name]
+
+for name in sys.argv[1:]:
+    forget()
+    try:
+        if by_attribute(name) != by_import(name):
+            print(name, "is two things")
+    except Exception as error:
+        print(name, type(error).__name__, error)
+"""
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -28,6 +74,20 @@ def test_the_package_shows_what_is_public_and_no_more():
     assert dir(cortado) == names
     program = "import cortado; print(*dir(cortado))"
     assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout.split() == names
+
+
+def test_what_documents_name_is_there_as_an_attribute_and_to_import():
+    """Each in a package that is imported anew, as what was used before brings names along."""
+    assert {"cortado.optimisers.Adam", "cortado.pictures.read_picture", "cortado.losses.Image"} <= NAMED
+    done = subprocess.run([sys.executable, "-c", ALONE, *sorted(NAMED)], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("", "")
+
+
+def test_the_renderer_of_the_documents_is_there():
+    """Also its views and cameras."""
+    names = {"Renderer", "TopView", "Volume", "Orthographic", "Perspective"}
+    text = (ROOT / "docs" / "rendering.md").read_text(encoding="utf-8")
+    assert all(f"`{name}`" in text and isinstance(getattr(cortado.render, name), type) for name in names)
 
 
 def test_types_are_checked_where_cortado_is_used(tmp_path):

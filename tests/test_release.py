@@ -57,7 +57,7 @@ def test_what_was_tested_is_pinned():
 
 def test_tasks_are_those_of_make():
     makefile = (ROOT / "Makefile").read_text("utf-8")
-    recipes = dict(re.findall(r"^(\w+): (?:setup|\$\(VENV\)/\.demo)\n\t\$\(BIN\)/(.*)$", makefile, re.MULTILINE))
+    recipes = dict(re.findall(r"^([\w-]+): (?:setup|docs|\$\(VENV\)/\.\w+)\n\t\$\(BIN\)/(.*)$", makefile, re.MULTILINE))
     recipes["fuzz"] = recipes["fuzz"].partition(" $(if")[0]
     recipes.pop("sanitize")  # takes GCC or Clang
     assert recipes == {
@@ -65,6 +65,9 @@ def test_tasks_are_those_of_make():
     }
     (test,) = re.findall(r"^test: (.*)$", makefile, re.MULTILINE)
     assert tuple(test.split()) == tasks.SEVERAL["test"]
+    assert {name for name, parts in tasks.SEVERAL.items() if "docs" in parts} == {"docs", "docs-browser"}
+    targets = set(re.search(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)[1].split())
+    assert targets - tasks.SEVERAL.keys() == {"sanitize", "clean"}
     assert all(f"{' '.join(tasks.INSTALL)} '.[{extra}]'" in makefile for extra in tasks.STAMPS)
 
 
@@ -74,6 +77,14 @@ def test_a_task_ends_with_the_first_failure(monkeypatch):
     monkeypatch.setattr(tasks, "run", lambda command: ran.append(command[0]) or (3 if command[0] == "mypy" else 0))
     assert tasks.main(["test"]) == 3 and ran == ["ruff", "mypy"]
     assert tasks.main(["lint", "--fix"]) == 0
+
+
+def test_the_site_is_made_after_what_it_needs_is_installed(monkeypatch, capsys):
+    done = []
+    monkeypatch.setattr(tasks, "set_up", done.append)
+    monkeypatch.setattr(tasks, "run", lambda command: done.append(command[0]) or 0)
+    assert tasks.main(["docs"]) == 0 and done == ["test", "docs", "sphinx-build"]
+    assert capsys.readouterr().out == "build/docs/index.html\n"
 
 
 @pytest.mark.parametrize("arguments", [[], ["walk"]])

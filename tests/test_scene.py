@@ -127,6 +127,28 @@ def test_a_bad_override_is_a_sentence(scene_file, override):
 # ---- bad scenes --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    "data, sentence",
+    [
+        ({"container": {"shape": "mesh", "file": "cup.stl"}}, "container.shape is 'mesh'"),
+        ({"fluid": [{"shape": "mesh"}]}, "fluid[0].shape is 'mesh'"),
+        ({"obstacle": [{"shape": "box"}]}, "obstacle is not a key of the scene"),
+        ({"rigid_body": {}}, "rigid_body is not a key of the scene"),
+    ],
+)
+def test_what_no_scene_can_have_yet_leads_to_the_limits(data, sentence):
+    with pytest.raises(SceneError) as error:
+        Scene(**{**plane(), **data})
+    said = str(error.value)
+    assert said.startswith(sentence) and "docs/limits.md" in said and "its keys are" not in said
+
+
+def test_a_shape_that_is_only_misspelt_does_not():
+    with pytest.raises(SceneError) as error:
+        Scene(**{**plane(), "container": {"shape": "bocks"}})
+    assert "limits" not in str(error.value)
+
+
 def test_there_are_enough_bad_scenes():
     assert len({name for name, *_ in BAD_SCENES}) == len(BAD_SCENES) >= 40
 

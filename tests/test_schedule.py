@@ -203,6 +203,7 @@ def test_a_run_says_whether_gravity_changed(last, turned):
 
 def test_a_schedule_is_told():
     told = scene_in_words(plane(schedule={"tilt": {"times": [0.0, 0.5], "values": [[0.0], [20.0]]}}), 100)
+    assert told.startswith("100 particles of water (1000 kg/m³, 0.05 Pa s) in 2-D, 0.05 m apart at rest, in a box ")
     assert told.endswith("under gravity (0, -9.81) m/s²; its tilt changes from 0 s to 0.5 s.")
 
 

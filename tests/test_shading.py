@@ -11,7 +11,7 @@ import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.cli import main
 from cortado.device.launching import launch
-from cortado.errors import ComputationError, InputError, SceneError
+from cortado.errors import ComputationError, CortadoWarning, InputError, SceneError
 from cortado.io.run_folder import RunFolder
 from cortado.io.srgb import to_srgb
 from cortado.lattice.shapes import corners
@@ -291,12 +291,32 @@ def test_a_film_has_its_size_and_its_frames(tmp_path):
     assert len(frames) == 6 and np.all(np.diff(frames) > 0.0) and frames[0] < 5.0 and frames[-1] > 250.0
 
 
-def test_a_film_takes_no_longer_than_it_may(tmp_path, monkeypatch):
-    av = pytest.importorskip("av")
+def frames_of(path):
+    with pytest.importorskip("av").open(str(path)) as container:
+        return sum(1 for _ in container.decode(video=0))
+
+
+def black(k):
+    return np.zeros((32, 32, 3))
+
+
+def test_a_film_takes_no_longer_than_it_may_and_says_what_is_left_out(tmp_path, monkeypatch, capsys):
+    assert frames_of(film(tmp_path / "film.mp4", page_of(black), range(30))) == 30
+    assert "frames" not in capsys.readouterr().err
     monkeypatch.setattr(shading_film, "SECONDS", 0.0)
-    path = film(tmp_path / "film.mp4", page_of(lambda k: np.zeros((32, 32, 3))), range(100), 90)
-    with av.open(str(path)) as container:
-        assert sum(1 for _ in container.decode(video=0)) == shading_film.LEAST_FRAMES
+    assert frames_of(film(tmp_path / "film.mp4", page_of(black), range(100))) == shading_film.LEAST_FRAMES
+    said = capsys.readouterr().err
+    assert "film.mp4 has 16 of 100 frames" in said and "; picture.film_frames=100 draws them." in said
+    assert frames_of(film(tmp_path / "film.mp4", page_of(black), range(300))) == shading_film.LEAST_FRAMES
+    assert "film.mp4 has 16 of 120 frames" in capsys.readouterr().err
+
+
+def test_a_film_has_as_many_frames_as_are_asked_for(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(shading_film, "SECONDS", 0.0)
+    assert frames_of(film(tmp_path / "film.mp4", page_of(black), range(100), 90)) == 90
+    assert "draws them" not in capsys.readouterr().err
+    with pytest.warns(CortadoWarning, match=r"film.mp4 has 7 frames of the 90 that picture.film_frames asks for"):
+        assert frames_of(film(tmp_path / "film.mp4", page_of(black), range(7), 90)) == 7
 
 
 def test_a_package_that_is_missing_is_named(monkeypatch):

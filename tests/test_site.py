@@ -17,12 +17,12 @@ def prose(path: Path) -> str:
     return CODE.sub("", path.read_text(encoding="utf-8"))
 
 
-def entries(page: Path) -> set[Path]:
+def entries(page: Path) -> list[Path]:
     """The pages that the tables of contents of a page list."""
-    found = set()
+    found = []
     for body in re.findall(r"^```\{toctree\}\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
         names = [line.strip() for line in body.splitlines() if line.strip() and not line.startswith(":")]
-        found |= {path for name in names for path in page.parent.glob(f"{name}.md")}
+        found += [path for name in names for path in page.parent.glob(f"{name}.md")]
     return found
 
 

@@ -51,8 +51,14 @@ def in_shell(line: str, *arguments: str, **environment: str) -> tuple[int, str]:
             1,
             "The result cannot be written to the standard output: No space left on device.\n",
         ),
+        (
+            '"$@" >&-',
+            ["schema"],
+            1,
+            "The result cannot be written to the standard output: Bad file descriptor.\n",
+        ),
     ],
-    ids=["whole", "no stderr", "no streams", "full stderr", "broken stderr", "broken stdout", "full stdout"],
+    ids=["whole", "no stderr", "no streams", "full stderr", "broken stderr", "broken stdout", "full stdout", "none"],
 )
 def test_broken_streams_leave_the_exit_code(line, arguments, code, said):
     assert in_shell(line, *arguments) == (code, said)

@@ -3,15 +3,16 @@
 Names are imported when they are first used, so that ``import cortado`` is quick.
 """
 
-import importlib
+from cortado.lazy import getter
 
 TYPE_CHECKING = False  # that of typing, which takes as long to import as all else here
 if TYPE_CHECKING:
-    from typing import Any
-
     from cortado import executors as executors
     from cortado import gradients as gradients
+    from cortado import image_losses as image_losses
     from cortado import losses as losses
+    from cortado import optimisers as optimisers
+    from cortado import pictures as pictures
     from cortado import render as render
     from cortado.certificate import certify as certify
     from cortado.errors import ComputationError as ComputationError
@@ -20,10 +21,7 @@ if TYPE_CHECKING:
     from cortado.errors import DivergedError as DivergedError
     from cortado.errors import InputError as InputError
     from cortado.errors import SceneError as SceneError
-    from cortado.io import pictures as pictures
     from cortado.io.trajectory import Trajectory as Trajectory
-    from cortado.losses import image_losses as image_losses
-    from cortado.optimisation import optimisers as optimisers
     from cortado.optimisation.evaluate import evaluate as evaluate
     from cortado.optimisation.optimise import optimise as optimise
     from cortado.optimisation.optimise import optimize as optimize
@@ -34,15 +32,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_MODULES = {
-    "executors": "executors",
-    "gradients": "gradients",
-    "image_losses": "losses.image_losses",
-    "losses": "losses",
-    "optimisers": "optimisation.optimisers",
-    "pictures": "io.pictures",
-    "render": "render",
-}
+_MODULES = ("executors", "gradients", "image_losses", "losses", "optimisers", "pictures", "render")
 _HOMES = {
     "ComputationError": "errors",
     "CortadoError": "errors",
@@ -62,13 +52,8 @@ _HOMES = {
 }
 __all__ = [*_MODULES, *_HOMES]
 
-
-def __getattr__(name: str) -> "Any":
-    if name in _MODULES:
-        return importlib.import_module(f"cortado.{_MODULES[name]}")
-    if name in _HOMES:
-        return getattr(importlib.import_module(f"cortado.{_HOMES[name]}"), name)
-    raise AttributeError(f"module 'cortado' has no attribute {name!r}")
+if not TYPE_CHECKING:  # which would take any name for one of the package
+    __getattr__ = getter(__name__, _HOMES)
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""Numbers that a user gives in whatever form, as arrays in float64."""
+"""Numbers that a user gives in whatever form, as arrays in float64; and what is no number, in a sentence."""
 
 from numbers import Real
 from typing import Any
@@ -76,12 +76,18 @@ def require_at_most(what: str, value: Any, most: int) -> None:
 
 def whole_number(what: str, value: Any, least: int) -> int:
     """A whole number of at least so much, also if it is a float, or an `InputError` in a sentence."""
-    whole = isinstance(value, (int, np.integer)) or (isinstance(value, (float, np.floating)) and value.is_integer())
+    whole = is_whole(value) or (isinstance(value, (float, np.floating)) and value.is_integer())
     if not whole or value < least:
         raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
     if value > GREATEST_NUMBER:
         raise InputError(f"{what} is {shown(value)}, but must be at most {GREATEST_NUMBER:g}.")
     return int(value)
+
+
+def require_function(what: str, value: object) -> None:
+    """Raises `InputError`, in a sentence that begins with ``what``, unless a value is a function or None."""
+    if value is not None and not callable(value):
+        raise InputError(f"{what} is {shown(value)}, but must be a function, or be left out.")
 
 
 def check_steps(steps: int, least: int = 1) -> int:

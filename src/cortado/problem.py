@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import check_steps, whole_number
+from cortado.arrays import check_steps, require_function, whole_number
 from cortado.device.memory import require
 from cortado.device.state import State
 from cortado.device.threads import Turn, in_turn
@@ -127,6 +127,7 @@ class Problem:
         ``observe`` is given the number and the adjoint of every state, from the last to the first, by estimators that
         go back through a run; `gradients.AdjointNorms` is such an observer.
         """
+        require_function("observe", observe)
         found = estimate(self, parameters, gradient, observe)
         kept = self._going if self.simulation.batch else slice(None)
         broken = [name for name, value in found.gradient.items() if not np.isfinite(np.atleast_1d(value)[kept]).all()]

@@ -366,6 +366,8 @@ def _made_again(
 def _device(name: str) -> Any:
     found = ", ".join(str(device) for device in wp.get_devices())
     none = "" if wp.get_cuda_device_count() else f"; {why_no_gpu()}"
+    if not isinstance(name, str):
+        raise InputError(f"device is {shown(name)}, but must be one of: {found}{none}.")
     try:
         if name == "cuda" and none:
             raise ValueError  # Warp itself would write on stderr

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from cortado.arrays import as_one_number, require_whole
 from cortado.certificate.alignment import Alignment, alignment
 from cortado.certificate.consistency import Consistency, balanced, check_consistency
 from cortado.certificate.growth import growth
@@ -151,7 +152,8 @@ def certify(
 
     Raises `InputError` for arguments that do not fit, `DivergedError` where the problem itself diverges.
     """
-    if not 0.0 < perturbation < 1.0:
+    require_whole("seed", seed, 0)
+    if not 0.0 < as_one_number("perturbation", perturbation) < 1.0:
         raise InputError(f"perturbation is {shown(perturbation)}, but must be greater than 0 and less than 1.")
     problem = _problem(problem, steps)
     if problem.simulation.batch is not None:

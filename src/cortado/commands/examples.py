@@ -24,7 +24,7 @@ def list_examples(names: list[str], folder: Path) -> str:
 
 
 def _chosen(names: list[str], known: list[str]) -> list[str]:
-    plain = [Path(name).stem if name.endswith((".toml", ".py")) else name for name in names]
+    plain = [name.removesuffix(".toml").removesuffix(".py") for name in names]
     for name, given in zip(plain, names, strict=True):
         if name not in (*known, ALL):
             raise InputError(f"--copy is {shown(given)}, but must be {ALL} or one of {', '.join(known)}.")

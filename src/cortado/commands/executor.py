@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from cortado.errors import InputError
 from cortado.executors import Distributed, Executor, InProcess, local_workers
 from cortado.executors.local import require_processes
+from cortado.io.interruption import keeping
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ class Where:
             with Distributed(self.scheduler) as there:
                 yield there
         elif self.workers is not None:
-            with local_workers(min(self.workers, max(items, 1)), device.partition(":")[0]) as here:
+            processes = min(self.workers, max(items, 1))
+            with keeping(lambda: ""), local_workers(processes, device.partition(":")[0]) as here:
                 yield here
         else:
             yield InProcess()

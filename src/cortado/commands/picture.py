@@ -27,7 +27,7 @@ def draw_run(run: Path, frame: int, as_film: bool, out: Path | None, overrides: 
     page = run_page(scene, trajectory, device)
     if as_film:
         path = out or folder.figures / "film.mp4"
-        film(path, page, range(len(trajectory)), (scene.picture or Picture()).film_frames or len(trajectory))
+        film(path, page, range(len(trajectory)), (scene.picture or Picture()).film_frames or None)
         return f"The film is in {path}."
     if frame not in range(-len(trajectory), len(trajectory)):
         raise InputError(f"--frame is {frame}, but the run has {len(trajectory)} frames, from 0.")

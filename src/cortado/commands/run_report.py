@@ -89,7 +89,7 @@ def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:
     wall = f" Walls are made of {len(simulation.walls)} particles." if len(simulation.walls) else ""
     substeps = f" Each step has {rollout.substeps} substeps of diffusion." if rollout.substeps else ""
     where = f"{simulation.precision.name} on {simulation.device}"
-    question = f"How do they move: {scene_in_words(scene, simulation.particles)}"
+    question = f"How does the fluid move? The scene: {scene_in_words(scene, simulation.particles)}"
     return [question, f"{length}, in {where}.{wall}{substeps}"]
 
 

@@ -52,6 +52,6 @@ FLOAT64 = Precision("float64", wp.float64, wp.vec3d, wp.vec2d, np.float64, 1e-20
 def precision_named(name: str) -> Precision:
     """The precision called ``"float32"`` or ``"float64"``; raises `InputError` for any other name."""
     for precision in (FLOAT32, FLOAT64):
-        if precision.name == name:
+        if isinstance(name, str) and precision.name == name:
             return precision
     raise InputError(f'precision is {name!r}, but must be "float32" or "float64".')

@@ -3,9 +3,10 @@
 import asyncio
 import logging
 import os
+import sys
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 from cortado.arrays import require_whole
@@ -13,6 +14,7 @@ from cortado.device.cores import VARIABLE as CORES
 from cortado.device.cores import usable_cores
 from cortado.errors import ComputationError, InputError, shown
 from cortado.executors.distributed import Distributed, distributed_module
+from cortado.io.interruption import Hold
 from cortado.words import counted
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
@@ -98,11 +100,24 @@ def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Di
     }
     somewhere = {"host": LOOPBACK, "port": 0, "dashboard_address": f"{LOOPBACK}:0", "dashboard": False}
     scheduler = {"cls": module.Scheduler, "options": somewhere}
-    with (
-        module.SpecCluster(workers, scheduler, silence_logs=logging.CRITICAL) as cluster,
-        module.Client(cluster, set_as_default=False) as client,
-    ):
+    hold = Hold()
+    with ExitStack() as stack:
+        _start_tracker()
+        hold.begin()
+        stack.callback(hold.end)
+        cluster = stack.enter_context(module.SpecCluster(workers, scheduler, silence_logs=logging.CRITICAL))
+        client = stack.enter_context(module.Client(cluster, set_as_default=False))
+        stack.callback(hold.begin)  # first of all at the end, as a second Ctrl-C would leave workers behind
+        hold.end()
         yield LocalWorkers(client, cluster)
+
+
+def _start_tracker() -> None:
+    """The process that removes semaphores which workers leave behind: a thread that starts it hears Ctrl-C again."""
+    if sys.platform != "win32":
+        from multiprocessing import resource_tracker
+
+        resource_tracker.ensure_running()
 
 
 def _environments(number: int | None, device: str) -> list[dict[str, str]]:

@@ -8,7 +8,7 @@ from cortado.arrays import is_whole
 from cortado.device.state import State
 from cortado.errors import InputError, shown
 from cortado.gradients.adjoint_filters import Drag, EddyViscosity, Limit
-from cortado.gradients.estimator import AdjointEstimator, Differentiable, Estimate, Filtered
+from cortado.gradients.estimator import AdjointEstimator, Differentiable, Estimate, Filtered, checked_estimator
 from cortado.gradients.exact import Exact
 from cortado.parameters.values import Values
 from cortado.rollout import BackwardStep, Observer, Rollout
@@ -65,7 +65,8 @@ class AdjointViscosity(AdjointEstimator):
     def __post_init__(self) -> None:
         if not is_whole(self.order) or self.order not in (1, 2):
             raise InputError(f"order is {shown(self.order)}, but must be 1 or 2.")
-        if self.limit != np.inf and (as_number(self.limit) or 0.0) < 1.0:
+        checked_estimator(self.base)
+        if not (isinstance(self.limit, float) and self.limit == np.inf) and (as_number(self.limit) or 0.0) < 1.0:
             raise InputError(f"limit is {shown(self.limit)}, but must be a number of at least 1.")
         coefficient = as_number(self.coefficient)
         if coefficient is None or coefficient < 0.0:

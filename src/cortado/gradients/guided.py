@@ -61,11 +61,11 @@ class Guided(Ensemble):
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         """``observe`` is called with the adjoints of the surrogate's samples."""
+        ensemble = self.around(problem, parameters, draw=1)
         surrogate = EnsembleMean(
             self.spread, self.samples, self.position_noise, self.seed, self.surrogate, executor=self.executor
         ).estimate(problem, parameters, observe)
         assert surrogate.standard_error is not None and surrogate.degrees_of_freedom is not None
-        ensemble = self.around(problem, parameters, draw=1)
         parts, turns = self._parts(ensemble, surrogate.gradient, surrogate.standard_error)
         self.require_memory(2 * self.differences * len(parts), 0)
         reach = [np.sqrt(np.count_nonzero(part)) for part in parts]

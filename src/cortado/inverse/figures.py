@@ -62,7 +62,7 @@ def _images(made: Setup, result: Result, folder: Path) -> Chapters:
     path = images(shown, [f"evaluation {k}" for k in evaluations], folder / "progress.png")
     search: Figures = [("The last image during the optimisation.", path)]
     steps = made.problem.steps
-    if steps > 0 and (made.task.scene.picture or Picture()).film_frames and find_spec("av"):
+    if steps > 0 and (made.task.scene.picture or Picture()).most_frames and find_spec("av"):
         numbers = np.unique(np.linspace(0, steps, MOST_FRAMES).astype(int))
         states = made.problem.states(made.search.parameters(result.parameters), numbers.tolist())
         path = write_video(folder / "estimate.mp4", (made.image(states[k]) for k in numbers.tolist()), 20)

@@ -30,7 +30,7 @@ Run = Mapping[int, Snapshot]
 def shaded_figures(made: Setup, result: Result, folder: Path) -> Chapters:
     """Draw them into a folder."""
     picture, device = made.task.scene.picture or Picture(), made.problem.simulation.device
-    steps = np.unique(np.linspace(0, made.problem.steps, max(picture.film_frames, 2)).astype(int)).tolist()
+    steps = np.unique(np.linspace(0, made.problem.steps, max(picture.most_frames, 2)).astype(int)).tolist()
 
     def run(parameters: Mapping[str, Any]) -> Run:
         return made.problem.states(dict(parameters), steps)
@@ -52,7 +52,7 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> Chapters:
     path = folder / "search.png"
     write_picture(path, searched.image(steps[-1]))
     search: Figures = [("The end of the run as the search went on.", path)]
-    if not picture.film_frames or len(steps) < 2:
+    if not picture.most_frames or len(steps) < 2:
         return Chapters(compared=compared, search=search)
     pair = {name: runs[name] for name in (("found", "target") if "target" in runs else ("first guess", "found"))}
     two = page(list(pair), list(pair.values()))

@@ -3,6 +3,9 @@
 import errno
 import os
 import stat
+from typing import Any
+
+from cortado.errors import InputError, shown
 
 OTHERS = (
     (stat.S_ISDIR, "a directory"),
@@ -12,6 +15,16 @@ OTHERS = (
     (stat.S_ISBLK, "a device"),
 )
 """What a path may lead to that is no regular file."""
+
+
+def as_path(what: str, value: Any) -> str:
+    """A path as text, or an `InputError` in a sentence that begins with ``what``; a number is none, though Python opens
+    it as a file that is already open."""
+    if isinstance(value, (str, os.PathLike)):
+        path = os.fspath(value)
+        if isinstance(path, str) and path:
+            return path
+    raise InputError(f"{what} is {shown(value)}, but must be the path of a file or a folder.")
 
 
 def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:

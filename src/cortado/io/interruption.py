@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
+from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN = 0.01
@@ -59,12 +60,47 @@ def keeping(kept: Callable[[], str]) -> Iterator[None]:
     try:
         yield
     except Interrupted as stop:
-        raise Interrupted(stop.args[0], stop.kept or kept()) from None
+        raise Interrupted(stop.args[0], _first_said(stop) or kept()) from None
     except KeyboardInterrupt:
         raise Interrupted(signal.SIGINT, kept()) from None
     finally:
         for number in ours:
             signal.signal(number, _leave)
+
+
+class Hold:
+    """Lets signals wait for a while. Threads and processes that begin meanwhile never get Ctrl-C, which a terminal
+    sends to all of them."""
+
+    def __init__(self) -> None:
+        self._late: list[int] = []
+        self._mask: set[int] | None = None
+        self._handler: Any = None
+
+    def begin(self) -> None:
+        """From now on they wait."""
+        if hasattr(signal, "pthread_sigmask"):  # not on Windows
+            self._mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        if signal.getsignal(signal.SIGTERM) in (_leave, _raise):  # a process that inherited a mask could not be ended
+            self._handler = signal.signal(signal.SIGTERM, lambda number, _: self._late.append(number))
+
+    def end(self) -> None:
+        """Those that came are delivered; it may be called again."""
+        if self._handler is not None:
+            signal.signal(signal.SIGTERM, self._handler)
+            self._handler = None
+        if self._mask is not None:
+            mask, self._mask = self._mask, None
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        while self._late:
+            os.kill(os.getpid(), self._late.pop())
+
+
+def _first_said(stop: BaseException | None) -> str:
+    """What is kept, as an interruption says, or one that it came upon on its way out."""
+    if not isinstance(stop, Interrupted):
+        return ""
+    return stop.kept or _first_said(stop.__context__)
 
 
 def _leave(number: int, _: FrameType | None) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cortado.errors import CortadoWarning, InputError
 from cortado.io.files import write_atomically
-from cortado.io.input_files import reason, regular_file
+from cortado.io.input_files import as_path, reason, regular_file
 from cortado.io.srgb import check_light, from_srgb, to_srgb
 from cortado.render.cameras import check_resolution, positive, vector
 
@@ -101,7 +101,7 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
     most = MOST_PIXELS_KEPT if resolution is None else MOST_PIXELS
     shape = None if resolution is None else _columns_and_rows(resolution)
     try:
-        regular_file(path, MOST_BYTES)
+        regular_file(as_path("path", path), MOST_BYTES)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow warns of large pictures, which are judged here
             with Image.open(path, formats=FORMATS) as file:
@@ -160,7 +160,7 @@ def write_picture(path: str | Path, image: ArrayLike) -> Path:
     """
     from PIL import Image
 
-    if Path(path).suffix.lower() != ".png":
+    if Path(as_path("path", path)).suffix.lower() != ".png":
         raise InputError(f"path is {str(path)!r}, but must be the name of a PNG file, such as picture.png.")
     pixels, content = to_srgb(image), BytesIO()
     check_light("The image", image)

@@ -59,8 +59,10 @@ def tell(result: str) -> None:
 def to_stdout() -> Iterator[None]:
     """What is printed within it arrives; else raises `ComputationError`, or `BrokenPipeError` if nobody reads it."""
     try:
-        yield
-        sys.stdout.flush()
+        try:
+            yield
+        finally:  # also where the process is about to exit
+            sys.stdout.flush()
     except BrokenPipeError:
         _point_nowhere(sys.stdout.fileno())
         raise
@@ -70,11 +72,12 @@ def to_stdout() -> Iterator[None]:
 
 
 def steady_streams() -> None:
-    """Make stdout and stderr of this process usable: streams that are closed go nowhere, characters that the terminal
+    """Make stdout and stderr of this process usable: streams that are closed go nowhere, but a
+    result that is written to a closed stdout fails, characters that the terminal
     cannot show are escaped, and a stderr that nobody reads any more is no reason to stop."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            _point_nowhere(number)
+            _point_nowhere(number, os.O_RDONLY if number == 1 else os.O_RDWR)
             setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", closefd=False))
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     stderr = os.fdopen(sys.stderr.fileno(), "wb", closefd=False)
@@ -95,8 +98,8 @@ class _Steady(io.TextIOWrapper):
             super().flush()
 
 
-def _point_nowhere(descriptor: int) -> None:
-    nowhere = os.open(os.devnull, os.O_RDWR)  # the same number where that was free, and the lowest
+def _point_nowhere(descriptor: int, mode: int = os.O_RDWR) -> None:
+    nowhere = os.open(os.devnull, mode)  # the same number where that was free, and the lowest
     if nowhere != descriptor:
         os.dup2(nowhere, descriptor)
         os.close(nowhere)

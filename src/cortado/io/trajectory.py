@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cortado.errors import InputError, shown
 from cortado.io import vtkhdf
+from cortado.io.input_files import as_path
 from cortado.io.notebook import as_text, with_view
 from cortado.io.particle_view import Cloud, particle_view, thinned
 from cortado.restart import Clock, Origin, RestartState
@@ -209,7 +210,7 @@ class Trajectory:
             InputError: no frames, a name that does not end in one of `SUFFIXES`, or a path that cannot be written.
             ComputationError: the disk is full.
         """
-        if Path(path).suffix.lower() not in SUFFIXES:
+        if Path(as_path("path", path)).suffix.lower() not in SUFFIXES:
             wanted = f"must be a VTKHDF file, whose name ends in {' or '.join(SUFFIXES)}"
             raise InputError(f"path is {str(path)!r}, but {wanted}.")
         frames = self._fields
@@ -227,7 +228,7 @@ class Trajectory:
         Raises:
             InputError: the file is missing, damaged, or none of Cortado's trajectories.
         """
-        arrays = vtkhdf.read(path)
+        arrays = vtkhdf.read(as_path("path", path))
         names = ("times", "steps", "positions", "velocities", "diagnostics", "others", "constants")
         phases = sum(name.startswith(FRACTION) for name in arrays)
         fractions = np.stack([arrays[name] for name in _fraction_names(phases)], axis=-1) if phases else None

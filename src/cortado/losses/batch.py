@@ -101,7 +101,8 @@ class Together(Protocol):
         """(batch,) the losses; of scenes that were lost they mean nothing."""
 
     def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
-        """The same, and the derivatives with respect to the states, as Warp arrays."""
+        """The same, and the derivatives with respect to the states, as Warp arrays: ``end.state.like()`` makes them,
+        all 0, and ``set({"positions": array})`` of it writes an array (batch, n, d)."""
 
 
 def values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray:

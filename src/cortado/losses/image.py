@@ -10,7 +10,7 @@ from cortado.arrays import read_only
 from cortado.device.threads import WARP
 from cortado.errors import InputError, shown
 from cortado.fixed import fixed
-from cortado.io.srgb import check_light
+from cortado.io.srgb import LIGHT, check_light
 from cortado.losses.image_losses import ImageLoss, SquaredDifference
 from cortado.losses.loss import Snapshot, SnapshotAdjoint
 
@@ -76,4 +76,6 @@ def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray
     if not np.isfinite(image).all():
         raise InputError("target has a value that is not finite, but must be made of finite numbers.")
     check_light("target", target)
+    if image.min() < 0.0:
+        raise InputError(f"target has a value of {image.min():g}, but must be {LIGHT}; clip noise at 0.")
     return image

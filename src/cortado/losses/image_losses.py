@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cortado.arrays import as_numbers
+from cortado.arrays import as_numbers, require_whole
 from cortado.errors import InputError
 
 __all__ = ["ImageLoss", "Pyramid", "SquaredDifference", "psnr"]
@@ -67,11 +67,11 @@ class Pyramid:
     """(levels,) from fine to coarse; None: 1, 2, 4 ..., as a shape is fainter the more it is blurred."""
 
     def __post_init__(self) -> None:
-        if self.levels is not None and self.levels < 1:
-            raise InputError(f"levels is {self.levels}, but must be 1 or more.")
+        if self.levels is not None:
+            require_whole("levels", self.levels, 1)
         if self.weights is None:
             return
-        weights = tuple(float(weight) for weight in self.weights)
+        weights = tuple(np.atleast_1d(as_numbers("weights", self.weights)).tolist())
         object.__setattr__(self, "weights", weights)
         if not (np.isfinite(weights).all() and min(weights, default=-1.0) >= 0.0 and max(weights) > 0.0):
             raise InputError(f"weights is {weights}, but must be finite, not negative and not all zero.")

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from cortado.arrays import is_whole
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.device.state import State
 from cortado.errors import InputError, shown
@@ -96,7 +97,8 @@ class Loss(Protocol):
         """The loss."""
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """The loss and its derivatives, in one call as they often share work."""
+        """The loss and its derivatives, in one call as they often share work: a tuple of NumPy arrays, or a `State` of
+        Warp arrays, which ``end.state.like()`` makes, all 0, and ``set({"positions": array})`` of it fills."""
 
 
 @fixed
@@ -107,6 +109,9 @@ class Frames:
         """``losses`` {number of steps: loss}; 0 is the first state."""
         if not isinstance(losses, Mapping) or not losses:
             raise InputError(f"losses is {shown(losses)}, but must be a table with a loss for at least one frame.")
+        for step in losses:
+            if not is_whole(step) and not (isinstance(step, float) and float(step).is_integer()):
+                raise InputError(f"losses has the frame {shown(step)}, but must have whole numbers of steps.")
         self.losses = FixedDict(losses)
 
     @property

@@ -1,12 +1,12 @@
 """`cortado.evaluate`: a problem at many points that do not depend on one another, such as a population of a search."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from cortado.arrays import as_one_number
-from cortado.errors import CortadoWarning
+from cortado.arrays import as_one_number, require_function
+from cortado.errors import CortadoWarning, InputError, shown
 from cortado.executors.executor import Executor, InProcess, OnResult, checked_executor
 from cortado.gradients import Estimate, GradientEstimator
 from cortado.gradients.estimator import Differentiable, checked_estimator
@@ -38,10 +38,17 @@ def evaluate(
 
     Raises the error of the first point that has another one.
     """
+    require_function("on_result", on_result)
+    if not callable(getattr(problem, "value", None)):
+        raise InputError(f"problem is {shown(problem)}, but must be a cortado.Problem.")
+    if not isinstance(points, Iterable) or isinstance(points, (str, bytes, Mapping)):
+        raise InputError(f"points is {shown(points)}, but must be a list of parameters by name.")
+    if loss_if_diverged is not None:
+        loss_if_diverged = as_one_number("loss_if_diverged", loss_if_diverged)
     chosen = checked_executor(InProcess() if executor is None else executor)
     estimator = None if gradient is None else checked_estimator(gradient)
-    loss = np.nan if loss_if_diverged is None else as_one_number("loss_if_diverged", loss_if_diverged)
-    made = (Daring(values, estimator, loss) for values in points)
+    loss = np.nan if loss_if_diverged is None else loss_if_diverged
+    made = (Daring(_by_name(values), estimator, loss) for values in points)
     found = evaluated(problem, made, chosen, on_result=on_result)
     lost = [number for number, one in enumerate(found) if one.diverged is not None]
     if lost and loss_if_diverged is None:
@@ -52,3 +59,9 @@ def evaluate(
             stacklevel=2,
         )
     return found
+
+
+def _by_name(point: Values) -> Values:
+    if not isinstance(point, Mapping):
+        raise InputError(f"a point is {shown(point)}, but must be parameters by name, as {{'gravity': value}}.")
+    return point

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from cortado.arrays import require_function
 from cortado.errors import InputError
+from cortado.io.input_files import as_path
 from cortado.optimisation.differentiable import Differentiable, LossFunction, as_differentiable
 from cortado.optimisation.evaluator import Evaluator, as_given
 from cortado.optimisation.named_optimisers import as_optimiser
@@ -63,11 +65,14 @@ def optimise(
     DivergedError if the start diverges, or a step that was halved ten times;
     ComputationError if the loss or its gradient is not finite; what came before is in the checkpoint.
     """
+    if checkpoint is not None:
+        checkpoint = as_path("checkpoint", checkpoint)
+    require_function("on_iteration", on_iteration)
     algorithm, differentiable = as_optimiser(optimiser, settings), as_differentiable(problem)
     values = checked_start(start)
     layout = ParameterLayout.of(values)
     vector = layout.ravel(values)
-    lower, upper = checked_bounds(bounds or {}, layout)
+    lower, upper = checked_bounds({} if bounds is None else bounds, layout)
     require_within(vector, lower, upper, layout)
     algorithm.check(layout)
     require_count(iterations)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cortado.arrays import require_at_most
+from cortado.arrays import is_whole, require_at_most
 from cortado.device.memory import require
 from cortado.errors import InputError
 from cortado.fixed import keep_own
@@ -150,7 +150,7 @@ class LBFGS:
     """A change worth trying, one number or one per parameter by name [unit of the parameter]."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.memory, int) or self.memory < 1:
+        if not is_whole(self.memory) or self.memory < 1:
             raise InputError(f"The memory of L-BFGS must be an integer of at least 1, not {self.memory!r}.")
         require_at_most("The memory of L-BFGS", self.memory, MOST_MEMORY)
         require_fraction("The tolerance of L-BFGS", self.tolerance)

@@ -34,7 +34,9 @@ def _checked_value(what: str, value: Any) -> Vector:
 
 def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], layout: ParameterLayout) -> tuple[Vector, Vector]:
     """Lower and upper bounds as vectors (size,), or InputError if they do not fit the parameters."""
-    unknown = sorted(set(bounds) - set(layout.names))
+    if not isinstance(bounds, Mapping):
+        raise InputError(f"bounds is {shown(bounds)}, but must be by name, as {{'gravity': (lower, upper)}}.")
+    unknown = sorted(set(bounds) - set(layout.names), key=str)
     if unknown:
         raise InputError(
             f"Bounds are given for {', '.join(map(repr, unknown))}, which the start does not name; the "

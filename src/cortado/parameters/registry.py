@@ -116,12 +116,12 @@ def _speed_of_fall(source: Source, value: Any) -> float:
     return float(np.sqrt(_size_of_gravity(source) * height))
 
 
-def _several_phases(source: Source, values: Mapping[str, NDArray]) -> bool:
-    return len(source.scene.phase) > 1
+def _has_several_phases(scene: Any) -> bool:
+    return len(scene.phase) > 1
 
 
 def _diffuses(source: Source, values: Mapping[str, NDArray]) -> bool:
-    return _several_phases(source, values) and bool(values["mobility"] > 0.0)
+    return bool(values["mobility"] > 0.0)
 
 
 def _of_phases(name: str) -> Callable[[Source], list[Any]]:
@@ -214,7 +214,7 @@ PARAMETERS = (
         role=Role.STATE,
         range=Range.FRACTIONS,
         change=lambda source, value: 0.02,
-        acts=_several_phases,
+        acts=lambda source, values: _has_several_phases(source.scene),
     ),
     Parameter(
         "rest_density",
@@ -231,6 +231,8 @@ PARAMETERS = (
         Axis.PHASE,
         _of_phases("viscosity"),
         range=Range.NOT_NEGATIVE,
+        present=lambda scene: scene.forces.viscosity != "none",
+        absent='has viscosity = "none" in [forces]',
         force="cortado.sph.viscosity",
     ),
     _optional("surface_tension", "N/m", "tension of the free surface", "cortado.sph.surface_tension", _capillary_step),
@@ -245,6 +247,8 @@ PARAMETERS = (
         lambda s: s.scene.mixture.mobility,
         range=Range.NOT_NEGATIVE,
         acts=_diffuses,
+        present=_has_several_phases,
+        absent="has only one phase",
     ),
     Parameter(
         "interface_width",
@@ -254,6 +258,8 @@ PARAMETERS = (
         lambda s: s.scene.mixture.width(s.scene.discretisation.spacing),
         range=Range.POSITIVE,
         acts=_diffuses,
+        present=_has_several_phases,
+        absent="has only one phase",
     ),
     Parameter(
         "nozzle_path",
@@ -297,6 +303,6 @@ def names(role: Role | None = None, axis: Axis | None = None) -> tuple[str, ...]
 
 
 def offered(scene: Any) -> tuple[str, ...]:
-    """The names of parameters that a scene has, without those of a mixture where there is only one phase."""
-    mixture = (_several_phases, _diffuses) if len(scene.phase) == 1 else ()
-    return tuple(p.name for p in PARAMETERS if p.present(scene) and p.acts not in mixture)
+    """The names of parameters that a scene has, without what its particles are made of where there is one phase."""
+    one_phase = {"mass_fractions"} if len(scene.phase) == 1 else set()
+    return tuple(p.name for p in PARAMETERS if p.present(scene) and p.name not in one_phase)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from cortado.arrays import as_numbers, as_one_number
+from cortado.arrays import as_numbers, as_one_number, is_whole
 from cortado.errors import InputError, shown
 from cortado.fixed import keep_own
 
@@ -127,7 +127,7 @@ class Perspective(Camera):
 
 def check_resolution(resolution: tuple[int, int]) -> None:
     """An `InputError` unless these are numbers of columns and rows."""
-    whole = isinstance(resolution, Sequence) and all(isinstance(n, (int, np.integer)) and n > 0 for n in resolution)
+    whole = isinstance(resolution, Sequence) and all(is_whole(n) and n > 0 for n in resolution)
     if not whole or len(resolution) != 2:
         raise InputError(
             f"resolution is {shown(resolution)}, but must be two positive whole numbers, columns and rows."

@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from cortado.arrays import is_whole
 from cortado.errors import InputError, shown
 from cortado.fixed import keep_own
 from cortado.render.cameras import Camera, Orthographic, Vector, check_resolution, positive, vector
@@ -69,7 +70,7 @@ class TopView:
     """Linear RGB, (3,)."""
 
     def __post_init__(self) -> None:
-        length = 2 if len(self.lower) == 2 else 3
+        length = 2 if np.shape(self.lower) == (2,) else 3
         for name in ("lower", "upper"):
             corner = vector(name, getattr(self, name), length)
             object.__setattr__(self, name, (*corner, 0.0)[:3])
@@ -78,7 +79,7 @@ class TopView:
         keep_own(self, "resolution")
         positive("spacing", self.spacing)
         positive("opacity", self.opacity)
-        if self.up_axis not in (0, 1, 2):
+        if not is_whole(self.up_axis) or self.up_axis not in (0, 1, 2):
             raise InputError(f"up_axis is {shown(self.up_axis)}, but must be 0, 1 or 2.")
         extent = np.delete(np.subtract(self.upper, self.lower), self.up_axis)
         if not (extent > 0).all():

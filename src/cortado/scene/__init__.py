@@ -1,1 +1,8 @@
 """What a user writes: the tables of a scene, checked and frozen."""
+
+from typing import TYPE_CHECKING
+
+from cortado.lazy import getter
+
+if not TYPE_CHECKING:
+    __getattr__ = getter(__name__)

@@ -10,11 +10,11 @@ def scene_in_words(scene: Scene, particles: int) -> str:
     phases = " and ".join(
         f"{phase.name} ({phase.rest_density:g} kg/m³, {phase.viscosity:g} Pa s)" for phase in scene.phase
     )
-    place = "plane" if scene.dimension == 2 else "space"
     emitter = " of which an emitter gives some," if scene.emitter is not None else ""
     return (
-        f"{counted(particles, 'particle')} of {phases} in the {place},{emitter} {scene.discretisation.spacing:g} m "
-        f"apart at rest, {_held(scene)}, under gravity {vector(scene.forces.gravity)} m/s²{_scheduled(scene)}."
+        f"{counted(particles, 'particle')} of {phases} in {scene.dimension}-D,{emitter} "
+        f"{scene.discretisation.spacing:g} m apart at rest, {_held(scene)}, "
+        f"under gravity {vector(scene.forces.gravity)} m/s²{_scheduled(scene)}."
     )
 
 

@@ -7,6 +7,8 @@ from pydantic import ValidationInfo, field_validator
 from cortado.scene.fields import Colour, FieldPath, Flag, Length, components, count, field_error, quantity
 from cortado.scene.tables import Table
 
+MOST_FRAMES = 120
+"""Of a film whose scene does not say how many."""
 Place = Annotated[tuple[Length, ...], components("x", "y", "z")]
 
 
@@ -33,8 +35,14 @@ class Picture(Table):
     """Whether there is a floor, in 3-D."""
     background: Colour = (0.74, 0.77, 0.80)
     """(3,) red, green and blue, linear, each from 0 to 1"""
-    film_frames: Annotated[int, count(0, 100_000)] = 120
-    """Frames of a film at most; no film if 0."""
+    film_frames: Annotated[int, count(0, 100_000)] | None = None
+    """Frames of a film, as far as there are so many; no film if 0. If left out as many as are drawn in about 40 s, at
+    most 120."""
+
+    @property
+    def most_frames(self) -> int:
+        """Of a film."""
+        return MOST_FRAMES if self.film_frames is None else self.film_frames
 
     @field_validator("look_at")
     @classmethod

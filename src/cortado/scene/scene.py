@@ -58,11 +58,14 @@ class Scene(SceneTables):
     @classmethod
     def from_json(cls, text: str | bytes, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":
         """The scene that `to_json` wrote to a file, with replacements as for `load_scene`."""
+        if not isinstance(text, str):
+            raise InputError(f"text is {shown(text)}, but must be the text that Scene.to_json gives.")
         try:
             data = json.loads(text)
         except (ValueError, RecursionError) as problem:
             raise SceneError(None, "", sentence=f"is not valid JSON: {problem}.") from None
-        if overrides and isinstance(data, dict):
+        given = not isinstance(overrides, Sequence) or len(overrides) > 0
+        if given and isinstance(data, dict):
             data = put_in(_given(data), overrides, file)
         return scene_from_dict(data)
 

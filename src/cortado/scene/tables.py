@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from cortado.errors import InputError, Words
 from cortado.scene.fields import PER_AXIS, FieldPath, field_error, without_numpy
-from cortado.scene.sentences import sentences
+from cortado.scene.sentences import absent, sentences
 
 
 class Table(BaseModel):
@@ -60,5 +60,6 @@ class Table(BaseModel):
 
 def _unknown_key(key: str, known: list[str]) -> PydanticCustomError:
     close = get_close_matches(key, known, n=1)
-    advice = f"did you mean {close[0]}?" if close else f"its keys are {', '.join(known)}."
+    others = f"{missing}." if (missing := absent(key)) else f"its keys are {', '.join(known)}."
+    advice = f"did you mean {close[0]}?" if close else others
     return field_error((key,), Words("unknown"), f"one of {', '.join(known)}", f"is not a key of {{table}}; {advice}")

@@ -6,8 +6,8 @@ import tomllib
 from collections.abc import Sequence
 from typing import Any
 
-from cortado.errors import LONGEST, SceneError, shown
-from cortado.io.input_files import content, reason
+from cortado.errors import LONGEST, InputError, SceneError, shown
+from cortado.io.input_files import as_path, content, reason
 
 MOST_BYTES = 1_000_000
 """Of a file: TOML of that size, made to be as bad as it can, takes a few seconds and some hundred MB."""
@@ -32,7 +32,7 @@ def read_toml(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> di
     an entry with a name may be called by it, ``phase.oil.viscosity=0.1``.
     A value that is not TOML is taken as text.
     """
-    file = os.fspath(path)
+    file = as_path("path", path)
     try:
         text = content(path, MOST_BYTES).decode("utf-8-sig")
         _require_shallow(text, file)
@@ -55,6 +55,8 @@ def put_in(data: dict[str, Any], overrides: Sequence[str], file: str) -> dict[st
     if isinstance(overrides, str):
         sentence = f"must be in a list, as [{shown(overrides)}], as there may be several overrides."
         raise SceneError(file, shown(overrides), sentence=sentence)
+    if not isinstance(overrides, Sequence):
+        raise InputError(f"overrides is {shown(overrides)}, but must be a list of texts such as 'solver.kind=pcisph'.")
     for override in overrides:
         if not isinstance(override, str):
             sentence = "is no override, which is a text such as 'solver.time_step=0.002'."

@@ -1,0 +1,181 @@
+"""Values of a wrong type, given to whatever a user may call: a sentence each, and never a bare error of Python's."""
+
+import inspect
+import os
+from functools import cache
+
+import numpy as np
+import pytest
+
+import cortado
+from bad_scenes import plane
+from cortado.errors import CortadoError, InputError
+
+WRONG = {
+    "nothing": None,
+    "a number": 3,
+    "a truth": True,
+    "no text": "",
+    "below 0": -1,
+    "a fraction": 2.5,
+    "a list": [],
+    "a table": {},
+    "an object": object(),
+    "a folder": os.getcwd(),
+    "no number": float("nan"),
+    "an array": np.zeros(3),
+    "bytes": b"x",
+    "a table of a truth": {True: 1},
+}
+
+
+@cache
+def calls():
+    """By its name what is called, and good arguments of it."""
+    scene = cortado.Scene(**plane())
+    simulation = cortado.Simulation(scene)
+    loss, start = cortado.losses.CentreOfMass([0.0, 0.0]), {"gravity": [0.0, -9.0]}
+    problem = cortado.Problem(simulation, 2, loss)
+    trajectory = simulation.run(2)
+    gradients, losses, optimisers = cortado.gradients, cortado.losses, cortado.optimisers
+    renderer = simulation.renderer(resolution=(10, 8))
+    image = renderer.render(trajectory[0])
+    search = {"problem": problem, "start": start, "optimiser": "adam", "iterations": 1, "learning_rate": 0.1}
+    return {
+        "load_scene": (cortado.load_scene, {"path": "scene.toml", "overrides": ()}),
+        "from_json": (cortado.Scene.from_json, {"text": scene.to_json(), "overrides": ()}),
+        "Simulation": (cortado.Simulation, {"scene": scene, "device": "cpu", "precision": "float32", "batch": None}),
+        "run": (simulation.run, {"steps": 1, "controls": None, "record_every": 1, "state": None}),
+        "Problem": (cortado.Problem, {"simulation": simulation, "steps": 2, "loss": loss, "memory_budget": 10**8}),
+        "value": (problem.value, {"parameters": start}),
+        "estimate": (problem.estimate, {"parameters": start, "gradient": None, "observe": None}),
+        "tangent": (problem.tangent, {"parameters": start, "directions": start}),
+        "optimise": (cortado.optimise, {**search, "bounds": None, "checkpoint": None, "on_iteration": None}),
+        "evaluate": (
+            cortado.evaluate,
+            {"problem": problem, "points": [start], "gradient": None, "executor": None, "on_result": None},
+        ),
+        "certify": (cortado.certify, {"problem": problem, "perturbation": 1e-3, "seed": 0}),
+        "load": (cortado.Trajectory.load, {"path": "run.vtkhdf"}),
+        "save": (trajectory.save, {"path": "run.vtkhdf"}),
+        "Frames": (losses.Frames, {"losses": {1: loss}}),
+        "FinalPositions": (losses.FinalPositions, {"target": trajectory[-1].positions}),
+        "CentreOfMass": (losses.CentreOfMass, {"target": [0.0, 0.0]}),
+        "Image": (losses.Image, {"renderer": renderer, "target": image, "distance": None}),
+        "Pyramid": (cortado.image_losses.Pyramid, {"levels": 2, "weights": (1.0, 2.0)}),
+        "Adam": (optimisers.Adam, {"learning_rate": 0.1}),
+        "LBFGS": (optimisers.LBFGS, {"memory": 5}),
+        "LineSearch": (optimisers.LineSearch, {}),
+        "EnsembleMean": (
+            gradients.EnsembleMean,
+            {"samples": 4, "spread": 0.1, "seed": 0, "estimator": gradients.Exact()},
+        ),
+        "AdjointViscosity": (gradients.AdjointViscosity, {"coefficient": 1.0, "limit": 4.0, "order": 1}),
+        "read_picture": (cortado.pictures.read_picture, {"path": "picture.png"}),
+        "write_picture": (cortado.pictures.write_picture, {"path": "picture.png", "image": image}),
+        "heart": (cortado.pictures.heart, {"resolution": 8, "size": 0.5}),
+        "TopView": (
+            cortado.render.TopView,
+            {"lower": (0.0, 0.0), "upper": (1.0, 1.0), "spacing": 0.1, "resolution": (10, 8), "up_axis": 2},
+        ),
+    }
+
+
+ARGUMENTS = [
+    (name, argument)
+    for name, arguments in {
+        "load_scene": ("path", "overrides"),
+        "from_json": ("text", "overrides"),
+        "Simulation": ("scene", "device", "precision", "batch"),
+        "run": ("steps", "controls", "record_every", "state"),
+        "Problem": ("simulation", "steps", "loss", "memory_budget"),
+        "value": ("parameters",),
+        "estimate": ("parameters", "gradient", "observe"),
+        "tangent": ("parameters", "directions"),
+        "optimise": ("problem", "start", "optimiser", "iterations", "bounds", "checkpoint", "on_iteration"),
+        "evaluate": ("problem", "points", "gradient", "executor", "on_result"),
+        "certify": ("problem", "perturbation", "seed"),
+        "load": ("path",),
+        "save": ("path",),
+        "Frames": ("losses",),
+        "FinalPositions": ("target",),
+        "CentreOfMass": ("target",),
+        "Image": ("target", "distance"),
+        "Pyramid": ("levels", "weights"),
+        "Adam": ("learning_rate",),
+        "LBFGS": ("memory",),
+        "EnsembleMean": ("samples", "spread", "seed", "estimator"),
+        "AdjointViscosity": ("coefficient", "limit", "order", "base"),
+        "read_picture": ("path",),
+        "write_picture": ("path", "image"),
+        "heart": ("resolution", "size"),
+        "TopView": ("lower", "upper", "spacing", "resolution", "up_axis"),
+    }.items()
+    for argument in arguments
+]
+
+
+@pytest.mark.filterwarnings("ignore::cortado.errors.CortadoWarning")
+@pytest.mark.parametrize("name, argument", ARGUMENTS)
+def test_a_wrong_value_works_or_is_a_sentence(name, argument, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    function, good = calls()[name]
+    for words, wrong in WRONG.items():
+        try:
+            function(**{**good, argument: wrong})
+        except CortadoError as error:
+            assert len(str(error)) > 10 and "\n" not in str(error), words
+        except Exception as error:  # of Python's or of a library's
+            pytest.fail(f"{argument} = {words}: {type(error).__name__}: {error}")
+
+
+NUMBERS = [
+    ("Simulation", "batch"),
+    ("run", "steps"),
+    ("run", "record_every"),
+    ("Problem", "steps"),
+    ("Problem", "memory_budget"),
+    ("optimise", "iterations"),
+    ("certify", "seed"),
+    ("certify", "perturbation"),
+    ("Pyramid", "levels"),
+    ("Adam", "learning_rate"),
+    ("LBFGS", "memory"),
+    ("EnsembleMean", "samples"),
+    ("EnsembleMean", "seed"),
+    ("heart", "resolution"),
+    ("heart", "size"),
+]
+
+
+@pytest.mark.parametrize("name, argument", NUMBERS)
+def test_a_truth_value_is_no_number(name, argument):
+    function, good = calls()[name]
+    assert argument in inspect.signature(function).parameters
+    with pytest.raises(InputError):
+        function(**{**good, argument: True})
+
+
+@pytest.mark.parametrize("frame", [True, False, "1", None, 1.5])
+def test_frames_are_numbered(frame):
+    with pytest.raises(InputError, match="losses has the frame"):
+        cortado.losses.Frames({frame: cortado.losses.CentreOfMass([0.0, 0.0])})
+
+
+def test_light_of_a_target_is_not_negative():
+    (renderer, target) = (calls()["Image"][1][name] for name in ("renderer", "target"))
+    with pytest.raises(InputError, match=r"target has a value of -0.25, but must be linear light from 0 to 1"):
+        cortado.losses.Image(renderer, np.where(target == target.max(), -0.25, target))
+
+
+@pytest.mark.parametrize("name", ["mobility", "interface_width"])
+def test_a_single_phase_has_no_parameters_of_a_mixture(name):
+    problem = calls()["Problem"][1]
+    with pytest.raises(InputError, match=f"{name} is given, but must be left out, as the scene has only one phase"):
+        cortado.Problem(**problem).value_and_gradient({name: 1e-6})
+
+
+def test_guided_is_named_where_it_is_given_a_batch():
+    problem = cortado.Problem(cortado.Simulation(cortado.Scene(**plane()), batch=2), 1, calls()["Problem"][1]["loss"])
+    with pytest.raises(InputError, match=r"^Guided is given a problem of a batch"):
+        problem.estimate({"gravity": np.zeros((2, 1, 2))}, cortado.gradients.Guided())
