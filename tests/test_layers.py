@@ -36,6 +36,7 @@ LAYERS = """
     scene.overlaps scene.checks scene.scene scene.in_words
     discretise.crowding parameters.checks
     discretise.bodies discretise.packing discretise.sampling discretise.discrete_scene
+    discretise.distance
     sph sph.density sph.free_energy sph.integration sph.order sph.materials sph.emitter_kernels sph.pair_forces
     sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
     sph.gravity sph.mixture sph.surface_tension sph.viscosity
@@ -63,7 +64,9 @@ LAYERS = """
     shading.scenery shading.trace shading.space shading.plane
     shading.painter shading.page shading.labels shading.film shading.scene_view
     outcome
+    recorded
     simulation
+    forward_pass
     problem
     figures.curves figures
     certificate.growth certificate.alignment certificate.perturbations certificate.twin certificate.loss_history

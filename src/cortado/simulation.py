@@ -10,30 +10,30 @@ from os import PathLike
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from cortado.arrays import check_steps, whole_number
 from cortado.device.compiling import begin_headers
-from cortado.device.driver import why_no_gpu
+from cortado.device.driver import device_named
 from cortado.device.kernel_cache import start_warp
 from cortado.device.memory import frame_parts, require, simulation_parts, within
-from cortado.device.precision import Precision, precision_named
+from cortado.device.precision import precision_named
 from cortado.device.reduction import sum_and_maximum_kernel
 from cortado.device.state import State
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.discretise.discrete_scene import DiscreteScene, discretise
+from cortado.discretise.distance import check_distance
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.figures.particle_sets import particles
 from cortado.fixed import fixed
 from cortado.io.notebook import with_picture
 from cortado.io.trajectory import Frame, Trajectory
-from cortado.io.trajectory_batch import TrajectoryBatch
 from cortado.lattice.calibration import diffusion_limit
 from cortado.outcome import lost_sentence, not_converged_sentence
 from cortado.parameters.checks import check_sizes
 from cortado.parameters.scene_parameters import SceneParameters
 from cortado.parameters.space import ParameterSpace
-from cortado.parameters.values import Arrays, scene_values
+from cortado.parameters.values import scene_values
+from cortado.recorded import recorded
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
 from cortado.restart import RestartState
@@ -80,7 +80,7 @@ class Simulation:
         if free_energy is not None and len(scene.phase) == 1:
             raise InputError("free_energy is given, but must be left out, as the scene has only one phase.")
         self.scene = scene
-        self.device = _device(device)
+        self.device = device_named(device)
         self.precision = precision_named(precision)
         begin_headers(sum_and_maximum_kernel(self.precision, self.device.is_cpu).kernel, self.device)
         discrete = discretise(scene)
@@ -89,7 +89,7 @@ class Simulation:
         parts = simulation_parts(*counts, room, self.precision.bytes)
         smaller = "" if self.batch is None else "a smaller batch, "
         require(parts, f"take {smaller}a larger spacing or a smaller container", self.device)
-        _check_distance(scene, discrete, self.precision)
+        check_distance(scene, discrete, self.precision)
         self.positions = discrete.fluid.positions
         """(n, d) first positions [m]."""
         self.velocities = discrete.fluid.velocities
@@ -195,37 +195,7 @@ class Simulation:
         if rollout.lost:
             warnings.warn(lost_sentence(rollout.lost, rollout.solver.layout.members), CortadoWarning, stacklevel=5)
         fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
-        return self._trajectory(rollout, np.array(steps), fields)  # type: ignore[return-value]  # of a batch
-
-    def _trajectory(self, rollout: Rollout, steps: np.ndarray, fields: Arrays) -> Trajectory | TrajectoryBatch:
-        """Of fields (frames, ...) after so many steps (frames,), in a batch (frames, batch, ...)."""
-        noted, constants = rollout.diagnostics, self.constants(rollout)
-
-        def one(number: int, kept: slice, at: tuple[Any, ...]) -> Trajectory:
-            own = {name: array[kept][at] for name, array in fields.items()}
-            clock = rollout.clocks[number]
-            return Trajectory(
-                times=clock.times(steps[kept], float(rollout.time_steps[number])),
-                steps=clock.steps + steps[kept],
-                positions=own.pop("positions"),
-                velocities=own.pop("velocities"),
-                diagnostics={name: column[at] for name, column in noted.items()},
-                mass_fractions=own.pop("mass_fractions", None),
-                others=own,
-                constants={name: array[at[1:]] for name, array in constants.items()},
-                substeps=rollout.substeps,
-                origin=rollout.origins[number],
-            )
-
-        if self.batch is None:
-            return one(0, slice(None), (slice(None),))
-        found = []
-        for b in range(self.batch):
-            good = np.count_nonzero(steps < rollout.lost[b].step) if b in rollout.lost else len(steps)
-            found.append(one(b, slice(good), (slice(None), b)))
-            for array in fields.values():
-                array[good:, b] = np.nan
-        return TrajectoryBatch(tuple(found), fields, rollout.lost)
+        return recorded(rollout, np.array(steps), fields, self.constants(rollout))  # type: ignore[return-value]  # of a batch
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
         """What a trajectory records of a state: the fields that steps change."""
@@ -338,18 +308,6 @@ class Simulation:
         return int(number)
 
 
-def _check_distance(scene: Scene, discrete: DiscreteScene, precision: Precision) -> None:
-    """Far from the origin, positions are rounded to coarse steps; raises `InputError`."""
-    spacing = scene.discretisation.spacing
-    furthest = max(np.abs(discrete.near.lower).max(), np.abs(discrete.near.upper).max()) / spacing
-    if furthest > precision.furthest:
-        raise InputError(
-            f"The scene reaches {furthest:.3g} spacings of {spacing:g} m from the origin, but must be within "
-            f"{precision.furthest:g} in {precision.name}, which rounds positions there to steps of "
-            f"{furthest * np.finfo(precision.numpy).eps:.1g} spacings: move it to the origin, or use another precision."
-        )
-
-
 def _made_again(
     scene: Scene, device: str, precision: str, free_energy: FreeEnergy | None, batch: int | None, points: str
 ) -> Simulation:
@@ -361,16 +319,3 @@ def _made_again(
             "of points that its scene names has changed. Restore it, or make the simulation anew."
         )
     return simulation
-
-
-def _device(name: str) -> Any:
-    found = ", ".join(str(device) for device in wp.get_devices())
-    none = "" if wp.get_cuda_device_count() else f"; {why_no_gpu()}"
-    if not isinstance(name, str):
-        raise InputError(f"device is {shown(name)}, but must be one of: {found}{none}.")
-    try:
-        if name == "cuda" and none:
-            raise ValueError  # Warp itself would write on stderr
-        return wp.get_device(name)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"device is {name!r}, but must be one of: {found}{none}.") from error

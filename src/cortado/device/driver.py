@@ -1,8 +1,14 @@
-"""The CUDA driver: which one there is, and what to say where it is too old for Warp, which then finds no GPU."""
+"""Devices by their names; and the CUDA driver: which one there is, and what to say where it is too old for Warp, which
+then finds no GPU."""
 
 import ctypes
 import sys
 from contextlib import suppress
+from typing import Any
+
+import warp as wp
+
+from cortado.errors import InputError, shown
 
 Version = tuple[int, int]
 PLACE = "https://nvidia.github.io/warp/stable/user_guide/installation.html"
@@ -40,3 +46,17 @@ def _needed() -> Version | None:
 
 def _shown(version: Version) -> str:
     return f"{version[0]}.{version[1]}"
+
+
+def device_named(name: str) -> Any:
+    """Warp's device of that name; raises `InputError` where there is none."""
+    found = ", ".join(str(device) for device in wp.get_devices())
+    none = "" if wp.get_cuda_device_count() else f"; {why_no_gpu()}"
+    if not isinstance(name, str):
+        raise InputError(f"device is {shown(name)}, but must be one of: {found}{none}.")
+    try:
+        if name == "cuda" and none:
+            raise ValueError  # Warp itself would write on stderr
+        return wp.get_device(name)
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"device is {name!r}, but must be one of: {found}{none}.") from error
