@@ -7,7 +7,6 @@ and leaves out what no kernel of Cortado's uses. They take 1.0 s of a core of 2.
 
 import os
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from contextlib import contextmanager, suppress
@@ -23,7 +22,7 @@ import warp as wp
 from cortado.device.cores import usable_cores
 from cortado.device.kernels import is_derivative
 from cortado.device.threads import MOST_CORES, helpers
-from cortado.io.terminal import note
+from cortado.io.terminal import note, timed_note
 
 BUILDERS = ("build_cpu", "build_cuda")
 """Functions of Warp that compile the file of a module, one of their first two arguments."""
@@ -199,14 +198,9 @@ class _Said:
 @contextmanager
 def _announced(count: int, device: Any) -> Iterator[None]:
     """One line on stderr: what is compiled, and at the end how long it took."""
-    _Said.anything, begun = True, time.monotonic()
-    note(f"Compiling {count} kernel modules for {device.alias}, once on this machine", end="")
-    try:
+    _Said.anything = True
+    with timed_note(f"Compiling {count} kernel modules for {device.alias}, once on this machine"):
         yield
-    except BaseException:
-        note(".")
-        raise
-    note(f": {time.monotonic() - begun:.1f} s")
 
 
 def watch_compilation() -> None:

@@ -6,6 +6,7 @@ where walls count with their weights and air counts as if it were fluid, and no 
 other. Only particles near a surface move, as those on a lattice have the rest density from the start.
 """
 
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.walls.weights import RestLattice
+from cortado.io.terminal import timed_note
 from cortado.lattice.calibration import SLACK, rest_volume
 from cortado.lattice.pairs import apart, are_near, pairs_among, pairs_within
 from cortado.lattice.shapes import Points
@@ -39,6 +41,8 @@ FARTHEST = 0.15
 """[spacings] that a particle moves in a round at most, as the equations are linear only nearby."""
 DAMPING, MOST_INNER_ROUNDS = 0.02, 20
 """Of the linear least squares: among solutions that are nearly as good, the one that moves particles least."""
+MANY = 20_000
+"""Particles, of which it is said that they are packed, as it takes some seconds or minutes."""
 GRAINS = 2.0**13
 """Particles move by whole numbers of this part of a spacing, so that round-off, which differs between machines, does
 not show in where they are."""
@@ -211,4 +215,6 @@ def _packed(lattice: RestLattice, shape: tuple[int, int], air: int, *arrays: byt
     *numbers, stays = arrays
     fixed, weights, lower, lengths, particles = (np.frombuffer(one) for one in numbers)
     packing = Packing(lattice, fixed.reshape(-1, shape[1]), weights, air, lower, lengths)
-    return packing.settled(particles.reshape(shape), np.frombuffer(stays, dtype=bool))
+    is_long = shape[0] > MANY
+    with timed_note(f"Packing the particles of round bodies, {shape[0]:,} in all") if is_long else nullcontext():
+        return packing.settled(particles.reshape(shape), np.frombuffer(stays, dtype=bool))

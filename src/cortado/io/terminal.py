@@ -3,6 +3,7 @@
 import io
 import os
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
@@ -26,6 +27,19 @@ def note(sentence: str, end: str = "\n") -> None:
     """What is good to know, on stderr, unless `quietly`: what is being done, how far it is."""
     if not is_quiet():
         say(sentence, end)
+
+
+@contextmanager
+def timed_note(what: str) -> Iterator[None]:
+    """One line as of `note`: what is done within, and at the end how long it took."""
+    begun = time.monotonic()
+    note(what, end="")
+    try:
+        yield
+    except BaseException:
+        note(".")
+        raise
+    note(f": {time.monotonic() - begun:.1f} s")
 
 
 def is_quiet() -> bool:

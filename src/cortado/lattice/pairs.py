@@ -65,6 +65,8 @@ def are_near(some: Points, others: Points, reach: float, lower: ArrayLike, lengt
 def apart(separations: Points, lengths: ArrayLike) -> Points:
     """Separations (m, d) [m] of pairs with the nearest image, where ``lengths`` (d,) [m] are those of the period."""
     lengths = np.asarray(lengths, dtype=np.float64)
+    if not lengths.any():
+        return separations
     return np.asarray(separations - lengths * np.rint(separations / np.where(lengths > 0.0, lengths, np.inf)))
 
 
