@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from cortado.arrays import as_one_number, require_function
+from cortado.arrays import as_one_number, require_function, require_table
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.executors.executor import Executor, InProcess, OnResult, checked_executor
 from cortado.gradients import Estimate, GradientEstimator
@@ -62,6 +62,5 @@ def evaluate(
 
 
 def _by_name(point: Values) -> Values:
-    if not isinstance(point, Mapping):
-        raise InputError(f"a point is {shown(point)}, but must be parameters by name, as {{'gravity': value}}.")
+    require_table("a point", point, "{'gravity': value}")
     return point
