@@ -23,13 +23,14 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
         values["tilt"] = tilt.value(simulation)
     if not isinstance(parameters, (Mapping, Sequence)) or isinstance(parameters, (str, bytes)):
         raise InputError(f"parameters is {shown(parameters)}, but must be values by name, or a list of names.")
+    known = ", ".join(values)
     if isinstance(parameters, Mapping):
         values = dict(parameters)
     unknown = [name for name in parameters if not isinstance(name, str) or name not in values]
     if unknown:
-        raise InputError(f"parameter {shown(unknown[0])} is unknown, but must be one of {', '.join(values)}.")
+        raise InputError(f"parameter {shown(unknown[0])} is unknown, but must be one of {known}.")
     if not parameters:
-        raise InputError(f"parameters is empty, but must have at least one of {', '.join(values)}.")
+        raise InputError(f"parameters is empty, but must have at least one of {known}.")
     found = ParameterSpace(simulation, problem.steps).checked({name: values[name] for name in parameters})
     for name, value in found.items():
         if not _moves_both_ways(name, value):

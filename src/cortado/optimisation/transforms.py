@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.special import softmax
 
-from cortado.arrays import as_numbers, read_only, require_function, require_methods, require_table, require_whole
+from cortado.arrays import as_numbers, read_only, require_methods, require_table, require_whole
 from cortado.errors import DivergedError, InputError
 from cortado.fixed import FixedDict, fixed
 from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator, estimate
@@ -42,7 +42,8 @@ class Logarithm:
     """p = exp(u): a step in u multiplies the parameter, which stays positive."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
-        return np.exp(as_numbers("a coordinate", u))
+        with np.errstate(over="ignore"):  # a problem refuses a parameter that is not finite
+            return np.exp(as_numbers("a coordinate", u))
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
         number = as_numbers("a parameter", parameter)
@@ -184,7 +185,6 @@ class Transformed:
         self, u: Mapping[str, Any], gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
         """The same, with what the estimator reports. The spread of an ensemble is one of coordinates."""
-        require_function("observe", observe)
         return estimate(self, u, gradient, observe)
 
     def forward_pass(self, u: Mapping[str, Any]) -> "TransformedPass":
