@@ -25,7 +25,9 @@ RATES |= {"nozzle_path": 0.01, "flow_rate": 0.01}
 def tense(**changes):
     """A square of fluid that surface tension rounds."""
     forces = {"gravity": [0.0, -9.81], "surface_tension": 20.0}
-    return plane(**{"phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 5.0}], "forces": forces, **changes})
+    return plane(
+        **{"phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 5.0}], "forces": forces, **changes}
+    )
 
 
 def tense_cube(**changes):
