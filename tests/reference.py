@@ -122,8 +122,8 @@ class Pcisph:
 
 
 class SurfaceTension:
-    """The acceleration of surface tension over all pairs: arrows n out of the fluid, a stress S(n), and its pull between
-    each two particles. Across the surface the stress is a third of that along it."""
+    """The acceleration of surface tension over all pairs: arrows n out of the fluid, a stress S(n), and its pull
+    between each two particles. Across the surface the stress is a third of that along it."""
 
     def __init__(self, support, inverse, scale):
         self.h, self.inverse, self.scale = support, inverse, scale

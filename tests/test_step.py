@@ -33,7 +33,8 @@ def tense(**changes):
 def tense_cube(**changes):
     """Two fluids in space with a tension of their surface."""
     forces = {"gravity": [0.0, -9.81, 0.0], "surface_tension": 15.0}
-    return two_layers(**{"forces": forces, **changes})
+    phases = [{**phase.model_dump(), "viscosity": 5.0} for phase in two_layers().phase]
+    return two_layers(**{"phase": phases, "forces": forces, **changes})
 
 
 def point_of(simulation, seed=0):

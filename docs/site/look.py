@@ -15,7 +15,7 @@ from chromium import chromium, listened
 
 WIDTHS = (390, 1280)
 """Of a telephone, and of a laptop [pixels]."""
-PICTURED = ("index", "start", "limits", "performance", "scene_file", "adjoint", "api/gradients", "tutorials/first_splash")
+PICTURED = ("index", "start", "performance", "scene_file", "adjoint", "api/gradients", "tutorials/first_splash")
 LOOK = """() => {
   const found = [];
   const width = document.documentElement.clientWidth;
