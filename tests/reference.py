@@ -121,6 +121,44 @@ class Pcisph:
         return (self.laplacian_correction * (s * g).sum(-1) / size)[..., None] * v
 
 
+class SurfaceTension:
+    """The acceleration of surface tension over all pairs: arrows n out of the fluid, a stress S(n), and its pull
+    between each two particles. Across the surface the stress is a third of that along it."""
+
+    def __init__(self, support, inverse, scale):
+        self.h, self.inverse, self.scale = support, inverse, scale
+
+    def acceleration(self, x, density, surface_tension):
+        """(n, d) [m/s2]; ``density`` (n,) is the mass of a particle over its volume at rest."""
+        s = x[:, None, :] - x[None, :, :]
+        q2 = (s * s).sum(-1) / self.h**2
+        weight = np.where(q2.real < 1, 1 - q2, 0) ** 2
+        n = self.inverse * (weight[..., None] * s).sum(1)
+        size = (n * n).sum(1)[:, None, None]
+        stress = (size * np.eye(x.shape[1]) - 2 / 3 * n[:, :, None] * n[:, None, :]) / np.sqrt(1 + size)
+        both = stress[:, None] + stress[None, :]
+        pull = ((q2 * weight)[..., None, None] * both * s[:, :, None, :]).sum((1, 3))
+        return -surface_tension * self.scale / density[:, None] * pull
+
+
+class Emitter:
+    """The end of steps of a scene with an emitter, whose last particles are led until they have left its nozzle."""
+
+    def __init__(self, upstream, offsets, direction, area, path):
+        """``upstream`` (m,) of the opening, ``offsets`` (m, d) from the axis; ``path`` (steps, d) of the opening."""
+        self.upstream, self.offsets, self.direction, self.area, self.path = upstream, offsets, direction, area, path
+
+    def lead(self, n, x, v, flow_rate, time_step):
+        """Positions and velocities (particles, d) after step n, counted from 0, given those of free particles."""
+        speed = flow_rate / self.area
+        left = (self.upstream - speed * time_step * (n + 1))[:, None]
+        turn = self.path[n] - self.path[max(n - 1, 0)]
+        place = self.path[n] + self.offsets - left * self.direction
+        first, led = len(x) - len(left), left.real > 0
+        x = np.concatenate([x[:first], np.where(led, place, x[first:])])
+        return x, np.concatenate([v[:first], np.where(led, turn / time_step + speed * self.direction, v[first:])])
+
+
 def complex_step(function, values, directions):
     """Derivative of ``function(*values)`` along ``directions``, exact to round-off."""
     return np.imag(function(*(v + 1j * STEP * d for v, d in zip(values, directions, strict=True)))) / STEP

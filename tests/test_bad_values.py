@@ -3,6 +3,7 @@
 import inspect
 import os
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 import cortado
 from bad_scenes import plane
 from cortado.errors import CortadoError, InputError
+from cortado.optimisation.transforms import Affine, Logarithm, Softmax, TimeInterpolation, Transformed
 
 WRONG = {
     "nothing": None,
@@ -26,6 +28,13 @@ WRONG = {
     "an array": np.zeros(3),
     "bytes": b"x",
     "a table of a truth": {True: 1},
+    "a table of nothing": {"gravity": None},
+    "a path": Path.cwd(),
+    "a letter": "x",
+    "a large number": 10**12,
+    "no finite number": float("inf"),
+    "a matrix": np.zeros((2, 2)),
+    "a complex number": 1j,
 }
 
 
@@ -40,6 +49,9 @@ def calls():
     gradients, losses, optimisers = cortado.gradients, cortado.losses, cortado.optimisers
     renderer = simulation.renderer(resolution=(10, 8))
     image = renderer.render(trajectory[0])
+    transformed, u = Transformed(problem, {"viscosity": Logarithm()}), {"viscosity": np.log(0.05)}
+    affine = Affine(np.zeros(2), np.ones((2, 3)))
+    executor = cortado.executors.InProcess()
     search = {"problem": problem, "start": start, "optimiser": "adam", "iterations": 1, "learning_rate": 0.1}
     return {
         "load_scene": (cortado.load_scene, {"path": "scene.toml", "overrides": ()}),
@@ -50,22 +62,64 @@ def calls():
         "value": (problem.value, {"parameters": start}),
         "estimate": (problem.estimate, {"parameters": start, "gradient": None, "observe": None}),
         "tangent": (problem.tangent, {"parameters": start, "directions": start}),
-        "optimise": (cortado.optimise, {**search, "bounds": None, "checkpoint": None, "on_iteration": None}),
+        "end": (problem.end, {"parameters": start}),
+        "states": (problem.states, {"parameters": start, "steps": [1]}),
+        "run of a problem": (problem.run, {"parameters": start, "record_every": 1}),
+        "tangents": (
+            problem.tangents,
+            {"parameters": start, "directions": start, "observe": lambda step, dot: None, "steps": ()},
+        ),
+        "room": (problem.room, {"estimator": None}),
+        "together": (problem.together, {"points": [start], "estimator": None}),
+        "Transformed": (Transformed, {"problem": problem, "coordinates": {"viscosity": Logarithm()}}),
+        "parameters": (transformed.parameters, {"u": u}),
+        "coordinate": (transformed.coordinate, {"parameters": {"viscosity": 0.05}}),
+        "value of coordinates": (transformed.value, {"u": u}),
+        "estimate of coordinates": (transformed.estimate, {"u": u, "gradient": None, "observe": None}),
+        "room of coordinates": (transformed.room, {"estimator": None}),
+        "together in coordinates": (transformed.together, {"points": [u], "estimator": None}),
+        "exp": (Logarithm().parameter, {"u": np.zeros(2)}),
+        "log": (Logarithm().coordinate, {"parameter": np.ones(2)}),
+        "softmax": (Softmax().parameter, {"u": np.zeros((2, 2))}),
+        "inverse softmax": (Softmax().coordinate, {"parameter": np.full((2, 2), 0.5)}),
+        "TimeInterpolation": (TimeInterpolation, {"steps": 4, "knots": 2}),
+        "path": (TimeInterpolation(4, 2).parameter, {"u": np.zeros((2, 2))}),
+        "knots": (TimeInterpolation(4, 2).coordinate, {"parameter": np.zeros((4, 2))}),
+        "Affine": (Affine, {"base": np.zeros(2), "matrix": np.ones((2, 3))}),
+        "affine": (affine.parameter, {"u": np.zeros(3)}),
+        "inverse affine": (affine.coordinate, {"parameter": np.zeros(2)}),
+        "estimator": (
+            gradients.estimate,
+            {"problem": problem, "parameters": start, "estimator": None, "observe": None},
+        ),
+        "map": (executor.map, {"function": str, "items": [1], "on_result": None}),
+        "renderer": (lambda **settings: simulation.renderer(**settings), {"resolution": (10, 8)}),
+        "rollout": (simulation.rollout, {"steps": 1, "controls": None, "state": None}),
+        "optimise": (
+            cortado.optimise,
+            {**search, "bounds": None, "checkpoint": None, "resume": False, "on_iteration": None},
+        ),
         "evaluate": (
             cortado.evaluate,
             {"problem": problem, "points": [start], "gradient": None, "executor": None, "on_result": None},
         ),
-        "certify": (cortado.certify, {"problem": problem, "perturbation": 1e-3, "seed": 0}),
+        "certify": (cortado.certify, {"problem": problem, "parameters": ["gravity"], "perturbation": 1e-3, "seed": 0}),
         "load": (cortado.Trajectory.load, {"path": "run.vtkhdf"}),
         "save": (trajectory.save, {"path": "run.vtkhdf"}),
         "Frames": (losses.Frames, {"losses": {1: loss}}),
         "FinalPositions": (losses.FinalPositions, {"target": trajectory[-1].positions}),
         "CentreOfMass": (losses.CentreOfMass, {"target": [0.0, 0.0]}),
         "Image": (losses.Image, {"renderer": renderer, "target": image, "distance": None}),
+        "Recorded": (losses.Recorded, {"function": lambda positions, velocities, loss: None}),
+        "CentreOfMassAlong": (losses.CentreOfMassAlong, {"direction": [0.0, 1.0]}),
         "Pyramid": (cortado.image_losses.Pyramid, {"levels": 2, "weights": (1.0, 2.0)}),
         "Adam": (optimisers.Adam, {"learning_rate": 0.1}),
         "LBFGS": (optimisers.LBFGS, {"memory": 5}),
+        "GradientDescent": (optimisers.GradientDescent, {"learning_rate": 0.1}),
         "LineSearch": (optimisers.LineSearch, {}),
+        "Damped": (gradients.Damped, {}),
+        "Guided": (gradients.Guided, {"samples": 4, "spread": 0.1}),
+        "RandomizedSmoothing": (gradients.RandomizedSmoothing, {"samples": 4, "spread": 0.1}),
         "EnsembleMean": (
             gradients.EnsembleMean,
             {"samples": 4, "spread": 0.1, "seed": 0, "estimator": gradients.Exact()},
@@ -73,6 +127,7 @@ def calls():
         "AdjointViscosity": (gradients.AdjointViscosity, {"coefficient": 1.0, "limit": 4.0, "order": 1}),
         "read_picture": (cortado.pictures.read_picture, {"path": "picture.png"}),
         "write_picture": (cortado.pictures.write_picture, {"path": "picture.png", "image": image}),
+        "rosetta": (cortado.pictures.rosetta, {"resolution": 8}),
         "heart": (cortado.pictures.heart, {"resolution": 8, "size": 0.5}),
         "TopView": (
             cortado.render.TopView,
@@ -92,23 +147,58 @@ ARGUMENTS = [
         "value": ("parameters",),
         "estimate": ("parameters", "gradient", "observe"),
         "tangent": ("parameters", "directions"),
-        "optimise": ("problem", "start", "optimiser", "iterations", "bounds", "checkpoint", "on_iteration"),
+        "end": ("parameters",),
+        "states": ("parameters", "steps"),
+        "run of a problem": ("parameters", "record_every"),
+        "tangents": ("parameters", "directions", "observe", "steps"),
+        "room": ("estimator",),
+        "together": ("points", "estimator"),
+        "Transformed": ("problem", "coordinates"),
+        "parameters": ("u",),
+        "coordinate": ("parameters",),
+        "value of coordinates": ("u",),
+        "estimate of coordinates": ("u", "gradient", "observe"),
+        "room of coordinates": ("estimator",),
+        "together in coordinates": ("points", "estimator"),
+        "exp": ("u",),
+        "log": ("parameter",),
+        "softmax": ("u",),
+        "inverse softmax": ("parameter",),
+        "TimeInterpolation": ("steps", "knots"),
+        "path": ("u",),
+        "knots": ("parameter",),
+        "Affine": ("base", "matrix"),
+        "affine": ("u",),
+        "inverse affine": ("parameter",),
+        "estimator": ("problem", "parameters", "estimator", "observe"),
+        "map": ("function", "items", "on_result"),
+        "renderer": ("resolution", "view", "background"),
+        "rollout": ("steps", "controls", "state"),
+        "optimise": ("problem", "start", "optimiser", "iterations", "bounds", "checkpoint", "resume", "on_iteration"),
         "evaluate": ("problem", "points", "gradient", "executor", "on_result"),
-        "certify": ("problem", "perturbation", "seed"),
+        "certify": ("problem", "parameters", "perturbation", "seed", "steps"),
         "load": ("path",),
         "save": ("path",),
         "Frames": ("losses",),
         "FinalPositions": ("target",),
         "CentreOfMass": ("target",),
-        "Image": ("target", "distance"),
+        "CentreOfMassAlong": ("direction", "masses"),
+        "Image": ("renderer", "target", "distance"),
+        "Recorded": ("function",),
         "Pyramid": ("levels", "weights"),
-        "Adam": ("learning_rate",),
-        "LBFGS": ("memory",),
+        "Adam": ("learning_rate", "beta1", "beta2", "epsilon"),
+        "GradientDescent": ("learning_rate",),
+        "LBFGS": ("memory", "tolerance", "scale"),
+        "LineSearch": ("scale", "trials", "shortest", "momentum"),
+        "Damped": ("rate",),
+        "Guided": ("samples", "spread", "seed"),
+        "RandomizedSmoothing": ("samples", "spread", "seed"),
         "EnsembleMean": ("samples", "spread", "seed", "estimator"),
         "AdjointViscosity": ("coefficient", "limit", "order", "base"),
         "read_picture": ("path",),
         "write_picture": ("path", "image"),
-        "heart": ("resolution", "size"),
+        "heart": ("resolution", "size", "cup", "milk"),
+        "rosetta": ("resolution",),
         "TopView": ("lower", "upper", "spacing", "resolution", "up_axis"),
     }.items()
     for argument in arguments
@@ -154,6 +244,33 @@ def test_a_truth_value_is_no_number(name, argument):
     assert argument in inspect.signature(function).parameters
     with pytest.raises(InputError):
         function(**{**good, argument: True})
+
+
+ACCEPTED = [
+    ("Image", "renderer", ["nothing", "a number", "a truth", "a table", "an object", "a class", "a letter"]),
+    ("Recorded", "function", ["nothing", "a number", "a truth", "a table", "an object", "a class", "a letter"]),
+    ("Transformed", "problem", ["nothing", "a number", "a truth", "a table", "an object", "a class", "a letter"]),
+    ("Transformed", "coordinates", ["nothing", "a number", "a truth", "no text", "a list", "a table of nothing"]),
+    ("states", "steps", ["nothing", "a number", "a letter", "a truth", "a table of a truth", "a table of nothing"]),
+    ("log", "parameter", ["nothing", "a truth", "no number", "a complex number", "below 0"]),
+    ("optimise", "resume", ["nothing", "a number", "no text", "an array"]),
+]
+
+
+@pytest.mark.parametrize("name, argument, wrong", ACCEPTED)
+def test_what_cannot_be_used_is_refused(name, argument, wrong):
+    function, good = calls()[name]
+    for words in wrong:
+        with pytest.raises(InputError, match="must"):
+            function(**{**good, argument: {**WRONG, "a class": int}[words]})
+
+
+@pytest.mark.parametrize("steps", [[3], [-1], [1.5], [True], ["1"], [None], [1, 10**12]])
+def test_states_are_those_of_steps_that_there_are(steps):
+    states, good = calls()["states"]
+    with pytest.raises(InputError, match="a number of steps is"):
+        states(**{**good, "steps": steps})
+    assert list(states(**{**good, "steps": [0, 2.0]})) == [0, 2]
 
 
 @pytest.mark.parametrize("frame", [True, False, "1", None, 1.5])

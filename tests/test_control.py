@@ -209,6 +209,43 @@ def test_what_is_done_is_not_repeated(tmp_path, capsys):
     assert "| carry | exact | 2 |" in capsys.readouterr().out
 
 
+def record_of(seed, loss=0.5):
+    run = Run("carry", "small", "exact", seed, 100.0, "cpu", "float32")
+    return Record(run, [10.0], [loss], [0.0], {"sloshing": loss}, 10, 10, 0.1, "0.1.0")
+
+
+def test_a_record_is_added_to_the_end_of_its_file(tmp_path):
+    """A file that is written anew for each record takes longer with each."""
+    records = Records(tmp_path / "runs.jsonl")
+    records.add(record_of(1))
+    before = records.path.stat().st_ino, records.path.read_bytes()
+    records.add(record_of(2))
+    assert records.path.stat().st_ino == before[0] and records.path.read_bytes().startswith(before[1])
+    assert records.read() == [record_of(1), record_of(2)]
+
+
+def test_a_record_that_was_cut_off_is_left_aside(tmp_path):
+    records = Records(tmp_path / "runs.jsonl")
+    for seed in (1, 2):
+        records.add(record_of(seed))
+    whole = records.path.read_bytes()
+    for length in (len(whole) - 1, len(whole) - 30):
+        records.path.write_bytes(whole[:length])
+        assert records.read() == [record_of(1)] and records.missing([record_of(2).run]) == [record_of(2).run]
+        records.add(record_of(3))
+        assert records.read() == [record_of(1), record_of(3)]
+    records.path.write_bytes(b"{}\n" + whole)
+    with pytest.raises(InputError, match=r"Line 1 of .*runs\.jsonl is no run of this benchmark"):
+        records.read()
+
+
+def test_the_last_record_of_a_run_counts(tmp_path):
+    records = Records(tmp_path / "runs.jsonl")
+    for one in (record_of(1), record_of(2), record_of(1, loss=0.25)):
+        records.add(one)
+    assert records.read() == [record_of(1, loss=0.25), record_of(2)]
+
+
 @pytest.mark.parametrize(
     ("changed", "said"),
     [

@@ -163,6 +163,15 @@ def test_all_of_them_or_none(cortado_command):
     assert_refused(cortado_command("examples", "--copy", "pour", "--to", "pour.toml"), "pour.toml")
 
 
+@pytest.mark.parametrize("name", ["../../dam", "a/../pour", "/tmp/pour.toml", "./pour", "examples/pour.toml", "..", ""])
+def test_what_is_copied_is_a_name_and_no_path(cortado_command, name):
+    for names in (["--copy", name], ["--copy", "pour", "--copy", name]):
+        code, out, err = cortado_command("examples", *names, "--to", "here")
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert err.startswith(f"--copy is {name!r}, but must be all or one of custom_loss, ")
+        assert not os.listdir()
+
+
 # ---- schema ------------------------------------------------------------------------------------------------------
 
 

@@ -13,13 +13,16 @@ import numpy as np
 import pytest
 
 import cortado.io.run_folder
+from bad_scenes import plane
 from bad_tasks import TINY_SCENE
+from cortado import Scene
 from cortado.errors import InputError
 from cortado.io.files import unfinished
 from cortado.io.particle_view import Cloud, particle_view, thinned
 from cortado.io.progress import track
 from cortado.io.report import Section, write_report, written
 from cortado.io.run_folder import RunFolder
+from cortado.scene.picture import Picture
 
 SCENE = '{"name": "drop", "dimension": 2}'
 COMMAND = ["cortado", "run", "drop.toml"]
@@ -118,6 +121,21 @@ def test_resume_needs_the_same_scene_and_is_noted(tmp_path):
     assert [session["command"] for session in environment["resumed"]] == [[*COMMAND, "--resume"]]
     with pytest.raises(InputError, match="no run in"):
         RunFolder.resume(tmp_path / "b", SCENE, COMMAND)
+
+
+def test_a_former_default_of_a_scene_was_not_asked_for(tmp_path):
+    """Runs of before wrote 120 as film_frames, the default then, whether or not anybody had asked for it."""
+    scene = Scene(**plane(picture={"film_frames": 120, "width": 100}))
+    folder = RunFolder.create(tmp_path / "run", scene.to_json(), COMMAND)
+    assert folder.read_scene().picture.film_frames == 120
+    noted = json.loads(folder.environment.read_text())
+    folder.environment.write_text(json.dumps({name: value for name, value in noted.items() if name != "format"}))
+    assert folder.read_scene().picture == Picture(width=100)
+    assert folder.read_scene(["picture.film_frames=120"]).picture.film_frames == 120
+    folder.scene.write_text(scene.replaced("picture.film_frames=90").to_json())
+    assert folder.read_scene().picture.film_frames == 90
+    RunFolder.resume(folder.path, scene.to_json(), COMMAND)
+    assert folder.read_scene().picture.film_frames == 120
 
 
 @pytest.mark.parametrize("name", ["scene.json", "environment.json", "metrics.jsonl"])

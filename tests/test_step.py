@@ -10,15 +10,31 @@ from cortado.gradients import Exact
 from cortado.lattice.smoothing import KERNELS
 from cortado.losses.loss import ADJOINT_FIELDS
 from cortado.parameters.space import ParameterSpace
-from scenes import plane, plane_of_three, scene, two_layers
-from twins import twin
+from scenes import jet, plane, plane_of_three, pour, scene, two_layers
+from twins import emitter_twin, tension_twin, twin
 
 GRAVITY, STEPS, ITERATIONS = np.array([0.3, -9.81, 0.1]), 3, 5
 ONE = {"rest_density": 1000.0, "viscosity": 5.0, "time_step": 0.0021}
 """Parameters of the fluids."""
 SEVERAL = {"rest_density": [1000.0, 1800.0, 1300.0], "viscosity": [5.0, 0.4, 20.0], "time_step": 0.0021}
 RATES = {"rest_density": 10.0, "viscosity": 0.3, "time_step": 1e-4, "mobility": 0.01, "interface_width": 0.003}
+RATES |= {"nozzle_path": 0.01, "flow_rate": 0.01}
 """Sizes of directions; 1 for the others."""
+
+
+def tense(**changes):
+    """A square of fluid that surface tension rounds."""
+    forces = {"gravity": [0.0, -9.81], "surface_tension": 20.0}
+    return plane(
+        **{"phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 5.0}], "forces": forces, **changes}
+    )
+
+
+def tense_cube(**changes):
+    """Two fluids in space with a tension of their surface."""
+    forces = {"gravity": [0.0, -9.81, 0.0], "surface_tension": 15.0}
+    phases = [{**phase.model_dump(), "viscosity": 5.0} for phase in two_layers().phase]
+    return two_layers(**{"phase": phases, "forces": forces, **changes})
 
 
 def point_of(simulation, seed=0):
@@ -36,6 +52,12 @@ def point_of(simulation, seed=0):
         point |= {name: simulation.parameters()[name] for name in ("mobility", "interface_width")}
         point |= {name: point[name][:phases] for name in ("rest_density", "viscosity")}
         point["mass_fractions"] = random.dirichlet(np.full(phases, 0.5), len(simulation.positions))
+    if simulation.scene.forces.surface_tension:
+        point["surface_tension"] = simulation.scene.forces.surface_tension
+    if nozzle := simulation.solver.emitter and simulation.solver.emitter.nozzle:
+        outlet = simulation.parameters()["nozzle_path"]
+        point["nozzle_path"] = outlet + 0.01 * random.standard_normal((STEPS, len(outlet)))
+        point["flow_rate"] = 0.6 * nozzle.area * simulation.scene.discretisation.spacing / point["time_step"]
     return {name: np.asarray(value, dtype=np.float64) for name, value in point.items()}
 
 
@@ -70,15 +92,22 @@ def twins_steps(simulation, substeps):
         mobility=0.0,
         interface_width=1.0,
         mass_fractions=None,
+        surface_tension=0.0,
+        nozzle_path=None,
+        flow_rate=0.0,
     ):
         x, v = initial_positions, initial_velocities
+        tension, emitter = tension_twin(simulation), emitter_twin(simulation, nozzle_path)
         c = np.ones((len(x), 1)) if mass_fractions is None else mass_fractions
         mass = reference.blend(c, rest_density, viscosity)[0]
-        for _ in range(STEPS):
+        for n in range(STEPS):
             if phases > 1:
                 c = mix(x, c, mass, time_step, mobility, interface_width)
             rho_0, mu = reference.blend(c, rest_density, viscosity)
-            x, v = slow.step(x, v, gravity, lattice.volume * mass, rho_0, mu, time_step, ITERATIONS)
+            pull = gravity + (tension.acceleration(x, mass, surface_tension) if tension else 0.0)
+            x, v = slow.step(x, v, pull, lattice.volume * mass, rho_0, mu, time_step, ITERATIONS)
+            if emitter:
+                x, v = emitter.lead(n, x, v, flow_rate, time_step)
         return np.concatenate([x, v, c], axis=1)
 
     return steps
@@ -92,6 +121,10 @@ CASES = [
     (plane, "wendland_c2", "pairwise", "no"),
     (two_layers, "cubic_spline", "pairwise", "free"),
     (plane_of_three, "cubic_spline", "laminar", "no"),
+    (tense, "cubic_spline", "pairwise", "free"),
+    (tense_cube, "wendland_c2", "pairwise", "no"),
+    (jet, "cubic_spline", "pairwise", "free"),
+    (pour, "wendland_c2", "laminar", "no"),
 ]
 cases = pytest.mark.parametrize(("make", "kernel", "viscosity", "slip"), CASES)
 
@@ -150,7 +183,7 @@ def prepared(make, kernel, viscosity, slip, precision):
     return Simulation(
         make(
             discretisation={"spacing": 0.05, "support": 2.0 if kernel == "cubic_spline" else 2.6, "kernel": kernel},
-            forces={"gravity": original.forces.gravity, "viscosity": viscosity},
+            forces={**original.forces.model_dump(), "viscosity": viscosity},
             container={**original.container.model_dump(), "slip": slip},
         ),
         precision=precision,

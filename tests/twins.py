@@ -3,6 +3,7 @@
 import numpy as np
 
 import reference
+from cortado.sph.surface_tension import SurfaceTension, tension_constants
 from cortado.sph.viscosity import Viscosity
 
 
@@ -24,3 +25,22 @@ def twin(simulation):
         response=lattice.response,
         laplacian_correction=lattice.laplacian_correction,
     )
+
+
+def tension_twin(simulation):
+    """The slow twin of its surface tension; None without."""
+    solver, scene = simulation.solver, simulation.scene
+    if not any(isinstance(force, SurfaceTension) for force in solver.forces):
+        return None
+    lattice = solver.lattice
+    constants = tension_constants(scene.discretisation.spacing, lattice.support, lattice.volume, scene.dimension)
+    return reference.SurfaceTension(lattice.support, *constants)
+
+
+def emitter_twin(simulation, path):
+    """The slow twin of its emitter, whose opening goes along a path (steps, d); None without."""
+    emitter = simulation.solver.emitter
+    if emitter is None:
+        return None
+    nozzle = emitter.nozzle
+    return reference.Emitter(nozzle.upstream, nozzle.offsets, nozzle.direction, nozzle.area, path)

@@ -1,6 +1,7 @@
 """Runs of contenders as lines of a file, by which a benchmark that was stopped goes on."""
 
 import json
+import os
 import time
 import warnings
 from dataclasses import asdict, astuple, dataclass
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cortado import CortadoError, CortadoWarning, InputError, __version__
-from cortado.io.files import write_atomically
+from cortado.io.files import sentences
 
 from .catalogue import task
 from .contenders import contender
@@ -97,23 +98,29 @@ class Records:
         self.path = path
 
     def read(self) -> list[Record]:
-        """Those in the file; none if there is no file. Raises `InputError` for a line of another kind."""
+        """Those in the file, of each run the last one; none if there is no file. What a command that was killed left of
+        a last line is left aside. Raises `InputError` for a line of another kind."""
         if not self.path.exists():
             return []
-        found = []
-        for number, line in enumerate(self.path.read_text(encoding="utf-8").splitlines(), 1):
+        found = {}
+        for number, line in enumerate(self.path.read_bytes().split(b"\n")[:-1], 1):
             try:
                 fields = json.loads(line)
-                found.append(Record(**{**fields, "run": Run(**fields["run"])}))
+                record = Record(**{**fields, "run": Run(**fields["run"])})
             except (ValueError, TypeError, KeyError):
                 raise InputError(f"Line {number} of {self.path} is no run of this benchmark; remove it.") from None
-        return found
+            found[astuple(record.run)] = record
+        return list(found.values())
 
     def add(self, record: Record) -> None:
-        """The file with one line more."""
-        lines = self.path.read_text(encoding="utf-8") if self.path.exists() else ""
+        """The file with one line more, in the place of one that was cut off."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.path, lines + json.dumps(asdict(record)) + "\n")
+        with sentences(self.path), open(self.path, "ab+") as file:
+            file.seek(0)
+            file.truncate(file.read().rfind(b"\n") + 1)
+            file.write(json.dumps(asdict(record)).encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
 
     def missing(self, runs: list[Run]) -> list[Run]:
         """Those that are not in the file."""

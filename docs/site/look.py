@@ -1,8 +1,8 @@
 """Look at every page of the built site in Chromium: ``python docs/site/look.py build/docs [--pictures FOLDER]``.
 
 A page fails if its console has an error, if a file that it needs does not come, if it is wider than the window, if a
-picture has no description, or if one does not show. Chromium has to be installed; where its command is not found,
-Playwright's own is taken.
+table on a telephone breaks a short entry into lines, if a picture has no description, or if one does not show.
+Chromium has to be installed; where its command is not found, Playwright's own is taken.
 """
 
 import argparse
@@ -13,14 +13,19 @@ from typing import Any
 
 from chromium import chromium, listened
 
-WIDTHS = (400, 1280)
+WIDTHS = (390, 1280)
 """Of a telephone, and of a laptop [pixels]."""
-PICTURED = ("index", "start", "limits", "scene_file", "adjoint", "api/gradients", "tutorials/first_splash")
+PICTURED = ("index", "start", "performance", "scene_file", "adjoint", "api/gradients", "tutorials/first_splash")
 LOOK = """() => {
   const found = [];
   const width = document.documentElement.clientWidth;
   if (document.documentElement.scrollWidth > width)
     found.push(`is ${document.documentElement.scrollWidth} pixels wide, not ${width}`);
+  for (const cell of width < 700 ? document.querySelectorAll(".table-wrapper td") : []) {
+    const text = cell.textContent.trim(), inside = document.createRange();
+    inside.selectNodeContents(cell);
+    if (text.length <= 12 && inside.getBoundingClientRect().height > 36) found.push(`breaks ${text} into lines`);
+  }
   for (const image of document.querySelectorAll("article img")) {
     if (!image.alt || image.alt.includes("_build") || image.alt.length < 10) found.push(`no words for ${image.src}`);
     if (!image.naturalWidth) found.push(`does not show ${image.src}`);

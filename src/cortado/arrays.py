@@ -1,5 +1,6 @@
 """Numbers that a user gives in whatever form, as arrays in float64; and what is no number, in a sentence."""
 
+from collections.abc import Mapping
 from numbers import Real
 from typing import Any
 
@@ -88,6 +89,25 @@ def require_function(what: str, value: object) -> None:
     """Raises `InputError`, in a sentence that begins with ``what``, unless a value is a function or None."""
     if value is not None and not callable(value):
         raise InputError(f"{what} is {shown(value)}, but must be a function, or be left out.")
+
+
+def require_truth(what: str, value: object) -> None:
+    """Raises `InputError`, in a sentence that begins with ``what``, unless a value is True or False."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise InputError(f"{what} is {shown(value)}, but must be True or False.")
+
+
+def require_methods(what: str, value: object, names: tuple[str, ...], wanted: str) -> None:
+    """Raises `InputError`, in a sentence that begins with ``what`` and says what is ``wanted``, unless a value is an
+    object with these methods."""
+    if isinstance(value, type) or not all(callable(getattr(value, name, None)) for name in names):
+        raise InputError(f"{what} is {shown(value)}, but must be {wanted}.")
+
+
+def require_table(what: str, value: object, example: str) -> None:
+    """Raises `InputError`, in a sentence that begins with ``what``, unless a value is a table of others by name."""
+    if not isinstance(value, Mapping):
+        raise InputError(f"{what} is {shown(value)}, but must be given by name, as {example}.")
 
 
 def check_steps(steps: int, least: int = 1) -> int:

@@ -7,19 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import check_steps, require_function, whole_number
+from cortado.arrays import check_steps, require_at_most, require_function, require_methods, whole_number
 from cortado.device.state import State
 from cortado.device.threads import Turn, in_turn
-from cortado.errors import CortadoWarning, DivergedError, InputError
+from cortado.errors import CortadoWarning, DivergedError, InputError, shown
 from cortado.fixed import fixed
 from cortado.forward_pass import ForwardPass
 from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator, estimate
+from cortado.gradients.estimator import checked_adjoint
 from cortado.io.trajectory import noted
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch, batch, fingerprint
 from cortado.losses.checked import as_loss
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
 from cortado.parameters.space import ParameterSpace
-from cortado.parameters.values import NAMES, OVER_TIME, UNITS, Arrays, Values
+from cortado.parameters.values import NAMES, OVER_TIME, UNITS, Arrays, Values, require_points
 from cortado.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
 from cortado.simulation import Simulation
 from cortado.words import counted
@@ -102,8 +103,8 @@ class Problem:
 
     @in_turn
     def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, Any]:
-        """States of the rollout under these parameters, by the number of steps before them."""
-        return self._ends(self._space.checked(parameters), steps, keep=False)
+        """States of the rollout under these parameters, by the number of steps before them, from 0 on."""
+        return self._ends(self._space.checked(parameters), self._checked_steps(steps), keep=False)
 
     @in_turn
     def run(self, parameters: Values, record_every: int = 1) -> Any:
@@ -181,9 +182,10 @@ class Problem:
         """Forward mode: run, and give ``observe`` the number of every state and its tangent along ``directions`` (any
         of the parameters), which the next step overwrites. Returns the states after ``steps`` steps, by these, as
         `states` does."""
+        require_methods("observe", observe, ("__call__",), "a function of a number of steps and a state")
         values = self._space.checked(parameters)
         along = self._space.checked(directions, "direction")
-        ends = self._ends(values, steps, keep=False, varied=along)
+        ends = self._ends(values, self._checked_steps(steps), keep=False, varied=along)
         self._rollout.tangent(*self._space.direction(self._rollout, values, along), observe)
         return ends
 
@@ -194,7 +196,7 @@ class Problem:
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
         """See `Batchable.room`."""
-        if self.simulation.batch is not None or (estimator is not None and not estimator.batches):
+        if self.simulation.batch is not None or (estimator is not None and not checked_adjoint(estimator).batches):
             return 1
         return self.simulation.room(self.steps, self.memory_budget if estimator else 0.0)
 
@@ -203,6 +205,9 @@ class Problem:
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
         """See `Batchable.together`."""
+        require_points(points)
+        if estimator is not None:
+            checked_adjoint(estimator)
         problem = self._batch_of(len(points))
         over_time = {name for name in points[0] if name in OVER_TIME and np.ndim(points[0][name]) == 1}
         rows = [{name: [value] if name in over_time else value for name, value in point.items()} for point in points]
@@ -243,6 +248,15 @@ class Problem:
     def diagnostics(self) -> Mapping[str, np.ndarray]:
         """(steps,) by name, of the last evaluation: ``converged``, and what else the solver notes of each step."""
         return self._rollout.diagnostics
+
+    def _checked_steps(self, steps: Iterable[int]) -> list[int]:
+        """Numbers of steps that the problem has; raises `InputError` for anything else."""
+        if not isinstance(steps, Iterable) or isinstance(steps, (str, bytes)):
+            raise InputError(f"steps is {shown(steps)}, but must be a list of numbers of steps.")
+        found = [whole_number("a number of steps", step, 0) for step in steps]
+        for step in found:
+            require_at_most("a number of steps", step, self.steps)
+        return found
 
     def _ends(self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()) -> dict[int, Any]:
         """States by the number of steps before them; ``keep`` checkpoints for a way back."""

@@ -13,6 +13,8 @@ MOST_LAUNCHES = 20
 """Launches at most that are timed together, so that the cost of waiting for the device is shared by them."""
 BATCH = 0.005
 """[s] that launches which are timed together should take: fewer than `MOST_LAUNCHES` of them where each takes long."""
+MOST_REPEATS = 100_000
+"""Of what is timed: more of them tell nothing more of a median, and of a dam break take days."""
 
 Work = Callable[[], object]
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from cortado.errors import InputError
+from cortado.errors import InputError, shown
 from cortado.parameters.registry import BY_NAME, Axis, Range, Role
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import Arrays, Values
@@ -21,13 +21,16 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
     tilt = BY_NAME["tilt"]
     if tilt.present(simulation.scene) and not simulation.scene.schedule.leads_gravity:
         values["tilt"] = tilt.value(simulation)
+    if not isinstance(parameters, (Mapping, Sequence)) or isinstance(parameters, (str, bytes)):
+        raise InputError(f"parameters is {shown(parameters)}, but must be values by name, or a list of names.")
+    known = ", ".join(values)
     if isinstance(parameters, Mapping):
         values = dict(parameters)
-    unknown = [name for name in parameters if name not in values]
+    unknown = [name for name in parameters if not isinstance(name, str) or name not in values]
     if unknown:
-        raise InputError(f"parameter {unknown[0]!r} is unknown, but must be one of {', '.join(values)}.")
+        raise InputError(f"parameter {shown(unknown[0])} is unknown, but must be one of {known}.")
     if not parameters:
-        raise InputError(f"parameters is empty, but must have at least one of {', '.join(values)}.")
+        raise InputError(f"parameters is empty, but must have at least one of {known}.")
     found = ParameterSpace(simulation, problem.steps).checked({name: values[name] for name in parameters})
     for name, value in found.items():
         if not _moves_both_ways(name, value):

@@ -265,6 +265,10 @@ def bench(
     require_at_least(1, len(particles), "the number of --particles")
     require_at_least(1, min(particles), "--particles")
     require_at_least(1, repeats, "--repeats")
+    from cortado.arrays import require_at_most
+    from cortado.bench.timing import MOST_REPEATS
+
+    require_at_most("--repeats", repeats, MOST_REPEATS)
     from cortado.commands.bench import bench_dam_break, bench_reference
 
     if engine == "reference":

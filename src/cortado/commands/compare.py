@@ -15,7 +15,7 @@ from cortado.io.trajectory import Trajectory
 
 _LARGEST = 2**31
 """Bytes of a file that is read."""
-_IGNORED = ("command", "started", "resumed", "settings", "kind")
+_IGNORED = ("command", "started", "resumed", "settings", "kind", "format")
 """Keys of environment.json that differ between any two runs, or are compared apart."""
 _MISSING = "missing"
 SAME_TIME = 1e-9

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.errors import InputError
+from cortado.errors import InputError, shown
 
 
 @dataclass(frozen=True)
@@ -54,4 +54,4 @@ def precision_named(name: str) -> Precision:
     for precision in (FLOAT32, FLOAT64):
         if isinstance(name, str) and precision.name == name:
             return precision
-    raise InputError(f'precision is {name!r}, but must be "float32" or "float64".')
+    raise InputError(f'precision is {shown(name)}, but must be "float32" or "float64".')

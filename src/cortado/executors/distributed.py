@@ -12,7 +12,7 @@ from uuid import uuid4
 
 from cortado.errors import ComputationError, CortadoWarning, InputError, shown
 from cortado.executors.calls import Answer, Lacking, Payload, call, in_words, pickled
-from cortado.executors.executor import Executor, Item, OnResult, Result
+from cortado.executors.executor import Executor, Item, OnResult, Result, check_call
 
 if TYPE_CHECKING:
     import distributed
@@ -75,6 +75,7 @@ class Distributed(Executor):
         Waits for the first worker. Raises `InputError` for what cannot be pickled, `ComputationError` where the
         scheduler or all workers are lost for good, or an item ends its process.
         """
+        check_call(function, items, on_result)
         return _Map(self, Payload.of(function), on_result).results(items)
 
     def threads(self) -> int:

@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from cortado.errors import InputError
+from cortado.arrays import require_function, require_methods
+from cortado.errors import InputError, shown
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -41,12 +42,21 @@ class InProcess(Executor):
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
     ) -> list[Result]:
+        check_call(function, items, on_result)
         results = []
         for number, item in enumerate(items):
             results.append(function(item))
             if on_result is not None:
                 on_result(number, results[-1])
         return results
+
+
+def check_call(function: Any, items: Any, on_result: Any) -> None:
+    """Raises `InputError` for arguments of `Executor.map` that it cannot work with."""
+    require_methods("function", function, ("__call__",), "a function of an item")
+    if not isinstance(items, Iterable):
+        raise InputError(f"items is {shown(items)}, but must be a list of them.")
+    require_function("on_result", on_result)
 
 
 def checked_executor(executor: Any) -> Executor:

@@ -7,6 +7,7 @@ take its place: `AdjointViscosity`, `FrozenGeometry`, `Damped`, the mean of thei
 runs alone, is the reference that they are compared with.
 """
 
+from cortado.arrays import require_function, require_methods
 from cortado.gradients.adjoint_filters import AdjointNorms
 from cortado.gradients.ensemble import EnsembleMean, RandomizedSmoothing
 from cortado.gradients.estimator import (
@@ -59,5 +60,7 @@ def estimate(
 
     Raises `InputError` where what is given is no estimator, or does not return the gradient of every parameter.
     """
+    require_methods("problem", problem, ("value",), "a cortado.Problem")
+    require_function("observe", observe)
     chosen = checked_estimator(Exact() if estimator is None else estimator)
     return checked_estimate(chosen.estimate(problem, parameters, observe), parameters, problem.simulation.batch)

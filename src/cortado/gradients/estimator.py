@@ -9,7 +9,7 @@ import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number
 from cortado.device.state import Parameters, State
-from cortado.errors import DivergedError, InputError
+from cortado.errors import DivergedError, InputError, shown
 from cortado.parameters.values import Arrays, Values
 from cortado.rollout import BackwardStep, Observer, Rollout
 from cortado.solvers.solver import Counts
@@ -122,7 +122,15 @@ class GradientEstimator(Protocol):
 def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
     """The estimator; raises `InputError` for anything else, such as the class of an estimator."""
     if isinstance(estimator, type) or not hasattr(estimator, "estimate"):
-        raise InputError(f"estimator is {estimator!r}, but must be an object such as cortado.gradients.Exact().")
+        raise InputError(f"estimator is {shown(estimator)}, but must be an object such as cortado.gradients.Exact().")
+    return estimator
+
+
+def checked_adjoint(estimator: "AdjointEstimator") -> "AdjointEstimator":
+    """The estimator; raises `InputError` for anything but one that goes back through a run."""
+    if not isinstance(estimator, AdjointEstimator):
+        wanted = "an AdjointEstimator such as cortado.gradients.Exact()"
+        raise InputError(f"estimator is {shown(estimator)}, but must be {wanted}.")
     return estimator
 
 

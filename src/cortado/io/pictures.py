@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cortado.device.memory import require
 from cortado.errors import CortadoWarning, InputError
 from cortado.io.files import write_atomically
 from cortado.io.input_files import as_path, reason, regular_file
@@ -32,6 +33,8 @@ Shape = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]]
 MILK: Colour = (0.96, 0.93, 0.86)
 COFFEE: Colour = (0.30, 0.16, 0.08)
 WHITE: Colour = (1.0, 1.0, 1.0)
+DRAWN = 100.0
+"""Bytes for each pixel of a picture that is drawn, about."""
 SAMPLES = 6
 """Points along either side of a pixel that tell how much of it a shape covers."""
 FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
@@ -175,6 +178,7 @@ def _drawn(
     for name, value in (("cup", 1.0 if cup is None else cup), ("size", size)):
         positive(name, value)
     columns, rows = _columns_and_rows(resolution)
+    require({"a picture": DRAWN * columns * rows}, "take a smaller resolution")
     milk, coffee, background = (np.array(vector("A colour", colour)) for colour in colours)
     scale = size * (1.0 if cup is None else cup)
     picture = _mixed(_coverage(lambda x, y: shape(x / scale, y / scale), columns, rows), milk, coffee)

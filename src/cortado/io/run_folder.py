@@ -18,8 +18,11 @@ from cortado.io.input_files import content, reason
 from cortado.io.run_environment import as_json, plain, require_same, session
 from cortado.optimisation.replay_log import FILE_NAME
 from cortado.parameters.values import NAMES
+from cortado.scene.picture import MOST_FRAMES
 from cortado.scene.scene import Scene
 
+_FORMAT = 2
+"""Of run folders, in environment.json; of those before it says nothing."""
 _RESUMABLE = "optimise"
 """The command that has --resume."""
 _LARGEST = 2**31
@@ -74,6 +77,7 @@ class RunFolder:
         """
         folder = cls(Path(path).absolute())
         noted = {**session(command, device), "kind": kind, "settings": as_json(settings or {}), "resumed": []}
+        noted["format"] = _FORMAT
         with sentences(folder.path):
             folder._make_room(kind, overwrite)
             folder.path.mkdir(parents=True, exist_ok=True)
@@ -113,6 +117,7 @@ class RunFolder:
         folder.require(scene_json, kind, settings)
         noted = _read_json(folder.environment)
         noted.setdefault("resumed", []).append(session(command, device))
+        noted["format"] = _FORMAT
         with sentences(folder.path):
             folder.result.unlink(missing_ok=True)
             folder._remove_unfinished()
@@ -181,10 +186,12 @@ class RunFolder:
         Raises:
             InputError: the file is damaged; `SceneError` where what it says, or a replacement, does not fit.
         """
-        text = _bytes_of(self.scene)
+        text = _bytes_of(self.scene).decode(errors="replace")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CortadoWarning)
             try:
+                if "format" not in _read_json(self.environment):
+                    text = _asked_for(text)
                 return Scene.from_json(text, overrides)
             except SceneError as error:
                 raise error.in_file(str(self.scene)) from None
@@ -272,6 +279,17 @@ class RunFolder:
     def _checkpoints(self) -> list[Path]:
         """The folders with the logs of one search after the other, that of the first one last, as it holds the rest."""
         return [*self.checkpoint.glob("[0-9]*/"), self.checkpoint]
+
+
+def _asked_for(scene_json: str) -> str:
+    """A scene of a folder without a format, whose default of film_frames, 120, was written as if it were asked for."""
+    try:
+        scene = json.loads(scene_json)
+        if scene["picture"]["film_frames"] == MOST_FRAMES:
+            del scene["picture"]["film_frames"]
+    except (ValueError, RecursionError, LookupError, TypeError):
+        return scene_json  # what is wrong is said where it is read
+    return json.dumps(scene)
 
 
 def _computed(scene: Any) -> Any:

@@ -6,9 +6,9 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
-from cortado.arrays import read_only
+from cortado.arrays import read_only, require_methods
 from cortado.device.threads import WARP
-from cortado.errors import InputError, shown
+from cortado.errors import InputError
 from cortado.fixed import fixed
 from cortado.io.srgb import LIGHT, check_light
 from cortado.losses.image_losses import ImageLoss, SquaredDifference
@@ -33,6 +33,7 @@ class Image:
         """``target`` (rows, columns, 3), linear RGB from 0 to 1; ``distance``:
         `cortado.image_losses.SquaredDifference`, the default, or `Pyramid`, whose gradient leads shapes to each other
         that do not overlap. Raises `InputError` for a target of another shape, or with values of a file up to 255."""
+        require_methods("renderer", renderer, ("render", "adjoint"), "an object such as Simulation.renderer() gives")
         self.renderer, self.distance = renderer, _distance(distance)
         self.target = _target_image(target, getattr(renderer, "shape", None))
         parts = (self.distance.fingerprint, sha256(self.target.tobytes()).hexdigest())
@@ -60,9 +61,7 @@ class Image:
 def _distance(distance: Any) -> ImageLoss:
     if distance is None:
         return SquaredDifference()
-    if isinstance(distance, type) or not callable(getattr(distance, "adjoint", None)):
-        wanted = "an object such as cortado.image_losses.Pyramid()"
-        raise InputError(f"distance is {shown(distance)}, but must be {wanted}.")
+    require_methods("distance", distance, ("value", "adjoint"), "an object such as cortado.image_losses.Pyramid()")
     return distance
 
 

@@ -71,7 +71,10 @@ class Pyramid:
             require_whole("levels", self.levels, 1)
         if self.weights is None:
             return
-        weights = tuple(np.atleast_1d(as_numbers("weights", self.weights)).tolist())
+        numbers = np.atleast_1d(as_numbers("weights", self.weights))
+        if numbers.ndim != 1:
+            raise InputError(f"weights has shape {numbers.shape}, but must be one number for each level.")
+        weights = tuple(numbers.tolist())
         object.__setattr__(self, "weights", weights)
         if not (np.isfinite(weights).all() and min(weights, default=-1.0) >= 0.0 and max(weights) > 0.0):
             raise InputError(f"weights is {weights}, but must be finite, not negative and not all zero.")

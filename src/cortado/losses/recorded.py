@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.arrays import require_methods
 from cortado.device.threads import WARP
 from cortado.fixed import fixed
 from cortado.losses.loss import Adjoint, Snapshot
@@ -23,6 +24,7 @@ class Recorded:
     """
 
     def __init__(self, function: WarpFunction):
+        require_methods("function", function, ("__call__",), "a function of positions, velocities and a loss")
         self.function = function
 
     @WARP

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from cortado.arrays import as_one_number, require_function
+from cortado.arrays import as_one_number, require_function, require_methods, require_table
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.executors.executor import Executor, InProcess, OnResult, checked_executor
 from cortado.gradients import Estimate, GradientEstimator
@@ -39,8 +39,7 @@ def evaluate(
     Raises the error of the first point that has another one.
     """
     require_function("on_result", on_result)
-    if not callable(getattr(problem, "value", None)):
-        raise InputError(f"problem is {shown(problem)}, but must be a cortado.Problem.")
+    require_methods("problem", problem, ("value",), "a cortado.Problem")
     if not isinstance(points, Iterable) or isinstance(points, (str, bytes, Mapping)):
         raise InputError(f"points is {shown(points)}, but must be a list of parameters by name.")
     if loss_if_diverged is not None:
@@ -62,6 +61,5 @@ def evaluate(
 
 
 def _by_name(point: Values) -> Values:
-    if not isinstance(point, Mapping):
-        raise InputError(f"a point is {shown(point)}, but must be parameters by name, as {{'gravity': value}}.")
+    require_table("a point", point, "{'gravity': value}")
     return point

@@ -6,7 +6,7 @@ import numpy as np
 
 from cortado.arrays import is_whole, require_at_most
 from cortado.device.memory import require
-from cortado.errors import InputError
+from cortado.errors import InputError, shown
 from cortado.fixed import keep_own
 from cortado.optimisation.iterate import Iterate
 from cortado.optimisation.replay_log import ParameterLayout, Vector
@@ -64,9 +64,9 @@ class LineSearch:
         require_fraction("shortest", self.shortest)
         if not is_whole(self.trials) or self.trials < 2 or self.shortest == 0.0:
             raise InputError(
-                f"trials is {self.trials!r} and shortest {self.shortest!r}, but must be at least 2 and greater than 0."
+                f"trials is {shown(self.trials)} and shortest {shown(self.shortest)}, but must be at least 2 and "
+                "greater than 0."
             )
-
         require_at_most("trials", self.trials, MOST_TRIALS)
 
     def check(self, layout: ParameterLayout) -> None:

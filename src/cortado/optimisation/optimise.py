@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import require_function
+from cortado.arrays import require_function, require_truth
 from cortado.errors import InputError
 from cortado.io.input_files import as_path
 from cortado.optimisation.differentiable import Differentiable, LossFunction, as_differentiable
@@ -68,6 +68,7 @@ def optimise(
     if checkpoint is not None:
         checkpoint = as_path("checkpoint", checkpoint)
     require_function("on_iteration", on_iteration)
+    require_truth("resume", resume)
     algorithm, differentiable = as_optimiser(optimiser, settings), as_differentiable(problem)
     values = checked_start(start)
     layout = ParameterLayout.of(values)

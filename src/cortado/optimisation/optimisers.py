@@ -11,7 +11,7 @@ import numpy as np
 
 from cortado.arrays import is_whole, require_at_most
 from cortado.device.memory import require
-from cortado.errors import InputError
+from cortado.errors import InputError, shown
 from cortado.fixed import keep_own
 from cortado.optimisation.iterate import Iterate
 from cortado.optimisation.line_search import LineSearch
@@ -151,7 +151,7 @@ class LBFGS:
 
     def __post_init__(self) -> None:
         if not is_whole(self.memory) or self.memory < 1:
-            raise InputError(f"The memory of L-BFGS must be an integer of at least 1, not {self.memory!r}.")
+            raise InputError(f"The memory of L-BFGS must be an integer of at least 1, not {shown(self.memory)}.")
         require_at_most("The memory of L-BFGS", self.memory, MOST_MEMORY)
         require_fraction("The tolerance of L-BFGS", self.tolerance)
         require_positive("scale", self.scale)

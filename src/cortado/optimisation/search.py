@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from cortado.errors import InputError
+from cortado.errors import InputError, shown
 from cortado.optimisation.replay_log import ParameterLayout, Vector
 from cortado.scene.fields import as_number
 from cortado.words import quoted
@@ -76,14 +76,14 @@ def require_positive(name: str, values: PerParameter) -> None:
     for value in _values(values):
         number = as_number(value)
         if number is None or number <= 0.0:
-            raise InputError(f"{name} must be a positive, finite number, not {value!r}.")
+            raise InputError(f"{name} must be a positive, finite number, not {shown(value)}.")
 
 
 def require_fraction(name: str, value: float) -> None:
     """Raise InputError unless a number is in [0, 1)."""
     number = as_number(value)
     if number is None or not 0.0 <= number < 1.0:
-        raise InputError(f"{name} must be a number in [0, 1), not {value!r}.")
+        raise InputError(f"{name} must be a number in [0, 1), not {shown(value)}.")
 
 
 def require_names(name: str, values: PerParameter, layout: ParameterLayout) -> None:

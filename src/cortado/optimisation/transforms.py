@@ -12,11 +12,11 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.special import softmax
 
-from cortado.arrays import as_numbers, read_only, require_whole
+from cortado.arrays import as_numbers, read_only, require_methods, require_table, require_whole
 from cortado.errors import DivergedError, InputError
 from cortado.fixed import FixedDict, fixed
 from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator, estimate
-from cortado.parameters.values import Arrays, Values, check_known
+from cortado.parameters.values import Arrays, Values, check_known, require_points
 from cortado.problem import Problem
 from cortado.rollout import BackwardStep, Observer
 
@@ -42,12 +42,14 @@ class Logarithm:
     """p = exp(u): a step in u multiplies the parameter, which stays positive."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
-        return np.exp(u)
+        with np.errstate(over="ignore"):  # a problem refuses a parameter that is not finite
+            return np.exp(as_numbers("a coordinate", u))
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        if (np.asarray(parameter) <= 0.0).any():
+        number = as_numbers("a parameter", parameter)
+        if not (number > 0.0).all():
             raise InputError("A parameter that is changed by factors must be greater than 0.")
-        return np.log(parameter)
+        return np.log(number)
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
         return bar * np.exp(u)
@@ -58,12 +60,10 @@ class Softmax:
     """p_k = exp(u_k) / sum_l exp(u_l), row by row: fractions (n, phases) that add up to 1."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
-        if np.ndim(u) != 2:
-            raise InputError(f"coordinates have shape {np.shape(u)}, but must have a row for each particle.")
-        return softmax(u, axis=1)
+        return softmax(_fractions("coordinates", u), axis=1)
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        u = np.log(np.maximum(parameter, SMALLEST))
+        u = np.log(np.maximum(_fractions("fractions", parameter), SMALLEST))
         return u - u.mean(axis=1, keepdims=True)
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
@@ -94,12 +94,10 @@ class TimeInterpolation:
         return np.maximum(1.0 - np.abs(places[:, None] - np.arange(self.knots)), 0.0)
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
-        _require_rows("knots", u, self.knots)
-        return self._weights @ u
+        return self._weights @ _rows("knots", u, self.knots)
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        _require_rows("values over time", parameter, self.steps)
-        return np.linalg.lstsq(self._weights, parameter, rcond=None)[0]
+        return np.linalg.lstsq(self._weights, _rows("values over time", parameter, self.steps), rcond=None)[0]
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
         return self._weights.T @ bar
@@ -122,14 +120,13 @@ class Affine:
         return f"Affine({sha256(self.base.tobytes() + self.matrix.tobytes()).hexdigest()[:16]})"
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
-        _require_shape("coordinates", u, self._shape)
-        return self.base + np.tensordot(self.matrix, u, len(self._shape))
+        return self.base + np.tensordot(self.matrix, _shaped("coordinates", u, self._shape), len(self._shape))
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
         """The least of all u that come nearest to ``parameter``."""
-        _require_shape("values", parameter, self.base.shape)
+        offset = _shaped("values", parameter, self.base.shape) - self.base
         matrix = self.matrix.reshape(self.base.size, -1)
-        return np.linalg.lstsq(matrix, (parameter - self.base).ravel(), rcond=None)[0].reshape(self._shape)
+        return np.linalg.lstsq(matrix, offset.ravel(), rcond=None)[0].reshape(self._shape)
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
         return np.tensordot(bar, self.matrix, self.base.ndim)
@@ -146,8 +143,12 @@ class Transformed:
 
     def __init__(self, problem: Problem, coordinates: Mapping[str, Bijector]):
         """Raises `InputError` for coordinates of a parameter that the scene does not have."""
-        for name in coordinates:
+        require_methods("problem", problem, ("value", "forward_pass"), "a cortado.Problem")
+        require_table("coordinates", coordinates, "{'viscosity': Logarithm()}")
+        for name, bijector in coordinates.items():
             check_known(name, problem.simulation.scene)
+            wanted = "an object such as Logarithm()"
+            require_methods(f"the coordinate of {name}", bijector, ("parameter", "coordinate", "adjoint"), wanted)
         self.problem, self.coordinates = problem, FixedDict(coordinates)
         self.simulation = problem.simulation
 
@@ -158,11 +159,13 @@ class Transformed:
 
     def parameters(self, u: Mapping[str, Any]) -> Arrays:
         """p(u) by name."""
+        require_table("u", u, "{'viscosity': value}")
         known = {name: as_numbers(f"coordinate of {name}", u[name]) for name in self.coordinates.keys() & u.keys()}
         return {**u, **{name: self.coordinates[name].parameter(value) for name, value in known.items()}}
 
     def coordinate(self, parameters: Mapping[str, Any]) -> Arrays:
         """u by name."""
+        require_table("parameters", parameters, "{'viscosity': value}")
         names = self.coordinates.keys() & parameters.keys()
         known = {name: as_numbers(f"parameter {name}", parameters[name]) for name in names}
         return {**parameters, **{name: self.coordinates[name].coordinate(value) for name, value in known.items()}}
@@ -196,6 +199,7 @@ class Transformed:
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
         """See `Batchable.together`."""
+        require_points(points)
         found = self.problem.together([self.parameters(u) for u in points], estimator)
         for u, one in zip(points, found, strict=True):
             if isinstance(one, Estimate):
@@ -216,14 +220,25 @@ class TransformedPass:
         return gradient | by_coordinates(self._coordinates, self._u, gradient)
 
 
-def _require_shape(what: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
-    if np.shape(array) != shape:
-        raise InputError(f"{what} have shape {np.shape(array)}, but must have {shape}.")
+def _shaped(what: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    array = as_numbers(what, value)
+    if array.shape != shape:
+        raise InputError(f"{what} have shape {array.shape}, but must have {shape}.")
+    return array
 
 
-def _require_rows(what: str, array: np.ndarray, rows: int) -> None:
-    if not np.ndim(array) or len(array) != rows:
-        raise InputError(f"{what} have shape {np.shape(array)}, but must have {rows} rows.")
+def _rows(what: str, value: Any, rows: int) -> np.ndarray:
+    array = as_numbers(what, value)
+    if not array.ndim or len(array) != rows:
+        raise InputError(f"{what} have shape {array.shape}, but must have {rows} rows.")
+    return array
+
+
+def _fractions(what: str, value: Any) -> np.ndarray:
+    array = as_numbers(what, value)
+    if array.ndim != 2:
+        raise InputError(f"{what} have shape {array.shape}, but must have a row for each particle.")
+    return array
 
 
 def by_coordinates(coordinates: Mapping[str, Bijector], u: Mapping[str, Any], gradient: Arrays) -> Arrays:

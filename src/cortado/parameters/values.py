@@ -3,12 +3,12 @@
 n counts fluid particles in the order in which the scene lists them, d is the scene's dimension. Without Warp.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from cortado.arrays import as_numbers
+from cortado.arrays import as_numbers, require_table
 from cortado.errors import InputError, shown
 from cortado.parameters.registry import BY_NAME, Axis, Range, Role, Source, names
 
@@ -45,6 +45,14 @@ def check_known(name: str, scene: Any, what: str = "parameter") -> None:
     parameter = BY_NAME[name]
     if not parameter.present(scene):
         raise InputError(f"{what} {name} is given, but must be left out, as the scene {parameter.absent}.")
+
+
+def require_points(points: object) -> None:
+    """Raises `InputError` unless these are parameters by name, of at least one point."""
+    if not isinstance(points, Sequence) or isinstance(points, (str, bytes)) or not points:
+        raise InputError(f"points is {shown(points)}, but must be a list of parameters by name.")
+    for point in points:
+        require_table("a point", point, "{'gravity': value}")
 
 
 def is_too_small(array: np.ndarray, allowed: Range) -> bool:

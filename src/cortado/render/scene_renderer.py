@@ -74,7 +74,8 @@ def scene_renderer(simulation: Pictured, extinction_factor: float = 1.0, **setti
 def _table(scene: Scene, settings: dict[str, Any]) -> Render:
     """The table [render] of a scene with some of its keys replaced; a camera stays with its view."""
     given = {} if scene.render is None else scene.render.model_dump(exclude_unset=True)
-    if settings.get("view", given.get("view")) != given.get("view"):
+    view = settings.get("view")
+    if isinstance(view, str) and view != given.get("view"):
         given = {name: value for name, value in given.items() if name not in CAMERA}
     resolved = Annotated[Render, AfterValidator(lambda table: table.in_dimension(scene.dimension))]
     with sentences(Scene):
