@@ -300,4 +300,4 @@ iterations = 3
 parameter_error = 2.0
 """
 """A small cup that is swung around, seen from above."""
-LATTE_PARTICLES = 41
+LATTE_PARTICLES = 65

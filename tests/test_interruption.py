@@ -42,7 +42,7 @@ def begin(process):
 
 SpawnProcess.start = begin
 try:
-    with Where(workers=2).executor("cpu") as executor:
+    with Where(workers=2).executor("cpu", 2) as executor:
         print("too late")
 except KeyboardInterrupt as stop:
     print(stop)

@@ -63,6 +63,8 @@ def point_and_direction(simulation, steps, seed=0, off_lattice=0.001):
         "initial_velocities": 0.1 * noise(*shape) / np.sqrt(shape[0]),
         "viscosity": np.array(0.05),
     }
+    if simulation.scene.forces.viscosity == "none":
+        del point["viscosity"], directions["viscosity"]
     return point, directions
 
 

@@ -45,4 +45,4 @@ def test_no_search_is_warned_of(path):
     for values in (start, dict(task.true_parameters)):
         if "tilt" in values:
             values["gravity"] = tilt.gravity(np.atleast_2d(values.pop("tilt")))
-        assert not task.problem.steps or unstable_sentence(values, task.scene) is None
+        assert not task.problem.steps or unstable_sentence(values, task.scene, set()) is None

@@ -52,6 +52,8 @@ def point_of(simulation, seed=0):
         point |= {name: simulation.parameters()[name] for name in ("mobility", "interface_width")}
         point |= {name: point[name][:phases] for name in ("rest_density", "viscosity")}
         point["mass_fractions"] = random.dirichlet(np.full(phases, 0.5), len(simulation.positions))
+    if simulation.scene.forces.viscosity == "none":
+        point = {name: value for name, value in point.items() if name != "viscosity"}
     if simulation.scene.forces.surface_tension:
         point["surface_tension"] = simulation.scene.forces.surface_tension
     if nozzle := simulation.solver.emitter and simulation.solver.emitter.nozzle:
@@ -87,8 +89,8 @@ def twins_steps(simulation, substeps):
         initial_positions,
         initial_velocities,
         rest_density,
-        viscosity,
         time_step,
+        viscosity=0.0,
         mobility=0.0,
         interface_width=1.0,
         mass_fractions=None,

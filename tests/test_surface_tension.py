@@ -120,12 +120,14 @@ def test_a_cube_rounds_to_a_sphere(dimension, across, periods):
     assert ratio > 0.97
 
 
-@pytest.mark.parametrize(("dimension", "across"), [(2, 16), (2, 32), (3, 10), (3, 14)])
-def test_the_pressure_jump_of_a_drop(dimension, across):
+@pytest.mark.parametrize(
+    ("dimension", "across", "error"), [(2, 16, 0.2), (2, 24, 0.1), (2, 32, 0.1), (3, 10, 0.2), (3, 14, 0.1)]
+)
+def test_the_pressure_jump_of_a_drop(dimension, across, error):
     """(d - 1) sigma / R by the solver's own pressure, in drops that have oscillated; the mean of drops, as how the
-    particles of a surface lie changes it from drop to drop."""
+    particles of a surface lie changes it from drop to drop: single ones are between 0.94 and 1.29 of it."""
     kicks = (0.1, 0.15, 0.2) if dimension == 2 else (0.1, 0.2)
-    assert abs(np.mean([kicked(dimension, across, kick).settled_pressure() for kick in kicks]) - 1.0) < 0.1
+    assert abs(np.mean([kicked(dimension, across, kick).settled_pressure() for kick in kicks]) - 1.0) < error
 
 
 @pytest.mark.parametrize(("dimension", "across"), [(2, 16), (2, 32), (3, 10), (3, 14)])
@@ -189,7 +191,8 @@ def test_a_drop_across_a_periodic_boundary():
     free, across = (
         Simulation(drop(2, 12, fluid=[body], **change), precision="float64") for change in ({}, {"container": room})
     )
-    shift = {"initial_positions": across.positions + [2.0 * RADIUS, 0.0]}
+    assert np.abs(across.positions - free.positions).max() < 0.01 * RADIUS / 6  # packed alike, but for round-off
+    shift = {"initial_positions": free.positions + [2.0 * RADIUS, 0.0]}
     shift["initial_positions"][:, 0] -= np.where(shift["initial_positions"][:, 0] > 2.0 * RADIUS, 4.0 * RADIUS, 0.0)
     here = free.rollout(50).forward(keep=False).numpy(2)["positions"]
     there = across.rollout(50, shift).forward(keep=False).numpy(2)["positions"]

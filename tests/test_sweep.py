@@ -225,7 +225,7 @@ def test_a_worker_that_does_not_see_the_folder_says_so(folder):
         (["task.toml", "--set", "optimise.learning_rate=0.5,-1"], "optimise.learning_rate is -1"),
         (["scene.toml", "--set", "solver.time_step=0.001", "--steps", "0"], "steps is 0"),
         (["scene.toml", "--set", "solver.time_stop=0.001,0.002"], "solver.time_stop"),
-        (["task.toml", *RATES, "--workers", "0"], "number is 0"),
+        (["task.toml", *RATES, "--workers", "0"], "--workers is 0"),
         (["task.toml", *RATES, "--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "--scheduler and --workers"),
         (["task.toml", *RATES, "--scheduler", "tcp://127.0.0.1:1"], "There is no scheduler at 'tcp://127.0.0.1:1'"),
         (["task.toml", *RATES, "--scheduler", "nowhere"], "There is no scheduler at 'nowhere'"),

@@ -100,7 +100,7 @@ def _first_said(stop: BaseException | None) -> str:
     """What is kept, as an interruption says, or one that it came upon on its way out."""
     if not isinstance(stop, Interrupted):
         return ""
-    return stop.kept or _first_said(stop.__context__)
+    return stop.kept or _first_said(None if stop.__suppress_context__ else stop.__context__)
 
 
 def _leave(number: int, _: FrameType | None) -> None:

@@ -58,7 +58,7 @@ class Scene(SceneTables):
     @classmethod
     def from_json(cls, text: str | bytes, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":
         """The scene that `to_json` wrote to a file, with replacements as for `load_scene`."""
-        if not isinstance(text, str):
+        if not isinstance(text, (str, bytes)):
             raise InputError(f"text is {shown(text)}, but must be the text that Scene.to_json gives.")
         try:
             data = json.loads(text)
