@@ -90,7 +90,7 @@ def twins_steps(simulation, substeps):
         initial_velocities,
         rest_density,
         time_step,
-        viscosity=0.0,
+        viscosity=1.0,
         mobility=0.0,
         interface_width=1.0,
         mass_fractions=None,
