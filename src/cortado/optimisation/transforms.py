@@ -147,7 +147,7 @@ class Transformed:
     def __init__(self, problem: Problem, coordinates: Mapping[str, Bijector]):
         """Raises `InputError` for coordinates of a parameter that the scene does not have."""
         for name in coordinates:
-            check_known(name, problem.simulation.scene)
+            check_known(name, problem.simulation.scene, known=problem.simulation.known)
         self.problem, self.coordinates = problem, FixedDict(coordinates)
         self.simulation = problem.simulation
 
