@@ -352,3 +352,23 @@ def test_the_forces_of_the_page_run_as_printed(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     assert len(blocks) == 3
     runpy.run_path(str(program))
+
+
+def test_values_from_outside_of_what_it_calls_count_too():
+    """The text is the same: what differs is a number of a function of Warp, or a vector."""
+
+    def made(strength, centre):
+        @wp.func
+        def scaled(r: wp.float64):
+            return r * wp.float64(strength)
+
+        def steady(x, v, k):
+            return scaled(k) * (centre - x)
+
+        return Body(steady, k=1.0)
+
+    ends = {}
+    for strength, centre in ((1.0, 0.0), (20.0, 0.0), (1.0, 9.0)):
+        judged = problem(made(strength, wp.vec3d(centre, 0.0, 0.0)))
+        ends[judged.fingerprint] = judged.run({}).velocities[-1].tobytes()
+    assert len(ends) == 3 and len(set(ends.values())) == 3

@@ -5,10 +5,11 @@ import inspect
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import FunctionType, MappingProxyType
+from types import FunctionType, MappingProxyType, ModuleType
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import numpy as np
 import warp as wp
 
 from cortado.device.precision import Precision
@@ -30,8 +31,8 @@ class Formula:
     """Its arguments before the parameters: two vectors, and time if there is a third."""
     parameters: tuple[str, ...]
     """Its other arguments."""
-    helpers: tuple[str, ...]
-    """The texts of Warp functions that it calls."""
+    outside: tuple[str, ...]
+    """What the text does not say: the functions of Warp that it calls, and values."""
     scope: Mapping[str, Any] = field(compare=False, repr=False)
     """What names in the text stand for."""
 
@@ -81,12 +82,14 @@ def formula(
     inputs, values = _arguments(what, function, parameters)
     tree, scope = _definition(what, source), _scope(function)
     helpers = _called(scope)
-    for one in (tree, *(ast.parse(textwrap.dedent(text)) for text in helpers)):
+    for one in (tree, *(helper.adj.tree for helper in helpers)):
         Differentiable(what).visit(one)
+    scopes = scope, *(_scope(helper.func) for helper in helpers)
+    outside = (*(helper.adj.source for helper in helpers), *map(_values, scopes))
     local = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
     rewritten = InPrecision(scope, {*inputs, *values, *local}).visit(tree)
     text = ast.unparse(ast.fix_missing_locations(rewritten)) + "\n"
-    return Formula(name, text, inputs, tuple(values), helpers, MappingProxyType(scope)), values
+    return Formula(name, text, inputs, tuple(values), outside, MappingProxyType(scope)), values
 
 
 def _arguments(what: str, function: FunctionType, given: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -127,13 +130,18 @@ def _scope(function: FunctionType) -> dict[str, Any]:
     return {**outside.globals, **outside.nonlocals}
 
 
-def _called(scope: Mapping[str, Any]) -> tuple[str, ...]:
-    """The texts of Warp functions that are named in a scope, and of those that they call."""
-    found: dict[str, None] = {}
+def _called(scope: Mapping[str, Any], found: tuple[Any, ...] = ()) -> tuple[Any, ...]:
+    """The functions of Warp's users that are named in a scope, and those that they call."""
     for _, helper in sorted(scope.items()):
-        if isinstance(helper, wp.Function) and helper.func and helper.adj.source not in found:
-            found |= dict.fromkeys((helper.adj.source, *_called(_scope(helper.func))))
-    return tuple(found)
+        if isinstance(helper, wp.Function) and helper.func and helper not in found:
+            found = _called(_scope(helper.func), (*found, helper))
+    return found
+
+
+def _values(scope: Mapping[str, Any]) -> str:
+    """What is named in a scope and is no function, module or type, in words."""
+    kept = {n: v for n, v in sorted(scope.items()) if not callable(v) and not isinstance(v, (ModuleType, wp.Function))}
+    return str({name: np.asarray(value).tolist() for name, value in kept.items()})
 
 
 def compiled(what: str, module: Any, device: Any) -> None:

@@ -86,7 +86,7 @@ class OwnForce:
     def fingerprint(self) -> str:
         """Of the function's text, and of those that it calls."""
         courses = [repr(value) for value in self._values.values() if isinstance(value, OverTime)]
-        words = (self.kind, self.name, self._formula.text, *self._formula.helpers, *courses)
+        words = (self.kind, self.name, self._formula.text, *self._formula.outside, *courses)
         return sha256("\n".join(words).encode()).hexdigest()
 
     def _value(self, argument: str, value: Any) -> Any:
@@ -168,7 +168,7 @@ class FunctionForce:
 
 def topic(kind: str, text: Formula, ranks: tuple[int, ...]) -> str:
     """The part of a Warp module's name that tells one function from another."""
-    words = "\n".join((text.text, *text.helpers, str(ranks)))
+    words = "\n".join((text.text, *text.outside, str(ranks)))
     return f"{kind}_{text.name}_{sha256(words.encode()).hexdigest()[:12]}"
 
 
