@@ -21,7 +21,8 @@ LAYERS = """
     io io.file_lock io.files io.folder_lock io.input_files io.interruption io.terminal io.progress
     io.run_environment io.shipped io.srgb io.particle_view io.notebook io.usage io.video io.vtkhdf_layout io.vtkhdf
     lattice lattice.shapes lattice.pairs lattice.region lattice.smoothing lattice.calibration
-    parameters parameters.reference_density parameters.registry parameters.table parameters.tilt parameters.values
+    parameters parameters.reference_density parameters.registry parameters.known parameters.table
+    parameters.tilt parameters.values
     scene scene.fields scene.sentences scene.point_reader scene.points scene.tables
     scene.schedule scene.fluids scene.emitter
     scene.mixture scene.picture scene.render scene.toml
@@ -39,7 +40,8 @@ LAYERS = """
     discretise.distance
     sph sph.density sph.free_energy sph.integration sph.order sph.materials sph.emitter_kernels sph.pair_forces
     sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
-    sph.gravity sph.mixture sph.surface_tension sph.viscosity
+    sph.gravity sph.makers sph.mixture sph.surface_tension sph.viscosity
+    sph.function_text sph.formula sph.packed sph.own_force sph.body sph.pair forces
     solvers solvers.containment_kernels solvers.containment solvers.solver solvers.convergence solvers.loop
     solvers.particles solvers.particle_derivatives solvers.build solvers.pcisph
     solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure solvers.pcisph.pressure

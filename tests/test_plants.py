@@ -41,6 +41,8 @@ SHARED = {
 """Derivatives that forward mode uses too, and those of pictures, so that only differences can tell."""
 ELSEWHERE = {
     "device.compiling": "it compiles adjoints and has none",
+    "sph.body": "made from functions of users, which scenes do not have: tests/test_own_functions.py",
+    "sph.pair": "the same",
     "solvers.pcisph.frozen_pressure": "an estimator that is not exact: tests/test_estimators.py",
 }
 """Modules with functions of adjoints that no plant is in, and why."""

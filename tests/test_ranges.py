@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 import cortado
-from cortado import Problem, Simulation, gradients
+from cortado import Problem, Simulation, forces, gradients
 from cortado.device import launching
 from cortado.device.launching import KernelLauncher
 from scenes import MIXING, jet, plane_of_three, scene, splash, two_layers
@@ -35,7 +36,19 @@ CASES = {
         forces={"gravity": [0.0, -9.81, 0.0], "surface_tension": 0.5},
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 2.0}],
     ),
+    "forces of one's own": splash,
 }
+
+
+def swirl(x, v, t, rate):
+    return rate * wp.vec3(-x[1], x[0], wp.sin(t)) - v
+
+
+def spring(x_ij, v_ij, k):
+    return -k * x_ij - 0.1 * k * v_ij
+
+
+FORCES = {"forces of one's own": [forces.Body(swirl, rate=2.0), forces.Pair(spring, k=3.0)]}
 ESTIMATORS = {
     "exact": gradients.Exact(),
     "adjoint viscosity": gradients.AdjointViscosity(5.0),
@@ -60,9 +73,9 @@ class Weighed:
         return tuple(self.weights)
 
 
-def results(make) -> dict[str, bytes]:
+def results(name) -> dict[str, bytes]:
     """Bits of a short run of a disturbed start, of tangents, and of gradients by every estimator."""
-    simulation = Simulation(make(), precision="float64")
+    simulation = Simulation(CASES[name](), precision="float64", forces=FORCES.get(name, []))
     problem, random = Problem(simulation, STEPS, Weighed(simulation)), np.random.default_rng(2)
     point = simulation.parameters()
     for name, size in (("initial_positions", 0.002), ("initial_velocities", 0.3)):
@@ -99,12 +112,12 @@ def once_and_cut(name):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(KernelLauncher, "_launch_parts", keep)
         set_parts(patch, 1, 1, particles)
-        once = results(CASES[name])
+        once = results(name)
         assert not cut
         several = []
         for cores, parts in CORES_AND_PARTS:
             set_parts(patch, cores, parts, particles)
-            several.append(results(CASES[name]))
+            several.append(results(name))
     return once, several, cut
 
 

@@ -8,6 +8,7 @@ from cortado.lazy import getter
 TYPE_CHECKING = False  # that of typing, which takes as long to import as all else here
 if TYPE_CHECKING:
     from cortado import executors as executors
+    from cortado import forces as forces
     from cortado import gradients as gradients
     from cortado import image_losses as image_losses
     from cortado import losses as losses
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_MODULES = ("executors", "gradients", "image_losses", "losses", "optimisers", "pictures", "render")
+_MODULES = ("executors", "forces", "gradients", "image_losses", "losses", "optimisers", "pictures", "render")
 _HOMES = {
     "ComputationError": "errors",
     "CortadoError": "errors",

@@ -20,9 +20,10 @@ from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatc
 from cortado.losses.checked import as_loss
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
 from cortado.parameters.space import ParameterSpace
-from cortado.parameters.values import NAMES, OVER_TIME, UNITS, Arrays, Values, require_points
+from cortado.parameters.values import NAMES, UNITS, Arrays, Values, require_points
 from cortado.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
 from cortado.simulation import Simulation
+from cortado.sph.makers import fingerprint as forces_fingerprint
 from cortado.words import counted
 
 __all__ = ["NAMES", "UNITS", "Problem"]
@@ -46,7 +47,8 @@ class Problem:
     - with an emitter ``nozzle_path`` (d,) or (steps, d), where its opening is after each step [m], and ``flow_rate``
       [m3 / s];
     - in a scene with surface tension ``surface_tension`` [N / m];
-    - with a loss of images ``colours`` (phases, 3).
+    - with a loss of images ``colours`` (phases, 3);
+    - with forces of one's own, ``simulation.forces``, their parameters, such as ``drag.k``.
 
     What is not given is the scene's, as its schedule changes it. n counts fluid particles in the order in which the
     scene lists them.
@@ -209,7 +211,8 @@ class Problem:
         if estimator is not None:
             checked_adjoint(estimator)
         problem = self._batch_of(len(points))
-        over_time = {name for name in points[0] if name in OVER_TIME and np.ndim(points[0][name]) == 1}
+        known = self.simulation.known
+        over_time = {n for n in points[0] if n in known.over_time and np.ndim(points[0][n]) == known[n].rank}
         rows = [{name: [value] if name in over_time else value for name, value in point.items()} for point in points]
         values = {name: np.stack([np.asarray(row[name], dtype=np.float64) for row in rows]) for name in points[0]}
         found = Estimate(problem.value(values), {}) if estimator is None else estimator.estimate(problem, values)
@@ -228,8 +231,8 @@ class Problem:
     @property
     def fingerprint(self) -> str:
         """Which problem this is, part by part, in words and checksums: steps, precision, scene, first positions (which
-        may be in a file), free energy (by its name and curvature), ``fingerprint`` of the loss; for a loss without one
-        only its type is known."""
+        may be in a file), free energy (by its name and curvature), forces of one's own, ``fingerprint`` of the loss;
+        for a loss without one only its type is known."""
         simulation, energy = self.simulation, self.simulation.free_energy
         parts = {
             "scene": simulation.scene.computed_json().encode(),
@@ -238,7 +241,8 @@ class Problem:
         }
         checksums = [f"{name} {sha256(content).hexdigest()[:16]}" for name, content in parts.items()]
         energies = f"free energy {energy.name} {energy.curvature}"
-        return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies])
+        forces = [f"forces {text}"] if (text := forces_fingerprint(simulation.forces, simulation)) else []
+        return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies, *forces])
 
     def iterations(self) -> np.ndarray:
         """(steps,) pressure iterations of the last evaluation, of a solver with one loop; see `diagnostics`."""

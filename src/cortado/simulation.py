@@ -45,6 +45,7 @@ from cortado.shading.painter import colours_of, painter
 from cortado.solvers.build import first_capacity
 from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
+from cortado.sph.makers import ForceMaker, check_own, checked_makers, known_of
 from cortado.words import counted
 
 MOST_SUBSTEPS = 10_000
@@ -68,10 +69,12 @@ class Simulation:
         precision: str = "float32",
         free_energy: FreeEnergy | None = None,
         batch: int | None = None,
+        forces: Sequence[ForceMaker] = (),
     ):
         """``scene``: one, or the path of its file; ``device`` as Warp names it ("cpu", "cuda:0"), ``precision``
         "float32" or "float64"; ``free_energy`` replaces the one that the scene names. ``batch``: run so many of it in
-        one launch, each with parameters of its own; see `docs/batches.md`."""
+        one launch, each with parameters of its own; see `docs/batches.md`. ``forces``: forces of one's own, such as
+        `cortado.forces.Body`, which act besides the scene's; see `docs/own_parts.md`."""
         scene, self.batch = as_scene(scene), None if batch is None else whole_number("batch", batch, 1)
         start_warp()
         if free_energy is not None and not isinstance(free_energy, FreeEnergy):
@@ -80,6 +83,10 @@ class Simulation:
         if free_energy is not None and len(scene.phase) == 1:
             raise InputError("free_energy is given, but must be left out, as the scene has only one phase.")
         self.scene = scene
+        self.forces = checked_makers(forces)
+        """What makes the forces that are not the scene's."""
+        self.known = known_of(self.forces)
+        """Its parameters."""
         self.device = device_named(device)
         self.precision = precision_named(precision)
         begin_headers(sum_and_maximum_kernel(self.precision, self.device.is_cpu).kernel, self.device)
@@ -97,6 +104,7 @@ class Simulation:
         self.mass_fractions = np.eye(len(scene.phase))[discrete.fluid.phase]
         """(n, phases) first mass fractions [-]."""
         self.particles = len(self.positions)
+        check_own(self.known, self)
         self.free_energy = FREE_ENERGIES[scene.mixture.free_energy] if free_energy is None else free_energy
         self.smoothing = discrete.kernel
         self.walls = discrete.walls.positions
@@ -112,22 +120,27 @@ class Simulation:
         self.state.set(first if self.batch is None else {name: [a] * self.batch for name, a in first.items()})
         for array in (self.positions, self.velocities, self.mass_fractions, self.walls):
             array.setflags(write=False)
-        check_sizes(self.parameters(), self.precision)
+        check_sizes(self.parameters(), self.precision, self.known)
 
     def _built(self, discrete: DiscreteScene) -> Solver:
         kind = self.scene.solver.kind
         build = import_module(SOLVERS[kind]).build
         own = (self.scene, discrete, self.free_energy, self.precision, self.device)
-        if self.batch is None:
-            return build(*own)
-        if "batch" not in signature(build).parameters:
+        asked = {"batch": self.batch} if self.batch is not None else {}
+        if asked and "batch" not in signature(build).parameters:
             raise InputError(f'batch is {self.batch}, but must be left out, as solver.kind "{kind}" has no batches.')
-        return build(*own, batch=self.batch)
+        if self.forces and "makers" not in signature(build).parameters:
+            raise InputError(f'forces is given, but must be left out, as solver.kind "{kind}" takes no others.')
+        return build(*own, **asked, **({"makers": self.forces} if self.forces else {}))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled and copied as what it is made from."""
+        return _made_again, (self._made_of(self.precision.name, self.batch), self._points)
+
+    def _made_of(self, precision: str, batch: int | None) -> tuple[Any, ...]:
+        """What a simulation of the same scene is made from."""
         energy = self.free_energy if len(self.scene.phase) > 1 else None
-        return _made_again, (self.scene, self.device.alias, self.precision.name, energy, self.batch, self._points)
+        return self.scene, self.device.alias, precision, energy, batch, self.forces
 
     def __repr__(self) -> str:
         sizes = f"{counted(self.particles, 'particle')}, {counted(len(self.scene.phase), 'phase')}"
@@ -239,8 +252,11 @@ class Simulation:
 
     def batch_of(self, size: int) -> "Simulation":
         """The same scene so many times in one launch."""
-        energy = self.free_energy if len(self.scene.phase) > 1 else None
-        return Simulation(self.scene, self.device.alias, self.precision.name, energy, size)
+        return Simulation(*self._made_of(self.precision.name, size))
+
+    def in_precision(self, precision: str) -> "Simulation":
+        """A single one of the same scene, on the same device, in a precision."""
+        return Simulation(*self._made_of(precision, None))
 
     def room(self, steps: int, checkpoints: float) -> int:
         """How many runs of so many steps are worth one launch, and fit half of the memory that is free, with at most so
@@ -278,8 +294,8 @@ class Simulation:
         return painter(scene, frame.positions, self.device).image(frame.positions, colours)
 
     def parameters(self) -> dict[str, np.ndarray]:
-        """Every parameter of `Problem` as the scene has it, without what its schedule changes."""
-        return scene_values(self)
+        """Every parameter of `Problem` as the scene and forces have it, without what its schedule changes."""
+        return scene_values(self, self.known)
 
     def substeps(
         self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
@@ -308,11 +324,9 @@ class Simulation:
         return int(number)
 
 
-def _made_again(
-    scene: Scene, device: str, precision: str, free_energy: FreeEnergy | None, batch: int | None, points: str
-) -> Simulation:
+def _made_again(made_of: tuple[Any, ...], points: str) -> Simulation:
     """A simulation from what it was made from, first positions of the same checksum included."""
-    simulation = Simulation(scene, device, precision, free_energy, batch)
+    simulation = Simulation(*made_of)
     if simulation._points != points:
         raise InputError(
             "The first positions of a simulation are others than when it was pickled, but must be the same: the file "

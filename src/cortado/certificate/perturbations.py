@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from cortado.errors import InputError, shown
-from cortado.parameters.registry import BY_NAME, Axis, Range, Role
+from cortado.parameters.registry import BY_NAME, Axis, Parameter, Range, Role
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import Arrays, Values
 from cortado.problem import Problem
@@ -33,7 +33,7 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
         raise InputError(f"parameters is empty, but must have at least one of {known}.")
     found = ParameterSpace(simulation, problem.steps).checked({name: values[name] for name in parameters})
     for name, value in found.items():
-        if not _moves_both_ways(name, value):
+        if not _moves_both_ways(simulation.known[name], value):
             raise InputError(f"parameter {name} is 0, but must be greater than 0, so that it can be moved both ways.")
     return found
 
@@ -48,20 +48,21 @@ def everything(problem: Problem, chosen: Arrays) -> Arrays:
     values = {**ParameterSpace(problem.simulation, problem.steps).defaults(), **chosen}
     found = {}
     for name, value in values.items():
-        parameter = BY_NAME[name]
+        parameter = problem.simulation.known[name]
         over_time = parameter.axis is Axis.STEP
         idle = over_time and problem.steps == 0
         idle = idle or (name == "gravity" and "tilt" in chosen)
-        idle = idle or not _moves_both_ways(name, value)
+        idle = idle or not _moves_both_ways(parameter, value)
         if idle or not parameter.acts(problem.simulation, values):
             continue
-        found[name] = np.broadcast_to(value, (problem.steps, value.shape[-1])).copy() if over_time else value
+        row = value.shape[value.ndim - parameter.rank :]
+        found[name] = np.broadcast_to(value, (problem.steps, *row)).copy() if over_time else value
     return found
 
 
-def _moves_both_ways(name: str, value: np.ndarray) -> bool:
+def _moves_both_ways(parameter: Parameter, value: np.ndarray) -> bool:
     """Whether no number of a parameter is at the end of its range."""
-    return BY_NAME[name].range is not Range.NOT_NEGATIVE or bool((value > 0.0).all())
+    return parameter.range is not Range.NOT_NEGATIVE or bool((value > 0.0).all())
 
 
 def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION) -> Arrays:
@@ -69,8 +70,9 @@ def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION)
 
     It is a part of the parameter's value; of the spacing for positions, of the speed of a fall for velocities.
     """
+    known = problem.simulation.known
     return {
-        name: np.broadcast_to(perturbation * BY_NAME[name].change(problem.simulation, value), value.shape)
+        name: np.broadcast_to(perturbation * known[name].change(problem.simulation, value), value.shape)
         for name, value in values.items()
     }
 
@@ -92,12 +94,12 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
     x = x / (np.abs(x).max() or 1.0)
     found = directions(values, sizes, random)
     for name in found:
-        parameter = BY_NAME[name]
+        parameter = problem.simulation.known[name]
         if parameter.axis not in (Axis.STEP, Axis.PARTICLE):
             continue
-        columns = values[name].shape[-1]
+        columns = values[name].shape[values[name].ndim - parameter.rank :]
         field = random.standard_normal(columns)
         if parameter.role is Role.STATE:
-            field = field + x @ random.standard_normal((x.shape[1], columns))
+            field = field + x @ random.standard_normal((x.shape[1], *columns))
         found[name] = sizes[name] * field
     return found

@@ -32,8 +32,7 @@ def in_float64(problem: Problem) -> Problem:
     single = problem.simulation
     if single.precision == FLOAT64:
         return problem
-    energy = single.free_energy if len(single.scene.phase) > 1 else None
-    double = Simulation(single.scene, str(single.device), "float64", energy)
+    double = single.in_precision("float64")
     loss: Any = problem.loss
     if isinstance(loss, Frames):
         loss = Frames({step: _loss_in_float64(one, single) for step, one in loss.losses.items()})

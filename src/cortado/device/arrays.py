@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.precision import Precision
+from cortado.parameters.known import argument
 
 
 def padded(vectors: np.ndarray) -> np.ndarray:
@@ -39,9 +40,10 @@ class Arrays:
         return list(self._arrays.values())
 
     def named(self, suffix: str = "") -> dict[str, wp.array]:
-        """The arrays as kernels call their arguments: "_dot" behind the name of a tangent, "_bar" of an adjoint."""
+        """The arrays as kernels call their arguments, ``drag_k`` for ``drag.k``: "_dot" behind the name of a tangent,
+        "_bar" of an adjoint."""
         if suffix not in self._named:
-            self._named[suffix] = {name + suffix: array for name, array in self._arrays.items()}
+            self._named[suffix] = {argument(name) + suffix: array for name, array in self._arrays.items()}
         return self._named[suffix]
 
     def assign(self, other: Self) -> None:

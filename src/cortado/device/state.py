@@ -11,8 +11,8 @@ from cortado.device.arrays import Arrays, padded, zeros
 from cortado.device.fields import Entry, StateField
 from cortado.device.launching import TreeReduction, sum_of
 from cortado.device.precision import Precision
-from cortado.parameters.registry import BY_NAME, Axis, Role, names
-from cortado.parameters.values import OVER_TIME
+from cortado.parameters.known import REGISTRY, Known
+from cortado.parameters.registry import Axis
 
 
 class State(Arrays):
@@ -121,10 +121,10 @@ class StateSeries:
 
 
 class Parameters(Arrays):
-    """What steps depend on besides the state, by the names of the registry. Also the type of its derivatives.
+    """What steps depend on besides the state, by the names of parameters. Also the type of its derivatives.
 
-    A parameter over time is (members, steps) vectors, one of phases (members, phases) numbers, any other (members,)
-    numbers, with one member for each scene of a batch.
+    A parameter over time is (members, steps) vectors or numbers, one of phases (members, phases) numbers, any other
+    (members,) numbers or vectors, with one member for each scene of a batch.
     """
 
     def __init__(self, arrays: Mapping[str, wp.array]):
@@ -133,14 +133,14 @@ class Parameters(Arrays):
         """What `set` has written last, and need not write again."""
 
     def set(self, values: Mapping[str, Any]) -> None:
-        """Write some by name, the same for all members or with an axis of them: a vector (d,) for every step, or
-        vectors (steps, d); numbers or arrays of them. Nothing else may write to arrays that are set again."""
+        """Write some by name, the same for all members or with an axis of them: a vector (d,) or vectors
+        (steps, d); numbers or arrays of them. Nothing else may write to arrays that are set again."""
         for name, value in values.items():
             array, given = self[name], np.array(value, dtype=np.float64)
             if name in self._written and np.array_equal(self._written[name], given):
                 continue
             self._written[name] = given
-            if name in OVER_TIME:
+            if hasattr(array.dtype, "_shape_"):
                 table = np.zeros((*array.shape, 3))
                 table[..., : given.shape[-1]] = given
                 array.assign(table)
@@ -160,6 +160,8 @@ class Layout:
     device: Any
     batch: int | None = None
     """How many scenes; None for a single one, whose arrays have no axis for it."""
+    known: Known = REGISTRY
+    """Their parameters."""
 
     @property
     def members(self) -> int:
@@ -191,6 +193,7 @@ class Layout:
     def parameters(self, steps: int, requires_grad: bool = False) -> Parameters:
         """Parameters of a run of so many steps, all 0."""
         real, vector, members = self.precision.real, self.precision.vector, self.members
-        of_axis = {Axis.STEP: ((members, max(steps, 1)), vector), Axis.PHASE: ((members, self.phases), real)}
-        kinds = {name: of_axis.get(BY_NAME[name].axis, (members, real)) for name in names(Role.RUN)}
+        sizes: dict[Axis, Any] = {Axis.STEP: (members, max(steps, 1)), Axis.PHASE: (members, self.phases)}
+        used = [self.known[name] for name in self.known.run]
+        kinds = {p.name: (sizes.get(p.axis, members), vector if p.rank else real) for p in used}
         return Parameters(zeros(kinds, self.device, requires_grad))

@@ -146,7 +146,7 @@ class Transformed:
         require_methods("problem", problem, ("value", "forward_pass"), "a cortado.Problem")
         require_table("coordinates", coordinates, "{'viscosity': Logarithm()}")
         for name, bijector in coordinates.items():
-            check_known(name, problem.simulation.scene)
+            check_known(name, problem.simulation.scene, known=problem.simulation.known)
             wanted = "an object such as Logarithm()"
             require_methods(f"the coordinate of {name}", bijector, ("parameter", "coordinate", "adjoint"), wanted)
         self.problem, self.coordinates = problem, FixedDict(coordinates)

@@ -8,7 +8,8 @@ import numpy as np
 from cortado.device.precision import Precision
 from cortado.errors import InputError
 from cortado.lattice.region import TOLERANCE
-from cortado.parameters.registry import BY_NAME, Range
+from cortado.parameters.known import Known
+from cortado.parameters.registry import Range
 from cortado.parameters.values import Arrays
 from cortado.scene.scene import Scene
 from cortado.scene.stability import broken_limits
@@ -17,14 +18,14 @@ CROWDED = 0.5
 """Of the room that their fluid fills: particles with less for all of them cannot be pushed apart."""
 
 
-def check_sizes(values: Arrays, precision: Precision) -> None:
+def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
     """Numbers are no larger than the precision bears, nor smaller where they must be positive; raises `InputError`."""
     for name, value in values.items():
         size = np.abs(value)
         if size.max(initial=0.0) > precision.greatest:
             wanted = f"at most {precision.greatest:g} in {precision.name}"
             raise InputError(f"parameter {name} has a value of size {size.max():g}, but must be {wanted}.")
-        if BY_NAME[name].range is Range.POSITIVE and size.min(initial=1.0) < 1.0 / precision.greatest:
+        if known[name].range is Range.POSITIVE and size.min(initial=1.0) < 1.0 / precision.greatest:
             wanted = f"at least {1.0 / precision.greatest:g} in {precision.name}"
             raise InputError(f"parameter {name} is {size.min():g}, but must be {wanted}.")
 

@@ -30,6 +30,7 @@ class Role(Enum):
     STATE = "part of the first state"
     VIEW = "another way to write a parameter"
     LOSS = "what only losses depend on"
+    CLOCK = "when steps are, which nobody gives"
 
 
 class Range(Enum):
@@ -48,6 +49,16 @@ class Source(Protocol):
     positions: NDArray
     velocities: NDArray
     mass_fractions: NDArray
+
+
+class Changing(Protocol):
+    """How a parameter changes while a scene runs, at times (n,) [s]."""
+
+    def at(self, times: NDArray) -> NDArray:
+        """(n,) numbers or (n, components)."""
+
+    def rates(self, times: NDArray) -> NDArray:
+        """The derivatives with respect to time, of the same shape."""
 
 
 Limit = Callable[[Any, Mapping[str, Any]], float]
@@ -86,6 +97,13 @@ class Parameter:
     """The largest at which an optional force is likely to be stable."""
     moment: float = 0.5
     """Of a parameter over time: when within a step its row is taken from a schedule; 0 is the start, 1 the end."""
+    course: Changing | None = None
+    """How one over time, of a force of one's own, changes where it is not given."""
+
+    @property
+    def rank(self) -> int:
+        """How many axes the value has for one step, one phase or one particle: 1 of a vector."""
+        return 0 if self.components is None else 1
 
     def shapes(self, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:
         """The shapes that its values may have, () for a number, where positions are (n, d)."""

@@ -14,18 +14,17 @@ from cortado.device.state import State
 from cortado.discretise.discrete_scene import Lattice
 from cortado.errors import InputError
 from cortado.lattice.smoothing import SmoothingKernel
+from cortado.parameters.known import Known
 from cortado.parameters.reference_density import (
     reference_density,
     reference_density_adjoint,
     reference_density_tangent,
 )
-from cortado.parameters.registry import BY_NAME, Axis, Role, Source, names
+from cortado.parameters.registry import Axis, Changing, Source
 from cortado.parameters.tilt import Tilt
-from cortado.parameters.values import OVER_TIME, Arrays, scene_values
+from cortado.parameters.values import Arrays, scene_values
 from cortado.restart import Clock
-from cortado.scene.schedule import Course
 
-RUN = names(Role.RUN)
 DENSITY = "reference_density"
 """The field of a state that the first mass fractions and the rest densities decide."""
 COMPOSITION = ("mass_fractions", "rest_density")
@@ -36,6 +35,8 @@ class Simulated(Source, Protocol):
 
     state: State
     """The first, on the device."""
+    known: Known
+    """Its parameters."""
     batch: int | None
     """How many scenes there are in one launch; None for a single one."""
 
@@ -67,24 +68,24 @@ class SceneParameters:
     """The parameters of one scene over a number of steps."""
 
     def __init__(self, simulation: Simulated, steps: int):
-        self._simulation, self._steps = simulation, steps
-        absent = {name: np.zeros(self.shapes(name)[0]) for name in RUN}
-        self.values: Arrays = absent | scene_values(simulation)
+        self._simulation, self._steps, self._known = simulation, steps, simulation.known
+        absent = {name: np.zeros(self.shapes(name)[0]) for name in self._known.run}
+        self.values: Arrays = absent | scene_values(simulation, self._known)
         """As the scene has them."""
 
     def shapes(self, name: str) -> list[tuple[int, ...]]:
         """The shapes that a parameter may have; () is a number."""
         simulation = self._simulation
-        return BY_NAME[name].shapes(self._steps, len(simulation.scene.phase), simulation.positions.shape)
+        return self._known[name].shapes(self._steps, len(simulation.scene.phase), simulation.positions.shape)
 
     def upright(self, values: Arrays) -> Arrays:
         """The values, with gravity in the place of a tilt."""
         return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values
 
-    def _courses(self, values: Arrays) -> dict[str, Course]:
-        """Those of the schedule that act: a gravity or a tilt that is given replaces either."""
+    def _courses(self, values: Arrays) -> dict[str, Changing]:
+        """Those of the schedule, and of forces, that act: a gravity or a tilt that is given replaces either."""
         replaced = {"gravity", "tilt"} if not values.keys().isdisjoint(("gravity", "tilt")) else set()
-        courses = self._simulation.scene.schedule.courses
+        courses = {**self._simulation.scene.schedule.courses, **self._known.courses}
         return {name: course for name, course in courses.items() if name not in values and name not in replaced}
 
     def _times(self, name: str, values: Arrays, clock: Clock | None = None) -> NDArray:
@@ -94,14 +95,15 @@ class SceneParameters:
 
     def _moments(self, name: str) -> NDArray:
         """(steps,) the same in steps."""
-        return np.arange(max(self._steps, 1)) + BY_NAME[name].moment
+        return np.arange(max(self._steps, 1)) + self._known[name].moment
 
     def _scheduled_rates(self, values: Arrays) -> Arrays:
-        """(steps, d) the derivatives of `scheduled` with respect to the time step."""
+        """The derivatives of `scheduled` with respect to the time step, with a row for each step."""
         found = {}
         for name, course in self._courses(values).items():
             times = self._times(name, values)
-            rates = course.rates(times) * self._moments(name)[:, None]
+            moments = self._moments(name)
+            rates = course.rates(times) * (moments[:, None] if self._known[name].rank else moments)
             if name == "tilt":
                 found["gravity"] = self._tilt.tangent(course.at(times), rates)
             else:
@@ -112,16 +114,18 @@ class SceneParameters:
         """What the scene's schedule says of the steps after a clock, with a row for each, in the place of what is not
         among the ``values``: gravity, also where it is a tilt that is scheduled, and the nozzle's path."""
         rows = {name: course.at(self._times(name, values, clock)) for name, course in self._courses(values).items()}
-        return {name: value for name, value in self.upright(rows).items() if name in RUN}
+        return {name: value for name, value in self.upright(rows).items() if name in self._known.run}
 
     def run(self, values: Arrays) -> Arrays:
         """What steps depend on, by the upright ``values``, and the scene's for what is not among them: parameters over
-        time as (steps, d), those of phases as (phases,), others as numbers ()."""
-        found = {name: values.get(name, self.values[name]) for name in RUN}
+        time with a row for each step, those of phases as (phases,), others as they are."""
+        known = self._known
+        found = {name: values.get(name, self.values[name]) for name in known.run}
         for name, value in found.items():
-            if name in OVER_TIME:
-                found[name] = np.broadcast_to(value, (max(self._steps, 1), value.shape[-1]))
-            elif BY_NAME[name].axis is Axis.PHASE:
+            if known[name].axis is Axis.STEP:
+                row = value.shape[value.ndim - known[name].rank :]
+                found[name] = np.broadcast_to(value, (max(self._steps, 1), *row))
+            elif known[name].axis is Axis.PHASE:
                 found[name] = np.atleast_1d(value)
         return found
 
@@ -167,7 +171,7 @@ class SceneParameters:
     def gradient(self, values: Arrays, first: Arrays, run: Arrays) -> Arrays:
         """From the adjoints of the fields of the first state and of what steps depend on to those of ``values``, in
         their shapes."""
-        found = {name: run[name].copy() for name in RUN if name in values}
+        found = {name: run[name].copy() for name in self._known.run if name in values}
         for field in self._simulation.state.fields:
             if field.first in values:
                 if field.first in found:
@@ -179,8 +183,8 @@ class SceneParameters:
         if "time_step" in values:
             later = sum(float((run[name] * rate).sum()) for name, rate in self._scheduled_rates(values).items())
             found["time_step"] = found["time_step"] + later
-        for name in OVER_TIME:
-            if name in values and values[name].ndim == 1:
+        for name in self._known.over_time:
+            if name in values and values[name].ndim == self._known[name].rank:
                 found[name] = found[name].sum(axis=0)
         if not values.keys().isdisjoint(COMPOSITION):
             bars = reference_density_adjoint(*self._composition(values), first[DENSITY])

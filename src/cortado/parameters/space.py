@@ -11,10 +11,11 @@ from cortado.device.threads import WARP
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.parameters.checks import check_places, check_sizes, unstable_sentence
 from cortado.parameters.first_positions import FirstPositions
+from cortado.parameters.known import TIME
 from cortado.parameters.registry import Role, names
 from cortado.parameters.restarts import check_state, origin_of
-from cortado.parameters.scene_parameters import DENSITY, RUN, SceneParameters, Simulated
-from cortado.parameters.values import OVER_TIME, Arrays, Values, check_known, checked_value, scene_values
+from cortado.parameters.scene_parameters import DENSITY, SceneParameters, Simulated
+from cortado.parameters.values import Arrays, Values, check_known, checked_value, scene_values
 from cortado.restart import Clock, Origin, RestartState
 from cortado.rollout import Rollout
 from cortado.scene.stability import divergence_advice
@@ -30,6 +31,7 @@ class ParameterSpace:
 
     def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._batch, self._steps = simulation, simulation.batch, steps
+        self._known = simulation.known
         self._one = SceneParameters(simulation, steps)
         self._first_positions = FirstPositions(simulation)
         self._told: set[str] = set()
@@ -43,7 +45,7 @@ class ParameterSpace:
             raise InputError(f"{what} gravity is given, but must be left out, as the tilt says where it points.")
         found = {name: self._checked(name, value, what) for name, value in values.items()}
         if what != "direction":
-            check_sizes(found, self._simulation.precision)
+            check_sizes(found, self._simulation.precision, self._known)
             for number, own in enumerate(self._different(found)):
                 self._check(own, number)
         return found
@@ -55,8 +57,9 @@ class ParameterSpace:
 
     def defaults(self) -> Arrays:
         """Every parameter that the scene has, as runs of so many steps take it where it is not given: parameters that
-        the scene's schedule changes with a row for each step, others as `Simulation.parameters` has them."""
-        return {**scene_values(self._simulation), **self._one.scheduled({})}
+        the scene's schedule or a force changes with a row for each step, others as `Simulation.parameters` has them."""
+        found = {**scene_values(self._simulation, self._known), **self._one.scheduled({})}
+        return {name: value for name, value in found.items() if name != TIME.name}
 
     def colours(self, values: Arrays) -> np.ndarray:
         """(phases, 3) the colours of the phases in one scene."""
@@ -78,7 +81,7 @@ class ParameterSpace:
         rollout.initial.assign(simulation.state)
         firsts = [dict(state.fields) for state in states] or [self._one.first(own) for own in members]
         rollout.initial.set(self._together(firsts))
-        if simulation.scene.schedule.courses and len(members) < len(rollout.clocks):
+        if (simulation.scene.schedule.courses or self._known.courses) and len(members) < len(rollout.clocks):
             members = members * len(rollout.clocks)  # each at its own time
         clocks = rollout.clocks if len(members) > 1 else rollout.clocks[:1]
         chosen = [
@@ -136,9 +139,9 @@ class ParameterSpace:
         each has a first axis with an entry for each scene, whether or not the value has one."""
         dimension = self._simulation.dimension
         read = {"gravity" if name == "tilt" else name for name in values}
-        read |= set(OVER_TIME) if "time_step" in values else set()
-        run = {name: parameters[name].numpy().astype(np.float64) for name in RUN if name in read}
-        run |= {name: run[name][..., :dimension] for name in OVER_TIME if name in run}
+        read |= set(self._known.over_time) if "time_step" in values else set()
+        run = {name: parameters[name].numpy().astype(np.float64) for name in self._known.run if name in read}
+        run |= {name: run[name][..., :dimension] for name in self._known.vectors if name in run}
         fields = [f.name for f in state.fields if f.first in values or f.name == DENSITY]
         first = {name: bar.astype(np.float64) for name, bar in state.numpy(dimension, only=fields).items()}
         if self._batch is None:
@@ -148,9 +151,9 @@ class ParameterSpace:
         return {name: bar.reshape(self._batch, *self._row(name, values[name])) for name, bar in found.items()}
 
     def _checked(self, name: str, value: Any, what: str) -> np.ndarray:
-        check_known(name, self._simulation.scene, what)
+        check_known(name, self._simulation.scene, what, self._known)
         own = self._one.shapes(name)
-        array = checked_value(name, value, [*own, *self._batched(own)], what)
+        array = checked_value(name, value, [*own, *self._batched(own)], what, self._known)
         if len(own) == 2 and array.shape == own[1] and self._batch == self._steps > 1:
             rows, *rest = own[1]
             raise InputError(

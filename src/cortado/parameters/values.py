@@ -10,6 +10,7 @@ import numpy as np
 
 from cortado.arrays import as_numbers, require_table
 from cortado.errors import InputError, shown
+from cortado.parameters.known import REGISTRY, Known
 from cortado.parameters.registry import BY_NAME, Axis, Range, Role, Source, names
 
 Values = Mapping[str, Any]
@@ -25,24 +26,24 @@ SUM_TOLERANCE = 0.01
 """How far the mass fractions of a particle may add up to something else than 1: differences need some room."""
 
 
-def scene_values(source: Source) -> Arrays:
-    """Every parameter that a scene has, as it has it, in the shape that a user would write; without a tilt, which is
-    another way to write gravity."""
+def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
+    """Every parameter of the ``known`` that a scene has, as it has it, in the shape that a user would write; without a
+    tilt, which is another way to write gravity."""
     phases, positions = len(source.scene.phase), source.positions.shape
     found = {}
-    for name, parameter in BY_NAME.items():
-        if parameter.present(source.scene) and parameter.role is not Role.VIEW:
+    for name, parameter in known.items():
+        if parameter.present(source.scene) and parameter.role not in (Role.VIEW, Role.CLOCK):
             shape = parameter.shapes(0, phases, positions)[0]
             found[name] = np.asarray(parameter.value(source), dtype=np.float64).reshape(shape)
     return found
 
 
-def check_known(name: str, scene: Any, what: str = "parameter") -> None:
+def check_known(name: str, scene: Any, what: str = "parameter", known: Known = REGISTRY) -> None:
     """Whether there is such a parameter, and a scene has it; raises `InputError`."""
-    if name not in BY_NAME:
-        present = [known for known, parameter in BY_NAME.items() if parameter.present(scene)]
+    if name not in known or known[name].role is Role.CLOCK:
+        present = [p.name for p in known.values() if p.present(scene) and p.role is not Role.CLOCK]
         raise InputError(f"{what} {name!r} is unknown, but must be one of {', '.join(present)} in this scene.")
-    parameter = BY_NAME[name]
+    parameter = known[name]
     if not parameter.present(scene):
         raise InputError(f"{what} {name} is given, but must be left out, as the scene {parameter.absent}.")
 
@@ -62,10 +63,12 @@ def is_too_small(array: np.ndarray, allowed: Range) -> bool:
     return allowed is Range.NOT_NEGATIVE and bool((array < 0.0).any())
 
 
-def checked_value(name: str, value: Any, shapes: list[tuple[int, ...]], what: str = "parameter") -> np.ndarray:
+def checked_value(
+    name: str, value: Any, shapes: list[tuple[int, ...]], what: str = "parameter", known: Known = REGISTRY
+) -> np.ndarray:
     """A value as a float64 array of one of the shapes, finite and in range, or an `InputError` in a sentence. A
     ``what`` of "direction" may be negative."""
-    array, parameter = as_numbers(f"{what} {name}", value), BY_NAME[name]
+    array, parameter = as_numbers(f"{what} {name}", value), known[name]
     unit = f" in {parameter.unit}" if parameter.unit else ""
     if array.shape not in shapes:
         raise InputError(f"{what} {name} has shape {array.shape}, but must be {' or '.join(map(str, shapes))}{unit}.")

@@ -1,5 +1,6 @@
 """What any solver of a scene is made of: neighbours, forces, phases, nozzle, and where particles may go."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
 from typing import Any
@@ -24,6 +25,7 @@ from cortado.solvers.particles import ParticleSystem
 from cortado.sph.diffusion import Diffusion
 from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy
+from cortado.sph.makers import ForceMaker, known_of
 from cortado.sph.mixture import Phases
 from cortado.sph.parts import Force, Setting
 
@@ -41,9 +43,11 @@ def particle_system(
     precision: Precision,
     device: Any,
     batch: int | None = None,
+    makers: Sequence[ForceMaker] = (),
 ) -> ParticleSystem:
-    """A scene that is cut into particles, on a device; ``batch`` of it in one launch."""
-    layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, batch)
+    """A scene that is cut into particles, on a device; ``batch`` of it in one launch. ``makers`` make forces that are
+    not the scene's."""
+    layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, batch, known_of(makers))
     shared = Discretisation(discrete.kernel, precision, lanes_for(layout.particles, device), any(discrete.periods))
     search = _search(scene, discrete, shared, layout)
 
@@ -54,7 +58,7 @@ def particle_system(
             layout,
             discrete.lattice,
             search,
-            _forces(scene, discrete, discretisation, layout),
+            _forces(scene, discrete, discretisation, layout, makers),
             [*discrete.periods, *[0.0] * (3 - scene.dimension)],
             _phases(scene, discretisation, free_energy),
             _nozzle(scene, discrete),
@@ -80,11 +84,13 @@ def _search(scene: Scene, discrete: DiscreteScene, discretisation: Discretisatio
     return NeighbourSearch(discretisation, grid, padded(walls.positions), walls.weights, layout, room)
 
 
-def _forces(scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, layout: Layout) -> list[Force]:
-    """Those of the parameters that the scene has, in the order of the registry."""
+def _forces(
+    scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, layout: Layout, makers: Sequence[ForceMaker]
+) -> list[Force]:
+    """Those of the parameters that the scene has, in the order of the registry, and then those of the makers."""
     setting = Setting(scene, discretisation, discrete.lattice, discrete.wall_layers, layout)
     modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene)]
-    found = [import_module(name).force(setting) for name in modules]
+    found = [maker.force(setting) for maker in (*map(import_module, modules), *makers)]
     forces = [force for force in found if force is not None]
     for force in forces:
         if layout.batch is not None and not getattr(force, "batches", False):

@@ -17,7 +17,8 @@ from cortado.device.neighbourhood import Discretisation
 from cortado.device.state import Layout, Parameters
 from cortado.discretise.discrete_scene import Lattice
 from cortado.discretise.walls.layers import WallLayers
-from cortado.parameters.registry import BY_NAME, PARAMETERS, Axis, Role
+from cortado.parameters.known import argument
+from cortado.parameters.registry import Axis
 from cortado.scene.scene import Scene
 
 
@@ -72,12 +73,16 @@ class Tangents:
 
 class Shares(Arrays):
     """The adjoints of parameters in which every particle has a share, kept particle by particle until they are added
-    up: (n,) numbers, of a parameter of phases (n,) of one for each phase."""
+    up: (n,) numbers or vectors, of a parameter of phases (n,) of one for each phase."""
 
     def __init__(self, names: Iterable[str], layout: Layout):
         """Of the parameters of these names, all 0. Raises `TypeError` for what cannot be shared."""
-        dtypes = {Axis.SCALAR: layout.precision.real, Axis.PHASE: layout.precision.fractions(layout.phases)}
-        known = {p.name: dtypes[p.axis] for p in PARAMETERS if p.role is Role.RUN and p.axis in dtypes}
+        precision, self.known = layout.precision, layout.known
+        """Of which parameters some are shared."""
+        of_phases = precision.fractions(layout.phases)
+        dtypes = {Axis.SCALAR: (precision.real, precision.vector), Axis.PHASE: (of_phases, of_phases)}
+        used = [self.known[name] for name in self.known.run]
+        known = {p.name: dtypes[p.axis][p.rank] for p in used if p.axis in dtypes}
         kinds = {}
         for name in names:
             if name not in known:
@@ -105,9 +110,8 @@ class Adjoints:
     def named(self) -> tuple[Named, ...]:
         """For kernels: ``x_bar`` and so on; the sums, (members, steps), of parameters over time; and particles' shares,
         of those parameters alone that a part names among its ``shares``."""
-        whole = {
-            f"{name}_bar": self.parameters[name] for name in self.parameters.names if BY_NAME[name].axis is Axis.STEP
-        }
+        over_time = [name for name in self.parameters.names if self.shares.known[name].axis is Axis.STEP]
+        whole = {f"{argument(name)}_bar": self.parameters[name] for name in over_time}
         return self.fields.named("_bar"), self.shares.named("_bar"), whole
 
 

@@ -1,5 +1,6 @@
 """The PCISPH solver of a scene."""
 
+from collections.abc import Sequence
 from math import inf
 from typing import Any
 
@@ -11,6 +12,7 @@ from cortado.solvers.loop import LoopLimits
 from cortado.solvers.pcisph.solver import Pcisph
 from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FreeEnergy
+from cortado.sph.makers import ForceMaker
 
 
 def build(
@@ -20,9 +22,12 @@ def build(
     precision: Precision,
     device: Any,
     batch: int | None = None,
+    makers: Sequence[ForceMaker] = (),
 ) -> Solver:
-    """The solver of a scene that is cut into particles, on a device; ``batch`` of it in one launch."""
-    return Pcisph(particle_system(scene, discrete, free_energy, precision, device, batch), pressure_limits(scene))
+    """The solver of a scene that is cut into particles, on a device; ``batch`` of it in one launch, with the forces of
+    ``makers`` besides the scene's."""
+    system = particle_system(scene, discrete, free_energy, precision, device, batch, makers)
+    return Pcisph(system, pressure_limits(scene))
 
 
 def pressure_limits(scene: Scene) -> LoopLimits | None:

@@ -1,0 +1,135 @@
+"""A force on each particle that is one function of a user's: a_i = f(x_i, v_i, t, theta) [m/s2].
+
+Its adjoint is Warp's own of the product f . a_bar; its tangent is put together of the gradients of its components, so
+that both are exact.
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.kernels import Kernels
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type
+from cortado.device.precision import Precision
+from cortado.sph.formula import Formula
+from cortado.sph.own_force import OwnForce, topic
+from cortado.sph.packed import theta_of
+
+
+@cache
+def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int, ...]) -> Kernels:
+    """Of a function whose parameters are numbers (rank 0) and vectors (rank 1). ``plane`` is 0 along an axis that a
+    scene in 2-D does not have."""
+    vector = discretisation.precision.vector
+    theta_type = theta_of(discretisation.precision, ranks)
+    neighbourhood = neighbourhood_type(discretisation.precision)
+    name = topic("body", text, ranks)
+    module = discretisation.module(True, name)
+    tangent_module, adjoint_module = discretisation.tangent_module(name), discretisation.module(False, name)
+    force = applied(text, discretisation.precision, ranks, module)
+    work_tangent = work_of(text, discretisation.precision, ranks, tangent_module)
+    work = work_of(text, discretisation.precision, ranks, adjoint_module)
+
+    @wp.kernel(module=module)
+    def body(
+        s: neighbourhood,
+        plane: vector,
+        theta: wp.array(dtype=theta_type),
+        x: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
+        acceleration_in: wp.array(dtype=vector),
+        # out
+        acceleration: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid()
+        acceleration[i] = acceleration_in[i] + wp.cw_mul(plane, force(x[i], v[i], theta[i // s.particles]))
+
+    @wp.kernel(module=tangent_module, enable_backward=False)
+    def body_tangent(
+        s: neighbourhood,
+        plane: vector,
+        theta: wp.array(dtype=theta_type),
+        theta_dot: wp.array(dtype=theta_type),
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
+        v_dot: wp.array(dtype=vector),
+        acceleration_in_dot: wp.array(dtype=vector),
+        # out
+        acceleration_dot: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid()
+        member = i // s.particles
+        change = vector()
+        for axis in range(3):
+            along = vector()
+            along[axis] = plane[axis]
+            x_bar, v_bar, theta_bar, _bar_bar = wp.grad(work_tangent)(x[i], v[i], theta[member], along)
+            change[axis] = wp.dot(x_bar, x_dot[i]) + wp.dot(v_bar, v_dot[i]) + wp.dot(theta_bar, theta_dot[member])
+        acceleration_dot[i] = acceleration_in_dot[i] + change
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def body_adjoint(
+        s: neighbourhood,
+        plane: vector,
+        theta: wp.array(dtype=theta_type),
+        x: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
+        acceleration_bar: wp.array(dtype=vector),
+        # in and out
+        x_bar: wp.array(dtype=vector),
+        v_bar: wp.array(dtype=vector),
+        # out
+        theta_bar: wp.array(dtype=theta_type),
+    ):
+        i = s.first + wp.tid()
+        bar = wp.cw_mul(plane, acceleration_bar[i])
+        own_x_bar, own_v_bar, own_theta_bar, _bar_bar = wp.grad(work)(x[i], v[i], theta[i // s.particles], bar)
+        x_bar[i] = x_bar[i] + own_x_bar
+        v_bar[i] = v_bar[i] + own_v_bar
+        theta_bar[i] = own_theta_bar
+
+    return Kernels(body, body_tangent, body_adjoint)
+
+
+def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], module: Any) -> Any:
+    """The Warp function of two vectors and theta that a user's function is."""
+    timed = len(text.inputs) == 3
+    types = tuple(precision.vector if rank else precision.real for rank in ranks[timed:])
+    terms, first = [], 0
+    for rank in ranks:
+        at = ", ".join(f"theta[{first + k}]" for k in range(3 if rank else 1))
+        terms.append(f"vector({at})" if rank else at)
+        first += 3 if rank else 1
+    source = f"def applied(x: vector, v: vector, theta: numbers):\n    return own({', '.join(['x', 'v', *terms])})\n"
+    scope = {
+        "vector": precision.vector,
+        "numbers": theta_of(precision, ranks),
+        "own": text.function(precision, types, module),
+    }
+    exec(source, scope)
+    made: Any = scope["applied"]
+    return wp.Function(func=made, key="applied", namespace="", module=module, source=source)
+
+
+def work_of(text: Formula, precision: Precision, ranks: tuple[int, ...], module: Any) -> Any:
+    """The Warp function f . bar, whose gradient a user's function f is differentiated by."""
+    vector, theta_type = precision.vector, theta_of(precision, ranks)
+    force = applied(text, precision, ranks, module)
+
+    @wp.func(module=module)
+    def work(x: vector, v: vector, theta: theta_type, bar: vector):
+        return wp.dot(force(x, v, theta), bar)
+
+    return work
+
+
+class Body(OwnForce):
+    """A force on each particle: ``function(x, v, t, ...)`` returns its acceleration [m/s2], as gravity is one, from the
+    position [m], the velocity [m/s] and the time [s] of the particle; time may be left out."""
+
+    kind = "Body"
+
+    def kernels(self, discretisation: Discretisation) -> Kernels:
+        return body_kernels(discretisation, self._formula, tuple(p.rank for p in self.parameters))

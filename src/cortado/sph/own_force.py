@@ -1,0 +1,191 @@
+"""What forces that are one function of a user's have in common: its text, its parameters, how they are made."""
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from hashlib import sha256
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from cortado.arrays import read_only
+from cortado.device.kernels import Kernels
+from cortado.device.neighbourhood import Discretisation
+from cortado.errors import InputError, shown
+from cortado.fixed import fixed
+from cortado.parameters.known import TIME
+from cortado.parameters.registry import Axis, Parameter, Source
+from cortado.scene.schedule import Course
+from cortado.sph.formula import Formula, compiled, formula, keep_source, plain_function, source_of
+from cortado.sph.packed import Packed
+from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
+
+
+class OverTime:
+    """A parameter of a force that changes while a scene runs: linear between the times, constant before the first and
+    after the last. Its row of a step is that at the middle of the step; a search may have a row for each step."""
+
+    def __init__(self, times: Any, values: Any):
+        """``times`` (k,) [s], each greater than the one before; ``values`` (k,) or (k, d)."""
+        self.times, self.values = read_only("OverTime times", times), read_only("OverTime values", values)
+        if self.times.ndim != 1 or not self.times.size or not np.isfinite(self.times).all():
+            raise InputError(f"OverTime times are {shown(times)}, but must be a list of finite times [s].")
+        if (np.diff(self.times) <= 0.0).any():
+            raise InputError(f"OverTime times are {shown(times)}, but each must be greater than the one before.")
+        if self.values.ndim not in (1, 2) or len(self.values) != len(self.times):
+            wanted = f"({len(self.times)},) or ({len(self.times)}, d), with a row for each of the times"
+            raise InputError(f"OverTime values have shape {self.values.shape}, but must be {wanted}.")
+        if not np.isfinite(self.values).all():
+            raise InputError("OverTime values have one that is not finite, but must be numbers.")
+        rows = self.values.reshape(len(self.times), -1)
+        self._course = Course.model_construct(times=tuple(self.times), values=tuple(map(tuple, rows)))
+
+    def __repr__(self) -> str:
+        return f"OverTime({self.times.tolist()}, {self.values.tolist()})"
+
+    def at(self, times: np.ndarray) -> np.ndarray:
+        """At times (n,) [s]."""
+        return self._course.at(times).reshape(-1, *self.values.shape[1:])
+
+    def rates(self, times: np.ndarray) -> np.ndarray:
+        """The derivative with respect to time at times (n,) [s]."""
+        return self._course.rates(times).reshape(-1, *self.values.shape[1:])
+
+
+@fixed
+class OwnForce:
+    """A force that is one function of a user's, given to `Simulation`; see `cortado.forces`."""
+
+    kind: ClassVar[str]
+    """What sentences call it."""
+
+    def __init__(self, function: Callable[..., Any], /, name: str | None = None, **parameters: Any):
+        """``function``: made by ``def``; ``parameters``: a value for each of its arguments but the first ones, a
+        number, a vector (d,) or an `OverTime`. Their names are ``name.k`` of an argument ``k``; by default the name is
+        that of the function. Raises `InputError`."""
+        self._function = plain_function(self.kind, function)
+        self._source = source_of(self.kind, self._function)
+        self._formula, values = formula(self.kind, self._function, self._source, parameters)
+        self.name = self._formula.name if name is None else name
+        if not isinstance(self.name, str) or not self.name.isidentifier():
+            raise InputError(f"{self.kind} has the name {shown(name)}, but must have a word, as names of Python are.")
+        self._values = {argument: self._value(argument, value) for argument, value in values.items()}
+        own = tuple(self._parameter(argument, value) for argument, value in self._values.items())
+        self.parameters = ((TIME,) if len(self._formula.inputs) == 3 else ()) + own
+        """Those of the function, in its order, behind time if it takes that."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled as what it is made from, with the text of the function."""
+        return _made_again, (type(self), self._function, self._source, self.name, self._values)
+
+    def __repr__(self) -> str:
+        values = "".join(f", {argument}={shown(value)}" for argument, value in self._values.items())
+        return f"{type(self).__name__}({self.name}{values})"
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the function's text, and of those that it calls."""
+        courses = [repr(value) for value in self._values.values() if isinstance(value, OverTime)]
+        words = (self.kind, self.name, self._formula.text, *self._formula.outside, *courses)
+        return sha256("\n".join(words).encode()).hexdigest()
+
+    def _value(self, argument: str, value: Any) -> Any:
+        """As it is kept."""
+        if isinstance(value, OverTime):
+            return value
+        what = f"parameter {self.name}.{argument}"
+        array = read_only(what, value)
+        if array.ndim > 1:
+            wanted = "a number, a vector (d,), or cortado.forces.OverTime(times, values)"
+            raise InputError(f"{what} has shape {array.shape}, but must be {wanted}.")
+        return array
+
+    def _parameter(self, argument: str, value: Any) -> Parameter:
+        course = value if isinstance(value, OverTime) else None
+        first = value if course is None else course.values[0]
+        return Parameter(
+            f"{self.name}.{argument}",
+            "",
+            f"{argument} of the force {self.name}",
+            Axis.STEP if course else Axis.SCALAR,
+            lambda source: first,
+            components=_dimension if first.ndim else None,
+            change=_length if first.ndim else _size,
+            course=course,
+        )
+
+    def kernels(self, discretisation: Discretisation) -> Kernels:
+        """Of the force, in a precision."""
+        raise NotImplementedError
+
+    def force(self, setting: Setting) -> "FunctionForce":
+        """The force in a solver; raises `InputError` for a function that Warp cannot compile."""
+        kernels = self.kernels(setting.discretisation)
+        made = FunctionForce(f"{self.kind} function {self._formula.name}", kernels, self.parameters, setting)
+        made.compile(kernels.forward)
+        return made
+
+
+class FunctionForce:
+    """Such a force in one solver."""
+
+    shares: tuple[str, ...] = ()
+    batches = True
+
+    def __init__(self, what: str, kernels: Kernels, parameters: tuple[Parameter, ...], setting: Setting):
+        self._what, self._kernels, self._device = what, kernels, setting.layout.device
+        self._packed = Packed(parameters, setting.layout, setting.discretisation.taped)
+        flat = setting.scene.dimension == 2
+        self._constants = {"plane": setting.layout.precision.vector(1.0, 1.0, 0.0 if flat else 1.0)}
+
+    def compile(self, kernel: Any) -> Any:
+        """A kernel, which can be launched then; raises `InputError`."""
+        compiled(self._what, kernel.module, self._device)
+        return kernel
+
+    @cached_property
+    def _tangent(self) -> Any:
+        return self.compile(self._kernels.tangent)
+
+    @cached_property
+    def _adjoint(self) -> Any:
+        return self.compile(self._kernels.adjoint)
+
+    def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
+        now = {"theta": self._packed.theta(step), "acceleration_in": before, "acceleration": after}
+        step.launch(self._kernels.forward, **self._constants, **now)
+
+    def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
+        theta = {"theta": self._packed.theta(step), "theta_dot": self._packed.theta_dot(step, dot.parameters)}
+        now = {"acceleration_in_dot": before, "acceleration_dot": after}
+        step.launch(self._tangent, *dot.named, **self._constants, **theta, **now)
+
+    def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
+        now = {"theta": self._packed.theta(step), "acceleration_bar": acceleration_bar}
+        step.launch(self._adjoint, *bar.named, **self._constants, **now, theta_bar=self._packed.shares)
+        self._packed.collect(step, bar)
+
+
+def topic(kind: str, text: Formula, ranks: tuple[int, ...]) -> str:
+    """The part of a Warp module's name that tells one function from another."""
+    words = "\n".join((text.text, *text.outside, str(ranks)))
+    return f"{kind}_{text.name}_{sha256(words.encode()).hexdigest()[:12]}"
+
+
+def _made_again(made: type[OwnForce], function: Any, source: str, name: str, values: Mapping[str, Any]) -> OwnForce:
+    keep_source(function, source)
+    return made(function, name, **values)
+
+
+def _dimension(dimension: int, phases: int) -> int:
+    return dimension
+
+
+def _size(source: Source, value: np.ndarray) -> np.ndarray:
+    """Of numbers; 1 of those that are 0."""
+    return np.where(value == 0.0, 1.0, np.abs(value))
+
+
+def _length(source: Source, value: np.ndarray) -> float:
+    """Of a vector, of several the greatest; 1 of what is 0."""
+    return float(np.linalg.norm(np.atleast_2d(value), axis=-1).max()) or 1.0

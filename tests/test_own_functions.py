@@ -1,0 +1,374 @@
+"""Forces that are one function: what they do, their derivatives, and what is said of functions that are none."""
+
+import math
+import pickle
+import re
+import runpy
+from pathlib import Path
+
+import cloudpickle
+import numpy as np
+import pytest
+import warp as wp
+
+import cortado
+from cortado import InputError, Problem, Simulation, gradients
+from cortado.forces import Body, OverTime, Pair
+from scenes import plane, splash, two_layers
+
+ROOT = Path(__file__).parent.parent
+STEPS = 5
+STRENGTH = 0.3
+
+
+@wp.func
+def bump(r: wp.float64):
+    return wp.exp(-r * r)
+
+
+def gust(x, v, t, k, centre, wind=(1.0, 0.5, -0.5)):
+    """Everything that a function may have: numbers from outside, whole numbers, branches, loops, types of Warp."""
+    away = x - centre
+    force = k / 2 * (wind - v) - away * math.exp(-wp.length(away)) + wp.vec3(0.0, STRENGTH, 1)
+    if x[0] > 0.1:
+        force += v * wp.sin(300 * t) * math.pi + x[1] ** 2 * wind
+    for axis in range(2):
+        force -= 1 / 10 * v * v[axis]
+    return force
+
+
+def spring(x_ij, v_ij, t, k, damping):
+    return -k * (wp.length(x_ij) - 0.04) * x_ij - damping * wp.dot(x_ij, v_ij) * x_ij
+
+
+def leaning(x_ij: wp.vec3, v_ij: wp.vec3, t: float, k: float, damping: float) -> wp.vec3:
+    """No odd function: momentum is not kept."""
+    return k * wp.vec3(x_ij[1] ** 2, wp.cos(200.0 * t), x_ij[0] * v_ij[1]) - damping * v_ij
+
+
+FORCES = {
+    "a body force": lambda d: Body(
+        gust, k=OverTime([0.002, 0.006], [20.0, 30.0]), centre=[0.1] * d, wind=[3.0, 0.5, -1][:d]
+    ),
+    "a pair force": lambda d: Pair(spring, k=3000.0, damping=OverTime([0.0, 0.01], [2e4, 3e4])),
+    "a pair force that is not odd": lambda d: Pair(leaning, k=1.0, damping=0.5),
+}
+SCENES = {"in space": splash, "two phases": two_layers, "in the plane": plane}
+
+
+def problem(force, make=splash, **options):
+    made = make()
+    simulation = Simulation(made, **{"precision": "float64", **options}, forces=[force])
+    target = simulation.positions + 0.02 * np.sin(7.0 * simulation.positions)
+    return Problem(simulation, STEPS, cortado.losses.FinalPositions(target))
+
+
+def point_of(judged):
+    """Particles that move, and all parameters of the force."""
+    random, simulation = np.random.default_rng(4), judged.simulation
+    point = {name: value for name, value in simulation.parameters().items() if "." in name}
+    point["initial_positions"] = simulation.positions + 0.002 * random.standard_normal(simulation.positions.shape)
+    point["initial_velocities"] = 0.3 * random.standard_normal(simulation.positions.shape)
+    return {**point, "time_step": 0.002, "rest_density": simulation.parameters()["rest_density"]}
+
+
+@pytest.mark.parametrize("make", SCENES)
+@pytest.mark.parametrize("force", FORCES)
+def test_reverse_forward_tape_and_differences_agree(force, make):
+    made = SCENES[make]
+    judged = problem(FORCES[force](made().dimension), made)
+    point, random = point_of(judged), np.random.default_rng(7)
+    found, taped = (judged.value_and_gradient(point, estimator)[1] for estimator in (None, gradients.Tape()))
+    for name, value in point.items():
+        direction = random.standard_normal(np.shape(value)) * np.abs(value).max()
+        along = float(np.sum(found[name] * direction))
+        assert along != 0.0, name
+        np.testing.assert_allclose(judged.tangent(point, {name: direction}), along, rtol=1e-9, err_msg=name)
+        np.testing.assert_allclose(taped[name], found[name], rtol=1e-8, atol=1e-12 * np.abs(found[name]).max())
+        h = 1e-4 if "." in name else 1e-6 if np.ndim(value) < 2 else 1e-7
+        moved = [judged.value({**point, name: value + s * h * direction}) for s in (1.0, -1.0)]
+        np.testing.assert_allclose((moved[0] - moved[1]) / (2.0 * h), along, rtol=2e-4, atol=1e-13, err_msg=name)
+
+
+@pytest.mark.parametrize("force", FORCES)
+def test_float32_is_near_float64(force):
+    found = []
+    for precision in ("float32", "float64"):
+        judged = problem(FORCES[force](3), precision=precision)
+        found.append(judged.value_and_gradient(point_of(judged))[1])
+    for name, bar in found[1].items():
+        assert np.linalg.norm(found[0][name] - bar) < 2e-3 * np.linalg.norm(bar), name
+
+
+@pytest.mark.parametrize("force", FORCES)
+def test_it_is_certified(force):
+    judged = problem(FORCES[force](3), precision="float32")
+    assert cortado.certify(judged, [name for name in judged.simulation.parameters() if "." in name]).right
+
+
+def free(**changes):
+    return plane(forces={"gravity": [0.0, 0.0], "viscosity": "none", "pressure": False}, **changes)
+
+
+def test_a_body_force_is_an_acceleration_at_the_place_the_speed_and_the_time_of_a_particle():
+    def pull(x, v, t, k, c):
+        return -k * x - c * v + wp.vec3(t, 0.0, 5.0)
+
+    simulation = Simulation(free(), precision="float64", forces=[Body(pull, k=3.0, c=0.5)])
+    x, v, dt = simulation.positions, simulation.velocities, 0.0021
+    for step in range(STEPS):
+        v = v + dt * (-3.0 * x - 0.5 * v + [step * dt, 0.0])
+        x = x + dt * v
+    np.testing.assert_allclose(simulation.run(STEPS).positions[-1], x, rtol=1e-13)
+
+
+def test_a_pair_force_is_the_weighted_sum_over_neighbours():
+    def pull(x_ij, v_ij, k):
+        return k * wp.vec3(x_ij[0] + 0.01, -2.0 * x_ij[1], 7.0)
+
+    simulation = Simulation(free(), precision="float64", forces=[Pair(pull, k=40.0)])
+    x, spacing = simulation.positions, 0.05
+    q = np.linalg.norm(x[:, None] - x[None], axis=-1) / (2.0 * spacing)
+    weights = np.where(q < 0.5, 1.0 - 6.0 * q**2 + 6.0 * q**3, 2.0 * np.clip(1.0 - q, 0.0, None) ** 3)
+    np.fill_diagonal(weights, 0.0)
+    away = x[:, None] - x[None]
+    force = 40.0 * np.stack([away[..., 0] + 0.01, -2.0 * away[..., 1]], axis=-1)
+    acceleration = (weights[..., None] * force).sum(axis=1) / (1000.0 * simulation.lattice.volume)
+    np.testing.assert_allclose(simulation.run(1).velocities[-1], 0.0021 * acceleration, rtol=1e-12, atol=1e-15)
+
+
+def test_an_odd_pair_force_keeps_momentum():
+    alone = {"container": {"shape": "none"}}
+    for force, kept in ((FORCES["a pair force"](3), True), (FORCES["a pair force that is not odd"](3), False)):
+        made = two_layers(forces={"gravity": [0.0] * 3, "viscosity": "none", "pressure": False}, **alone)
+        simulation = Simulation(made, precision="float64", forces=[force])
+        heavy = np.array([1000.0, 1800.0])[simulation.mass_fractions.argmax(axis=1)]
+        moved = heavy[:, None] * simulation.run(1).velocities[-1]
+        assert np.abs(moved).max() > 1e-3
+        assert (np.abs(moved.sum(axis=0)).max() < 1e-12 * np.abs(moved).sum()) == kept
+
+
+def test_time_and_an_annotation_may_be_left_out_and_a_default_is_a_parameter():
+    def brake(x, v, k=4.0):
+        return -k * v
+
+    judged = problem(Body(brake, name="slow"))
+    assert judged.simulation.parameters()["slow.k"] == 4.0
+    assert "time" not in judged.simulation.known
+
+
+def test_one_without_parameters_and_one_for_each_axis():
+    def lift(x, v):
+        return wp.vec3(0.0, 1.0, 0.0)
+
+    assert problem(Body(lift)).value_and_gradient({"time_step": 0.002})[1]["time_step"] != 0.0
+
+
+def test_a_row_for_each_step_is_searched_for():
+    force = Body(gust, k=OverTime([0.0], [20.0]), centre=[0.1] * 3)
+    judged = problem(force)
+    goal = judged.end({"gust.k": np.linspace(20.0, 60.0, STEPS)}).positions
+    judged = Problem(judged.simulation, STEPS, cortado.losses.FinalPositions(goal))
+    start = {"gust.k": np.full(STEPS, 30.0), "gust.wind": [1.0, 0.5, -0.5]}
+    found = cortado.optimise(judged, start, optimiser=cortado.optimisers.LBFGS(), iterations=20)
+    assert found.loss < 1e-3 * judged.value(start)
+
+
+def test_parameters_over_time_of_a_batch():
+    force = Body(gust, k=OverTime([0.0], [20.0]), centre=[0.1] * 3)
+    rows = np.array([np.linspace(1.0, 2.0, STEPS), np.linspace(4.0, 3.0, STEPS)])
+    together, alone = problem(force, batch=2), problem(force)
+    loss, gradient = together.value_and_gradient({"gust.k": rows, "time_step": [0.002, 0.001]})
+    for b in range(2):
+        single, found = alone.value_and_gradient({"gust.k": rows[b], "time_step": [0.002, 0.001][b]})
+        assert loss[b] == single
+        np.testing.assert_array_equal(gradient["gust.k"][b], found["gust.k"])
+
+
+def test_a_step_of_a_captured_search_has_the_numbers_of_its_own():
+    """The same arrays over and over: a parameter that changes from one evaluation to the next is read anew."""
+    judged = problem(FORCES["a body force"](3))
+    first = [judged.value({"gust.k": k}) for k in (1.0, 2.0, 3.0, 1.0)]
+    assert first[0] == first[3] and len(set(first)) == 3
+
+
+def test_another_function_is_another_force_also_by_numbers_from_outside():
+    def made(strength):
+        def steady(x, v, k):
+            return k * strength * wp.vec3(1.0, 0.0, 0.0)
+
+        return Body(steady, k=1.0)
+
+    one, other = problem(made(1.0)), problem(made(2.0))
+    assert one.fingerprint != other.fingerprint
+    fast, slow = (judged.run({}).velocities[-1][:, 0].mean() for judged in (other, one))
+    assert fast > 1.9 * slow
+    assert problem(made(1.0)).fingerprint == one.fingerprint
+    courses = [OverTime([0.0, 1.0], [1.0, last]) for last in (2.0, 3.0)]
+    texts = {problem(Body(gust, k=course, centre=[0.1] * 3)).fingerprint for course in courses}
+    assert len(texts) == 2
+
+
+def test_it_goes_to_processes_that_do_not_have_its_text():
+    force = FORCES["a body force"](3)
+    judged = problem(force)
+    again = pickle.loads(cloudpickle.dumps(judged))
+    assert again.fingerprint == judged.fingerprint
+    assert again.value({"gust.k": 1.5}) == judged.value({"gust.k": 1.5})
+
+
+def test_what_it_is_made_with_stays():
+    force = Body(gust, k=1.0, centre=[0.1] * 3)
+    with pytest.raises(InputError, match="name cannot be set"):
+        force.name = "other"
+    centre = np.full(3, 0.1)
+    kept = Body(gust, k=1.0, centre=centre)
+    centre[:] = 9.0
+    assert problem(kept).simulation.parameters()["gust.centre"].tolist() == [0.1] * 3
+
+
+def drag(x, v, t, k):
+    return -k * v
+
+
+def no_vector(x, v, k):
+    return k
+
+
+def nothing(x, v, k):
+    wp.length(x)
+
+
+def unknown(x, v, k):
+    return -k * undefined(v)  # noqa: F821
+
+
+def numpy_inside(x, v, k):
+    return -k * np.tanh(v)
+
+
+def part(x, v, k):
+    f = -k * v
+    f[1] = 0.0
+    return f
+
+
+def long_loop(x, v, k):
+    for _ in range(17):
+        v = v * 0.5
+    return k * v
+
+
+def until(x, v, k):
+    while k > 1.0:
+        k = k - 1.0
+    return k * v
+
+
+def leaving(x, v, k):
+    for axis in range(3):
+        if v[axis] > 0.0:
+            break
+    return k * v
+
+
+@wp.func
+def looping(r: wp.float64):
+    while r > 1.0:
+        r = r * r
+    return r
+
+
+def with_looping(x, v, k):
+    return k * looping(x[0]) * v
+
+
+def many(x, v, *rest):
+    return v
+
+
+def three(x, v, t, k, c):
+    return v
+
+
+def one(x):
+    return x
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Body(3.0), "Body has 3.0, but must have a function, made by def"),
+        (
+            lambda: Body(lambda x, v, k: -k * v, k=1.0),
+            "Body function <lambda> is no definition, but must be",
+        ),
+        (lambda: Body(np.sin, k=1.0), "Body has <ufunc 'sin'>, but must have a function"),
+        (lambda: Body(drag), r"Body function drag has x, v, t, k without a value, but must have two vectors first"),
+        (lambda: Body(three, k=1.0), "Body function three has x, v, t, c without a value, but must have"),
+        (lambda: Body(one), "Body function one has x without a value, but must have"),
+        (
+            lambda: Pair(drag, k=1.0, c=2.0),
+            r"is given a value of c, but .* among .*\(x, v, t, k\)",
+        ),
+        (lambda: Body(many), r"Body function many has the argument \*rest, but must have"),
+        (lambda: Body(drag, k="fast"), "parameter drag.k is 'fast', but must be"),
+        (lambda: Body(drag, k=[[1.0]]), r"parameter drag.k has shape \(1, 1\), but must be a number, a vector"),
+        (lambda: Body(drag, "a b", k=1.0), "Body has the name 'a b', but must have a word"),
+        (lambda: problem(Body(drag, k=math.nan)), "parameter drag.k has a value that is not finite"),
+        (lambda: problem(Body(drag, k=[1.0, 2.0])), r"parameter drag.k has shape \(2,\), but must be \(3,\)"),
+        (
+            lambda: problem(Body(no_vector, k=1.0)),
+            "Body function no_vector cannot be compiled: .* return a vector",
+        ),
+        (lambda: problem(Body(nothing, k=1.0)), "Body function nothing cannot be compiled: .* return a vector"),
+        (lambda: problem(Pair(unknown, k=1.0)), "Pair function unknown cannot be compiled: .*undefined"),
+        (lambda: problem(Body(numpy_inside, k=1.0)), "Body function numpy_inside cannot be compiled: "),
+        (lambda: Body(part, k=1.0), r"Body function part changes f\[1\] alone, which Warp cannot differentiate"),
+        (lambda: Body(long_loop, k=1.0), r"long_loop has 'for _ in range\(17\)', which Warp cannot differentiate"),
+        (lambda: Body(until, k=1.0), "until has 'while k > 1.0', which Warp cannot differentiate"),
+        (lambda: Body(leaving, k=1.0), "leaving has 'break', which Warp cannot differentiate"),
+        (lambda: Body(with_looping, k=1.0), "with_looping has 'while r > 1.0', which Warp cannot differentiate"),
+        (
+            lambda: OverTime([0.0, 0.0], [1.0, 2.0]),
+            "OverTime times are .*, but each must be greater than the one",
+        ),
+        (lambda: OverTime([0.0], [1.0, 2.0]), r"OverTime values have shape \(2,\), but must be \(1,\) or \(1, d\)"),
+        (lambda: OverTime([0.0], [math.nan]), "OverTime values have one that is not finite"),
+        (lambda: OverTime([], []), "OverTime times are .*, but must be a list of finite times"),
+    ],
+)
+def test_what_is_no_force_is_a_sentence(make, said):
+    with pytest.raises(InputError, match=said):
+        make()
+
+
+def test_the_forces_of_the_page_run_as_printed(tmp_path, monkeypatch):
+    """From a file, as Warp wants the text of functions."""
+    page = (ROOT / "docs/own_parts.md").read_text()
+    blocks = re.findall(r"^```py\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    program = tmp_path / "page.py"
+    program.write_text("\n".join(blocks))
+    monkeypatch.chdir(ROOT)
+    assert len(blocks) == 3
+    runpy.run_path(str(program))
+
+
+def test_values_from_outside_of_what_it_calls_count_too():
+    """The text is the same: what differs is a number of a function of Warp, or a vector."""
+
+    def made(strength, centre):
+        @wp.func
+        def scaled(r: wp.float64):
+            return r * wp.float64(strength)
+
+        def steady(x, v, k):
+            return scaled(k) * (centre - x)
+
+        return Body(steady, k=1.0)
+
+    ends = {}
+    for strength, centre in ((1.0, 0.0), (20.0, 0.0), (1.0, 9.0)):
+        judged = problem(made(strength, wp.vec3d(centre, 0.0, 0.0)))
+        ends[judged.fingerprint] = judged.run({}).velocities[-1].tobytes()
+    assert len(ends) == 3 and len(set(ends.values())) == 3
