@@ -62,7 +62,7 @@ LAYERS = """
     shading shading.surface shading.stage shading.shadow shading.surroundings shading.glass shading.meeting
     shading.scenery shading.trace shading.space shading.plane
     shading.painter shading.page shading.labels shading.film shading.scene_view
-    outcome
+    outcome stepper stepping
     simulation
     problem
     figures.curves figures

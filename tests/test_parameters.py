@@ -76,7 +76,7 @@ def test_a_rollout_takes_derivatives_of_its_own_alone():
         rollout.tangent(simulation.solver.new_state(), simulation.solver.new_parameters(3), lambda step, dot: None)
     rollout.forward()
     with pytest.raises(InputError, match="bars has the state 7, but must have states from 0 to 3"):
-        rollout.backward(Exact().derivative(rollout), {7: simulation.state})
+        rollout.backward(Exact().derivative(rollout), {7: simulation.initial})
 
 
 @pytest.mark.parametrize("given", [None, [1.0], 3, "gravity"])

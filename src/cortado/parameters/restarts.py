@@ -1,6 +1,6 @@
 """Whether a state is one of a simulation: what it belongs to, its numbers, and its clock."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,11 +37,26 @@ def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:
     )
 
 
+def one_for_each(state: RestartState | Sequence[RestartState] | None, batch: int | None) -> list[RestartState]:
+    """The states to go on from, one for each scene; none for the scenes' own. Raises `InputError` for another number of
+    them."""
+    if state is None:
+        return []
+    states = list(state) if isinstance(state, Sequence) else [state]
+    if len(states) != (batch or 1):
+        raise InputError(f"state has {len(states)} states, but must have {batch or 1}, one for each scene.")
+    return states
+
+
 def check_state(
     state: RestartState, shapes: Mapping[str, tuple[int, ...]], origin: Origin, simulation: Simulated
 ) -> None:
     """A state to go on from is one of the simulation, whose fields have these shapes, and of these particles; raises
-    `InputError`."""
+    `InputError`. One that the simulation's own steps have made can only be of other rest densities."""
+    if isinstance(state, RestartState) and state in simulation.own_states:
+        assert state.origin is not None
+        _check_origin(state.origin, origin)
+        return
     if not isinstance(state, RestartState):
         raise InputError(f"state is {shown(state)}, but must be a RestartState, such as trajectory.last_state.")
     if state.fields.keys() != shapes.keys():

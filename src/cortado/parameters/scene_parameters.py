@@ -4,6 +4,7 @@ n counts fluid particles in the order in which the scene lists them, d is the sc
 """
 
 from typing import Protocol
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from cortado.parameters.reference_density import (
 from cortado.parameters.registry import BY_NAME, Axis, Role, Source, names
 from cortado.parameters.tilt import Tilt
 from cortado.parameters.values import OVER_TIME, Arrays, scene_values
-from cortado.restart import Clock
+from cortado.restart import Clock, RestartState
 from cortado.scene.schedule import Course
 
 RUN = names(Role.RUN)
@@ -34,8 +35,10 @@ COMPOSITION = ("mass_fractions", "rest_density")
 class Simulated(Source, Protocol):
     """A simulation as its parameters see it."""
 
-    state: State
-    """The first, on the device."""
+    initial: State
+    """The first state, on the device."""
+    own_states: WeakSet[RestartState]
+    """Those that its steps have made, which need not be judged."""
     batch: int | None
     """How many scenes there are in one launch; None for a single one."""
 
@@ -128,7 +131,7 @@ class SceneParameters:
     def first(self, values: Arrays) -> Arrays:
         """The fields of the first state that differ from the scene's under these values. Raises `InputError` for mass
         fractions without a volume: a little below 0, as diffusion may leave them."""
-        fields = first_values(self._simulation.state.fields, values)
+        fields = first_values(self._simulation.initial.fields, values)
         if values.keys().isdisjoint(COMPOSITION):
             return fields
         fractions, density = self._composition(values)
@@ -160,7 +163,7 @@ class SceneParameters:
         along = {name: along.get(name, np.zeros_like(value)) for name, value in self.values.items()}
         fractions_dot, density_dot = along["mass_fractions"], np.atleast_1d(along["rest_density"])
         density = reference_density_tangent(*self._composition(values), fractions_dot, density_dot)
-        first = {**first_values(self._simulation.state.fields, along), DENSITY: density}
+        first = {**first_values(self._simulation.initial.fields, along), DENSITY: density}
         moved = {name: along[name] + along["time_step"] * rate for name, rate in rates.items()}
         return first, self.run({**along, **moved})
 
@@ -168,7 +171,7 @@ class SceneParameters:
         """From the adjoints of the fields of the first state and of what steps depend on to those of ``values``, in
         their shapes."""
         found = {name: run[name].copy() for name in RUN if name in values}
-        for field in self._simulation.state.fields:
+        for field in self._simulation.initial.fields:
             if field.first in values:
                 if field.first in found:
                     found[field.first][0] += first[field.name][0]

@@ -75,7 +75,7 @@ class ParameterSpace:
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
         rollout.evaluation += 1
         rollout.clocks = [state.clock for state in states] or [Clock()] * len(rollout.clocks)
-        rollout.initial.assign(simulation.state)
+        rollout.initial.assign(simulation.initial)
         firsts = [dict(state.fields) for state in states] or [self._one.first(own) for own in members]
         rollout.initial.set(self._together(firsts))
         if simulation.scene.schedule.courses and len(members) < len(rollout.clocks):
@@ -112,7 +112,7 @@ class ParameterSpace:
                 raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
         simulation = self._simulation
         sizes = len(simulation.positions), simulation.dimension, len(simulation.scene.phase)
-        shapes = {field.name: field.shape(*sizes) for field in simulation.state.fields}
+        shapes = {field.name: field.shape(*sizes) for field in simulation.initial.fields}
         for state, own in zip(states, self.members(values), strict=False):
             origin = self._origin(np.atleast_1d(own.get("rest_density", self._one.values["rest_density"])))
             check_state(state, shapes, origin, simulation)
