@@ -2,18 +2,17 @@
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
 from cortado.arrays import check_steps, require_function, whole_number
-from cortado.device.memory import require
 from cortado.device.state import State
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import CortadoWarning, DivergedError, InputError
 from cortado.fixed import fixed
+from cortado.forward_pass import ForwardPass
 from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator, estimate
 from cortado.io.trajectory import noted
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch, batch, fingerprint
@@ -21,6 +20,7 @@ from cortado.losses.checked import as_loss
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import NAMES, OVER_TIME, UNITS, Arrays, Values
+from cortado.residual import Residual
 from cortado.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
 from cortado.simulation import Simulation
 from cortado.words import counted
@@ -141,13 +141,14 @@ class Problem:
         return found
 
     @in_turn
-    def forward_pass(self, parameters: Values) -> "ForwardPass":
-        """A forward run that can be gone back through, until the next evaluation: what estimators work with."""
+    def forward_pass(self, parameters: Values) -> ForwardPass:
+        """A forward run that can be gone back through, also after other evaluations: what estimators work with. It keeps
+        its states for as long as it is held."""
         values = self._space.checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
-        evaluation = self._rollout.evaluation  # before the loss, which may evaluate the problem itself
+        residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself
         loss, bars = self._judged(ends)
-        return ForwardPass(loss, self._rollout, values, bars, self._space, self._derivatives, evaluation)
+        return ForwardPass(loss, residual, values, bars, self._space, self._derivatives)
 
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> Any:
@@ -291,64 +292,3 @@ class Problem:
         state = self.simulation.solver.new_state()
         state.set(dict(zip(ADJOINT_FIELDS, bar, strict=False)))
         return SnapshotAdjoint(state, no_colours)
-
-
-@dataclass(frozen=True)
-class ForwardPass:
-    """A forward run of a problem with its loss, and the ways back through it."""
-
-    loss: Any
-    """Of a batch (batch,)."""
-    rollout: Rollout
-    _values: Arrays
-    _bars: Mapping[int, SnapshotAdjoint]
-    _space: ParameterSpace
-    _derivatives: dict[AdjointEstimator, BackwardStep]
-    _evaluation: int
-
-    @property
-    def turn(self) -> Turn:
-        """What a thread holds that uses the rollout."""
-        return self.rollout.turn
-
-    @in_turn
-    def derivative(self, estimator: AdjointEstimator) -> BackwardStep:
-        """The estimator's backward step, made once for each problem. Raises `InputError` for an estimator whose
-        settings may change, as its backward step would keep the first ones, and for one that may mix up the scenes of a
-        batch."""
-        if self.rollout.solver.layout.batch is not None and not estimator.batches:
-            raise InputError(
-                f"{type(estimator).__name__} is given a batch, but has no `batches = True`, which says that it treats "
-                "each scene by itself."
-            )
-        try:
-            is_new = estimator not in self._derivatives
-        except TypeError as error:
-            raise InputError(f"estimator has an {error}, but must be a dataclass(frozen=True) of numbers.") from None
-        if is_new:
-            solver = self.rollout.solver
-            parts = solver.gradient_memory(self.rollout.log)
-            require(parts, "take a larger spacing or fewer pressure iterations", solver.device)
-            self._derivatives[estimator] = estimator.derivative(self.rollout)
-        return self._derivatives[estimator]
-
-    @in_turn
-    def back(self, derivative: BackwardStep, observe: Observer | None = None) -> Arrays:
-        """The gradient; ``observe`` is given the number and the adjoint of every state, from the last to the first.
-
-        Raises `InputError` after another evaluation of the problem, which overwrites the states of this one.
-        """
-        if self._evaluation != self.rollout.evaluation:
-            raise InputError(
-                "The problem was evaluated again after this forward pass, but a forward pass can be gone back through "
-                "only until then: make another one with forward_pass()."
-            )
-        bars, values = self._bars, self._values
-        first = self.rollout.backward(derivative, {step: bar.state for step, bar in bars.items()}, observe)
-        gradient = self._space.gradient(values, first, derivative.parameters())
-        if "colours" in values:
-            gradient["colours"] = np.sum([bar.colours for bar in bars.values()], axis=0)
-        for b in self.rollout.lost:
-            for bar in gradient.values():
-                bar[b] = np.nan
-        return {name: gradient[name] for name in values}

@@ -6,9 +6,12 @@ of steps, or a step back, is a captured graph on a GPU, and on a CPU where launc
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
+from itertools import count
 from math import isqrt
-from typing import Protocol
+from typing import Any, Protocol
+from weakref import WeakSet
 
 import numpy as np
 
@@ -20,7 +23,7 @@ from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.restart import Clock, Origin
 from cortado.solvers.containment import Lost
-from cortado.solvers.solver import Counts, Solver
+from cortado.solvers.solver import Counts, Solver, StepLog
 
 CHUNK = 64
 """Steps between two looks of the host, at most."""
@@ -31,6 +34,29 @@ MEMORY_BUDGET = 8 * 2**30
 
 Observer = Callable[[int, State], None]
 """Is given the number of a state and the state, which later steps overwrite."""
+
+
+OF_AN_EVALUATION = ("clocks", "origins", "substeps", "advice", "lost", "goes_on", "evaluation", "_states", "_kept", "_run")
+"""Attributes of a rollout that are replaced, and not overwritten, from one evaluation to the next."""
+
+
+@dataclass(frozen=True)
+class PutAside:
+    """What an evaluation of a rollout needs to be the present one again."""
+
+    first: State
+    parameters: Mapping[str, np.ndarray]
+    """As `Parameters.set` takes them."""
+    log: StepLog
+    own: Mapping[str, Any]
+    """Attributes of the rollout, by name."""
+
+
+class Pending(Protocol):
+    """Who will come back to an evaluation."""
+
+    def put_aside(self) -> None:
+        """Keep what the next evaluation overwrites."""
 
 
 class BackwardStep(Protocol):
@@ -100,8 +126,13 @@ class Rollout:
         """The states of the last chunk."""
         self._generation = -1
         self._forget_stale_graphs()
+        self.goes_on = False
+        """Whether the first state was given whole, so that it depends on no parameter."""
         self.evaluation = 0
-        """How often the first state and the parameters were replaced: a way back belongs to one evaluation."""
+        """Which first state and parameters these are: a way back belongs to one evaluation."""
+        self._evaluations = count(1)
+        self.pending: WeakSet[Pending] = WeakSet()
+        """Who will come back to the present evaluation."""
         self._kept = self._run = -1
         """The evaluations that states were kept of, and that the last run was of."""
 
@@ -114,6 +145,31 @@ class Rollout:
     def turn(self) -> Turn:
         """What a thread holds that uses the solver."""
         return self.solver.turn
+
+    # ---- evaluations ---------------------------------------------------------------------------------------------
+
+    def begin_evaluation(self) -> None:
+        """Before the first state and the parameters are replaced: whoever will come back to them puts them aside."""
+        for pending in list(self.pending):
+            pending.put_aside()
+        self.pending.clear()
+        self.evaluation = next(self._evaluations)
+
+    def put_aside(self) -> PutAside:
+        """What the next evaluation overwrites, in arrays of its own."""
+        log, own = self.solver.new_log(self.steps), {name: getattr(self, name) for name in OF_AN_EVALUATION}
+        log.assign(self.log)
+        return PutAside(self.initial.copy(), self.parameters.written, log, {**own, "time_steps": self.time_steps.copy()})
+
+    @in_turn
+    def bring_back(self, aside: PutAside) -> None:
+        """Have an evaluation again that was put aside."""
+        self.begin_evaluation()
+        self.initial.assign(aside.first)
+        self.parameters.set(aside.parameters)
+        self.log.assign(aside.log)
+        for name, value in aside.own.items():
+            setattr(self, name, value)
 
     # ---- forward -------------------------------------------------------------------------------------------------
 
@@ -162,16 +218,16 @@ class Rollout:
         """Take the steps from one to another and return the states after them, which the next chunk overwrites."""
         self.solver.step_number.fill_(first)
         self._buffer.assign(state)
-        count = last - first
-        if count not in self._chunks:
-            self._chunks[count] = CapturedGraph(partial(self._take, count), self.solver.launch)
-        self._chunks[count]()
-        return self._chunk[:count]
+        length = last - first
+        if length not in self._chunks:
+            self._chunks[length] = CapturedGraph(partial(self._take, length), self.solver.launch)
+        self._chunks[length]()
+        return self._chunk[:length]
 
-    def _take(self, count: int) -> None:
+    def _take(self, length: int) -> None:
         """So many steps from the state in the buffer."""
         state = self._buffer
-        for new_state in self._chunk[:count]:
+        for new_state in self._chunk[:length]:
             self.solver.step(state, new_state, self.parameters, self.log)
             state = new_state
 

@@ -132,6 +132,11 @@ class Parameters(Arrays):
         self._written: dict[str, np.ndarray] = {}
         """What `set` has written last, and need not write again."""
 
+    @property
+    def written(self) -> Mapping[str, np.ndarray]:
+        """What `set` has written, by name."""
+        return dict(self._written)
+
     def set(self, values: Mapping[str, Any]) -> None:
         """Write some by name, the same for all members or with an axis of them: a vector (d,) for every step, or
         vectors (steps, d); numbers or arrays of them. Nothing else may write to arrays that are set again."""

@@ -73,7 +73,8 @@ class ParameterSpace:
         diffusion even where it is 0. ``states``, one for each scene, replace the scene's first state.
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
-        rollout.evaluation += 1
+        rollout.begin_evaluation()
+        rollout.goes_on = bool(states)
         rollout.clocks = [state.clock for state in states] or [Clock()] * len(rollout.clocks)
         rollout.initial.assign(simulation.initial)
         firsts = [dict(state.fields) for state in states] or [self._one.first(own) for own in members]

@@ -1,0 +1,78 @@
+"""A forward run of a problem with its loss, and the ways back through it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cortado.device.memory import require
+from cortado.device.threads import Turn, in_turn
+from cortado.errors import InputError
+from cortado.gradients import AdjointEstimator
+from cortado.losses import SnapshotAdjoint
+from cortado.parameters.space import ParameterSpace
+from cortado.parameters.values import Arrays
+from cortado.residual import Residual
+from cortado.rollout import BackwardStep, Observer, Rollout
+
+
+@dataclass(frozen=True)
+class ForwardPass:
+    """A forward run of a problem with its loss, and the ways back through it."""
+
+    loss: Any
+    """Of a batch (batch,)."""
+    _residual: Residual
+    _values: Arrays
+    _bars: Mapping[int, SnapshotAdjoint]
+    _space: ParameterSpace
+    _derivatives: dict[AdjointEstimator, BackwardStep]
+
+    @property
+    def rollout(self) -> Rollout:
+        """The run."""
+        return self._residual.rollout
+
+    @property
+    def turn(self) -> Turn:
+        """What a thread holds that uses the rollout."""
+        return self.rollout.turn
+
+    @in_turn
+    def derivative(self, estimator: AdjointEstimator) -> BackwardStep:
+        """The estimator's backward step, made once for each problem. Raises `InputError` for an estimator whose
+        settings may change, as its backward step would keep the first ones, and for one that may mix up the scenes of a
+        batch."""
+        if self.rollout.solver.layout.batch is not None and not estimator.batches:
+            raise InputError(
+                f"{type(estimator).__name__} is given a batch, but has no `batches = True`, which says that it treats "
+                "each scene by itself."
+            )
+        try:
+            is_new = estimator not in self._derivatives
+        except TypeError as error:
+            raise InputError(f"estimator has an {error}, but must be a dataclass(frozen=True) of numbers.") from None
+        if is_new:
+            solver = self.rollout.solver
+            parts = solver.gradient_memory(self.rollout.log)
+            require(parts, "take a larger spacing or fewer pressure iterations", solver.device)
+            self._derivatives[estimator] = estimator.derivative(self.rollout)
+        return self._derivatives[estimator]
+
+    @in_turn
+    def back(self, derivative: BackwardStep, observe: Observer | None = None) -> Arrays:
+        """The gradient; ``observe`` is given the number and the adjoint of every state, from the last to the first.
+
+        Other evaluations of the problem may be in between: the bits are the same.
+        """
+        self._residual.bring_back()
+        bars, values = self._bars, self._values
+        first = self.rollout.backward(derivative, {step: bar.state for step, bar in bars.items()}, observe)
+        gradient = self._space.gradient(values, first, derivative.parameters())
+        if "colours" in values:
+            gradient["colours"] = np.sum([bar.colours for bar in bars.values()], axis=0)
+        for b in self.rollout.lost:
+            for bar in gradient.values():
+                bar[b] = np.nan
+        return {name: gradient[name] for name in values}
