@@ -62,7 +62,8 @@ LAYERS = """
     shading shading.surface shading.stage shading.shadow shading.surroundings shading.glass shading.meeting
     shading.scenery shading.trace shading.space shading.plane
     shading.painter shading.page shading.labels shading.film shading.scene_view
-    outcome stepper stepping
+    outcome
+    stepper stepping
     simulation
     forward_pass
     problem

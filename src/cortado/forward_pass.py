@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from cortado.device.memory import require
+from cortado.device.state import State
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import InputError
 from cortado.gradients import AdjointEstimator
 from cortado.losses import SnapshotAdjoint
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import Arrays
-from cortado.residual import Residual
+from cortado.residual import Residual, without_lost
 from cortado.rollout import BackwardStep, Observer, Rollout
 
 
@@ -66,13 +67,24 @@ class ForwardPass:
 
         Other evaluations of the problem may be in between: the bits are the same.
         """
+        return self._gradient(derivative, self._first_adjoint(derivative, observe))
+
+    @in_turn
+    def back_to_state(self, derivative: BackwardStep) -> tuple[Arrays, Arrays]:
+        """The gradient, and the derivatives with respect to the fields of the first state, by name, and to its
+        ``time``."""
+        first = self._first_adjoint(derivative)
+        initial_state = self._space.state_adjoint(self.rollout, self._values, first, derivative.parameters())
+        return self._gradient(derivative, first), without_lost(self.rollout, initial_state)
+
+    def _first_adjoint(self, derivative: BackwardStep, observe: Observer | None = None) -> State:
         self._residual.bring_back()
+        return self.rollout.backward(derivative, {step: bar.state for step, bar in self._bars.items()}, observe)
+
+    def _gradient(self, derivative: BackwardStep, first: State) -> Arrays:
         bars, values = self._bars, self._values
-        first = self.rollout.backward(derivative, {step: bar.state for step, bar in bars.items()}, observe)
-        gradient = self._space.gradient(values, first, derivative.parameters())
+        gradient = self._space.gradient(self.rollout, values, first, derivative.parameters())
         if "colours" in values:
             gradient["colours"] = np.sum([bar.colours for bar in bars.values()], axis=0)
-        for b in self.rollout.lost:
-            for bar in gradient.values():
-                bar[b] = np.nan
+        gradient = without_lost(self.rollout, gradient)
         return {name: gradient[name] for name in values}

@@ -1,5 +1,8 @@
 """What one evaluation of a rollout leaves for ways back and along tangents, while others follow."""
 
+import numpy as np
+
+from cortado.parameters.values import Arrays
 from cortado.rollout import PutAside, Rollout
 
 
@@ -26,3 +29,11 @@ class Residual:
             aside, self._aside = self._aside, None
             self.rollout.bring_back(aside)
             self.rollout.pending.add(self)
+
+
+def without_lost(rollout: Rollout, found: Arrays) -> Arrays:
+    """Derivatives, of a batch with a first axis for the scenes, without numbers for scenes that were lost."""
+    for b in rollout.lost:
+        for array in found.values():
+            array[b] = np.nan
+    return found

@@ -36,7 +36,18 @@ Observer = Callable[[int, State], None]
 """Is given the number of a state and the state, which later steps overwrite."""
 
 
-OF_AN_EVALUATION = ("clocks", "origins", "substeps", "advice", "lost", "goes_on", "evaluation", "_states", "_kept", "_run")
+OF_AN_EVALUATION = (
+    "clocks",
+    "origins",
+    "substeps",
+    "advice",
+    "lost",
+    "goes_on",
+    "evaluation",
+    "_states",
+    "_kept",
+    "_run",
+)
 """Attributes of a rollout that are replaced, and not overwritten, from one evaluation to the next."""
 
 
@@ -159,7 +170,9 @@ class Rollout:
         """What the next evaluation overwrites, in arrays of its own."""
         log, own = self.solver.new_log(self.steps), {name: getattr(self, name) for name in OF_AN_EVALUATION}
         log.assign(self.log)
-        return PutAside(self.initial.copy(), self.parameters.written, log, {**own, "time_steps": self.time_steps.copy()})
+        return PutAside(
+            self.initial.copy(), self.parameters.written, log, {**own, "time_steps": self.time_steps.copy()}
+        )
 
     @in_turn
     def bring_back(self, aside: PutAside) -> None:

@@ -111,8 +111,8 @@ class Simulation(Stepping):
         self.solver: Solver = self._built(discrete)
         self.initial = self.solver.new_state()
         """The first state on the device."""
-        self.own_states: WeakSet[RestartState] = WeakSet()
-        """Those that its steps have made, which nobody can change."""
+        self.judged_states: WeakSet[RestartState] = WeakSet()
+        """Those that need not be judged again, as nobody can change them."""
         first = SceneParameters(self, 0).first(self.parameters())
         self.initial.set(first if self.batch is None else {name: [a] * self.batch for name, a in first.items()})
         for array in (self.positions, self.velocities, self.mass_fractions, self.walls):

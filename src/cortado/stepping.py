@@ -4,7 +4,7 @@ from typing import cast
 
 from cortado.arrays import check_steps
 from cortado.device.threads import Turn, in_turn
-from cortado.parameters.values import Values
+from cortado.parameters.values import Arrays, Values
 from cortado.stepper import Given, States, Steppable, Stepper
 
 KEPT = 4
@@ -37,6 +37,26 @@ class Stepping:
         device is allocated, and no graph captured. Warns and raises as `Simulation.run` does.
         """
         return self.stepper(check_steps(steps)).advance(state, parameters)
+
+    def vjp(self, state: Given, parameters: Values | None, state_bar: Values, steps: int = 1) -> tuple[Arrays, Arrays]:
+        """The derivatives of `step` in reverse: from the adjoint of the state after the steps to those of ``state`` and
+        of ``parameters``; see `Stepper.vjp`, which takes the steps once for several adjoints."""
+        stepper = self.stepper(check_steps(steps))
+        return stepper.vjp(stepper.step(state, parameters)[1], state_bar)
+
+    def jvp(
+        self,
+        state: Given,
+        parameters: Values | None,
+        state_dot: Values,
+        parameter_dots: Values | None = None,
+        steps: int = 1,
+    ) -> Arrays:
+        """The derivative of `step` along tangents of ``state`` and of any parameters, as the tangent of the state after
+        the steps; see `Stepper.jvp`."""
+        stepper = self.stepper(check_steps(steps))
+        residual = stepper.step(state, parameters, along=parameter_dots or ())[1]
+        return stepper.jvp(residual, state_dot, parameter_dots)
 
     @in_turn
     def stepper(self, steps: int) -> Stepper:
