@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from cortado.evaluation import PutAside
 from cortado.parameters.values import Arrays
-from cortado.rollout import PutAside, Rollout
+from cortado.rollout import Rollout
 
 
 class Residual:

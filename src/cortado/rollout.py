@@ -6,11 +6,10 @@ of steps, or a step back, is a captured graph on a GPU, and on a CPU where launc
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from math import isqrt
-from typing import Any, Protocol
+from typing import Protocol
 from weakref import WeakSet
 
 import numpy as np
@@ -21,9 +20,10 @@ from cortado.device.memory import require, step_parts, within
 from cortado.device.state import Parameters, State, StateSeries
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
+from cortado.evaluation import Pending, PutAside
 from cortado.restart import Clock, Origin
 from cortado.solvers.containment import Lost
-from cortado.solvers.solver import Counts, Solver, StepLog
+from cortado.solvers.solver import Counts, Solver, StepTangent
 
 CHUNK = 64
 """Steps between two looks of the host, at most."""
@@ -49,25 +49,6 @@ OF_AN_EVALUATION = (
     "_run",
 )
 """Attributes of a rollout that are replaced, and not overwritten, from one evaluation to the next."""
-
-
-@dataclass(frozen=True)
-class PutAside:
-    """What an evaluation of a rollout needs to be the present one again."""
-
-    first: State
-    parameters: Mapping[str, np.ndarray]
-    """As `Parameters.set` takes them."""
-    log: StepLog
-    own: Mapping[str, Any]
-    """Attributes of the rollout, by name."""
-
-
-class Pending(Protocol):
-    """Who will come back to an evaluation."""
-
-    def put_aside(self) -> None:
-        """Keep what the next evaluation overwrites."""
 
 
 class BackwardStep(Protocol):
@@ -135,6 +116,8 @@ class Rollout:
         self._series = StateSeries(self.initial, length)
         self._chunk = [self._series.state(k) for k in range(length)]
         """The states of the last chunk."""
+        self._tangent: tuple[Parameters, StepTangent] | None = None
+        """The last one, with the tangents of the parameters that it was made for."""
         self._generation = -1
         self._forget_stale_graphs()
         self.goes_on = False
@@ -167,22 +150,14 @@ class Rollout:
         self.evaluation = next(self._evaluations)
 
     def put_aside(self) -> PutAside:
-        """What the next evaluation overwrites, in arrays of its own."""
-        log, own = self.solver.new_log(self.steps), {name: getattr(self, name) for name in OF_AN_EVALUATION}
-        log.assign(self.log)
-        return PutAside(
-            self.initial.copy(), self.parameters.written, log, {**own, "time_steps": self.time_steps.copy()}
-        )
+        """What the next evaluation overwrites."""
+        return PutAside(self, OF_AN_EVALUATION)
 
     @in_turn
     def bring_back(self, aside: PutAside) -> None:
         """Have an evaluation again that was put aside."""
         self.begin_evaluation()
-        self.initial.assign(aside.first)
-        self.parameters.set(aside.parameters)
-        self.log.assign(aside.log)
-        for name, value in aside.own.items():
-            setattr(self, name, value)
+        aside.bring_back(self)
 
     # ---- forward -------------------------------------------------------------------------------------------------
 
@@ -326,10 +301,11 @@ class Rollout:
         """From ``dot``, the tangent of the first state, to that of every state, given to ``observe``; `forward` has
         run with these parameters."""
         self._require("along a tangent", self._run)
-        solver = self.solver
+        solver, state = self.solver, self._buffer
         solver.set_substeps(self.substeps)
-        derivative = solver.tangent(parameters_dot)
-        state = self.initial.following()
+        if self._tangent is None or self._tangent[0] is not parameters_dot:
+            self._tangent = parameters_dot, solver.tangent(parameters_dot)
+        derivative = self._tangent[1]
         state.assign(self.initial)
         observe(0, dot)
         for n in range(self.steps):
