@@ -138,18 +138,26 @@ def test_a_scene_of_a_batch_that_is_lost_has_no_numbers_and_cannot_go_on():
         simulation.step([one, lost])
 
 
-def test_from_the_second_call_on_nothing_is_allocated_on_the_device(monkeypatch):
-    simulation = Simulation(plane())
-    state = simulation.state()
+@pytest.mark.parametrize("name", ["one fluid", "mixture", "jet"])
+def test_from_the_second_call_on_nothing_is_allocated_on_the_device(name, monkeypatch):
+    simulation = Simulation(SCENES[name]())
+    first, stepper = simulation.state(), simulation.stepper(3)
+
+    def every_call():
+        state, residual = stepper.step(simulation.step(first, steps=3))
+        stepper.vjp(residual, last_adjoint(state))
+        stepper.jvp(residual, {"velocities": state["positions"]}, {"gravity": np.ones(simulation.dimension)})
+        return state
+
     for _ in range(2):
-        state = simulation.step(state, steps=3)
+        wanted = every_call()
     made = []
-    for name in ("zeros", "empty", "zeros_like", "empty_like", "clone", "full"):
-        monkeypatch.setattr(wp, name, lambda *a, name=name, **k: made.append(name))
+    for make in ("zeros", "empty", "zeros_like", "empty_like", "clone", "full"):
+        monkeypatch.setattr(wp, make, lambda *a, make=make, **k: made.append(make))
     monkeypatch.setattr(wp, "ScopedCapture", lambda *a, **k: made.append("capture"))
     for _ in range(2):
-        state = simulation.step(state, steps=3)
-    assert not made and state.clock.steps == 12
+        assert_same_state(every_call(), wanted)
+    assert not made
 
 
 class Weighted:

@@ -45,6 +45,7 @@ OF_AN_EVALUATION = (
     "goes_on",
     "evaluation",
     "_states",
+    "_copies",
     "_kept",
     "_run",
 )
@@ -109,6 +110,10 @@ class Rollout:
         self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
         self._states: dict[int, Callable[[], State]] = {}
         """Checkpoints by their number, each as what gives the state."""
+        self._copies: list[StateSeries] = []
+        """Of whole chunks, which hold them."""
+        self._spare: list[StateSeries] = []
+        """Those of earlier runs that nobody will come back to, for the next run that keeps states."""
         self._buffer, self._bar = self.initial.following(), self.initial.like()
         particles = max(solver.layout.all_particles, 1)
         filled = FILLED["cpu" if self._device.is_cpu else "cuda"] // particles
@@ -144,8 +149,11 @@ class Rollout:
 
     def begin_evaluation(self) -> None:
         """Before the first state and the parameters are replaced: whoever will come back to them puts them aside."""
+        if len(self.pending) > 1:
+            self._copies = []  # of several owners: not to be used again
         for pending in list(self.pending):
             pending.put_aside()
+            self._copies = []
         self.pending.clear()
         self.evaluation = next(self._evaluations)
 
@@ -167,6 +175,7 @@ class Rollout:
         ``keep`` checkpoints for a way back. Raises `DivergedError` after the good states were observed; a batch goes on
         without the scenes that have ``lost`` a particle."""
         self._states, self._kept, self._run = {0: lambda: self.initial}, -1, -1
+        self._spare, self._copies = [*self._spare, *self._copies], []
         self.lost = {}
         state, step = self.initial, 0
         self.solver.set_substeps(self.substeps)
@@ -223,7 +232,9 @@ class Rollout:
         """Keep checkpoints among the states after a step."""
         numbers = [n for n in range(step + 1, step + len(chunk) + 1) if n % self._interval == 0]
         if len(numbers) == len(self._chunk):
-            copy = self._series.copy()
+            copy = self._spare.pop() if self._spare else self._series.like()
+            copy.assign(self._series)
+            self._copies.append(copy)
             self._states |= {n: partial(copy.state, k) for k, n in enumerate(numbers)}
             return
         for n in numbers:
