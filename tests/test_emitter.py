@@ -128,7 +128,7 @@ def test_same_bits_twice_and_under_a_memory_budget(name):
     problem = problem_of(name)
     point = point_of(problem)
     loss, gradient = problem.value_and_gradient(point)
-    state_bytes = sum(array.capacity for array in problem.simulation.state.arrays())
+    state_bytes = sum(array.capacity for array in problem.simulation.initial.arrays())
     frugal = Problem(problem.simulation, STEPS, problem.loss, memory_budget=12 * state_bytes)
     for other in (Problem(problem.simulation, STEPS, problem.loss), frugal):
         found, bits = other.value_and_gradient(point)

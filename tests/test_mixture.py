@@ -116,7 +116,7 @@ def test_gradient_equals_warps_tape(name):
 @scenes
 def test_same_bits_twice_and_under_a_memory_budget(name):
     problem, point, _, (loss, gradient) = case(name)
-    state_bytes = sum(array.capacity for array in problem.simulation.state.arrays())
+    state_bytes = sum(array.capacity for array in problem.simulation.initial.arrays())
     frugal = Problem(problem.simulation, problem.steps, problem.loss, memory_budget=12 * state_bytes)
     for other in (Problem(problem.simulation, problem.steps, problem.loss), frugal):
         found, bits = other.value_and_gradient(point)

@@ -68,7 +68,7 @@ def test_states_that_do_not_fit_are_refused():
         ),
         ({"state": other(emitted=np.array([np.nan]))}, "state emitted has a value that is not finite"),
         ({"state": emitterless}, "state has positions, .*, but must have positions, .*, outlet, emitted in this scene"),
-        ({"state": simulation.state}, "must be a RestartState"),
+        ({"state": simulation.initial}, "must be a RestartState"),
         ({"state": state, "controls": {"initial_velocities": state["velocities"]}}, "must be left out with a state"),
     ]:
         with pytest.raises(InputError, match=what):

@@ -70,7 +70,7 @@ def test_only_the_view_of_the_volume_has_a_camera():
 def test_fluid_that_went_round_is_still_seen():
     box = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.5, 1.0], "periodic": [True, False]}
     simulation = Simulation(Scene(**plane_tables(render={"resolution": [20, 16]}, container=box)), precision="float64")
-    renderer, c = scene_renderer(simulation), simulation.state.mass_fractions
+    renderer, c = scene_renderer(simulation), simulation.initial.mass_fractions
     shift, colours = np.array([3 * 1.5, 0.0]), simulation.parameters()["colours"]
     here, there = (to_device(simulation.positions + k * shift, FLOAT64, simulation.device) for k in (0, 1))
     pictures = [renderer.render(x, c, colours) for x in (here, there)]

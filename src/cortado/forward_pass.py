@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from cortado.device.memory import require
+from cortado.device.state import State
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import InputError
 from cortado.gradients import AdjointEstimator
 from cortado.losses import SnapshotAdjoint
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import Arrays
+from cortado.residual import Residual, without_lost
 from cortado.rollout import BackwardStep, Observer, Rollout
 
 
@@ -22,12 +24,16 @@ class ForwardPass:
 
     loss: Any
     """Of a batch (batch,)."""
-    rollout: Rollout
+    _residual: Residual
     _values: Arrays
     _bars: Mapping[int, SnapshotAdjoint]
     _space: ParameterSpace
     _derivatives: dict[AdjointEstimator, BackwardStep]
-    _evaluation: int
+
+    @property
+    def rollout(self) -> Rollout:
+        """The run."""
+        return self._residual.rollout
 
     @property
     def turn(self) -> Turn:
@@ -59,19 +65,26 @@ class ForwardPass:
     def back(self, derivative: BackwardStep, observe: Observer | None = None) -> Arrays:
         """The gradient; ``observe`` is given the number and the adjoint of every state, from the last to the first.
 
-        Raises `InputError` after another evaluation of the problem, which overwrites the states of this one.
+        Other evaluations of the problem may be in between: the bits are the same.
         """
-        if self._evaluation != self.rollout.evaluation:
-            raise InputError(
-                "The problem was evaluated again after this forward pass, but a forward pass can be gone back through "
-                "only until then: make another one with forward_pass()."
-            )
+        return self._gradient(derivative, self._first_adjoint(derivative, observe))
+
+    @in_turn
+    def back_to_state(self, derivative: BackwardStep) -> tuple[Arrays, Arrays]:
+        """The gradient, and the derivatives with respect to the fields of the first state, by name, and to its
+        ``time``."""
+        first = self._first_adjoint(derivative)
+        initial_state = self._space.state_adjoint(self.rollout, self._values, first, derivative.parameters())
+        return self._gradient(derivative, first), without_lost(self.rollout, initial_state)
+
+    def _first_adjoint(self, derivative: BackwardStep, observe: Observer | None = None) -> State:
+        self._residual.bring_back()
+        return self.rollout.backward(derivative, {step: bar.state for step, bar in self._bars.items()}, observe)
+
+    def _gradient(self, derivative: BackwardStep, first: State) -> Arrays:
         bars, values = self._bars, self._values
-        first = self.rollout.backward(derivative, {step: bar.state for step, bar in bars.items()}, observe)
-        gradient = self._space.gradient(values, first, derivative.parameters())
+        gradient = self._space.gradient(self.rollout, values, first, derivative.parameters())
         if "colours" in values:
             gradient["colours"] = np.sum([bar.colours for bar in bars.values()], axis=0)
-        for b in self.rollout.lost:
-            for bar in gradient.values():
-                bar[b] = np.nan
+        gradient = without_lost(self.rollout, gradient)
         return {name: gradient[name] for name in values}

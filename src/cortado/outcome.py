@@ -1,12 +1,22 @@
 """What to say of a run whose pressure did not converge, and of a batch that lost scenes."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from cortado.errors import DivergedError
+from cortado.rollout import Rollout
 from cortado.scene.scene import Scene
 from cortado.words import counted
+
+
+def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
+    """What to say of the last forward run of a rollout; nothing where all is well."""
+    converged = rollout.diagnostics["converged"]
+    if not converged.all():
+        yield not_converged_sentence(converged, scene)
+    if rollout.lost:
+        yield lost_sentence(rollout.lost, rollout.solver.layout.members)
 
 
 def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:

@@ -13,14 +13,17 @@ from cortado.device.threads import Turn, in_turn
 from cortado.errors import CortadoWarning, DivergedError, InputError, shown
 from cortado.fixed import fixed
 from cortado.forward_pass import ForwardPass
-from cortado.gradients import AdjointEstimator, Estimate, GradientEstimator, estimate
+from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator, estimate
 from cortado.gradients.estimator import checked_adjoint
 from cortado.io.trajectory import noted
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch, batch, fingerprint
 from cortado.losses.checked import as_loss
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
+from cortado.parameters.restarts import one_for_each
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import NAMES, UNITS, Arrays, Values, require_points
+from cortado.residual import Residual
+from cortado.restart import RestartState
 from cortado.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
 from cortado.simulation import Simulation
 from cortado.sph.makers import fingerprint as forces_fingerprint
@@ -60,17 +63,20 @@ class Problem:
         steps: int,
         loss: Loss | Frames | Callable[..., Any],
         memory_budget: int = MEMORY_BUDGET,
+        state: RestartState | Sequence[RestartState] | None = None,
     ):
         """``steps`` may be 0: the loss is then one of the first state.
 
         ``loss``: an object with ``value`` and ``adjoint``, `losses.Frames` of such, or a function of Warp arrays (see
         `losses.Recorded`). ``memory_budget``: bytes of states kept on the way forward; with less, states are
-        recomputed on the way back.
+        recomputed on the way back. ``state``: where the steps begin, of a batch one for each scene; parameters are
+        then those of the steps to come, and first values cannot be given. See `Simulation.state`.
         """
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is a {type(simulation).__name__}, but must be a cortado.Simulation.")
-        self.simulation, self.steps, self.loss = simulation, check_steps(steps, least=0), loss
+        self.simulation, self.steps, self.loss, self.state = simulation, check_steps(steps, least=0), loss, state
         self.memory_budget = whole_number("memory_budget", memory_budget, 0)
+        self._states = [one.fixed() for one in one_for_each(state, simulation.batch)]
         by_step = loss.losses if isinstance(loss, Frames) else {self.steps: loss}
         for step in by_step:
             if step not in range(self.steps + 1):
@@ -83,7 +89,7 @@ class Problem:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled and copied as what it is made from."""
-        return Problem, (self.simulation, self.steps, self.loss, self.memory_budget)
+        return Problem, (self.simulation, self.steps, self.loss, self.memory_budget, self._states or None)
 
     def __repr__(self) -> str:
         loss = getattr(self.loss, "__name__", type(self.loss).__name__)
@@ -97,7 +103,7 @@ class Problem:
     @in_turn
     def value(self, parameters: Values) -> Any:
         """The loss, forward only: a float, of a batch (batch,), NaN for a scene that was ``lost``."""
-        return self._total(self._ends(self._space.checked(parameters), self._losses, keep=False))
+        return self._total(self._ends(self._checked(parameters), self._losses, keep=False))
 
     def end(self, parameters: Values) -> Any:
         """The last state of the rollout under these parameters: a `Snapshot`, of a batch a `SnapshotBatch`."""
@@ -106,12 +112,12 @@ class Problem:
     @in_turn
     def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, Any]:
         """States of the rollout under these parameters, by the number of steps before them, from 0 on."""
-        return self._ends(self._space.checked(parameters), self._checked_steps(steps), keep=False)
+        return self._ends(self._checked(parameters), self._checked_steps(steps), keep=False)
 
     @in_turn
     def run(self, parameters: Values, record_every: int = 1) -> Any:
         """The whole trajectory under these parameters; see `Simulation.run`."""
-        self._space.begin(self._rollout, self._space.checked(parameters))
+        self._space.begin(self._rollout, self._checked(parameters), states=self._states)
         return self.simulation.collect(self._rollout, record_every)
 
     def value_and_gradient(self, parameters: Values, gradient: GradientEstimator | None = None) -> tuple[Any, Arrays]:
@@ -119,6 +125,17 @@ class Problem:
         first axis for the scenes."""
         found = self.estimate(parameters, gradient)
         return found.loss, found.gradient
+
+    @in_turn
+    def value_and_gradients(
+        self, parameters: Values, gradient: AdjointEstimator | None = None
+    ) -> tuple[Any, Arrays, Arrays]:
+        """The loss, its derivatives with respect to the parameters as of `value_and_gradient`, and those with respect
+        to the first state: float64, by the names of its fields in their shapes, with ``time`` for its clock; of a batch
+        with a first axis for the scenes."""
+        forward_pass = self.forward_pass(parameters)
+        derivative = forward_pass.derivative(Exact() if gradient is None else gradient)
+        return forward_pass.loss, *forward_pass.back_to_state(derivative)
 
     @in_turn
     def estimate(
@@ -144,12 +161,13 @@ class Problem:
 
     @in_turn
     def forward_pass(self, parameters: Values) -> ForwardPass:
-        """A forward run that can be gone back through, until the next evaluation: what estimators work with."""
-        values = self._space.checked(parameters)
+        """A forward run that can be gone back through, also after other evaluations: what estimators work with. Its
+        states are kept for as long as it is held."""
+        values = self._checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
-        evaluation = self._rollout.evaluation  # before the loss, which may evaluate the problem itself
+        residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself
         loss, bars = self._judged(ends)
-        return ForwardPass(loss, self._rollout, values, bars, self._space, self._derivatives, evaluation)
+        return ForwardPass(loss, residual, values, bars, self._space, self._derivatives)
 
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> Any:
@@ -185,7 +203,7 @@ class Problem:
         of the parameters), which the next step overwrites. Returns the states after ``steps`` steps, by these, as
         `states` does."""
         require_methods("observe", observe, ("__call__",), "a function of a number of steps and a state")
-        values = self._space.checked(parameters)
+        values = self._checked(parameters)
         along = self._space.checked(directions, "direction")
         ends = self._ends(values, self._checked_steps(steps), keep=False, varied=along)
         self._rollout.tangent(*self._space.direction(self._rollout, values, along), observe)
@@ -225,7 +243,9 @@ class Problem:
         if size not in self._batches:
             while len(self._batches) >= KEPT:
                 self._batches.pop(next(iter(self._batches)))
-            self._batches[size] = Problem(self.simulation.batch_of(size), self.steps, self.loss, self.memory_budget)
+            self._batches[size] = Problem(
+                self.simulation.batch_of(size), self.steps, self.loss, self.memory_budget, self._states * size or None
+            )
         return self._batches[size]
 
     @property
@@ -240,6 +260,9 @@ class Problem:
             "target and loss": fingerprint(self.loss).encode(),
         }
         checksums = [f"{name} {sha256(content).hexdigest()[:16]}" for name, content in parts.items()]
+        for state in self._states:
+            fields = b"".join(np.asarray(state[name]).tobytes() for name in sorted(state.fields))
+            checksums.append(f"state {sha256(fields + repr(state.clock).encode()).hexdigest()[:16]}")
         energies = f"free energy {energy.name} {energy.curvature}"
         forces = [f"forces {text}"] if (text := forces_fingerprint(simulation.forces, simulation)) else []
         return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies, *forces])
@@ -262,6 +285,13 @@ class Problem:
             require_at_most("a number of steps", step, self.steps)
         return found
 
+    def _checked(self, parameters: Values) -> Arrays:
+        """The parameters as arrays; they go with the state, if one is given."""
+        values = self._space.checked(parameters)
+        self._space.check_restarts(self._states, values)
+        self.simulation.judged_states.update(one for one in self._states if one.origin is not None)
+        return values
+
     def _ends(self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()) -> dict[int, Any]:
         """States by the number of steps before them; ``keep`` checkpoints for a way back."""
         wanted, dimension = set(steps), self.simulation.dimension
@@ -274,7 +304,7 @@ class Problem:
             elif step in wanted:
                 ends[step] = SnapshotBatch(state.copy(), dimension, np.array(colours))
 
-        self._space.begin(self._rollout, values, varied)
+        self._space.begin(self._rollout, values, varied, self._states)
         observe(0, self._rollout.initial)
         self._rollout.forward(observe, keep)
         return ends

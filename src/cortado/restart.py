@@ -2,11 +2,13 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
+from cortado.fixed import FixedDict
 from cortado.words import Brief
 
 
@@ -70,3 +72,10 @@ class RestartState(Brief):
 
     def __getitem__(self, name: str) -> NDArray:
         return self.fields[name]
+
+    def fixed(self) -> "RestartState":
+        """The same in arrays of its own, which nobody can change."""
+        own = {name: np.array(value) for name, value in self.fields.items()}
+        for array in own.values():
+            array.setflags(write=False)
+        return replace(self, fields=FixedDict(own))

@@ -7,8 +7,10 @@ of steps, or a step back, is a captured graph on a GPU, and on a CPU where launc
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import count
 from math import isqrt
 from typing import Protocol
+from weakref import WeakSet
 
 import numpy as np
 
@@ -18,9 +20,10 @@ from cortado.device.memory import require, step_parts, within
 from cortado.device.state import Parameters, State, StateSeries
 from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
+from cortado.evaluation import Pending, PutAside
 from cortado.restart import Clock, Origin
 from cortado.solvers.containment import Lost
-from cortado.solvers.solver import Counts, Solver
+from cortado.solvers.solver import Counts, Solver, StepTangent
 
 CHUNK = 64
 """Steps between two looks of the host, at most."""
@@ -31,6 +34,22 @@ MEMORY_BUDGET = 8 * 2**30
 
 Observer = Callable[[int, State], None]
 """Is given the number of a state and the state, which later steps overwrite."""
+
+
+OF_AN_EVALUATION = (
+    "clocks",
+    "origins",
+    "substeps",
+    "advice",
+    "lost",
+    "goes_on",
+    "evaluation",
+    "_states",
+    "_copies",
+    "_kept",
+    "_run",
+)
+"""Attributes of a rollout that are replaced, and not overwritten, from one evaluation to the next."""
 
 
 class BackwardStep(Protocol):
@@ -91,6 +110,10 @@ class Rollout:
         self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
         self._states: dict[int, Callable[[], State]] = {}
         """Checkpoints by their number, each as what gives the state."""
+        self._copies: list[StateSeries] = []
+        """Of whole chunks, which hold them."""
+        self._spare: list[StateSeries] = []
+        """Those of earlier runs that nobody will come back to, for the next run that keeps states."""
         self._buffer, self._bar = self.initial.following(), self.initial.like()
         particles = max(solver.layout.all_particles, 1)
         filled = FILLED["cpu" if self._device.is_cpu else "cuda"] // particles
@@ -98,10 +121,17 @@ class Rollout:
         self._series = StateSeries(self.initial, length)
         self._chunk = [self._series.state(k) for k in range(length)]
         """The states of the last chunk."""
+        self._tangent: tuple[Parameters, StepTangent] | None = None
+        """The last one, with the tangents of the parameters that it was made for."""
         self._generation = -1
         self._forget_stale_graphs()
+        self.goes_on = False
+        """Whether the first state was given whole, so that it depends on no parameter."""
         self.evaluation = 0
-        """How often the first state and the parameters were replaced: a way back belongs to one evaluation."""
+        """Which first state and parameters these are: a way back belongs to one evaluation."""
+        self._evaluations = count(1)
+        self.pending: WeakSet[Pending] = WeakSet()
+        """Who will come back to the present evaluation."""
         self._kept = self._run = -1
         """The evaluations that states were kept of, and that the last run was of."""
 
@@ -115,6 +145,28 @@ class Rollout:
         """What a thread holds that uses the solver."""
         return self.solver.turn
 
+    # ---- evaluations ---------------------------------------------------------------------------------------------
+
+    def begin_evaluation(self) -> None:
+        """Before the first state and the parameters are replaced: whoever will come back to them puts them aside."""
+        if len(self.pending) > 1:
+            self._copies = []  # of several owners: not to be used again
+        for pending in list(self.pending):
+            pending.put_aside()
+            self._copies = []
+        self.pending.clear()
+        self.evaluation = next(self._evaluations)
+
+    def put_aside(self) -> PutAside:
+        """What the next evaluation overwrites."""
+        return PutAside(self, OF_AN_EVALUATION)
+
+    @in_turn
+    def bring_back(self, aside: PutAside) -> None:
+        """Have an evaluation again that was put aside."""
+        self.begin_evaluation()
+        aside.bring_back(self)
+
     # ---- forward -------------------------------------------------------------------------------------------------
 
     @in_turn
@@ -123,6 +175,7 @@ class Rollout:
         ``keep`` checkpoints for a way back. Raises `DivergedError` after the good states were observed; a batch goes on
         without the scenes that have ``lost`` a particle."""
         self._states, self._kept, self._run = {0: lambda: self.initial}, -1, -1
+        self._spare, self._copies = [*self._spare, *self._copies], []
         self.lost = {}
         state, step = self.initial, 0
         self.solver.set_substeps(self.substeps)
@@ -162,16 +215,16 @@ class Rollout:
         """Take the steps from one to another and return the states after them, which the next chunk overwrites."""
         self.solver.step_number.fill_(first)
         self._buffer.assign(state)
-        count = last - first
-        if count not in self._chunks:
-            self._chunks[count] = CapturedGraph(partial(self._take, count), self.solver.launch)
-        self._chunks[count]()
-        return self._chunk[:count]
+        length = last - first
+        if length not in self._chunks:
+            self._chunks[length] = CapturedGraph(partial(self._take, length), self.solver.launch)
+        self._chunks[length]()
+        return self._chunk[:length]
 
-    def _take(self, count: int) -> None:
+    def _take(self, length: int) -> None:
         """So many steps from the state in the buffer."""
         state = self._buffer
-        for new_state in self._chunk[:count]:
+        for new_state in self._chunk[:length]:
             self.solver.step(state, new_state, self.parameters, self.log)
             state = new_state
 
@@ -179,7 +232,9 @@ class Rollout:
         """Keep checkpoints among the states after a step."""
         numbers = [n for n in range(step + 1, step + len(chunk) + 1) if n % self._interval == 0]
         if len(numbers) == len(self._chunk):
-            copy = self._series.copy()
+            copy = self._spare.pop() if self._spare else self._series.like()
+            copy.assign(self._series)
+            self._copies.append(copy)
             self._states |= {n: partial(copy.state, k) for k, n in enumerate(numbers)}
             return
         for n in numbers:
@@ -257,10 +312,11 @@ class Rollout:
         """From ``dot``, the tangent of the first state, to that of every state, given to ``observe``; `forward` has
         run with these parameters."""
         self._require("along a tangent", self._run)
-        solver = self.solver
+        solver, state = self.solver, self._buffer
         solver.set_substeps(self.substeps)
-        derivative = solver.tangent(parameters_dot)
-        state = self.initial.following()
+        if self._tangent is None or self._tangent[0] is not parameters_dot:
+            self._tangent = parameters_dot, solver.tangent(parameters_dot)
+        derivative = self._tangent[1]
         state.assign(self.initial)
         observe(0, dot)
         for n in range(self.steps):

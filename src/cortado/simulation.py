@@ -8,6 +8,7 @@ from inspect import signature
 from math import isqrt, prod
 from os import PathLike
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 
@@ -28,8 +29,9 @@ from cortado.fixed import fixed
 from cortado.io.notebook import with_picture
 from cortado.io.trajectory import Frame, Trajectory
 from cortado.lattice.calibration import diffusion_limit
-from cortado.outcome import lost_sentence, not_converged_sentence
+from cortado.outcome import trouble
 from cortado.parameters.checks import check_sizes
+from cortado.parameters.restarts import one_for_each
 from cortado.parameters.scene_parameters import SceneParameters
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import scene_values
@@ -46,6 +48,7 @@ from cortado.solvers.build import first_capacity
 from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
 from cortado.sph.makers import ForceMaker, check_own, checked_makers, known_of
+from cortado.stepping import Stepping
 from cortado.words import counted
 
 MOST_SUBSTEPS = 10_000
@@ -55,7 +58,7 @@ WORTH = {"cpu": 16_000, "cuda": 1_000_000}
 
 
 @fixed
-class Simulation:
+class Simulation(Stepping):
     """A scene made ready to run: particles sampled, masses calibrated, kernels chosen.
 
     Threads that use it take turns, and other processes can have it, pickled or by a fork: see `docs/processes.md`.
@@ -114,10 +117,12 @@ class Simulation:
         self.free_particles = discrete.fluid.emitted.start
         """How many particles, the first ones, do not wait in a nozzle."""
         self.solver: Solver = self._built(discrete)
-        self.state = self.solver.new_state()
+        self.initial = self.solver.new_state()
         """The first state on the device."""
+        self.judged_states: WeakSet[RestartState] = WeakSet()
+        """Those that need not be judged again, as nobody can change them."""
         first = SceneParameters(self, 0).first(self.parameters())
-        self.state.set(first if self.batch is None else {name: [a] * self.batch for name, a in first.items()})
+        self.initial.set(first if self.batch is None else {name: [a] * self.batch for name, a in first.items()})
         for array in (self.positions, self.velocities, self.mass_fractions, self.walls):
             array.setflags(write=False)
         check_sizes(self.parameters(), self.precision, self.known)
@@ -202,11 +207,8 @@ class Simulation:
                 frames.append(self.frame(state))
 
         rollout.forward(keep, keep=False)
-        converged = rollout.diagnostics["converged"]
-        if not converged.all():
-            warnings.warn(not_converged_sentence(converged, self.scene), CortadoWarning, stacklevel=5)
-        if rollout.lost:
-            warnings.warn(lost_sentence(rollout.lost, rollout.solver.layout.members), CortadoWarning, stacklevel=5)
+        for sentence in trouble(rollout, self.scene):
+            warnings.warn(sentence, CortadoWarning, stacklevel=5)
         fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
         return recorded(rollout, np.array(steps), fields, self.constants(rollout))  # type: ignore[return-value]  # of a batch
 
@@ -217,7 +219,7 @@ class Simulation:
     def numbers_in_frame(self, components: int) -> int:
         """How many numbers `frame` records at most, if vectors have so many components."""
         sizes = self.particles, components, len(self.scene.phase)
-        return sum(prod(field.shape(*sizes)) for field in self.state.fields if not field.is_constant)
+        return sum(prod(field.shape(*sizes)) for field in self.initial.fields if not field.is_constant)
 
     def constants(self, rollout: Rollout) -> dict[str, np.ndarray]:
         """The fields of a rollout's states that no step changes."""
@@ -236,19 +238,10 @@ class Simulation:
         rollout = Rollout(self.solver, check_steps(steps))
         space = ParameterSpace(self, rollout.steps)
         values = space.checked({} if controls is None else controls)
-        states = self._states(state)
+        states = one_for_each(state, self.batch)
         space.check_restarts(states, values)
         space.begin(rollout, values, states=states)
         return rollout
-
-    def _states(self, state: RestartState | Sequence[RestartState] | None) -> list[RestartState]:
-        """The states to go on from, one for each scene; none for the scene's own."""
-        if state is None:
-            return []
-        states = list(state) if isinstance(state, Sequence) else [state]
-        if len(states) != (self.batch or 1):
-            raise InputError(f"state has {len(states)} states, but must have {self.batch or 1}, one for each scene.")
-        return states
 
     def batch_of(self, size: int) -> "Simulation":
         """The same scene so many times in one launch."""

@@ -17,6 +17,11 @@ PERTURBATION = 0.05
 def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
     """The values of parameters, given as values or as names of the scene's."""
     simulation = problem.simulation
+    if problem.state is not None:
+        raise InputError(
+            "problem begins at a state, but must begin as its scene does to be certified, as first positions and "
+            "velocities are moved, too."
+        )
     values = ParameterSpace(simulation, problem.steps).defaults()
     tilt = BY_NAME["tilt"]
     if tilt.present(simulation.scene) and not simulation.scene.schedule.leads_gravity:

@@ -53,7 +53,7 @@ def _loss(name: str, simulation: Simulation) -> Loss:
     if name == "centre-of-mass":
         return CentreOfMass(simulation.positions.mean(axis=0))
     renderer = simulation.renderer()
-    return Image(renderer, renderer.render(simulation.state))
+    return Image(renderer, renderer.render(simulation.initial))
 
 
 def _make(folder: Path) -> None:

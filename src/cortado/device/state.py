@@ -112,12 +112,14 @@ class StateSeries:
         arrays = {field.name: own.get(field.name, self._like[field.name]) for field in self._like.fields}
         return State(self._like.fields, arrays, self._like.batch)
 
-    def copy(self) -> Self:
-        """The same in arrays of their own."""
-        new = type(self)(self._like, self._length)
+    def like(self) -> Self:
+        """As many, still to be written."""
+        return type(self)(self._like, self._length)
+
+    def assign(self, other: Self) -> None:
+        """Copy as many others of the same run."""
         for name, array in self._whole.items():
-            wp.copy(new._whole[name], array)
-        return new
+            wp.copy(array, other._whole[name])
 
 
 class Parameters(Arrays):
@@ -131,6 +133,11 @@ class Parameters(Arrays):
         super().__init__(arrays)
         self._written: dict[str, np.ndarray] = {}
         """What `set` has written last, and need not write again."""
+
+    @property
+    def written(self) -> Mapping[str, np.ndarray]:
+        """What `set` has written, by name."""
+        return dict(self._written)
 
     def set(self, values: Mapping[str, Any]) -> None:
         """Write some by name, the same for all members or with an axis of them: a vector (d,) or vectors

@@ -35,7 +35,9 @@ def result_page(found: object, problem: Any, start: Mapping[str, Any], best: Map
 
 def _draw_ends(problem: Problem, points: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Where runs with the first guess and with what was found end, or how they look, and the target if it is known."""
-    own = Problem(problem.simulation, problem.steps, problem.loss)  # the user's keeps its last evaluation
+    own = Problem(
+        problem.simulation, problem.steps, problem.loss, state=problem.state
+    )  # the user's keeps its last evaluation
     step, loss = max(own.loss.losses.items()) if isinstance(own.loss, Frames) else (own.steps, own.loss)
     ends: list[Snapshot] = [own.states(point, [step])[step] for point in points]
     titles = [f"first guess, after {step} steps", "found"]

@@ -1,6 +1,6 @@
 """Whether a state is one of a simulation: what it belongs to, its numbers, and its clock."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,13 +37,28 @@ def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:
     )
 
 
+def one_for_each(state: RestartState | Sequence[RestartState] | None, batch: int | None) -> list[RestartState]:
+    """The states to go on from, one for each scene; none for the scenes' own. Raises `InputError` for another number of
+    them, and for anything else."""
+    if state is None:
+        return []
+    states = list(state) if isinstance(state, Sequence) else [state]
+    if len(states) != (batch or 1):
+        raise InputError(f"state has {len(states)} states, but must have {batch or 1}, one for each scene.")
+    for one in states:
+        if not isinstance(one, RestartState):
+            raise InputError(f"state is {shown(one)}, but must be a RestartState, such as trajectory.last_state.")
+    return states
+
+
 def check_state(
     state: RestartState, shapes: Mapping[str, tuple[int, ...]], origin: Origin, simulation: Simulated
 ) -> None:
     """A state to go on from is one of the simulation, whose fields have these shapes, and of these particles; raises
-    `InputError`."""
-    if not isinstance(state, RestartState):
-        raise InputError(f"state is {shown(state)}, but must be a RestartState, such as trajectory.last_state.")
+    `InputError`. One that was judged before can only be of other rest densities."""
+    if state.origin is not None and state in simulation.judged_states:
+        _check_origin(state.origin, origin)
+        return
     if state.fields.keys() != shapes.keys():
         raise InputError(f"state has {', '.join(state.fields)}, but must have {', '.join(shapes)} in this scene.")
     fields = {name: _numbers(name, state[name], wanted, simulation) for name, wanted in shapes.items()}

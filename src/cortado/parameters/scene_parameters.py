@@ -4,6 +4,7 @@ n counts fluid particles in the order in which the scene lists them, d is the sc
 """
 
 from typing import Protocol
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from cortado.parameters.reference_density import (
 from cortado.parameters.registry import Axis, Changing, Source
 from cortado.parameters.tilt import Tilt
 from cortado.parameters.values import Arrays, scene_values
-from cortado.restart import Clock
+from cortado.restart import Clock, RestartState
 
 DENSITY = "reference_density"
 """The field of a state that the first mass fractions and the rest densities decide."""
@@ -33,10 +34,12 @@ COMPOSITION = ("mass_fractions", "rest_density")
 class Simulated(Source, Protocol):
     """A simulation as its parameters see it."""
 
-    state: State
-    """The first, on the device."""
+    initial: State
+    """The first state, on the device."""
     known: Known
     """Its parameters."""
+    judged_states: WeakSet[RestartState]
+    """Those that need not be judged again, as nobody can change them."""
     batch: int | None
     """How many scenes there are in one launch; None for a single one."""
 
@@ -97,13 +100,14 @@ class SceneParameters:
         """(steps,) the same in steps."""
         return np.arange(max(self._steps, 1)) + self._known[name].moment
 
-    def _scheduled_rates(self, values: Arrays) -> Arrays:
-        """The derivatives of `scheduled` with respect to the time step, with a row for each step."""
+    def _scheduled_rates(self, values: Arrays, clock: Clock | None, of_clock: bool = False) -> Arrays:
+        """The derivatives of `scheduled` with respect to the time step, or to the time of the clock, with a row for
+        each step."""
         found = {}
         for name, course in self._courses(values).items():
-            times = self._times(name, values)
-            moments = self._moments(name)
-            rates = course.rates(times) * (moments[:, None] if self._known[name].rank else moments)
+            times, moments = self._times(name, values, clock), self._moments(name)
+            slopes = np.ones_like(moments) if of_clock else moments
+            rates = course.rates(times) * (slopes[:, None] if self._known[name].rank else slopes)
             if name == "tilt":
                 found["gravity"] = self._tilt.tangent(course.at(times), rates)
             else:
@@ -132,7 +136,7 @@ class SceneParameters:
     def first(self, values: Arrays) -> Arrays:
         """The fields of the first state that differ from the scene's under these values. Raises `InputError` for mass
         fractions without a volume: a little below 0, as diffusion may leave them."""
-        fields = first_values(self._simulation.state.fields, values)
+        fields = first_values(self._simulation.initial.fields, values)
         if values.keys().isdisjoint(COMPOSITION):
             return fields
         fractions, density = self._composition(values)
@@ -146,8 +150,11 @@ class SceneParameters:
             )
         return {**fields, DENSITY: found}
 
-    def direction(self, values: Arrays, along: Arrays) -> tuple[Arrays, Arrays]:
-        """A direction by name as tangents of the fields of the first state and of what steps depend on."""
+    def direction(
+        self, values: Arrays, along: Arrays, clock: Clock | None = None, time_dot: float = 0.0
+    ) -> tuple[Arrays, Arrays]:
+        """A direction by name as tangents of the fields of the first state and of what steps depend on, where the first
+        state is at a clock whose time has a tangent."""
         if "gravity" in along and "tilt" in values:
             raise InputError("direction gravity is given, but must be left out, as tilt is given in its place.")
         if "tilt" in along:
@@ -160,20 +167,27 @@ class SceneParameters:
                 )
             angles = values.get("tilt", np.zeros(self._simulation.dimension - 1))
             along = {**along, "gravity": self._tilt.tangent(angles, along["tilt"])}
-        rates = self._scheduled_rates(values) if "time_step" in along else {}
+        rates = self._scheduled_rates(values, clock) if "time_step" in along else {}
+        later = self._scheduled_rates(values, clock, of_clock=True) if time_dot else {}
         along = {name: along.get(name, np.zeros_like(value)) for name, value in self.values.items()}
         fractions_dot, density_dot = along["mass_fractions"], np.atleast_1d(along["rest_density"])
         density = reference_density_tangent(*self._composition(values), fractions_dot, density_dot)
-        first = {**first_values(self._simulation.state.fields, along), DENSITY: density}
+        first = {**first_values(self._simulation.initial.fields, along), DENSITY: density}
         moved = {name: along[name] + along["time_step"] * rate for name, rate in rates.items()}
+        moved |= {name: moved.get(name, along[name]) + time_dot * rate for name, rate in later.items()}
         return first, self.run({**along, **moved})
 
-    def gradient(self, values: Arrays, first: Arrays, run: Arrays) -> Arrays:
-        """From the adjoints of the fields of the first state and of what steps depend on to those of ``values``, in
-        their shapes."""
+    def time_adjoint(self, values: Arrays, run: Arrays, clock: Clock) -> float:
+        """From the adjoints of what steps depend on to that of the time at which they begin."""
+        rates = self._scheduled_rates(values, clock, of_clock=True)
+        return sum(float((run[name] * rate).sum()) for name, rate in rates.items())
+
+    def gradient(self, values: Arrays, first: Arrays, run: Arrays, clock: Clock | None = None) -> Arrays:
+        """From the adjoints of what steps depend on and of those fields of the first state that depend on parameters,
+        which is at a clock, to those of ``values``, in their shapes."""
         found = {name: run[name].copy() for name in self._known.run if name in values}
-        for field in self._simulation.state.fields:
-            if field.first in values:
+        for field in self._simulation.initial.fields:
+            if field.first in values and field.name in first:
                 if field.first in found:
                     found[field.first][0] += first[field.name][0]
                 else:
@@ -181,12 +195,12 @@ class SceneParameters:
         if "tilt" in values:
             found["tilt"] = self._tilt.adjoint(values["tilt"], run["gravity"])
         if "time_step" in values:
-            later = sum(float((run[name] * rate).sum()) for name, rate in self._scheduled_rates(values).items())
+            later = sum(float((run[name] * rate).sum()) for name, rate in self._scheduled_rates(values, clock).items())
             found["time_step"] = found["time_step"] + later
         for name in self._known.over_time:
             if name in values and values[name].ndim == self._known[name].rank:
                 found[name] = found[name].sum(axis=0)
-        if not values.keys().isdisjoint(COMPOSITION):
+        if DENSITY in first and not values.keys().isdisjoint(COMPOSITION):
             bars = reference_density_adjoint(*self._composition(values), first[DENSITY])
             for name, own_bar in zip(COMPOSITION, bars, strict=True):
                 if name in found:

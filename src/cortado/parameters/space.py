@@ -21,6 +21,8 @@ from cortado.rollout import Rollout
 from cortado.scene.stability import divergence_advice
 
 STATE = names(Role.STATE)
+STATE_TIME = "time"
+"""What the time of a state is called among derivatives with respect to its fields."""
 DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
 """Parameters that explicit steps of diffusion have to follow."""
 
@@ -76,9 +78,10 @@ class ParameterSpace:
         diffusion even where it is 0. ``states``, one for each scene, replace the scene's first state.
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
-        rollout.evaluation += 1
+        rollout.begin_evaluation()
+        rollout.goes_on = bool(states)
         rollout.clocks = [state.clock for state in states] or [Clock()] * len(rollout.clocks)
-        rollout.initial.assign(simulation.state)
+        rollout.initial.assign(simulation.initial)
         firsts = [dict(state.fields) for state in states] or [self._one.first(own) for own in members]
         rollout.initial.set(self._together(firsts))
         if (simulation.scene.schedule.courses or self._known.courses) and len(members) < len(rollout.clocks):
@@ -115,10 +118,18 @@ class ParameterSpace:
                 raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
         simulation = self._simulation
         sizes = len(simulation.positions), simulation.dimension, len(simulation.scene.phase)
-        shapes = {field.name: field.shape(*sizes) for field in simulation.state.fields}
+        shapes = {field.name: field.shape(*sizes) for field in simulation.initial.fields}
         for state, own in zip(states, self.members(values), strict=False):
             origin = self._origin(np.atleast_1d(own.get("rest_density", self._one.values["rest_density"])))
             check_state(state, shapes, origin, simulation)
+
+    def check_directions(self, along: Arrays) -> None:
+        """Whether directions go with a state; raises `InputError`."""
+        for name in STATE:
+            if name in along:
+                raise InputError(
+                    f"direction {name} is given, but must be left out: give it among those of the state's fields."
+                )
 
     def _origin(self, rest_density: np.ndarray) -> Origin:
         """Of the particles of a run with these rest densities (phases,)."""
@@ -126,28 +137,64 @@ class ParameterSpace:
 
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
-        """A direction by name as tangents of the first state and of the parameters, at ``values``."""
+        """A direction by name as tangents of the first state, 0 of one that was given, and of the parameters, at
+        ``values``."""
         dot, parameters = rollout.solver.new_state(), rollout.solver.new_parameters(self._steps)
-        pairs = zip(self.members(values), self.members(along), strict=True)
-        directions = [self._one.direction(*pair) for pair in pairs]
-        dot.set(self._together([first for first, _ in directions]))
-        parameters.set(_stacked([run for _, run in directions]))
+        self.set_direction(rollout, values, along, dot, parameters)
         return dot, parameters
 
-    def gradient(self, values: Arrays, state: State, parameters: Parameters) -> Arrays:
-        """Adjoints of the first state and of the parameters, for the names and in the shapes of ``values``; in a batch
-        each has a first axis with an entry for each scene, whether or not the value has one."""
+    @WARP
+    def set_direction(
+        self,
+        rollout: Rollout,
+        values: Arrays,
+        along: Arrays,
+        dot: State,
+        parameters: Parameters,
+        time_dots: np.ndarray | None = None,
+    ) -> None:
+        """Write a direction by name to tangents of the first state, unless it was given, and of the parameters.
+        ``time_dots`` (members,): those of the times at which the first states are."""
+        members, times = self.members(values), np.zeros(len(rollout.clocks)) if time_dots is None else time_dots
+        each = zip(members, self.members(along), rollout.clocks, times, strict=True)
+        directions = [self._one.direction(*own) for own in each]
+        if not rollout.goes_on:
+            dot.set(self._together([first for first, _ in directions]))
+        parameters.set(_stacked([run for _, run in directions]))
+
+    def time_adjoints(self, rollout: Rollout, values: Arrays, parameters: Parameters) -> np.ndarray:
+        """(members,) from the adjoints of the parameters those of the times at which the first states are."""
+        dimension = self._simulation.dimension
+        over_time = [name for name in self._known.over_time if name in self._known.run]
+        run = {name: parameters[name].numpy().astype(np.float64) for name in over_time}
+        run |= {name: run[name][..., :dimension] for name in self._known.vectors if name in run}
+        members = enumerate(zip(self.members(values), rollout.clocks, strict=True))
+        return np.array([self._one.time_adjoint(own, _entry(run, b), clock) for b, (own, clock) in members])
+
+    def state_adjoint(self, rollout: Rollout, values: Arrays, state: State, parameters: Parameters) -> Arrays:
+        """Adjoints of the first state as those of its fields, by name, and of its ``time``, all in float64; in a batch
+        each has a first axis for the scenes."""
+        found = {name: bar.astype(np.float64) for name, bar in state.numpy(self._simulation.dimension).items()}
+        times = self.time_adjoints(rollout, values, parameters)
+        return {**found, STATE_TIME: times[0] if self._batch is None else times}
+
+    def gradient(self, rollout: Rollout, values: Arrays, state: State, parameters: Parameters) -> Arrays:
+        """Adjoints of the first state, unless it was given, and of the parameters, for the names and in the shapes of
+        ``values``; in a batch each has a first axis with an entry for each scene, whether or not the value has one."""
         dimension = self._simulation.dimension
         read = {"gravity" if name == "tilt" else name for name in values}
         read |= set(self._known.over_time) if "time_step" in values else set()
         run = {name: parameters[name].numpy().astype(np.float64) for name in self._known.run if name in read}
         run |= {name: run[name][..., :dimension] for name in self._known.vectors if name in run}
         fields = [f.name for f in state.fields if f.first in values or f.name == DENSITY]
+        fields = [] if rollout.goes_on else fields
         first = {name: bar.astype(np.float64) for name, bar in state.numpy(dimension, only=fields).items()}
         if self._batch is None:
-            return self._one.gradient(values, first, _entry(run, 0))
-        members = self.members(values)
-        found = _stacked([self._one.gradient(own, _entry(first, b), _entry(run, b)) for b, own in enumerate(members)])
+            return self._one.gradient(values, first, _entry(run, 0), rollout.clocks[0])
+        members = enumerate(zip(self.members(values), rollout.clocks, strict=True))
+        found = _stacked(
+            [self._one.gradient(own, _entry(first, b), _entry(run, b), clock) for b, (own, clock) in members]
+        )
         return {name: bar.reshape(self._batch, *self._row(name, values[name])) for name, bar in found.items()}
 
     def _checked(self, name: str, value: Any, what: str) -> np.ndarray:

@@ -55,6 +55,12 @@ class LoopRecord:
         }
         """(steps,) by name, in a batch (steps, batch), of the steps that were read."""
 
+    def assign(self, other: "LoopRecord") -> None:
+        """Hold what another has read, on the device and off it."""
+        wp.copy(self.iterations, other.iterations)
+        wp.copy(self.errors, other.errors)
+        self.counts, self.diagnostics = other.counts, other.diagnostics
+
     @property
     def converged(self) -> NDArray:
         """(steps,) or (steps, batch) whether the errors came below the tolerances; always, with a fixed number of
@@ -87,6 +93,11 @@ class IterationLog:
         self._steps = steps
         for record in self.records:
             record.read(steps)
+
+    def assign(self, other: "IterationLog") -> None:
+        self._steps = other._steps
+        for own, given in zip(self.records, other.records, strict=True):
+            own.assign(given)
 
     def seek(self, step: int) -> Counts:
         return tuple(record.loop.seek(record, step) for record in self.records)

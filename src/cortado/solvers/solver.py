@@ -34,6 +34,9 @@ class StepLog(Protocol):
     def read(self, steps: int) -> None:
         """Read so many steps from the device."""
 
+    def assign(self, other: Self) -> None:
+        """Hold what another of as many steps of the same solver has read."""
+
     def seek(self, step: int) -> Counts:
         """Make the loops of the solver ready to take a step again that was read, from 0. Of a batch the counts are
         those of the scene that went round most often."""

@@ -1,0 +1,399 @@
+"""Steps as a function of a state: chained, they have the bits of one run."""
+
+import pickle
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+
+from cortado import InputError, Problem, Scene, Simulation, certify, gradients
+from scenes import MIXING, jet, plane, plane_of_three, pour, scene, two_layers
+
+SWAY = {"times": [0.0, 0.03, 0.06, 0.1], "values": [[0.0, -9.81], [8.0, -9.81], [-5.0, -7.0], [0.0, -9.81]]}
+PATH = {"times": [0.0, 0.02, 0.05], "values": [[0.3, 0.26], [0.34, 0.28], [0.28, 0.3]]}
+
+
+def scheduled() -> Scene:
+    return plane(schedule={"gravity": SWAY})
+
+
+def moving_jet() -> Scene:
+    return jet(schedule={"nozzle_path": PATH})
+
+
+def tense() -> Scene:
+    honey = [{"name": "water", "rest_density": 1000.0, "viscosity": 0.6}]
+    return plane(phase=honey, forces={"gravity": [0.0, -9.81], "surface_tension": 0.5})
+
+
+def periodic() -> Scene:
+    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.8], "periodic": [True, False]}
+    return plane(container=room, forces={"gravity": [0.5, -9.81]})
+
+
+SCENES = {
+    "one fluid": plane,
+    "in space": scene,
+    "mixture": two_layers,
+    "three fluids": plane_of_three,
+    "schedule": scheduled,
+    "jet": moving_jet,
+    "pour": pour,
+    "surface tension": tense,
+    "periodic": periodic,
+}
+
+
+def assert_same_state(found, wanted):
+    assert found.fields.keys() == wanted.fields.keys()
+    for name in wanted.fields:
+        assert found[name].dtype == wanted[name].dtype and found[name].tobytes() == wanted[name].tobytes(), name
+    assert (found.clock, found.origin) == (wanted.clock, wanted.origin)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("name", SCENES)
+def test_chained_steps_have_the_bits_of_one_run(name, precision):
+    simulation = Simulation(SCENES[name](), precision=precision)
+    whole = simulation.run(40)
+    state = simulation.state()
+    assert_same_state(state, whole[:1].last_state)
+    for steps in (10, 1, 10, 1, 18):
+        state = simulation.step(state, steps=steps)
+        assert state.clock.time == whole.times[state.clock.steps]
+    assert_same_state(state, whole.last_state)
+    assert_same_state(simulation.step(simulation.state(), steps=40), whole.last_state)
+
+
+def test_steps_of_a_batch_have_the_bits_of_one_run():
+    simulation = Simulation(scheduled(), batch=3)
+    parameters = {"viscosity": [0.05, 0.1, 0.3]}
+    whole = simulation.run(30, parameters)
+    states = simulation.state()
+    for _ in range(3):
+        states = simulation.step(states, parameters, steps=10)
+    assert isinstance(states, tuple) and len(states) == 3
+    for b in range(3):
+        assert_same_state(states[b], whole[b].last_state)
+
+
+def test_parameters_of_steps_are_those_of_the_steps_to_come():
+    simulation = Simulation(moving_jet(), precision="float64")
+    gravity = np.array([0.0, -9.81]) + np.sin(np.arange(20))[:, None]
+    path = np.array([0.3, 0.26]) + 0.002 * np.sin(0.2 * np.arange(20))[:, None]
+    start = {"initial_velocities": 0.1 * np.random.default_rng(0).standard_normal((simulation.particles, 2))}
+    whole = simulation.run(20, {"gravity": gravity, "nozzle_path": path, **start})
+    state = simulation.state({"nozzle_path": path[0], **start})
+    for k in (0, 10):
+        state = simulation.step(state, {"gravity": gravity[k : k + 10], "nozzle_path": path[k : k + 10]}, steps=10)
+    assert_same_state(state, whole.last_state)
+
+
+def test_what_a_step_cannot_take_is_refused_in_a_sentence():
+    simulation = Simulation(plane())
+    state = simulation.state()
+    for arguments, words in [
+        ((None, {"viscosity": -1.0}), "viscosity"),
+        ((state, {"initial_velocities": simulation.velocities}), "must be left out with a state"),
+        ((simulation.initial,), "must be a RestartState"),
+        (([state, state],), "has 2 states, but must have 1"),
+        ((replace(state, fields={"positions": state["positions"]}),), "but must have"),
+        ((state, {}, 0), "steps"),
+        ((state, {}, 2.5), "steps"),
+    ]:
+        with pytest.raises(InputError, match=words):
+            simulation.step(*arguments)
+    with pytest.raises(InputError, match="has 1 states, but must have 3"):
+        Simulation(plane(), batch=3).step(state)
+
+
+def test_a_state_of_a_step_cannot_be_changed_and_one_that_is_made_of_it_is_judged():
+    simulation = Simulation(plane())
+    state = simulation.step(simulation.state(), steps=2)
+    with pytest.raises(ValueError, match="read-only"):
+        state["positions"][0] = 0.0
+    with pytest.raises(InputError, match="cannot be changed"):
+        state.fields["positions"] = np.zeros((64, 2))
+    crowded = np.array(state["positions"])
+    crowded[3] = crowded[5]
+    with pytest.raises(InputError, match="particles 3 and 5 at one place"):
+        simulation.step(replace(state, fields={**state.fields, "positions": crowded}))
+    with pytest.raises(InputError, match="to be given again"):
+        simulation.step(state, {"rest_density": 900.0})
+    again = pickle.loads(pickle.dumps(state))
+    assert_same_state(simulation.step(again), simulation.step(state))
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_a_scene_of_a_batch_that_is_lost_has_no_numbers_and_cannot_go_on():
+    simulation = Simulation(plane(), batch=2)
+    fast = np.zeros((2, simulation.particles, 2))
+    fast[1, 0] = [400.0, 0.0]
+    one, lost = simulation.step(simulation.state({"initial_velocities": fast}), steps=3)
+    assert_same_state(one, Simulation(plane()).run(3).last_state)
+    assert np.isnan(lost["positions"]).all() and np.isnan(lost["velocities"]).all()
+    with pytest.raises(InputError, match="not finite"):
+        simulation.step([one, lost])
+
+
+@pytest.mark.parametrize("name", ["one fluid", "mixture", "jet"])
+def test_from_the_second_call_on_nothing_is_allocated_on_the_device(name, monkeypatch):
+    simulation = Simulation(SCENES[name]())
+    first, stepper = simulation.state(), simulation.stepper(3)
+
+    def every_call():
+        state, residual = stepper.step(simulation.step(first, steps=3))
+        stepper.vjp(residual, last_adjoint(state))
+        stepper.jvp(residual, {"velocities": state["positions"]}, {"gravity": np.ones(simulation.dimension)})
+        return state
+
+    for _ in range(2):
+        wanted = every_call()
+    made = []
+    for make in ("zeros", "empty", "zeros_like", "empty_like", "clone", "full"):
+        monkeypatch.setattr(wp, make, lambda *a, make=make, **k: made.append(make))
+    monkeypatch.setattr(wp, "ScopedCapture", lambda *a, **k: made.append("capture"))
+    for _ in range(2):
+        assert_same_state(every_call(), wanted)
+    assert not made
+
+
+class Weighted:
+    """A loss of the last state alone, with the same weights in every dimension."""
+
+    def value(self, end):
+        return float((end.positions**2).sum() + (end.positions * end.velocities).sum())
+
+    def adjoint(self, end):
+        return 2.0 * end.positions + end.velocities, end.positions
+
+
+def last_adjoint(state):
+    x, v = np.float64(state["positions"]), np.float64(state["velocities"])
+    return {"positions": 2.0 * x + v, "velocities": x}
+
+
+def differentiated(simulation):
+    """Parameters of a whole run of 200 steps: a gravity in every step, a viscosity, a nozzle that moves."""
+    steps = 200
+    sway = np.sin(0.1 * np.arange(steps))[:, None] * np.eye(simulation.dimension)[0]
+    found = {"gravity": np.array(simulation.scene.forces.gravity) + sway}
+    found["viscosity"] = np.asarray(simulation.parameters()["viscosity"]) * 1.1
+    if simulation.scene.emitter is not None:
+        found["nozzle_path"] = np.array(simulation.scene.emitter.outlet) + 0.002 * sway
+    return found
+
+
+def rows(parameters, steps):
+    return {name: value[steps] if np.ndim(value) == 2 else value for name, value in parameters.items()}
+
+
+ROUND_OFF = {"float32": 2e-5, "float64": 1e-11}
+"""Relative: adjoints of parameters of all steps are added up in segments."""
+CHAINED = {name: SCENES[name] for name in ("one fluid", "mixture", "schedule", "jet", "surface tension", "periodic")}
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("name", CHAINED)
+def test_segments_chained_by_vjp_have_the_bits_of_one_run(name, precision):
+    simulation = Simulation(CHAINED[name](), precision=precision)
+    parameters = differentiated(simulation)
+    if name == "schedule":
+        del parameters["gravity"]
+    start = {"initial_velocities": simulation.velocities + 0.01}
+    problem = Problem(simulation, 200, Weighted())
+    loss, gradient = problem.value_and_gradient({**parameters, **start})
+    stepper, state = simulation.stepper(10), simulation.state(start)
+    residuals = []
+    for k in range(20):
+        state, residual = stepper.step(state, rows(parameters, slice(10 * k, 10 * k + 10)))
+        residuals.append(residual)
+    assert Weighted().value(SimpleNamespace(**{n: np.float64(a) for n, a in state.fields.items()})) == loss
+    bar, parts = last_adjoint(state), []
+    while residuals:
+        bar, part = stepper.vjp(residuals.pop(), bar)
+        parts.insert(0, part)
+    assert bar["velocities"].tobytes() == gradient["initial_velocities"].tobytes()
+    assert np.abs(bar["velocities"]).max() > 0.0
+    for parameter, value in parameters.items():
+        if np.ndim(value) == 2:
+            found = np.concatenate([part[parameter] for part in parts])
+            if parameter == "nozzle_path":  # where a run begins that is given a path
+                found[0] += bar["outlet"][0]
+            assert found.tobytes() == gradient[parameter].tobytes(), parameter
+        else:
+            found = sum(part[parameter] for part in parts)
+            np.testing.assert_allclose(found, gradient[parameter], rtol=ROUND_OFF[precision], atol=0.0)
+
+
+def test_segments_of_a_batch_chained_by_vjp_have_the_bits_of_one_run():
+    simulation = Simulation(two_layers(), batch=3, precision="float64")
+    start = {"initial_velocities": 0.02 * np.arange(3)[:, None, None] + simulation.velocities}
+    gravity = np.array([0.0, -9.81, 0.0]) + np.random.default_rng(2).standard_normal((3, 60, 3))
+    problem = Problem(simulation, 60, Weighted())
+    losses, gradient = problem.value_and_gradient({"gravity": gravity, **start})
+    stepper, states, residuals = simulation.stepper(20), simulation.state(start), []
+    for k in (0, 20, 40):
+        states, residual = stepper.step(states, {"gravity": gravity[:, k : k + 20]})
+        residuals.append(residual)
+    found = [Weighted().value(SimpleNamespace(**state.fields)) for state in states]
+    assert found == losses.tolist()
+    each = [last_adjoint(state) for state in states]
+    bar, parts = {name: np.stack([one[name] for one in each]) for name in each[0]}, []
+    while residuals:
+        bar, part = stepper.vjp(residuals.pop(), bar)
+        parts.insert(0, part["gravity"])
+    assert bar["velocities"].tobytes() == gradient["initial_velocities"].tobytes()
+    assert np.concatenate(parts, axis=1).tobytes() == gradient["gravity"].tobytes()
+    assert bar["time"].shape == (3,)
+
+
+@pytest.mark.parametrize("name", ["mixture", "schedule", "jet"])
+def test_interleaved_steps_have_the_bits_of_steps_in_turn(name):
+    simulation = Simulation(SCENES[name]())
+    stepper, first = simulation.stepper(5), simulation.state()
+    later = simulation.step(first, steps=7)
+    points = [(first, {"viscosity": simulation.parameters()["viscosity"]}), (later, {"time_step": 0.0015})]
+    ends, wanted = [], []
+    for state, parameters in points:
+        end, residual = stepper.step(state, parameters)
+        ends.append(end)
+        wanted.append(
+            (*stepper.vjp(residual, last_adjoint(end)), stepper.jvp(residual, {"velocities": first["positions"]}))
+        )
+    pending = [stepper.step(state, parameters)[1] for state, parameters in points]
+    for k in (0, 1, 0):
+        dot = stepper.jvp(pending[k], {"velocities": first["positions"]})
+        found = (*stepper.vjp(pending[k], last_adjoint(ends[k])), dot)
+        for one, other in zip(found, wanted[k], strict=True):
+            assert {n: a.tobytes() for n, a in one.items()} == {n: a.tobytes() for n, a in other.items()}
+
+
+def moved(simulation, state, by, dot):
+    """A state that nobody judges: its densities are of no fluid that there is."""
+    clock = replace(state.clock, time=state.clock.time + by * float(dot.get("time", 0.0)))
+    fields = {name: array + by * dot.get(name, 0.0) for name, array in state.fields.items()}
+    found = replace(state, clock=clock, fields=fields).fixed()
+    simulation.judged_states.add(found)
+    return found
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_vjp_jvp_and_differences_agree_for_every_field_of_a_state(name):
+    """And for the time of the state and the time step, on which a schedule depends."""
+    simulation, steps = Simulation(SCENES[name](), precision="float64"), 6
+    state, rng = simulation.step(simulation.state(), steps=9), np.random.default_rng(1)
+    end_bar = {n: rng.standard_normal(a.shape) for n, a in state.fields.items()} | {"time": 0.7}
+    parameters = {"time_step": 0.0018}
+    bar, parameter_bars = simulation.vjp(state, parameters, end_bar, steps)
+    assert bar.keys() == {*state.fields, "time"}
+    for field in bar:
+        dot = {field: rng.standard_normal(np.shape(bar[field]))}
+        out = simulation.jvp(state, parameters, dot, steps=steps)
+        forward = sum((np.asarray(end_bar[n]) * out[n]).sum() for n in out)
+        assert forward == pytest.approx((bar[field] * dot[field]).sum(), rel=1e-9, abs=1e-9)
+        step = 1e-8 if field != "reference_density" else 1e-4
+        up, down = (simulation.step(moved(simulation, state, sign * step, dot), parameters, steps) for sign in (1, -1))
+        difference = sum((end_bar[n] * (up[n] - down[n])).sum() for n in up.fields)
+        difference += end_bar["time"] * (up.clock.time - down.clock.time)
+        assert difference / (2.0 * step) == pytest.approx(forward, rel=2e-5, abs=2e-5), field
+    along = simulation.jvp(state, parameters, {}, {"time_step": 1.0}, steps=steps)
+    forward = sum((np.asarray(end_bar[n]) * along[n]).sum() for n in along)
+    assert forward == pytest.approx(float(parameter_bars["time_step"]), rel=1e-9)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("name", SCENES)
+def test_a_problem_begins_at_a_state(name, precision):
+    simulation = Simulation(SCENES[name](), precision=precision)
+    viscosity = {"viscosity": 1.2 * np.asarray(simulation.parameters()["viscosity"])}
+    whole = simulation.run(20, viscosity)
+    state = simulation.run(12, viscosity).last_state
+    problem = Problem(simulation, 8, Weighted(), state=state)
+    for _ in range(2):
+        assert problem.end(viscosity).positions.tobytes() == np.float64(whole.positions[-1]).tobytes()
+    assert_same_state(problem.run(viscosity).last_state, whole.last_state)
+    loss, gradient, initial_state = problem.value_and_gradients(viscosity)
+    residual = simulation.stepper(8).step(state, viscosity)[1]
+    bar, wanted = simulation.stepper(8).vjp(residual, last_adjoint(whole.last_state))
+    assert loss == Problem(simulation, 20, Weighted()).value(viscosity)
+    assert gradient["viscosity"].tobytes() == wanted["viscosity"].tobytes()
+    assert problem.value_and_gradient(viscosity)[1]["viscosity"].tobytes() == wanted["viscosity"].tobytes()
+    assert {n: np.asarray(a).tobytes() for n, a in initial_state.items()} == {
+        n: np.asarray(a).tobytes() for n, a in bar.items()
+    }
+    assert Problem(simulation, 8, Weighted(), state=simulation.state()).value({}) == Problem(
+        simulation, 8, Weighted()
+    ).value({})
+
+
+def test_a_problem_with_a_state_is_copied_batched_and_told_from_others():
+    simulation = Simulation(jet(), precision="float64")
+    state = simulation.step(simulation.state(), steps=12)
+    problem = Problem(simulation, 6, Weighted(), state=state)
+    point = {"flow_rate": 0.25}
+    loss, gradient = problem.value_and_gradient(point)
+    again = pickle.loads(pickle.dumps(problem))
+    assert again.value(point) == loss and again.fingerprint == problem.fingerprint
+    assert problem.fingerprint != Problem(simulation, 6, Weighted()).fingerprint
+    together = problem.together([point, {"flow_rate": 0.3}], gradients.Exact())
+    assert together[0].loss == loss and together[0].gradient["flow_rate"] == gradient["flow_rate"]
+    assert together[1].loss == problem.value({"flow_rate": 0.3})
+    assert problem.tangent(point, {"flow_rate": 1.0}) == pytest.approx(float(gradient["flow_rate"]), rel=1e-10)
+    with pytest.raises(InputError, match="must begin as its scene does to be certified"):
+        certify(problem, point)
+    path = np.array(state["outlet"]) + np.zeros((6, 2))
+    bars, directions = problem.value_and_gradient({"nozzle_path": path})[1], np.ones((6, 2))
+    assert problem.tangent({"nozzle_path": path}, {"nozzle_path": directions}) == pytest.approx(
+        bars["nozzle_path"].sum()
+    )
+    for parameters in ({"initial_velocities": simulation.velocities}, {"rest_density": 900.0}):
+        with pytest.raises(InputError, match="state"):
+            problem.value(parameters)
+    with pytest.raises(InputError, match="state is 3, but must be a RestartState"):
+        Problem(simulation, 6, Weighted(), state=3)
+
+
+def test_a_problem_keeps_its_own_copy_of_a_state():
+    simulation = Simulation(plane())
+    state = simulation.run(5).last_state
+    problem = Problem(simulation, 4, Weighted(), state=state)
+    loss = problem.value({})
+    state["positions"][:] = 0.0
+    assert problem.value({}) == loss
+
+
+@pytest.mark.parametrize(
+    ("bar", "words"),
+    [
+        ({"pressure": np.zeros(64)}, "'pressure', but must have only positions"),
+        ({"positions": np.zeros((63, 2))}, r"has shape \(63, 2\), but must be \(64, 2\)"),
+        ({"time": [1.0]}, r"time has shape \(1,\)"),
+        ({"velocities": "fast"}, "velocities"),
+        (None, "must be a table"),
+    ],
+)
+def test_derivatives_of_states_that_do_not_fit_are_sentences(bar, words):
+    simulation = Simulation(plane())
+    state = simulation.state()
+    with pytest.raises(InputError, match=words):
+        simulation.vjp(state, {}, bar)
+    with pytest.raises(InputError, match=words):
+        simulation.jvp(state, {}, bar)
+
+
+def test_directions_and_residuals_that_do_not_fit_are_sentences():
+    simulation = Simulation(two_layers(mixture={**MIXING, "mobility": 0.0}))
+    state, stepper = simulation.state(), simulation.stepper(2)
+    residual = stepper.step(state)[1]
+    with pytest.raises(InputError, match="give it among those of the state's fields"):
+        stepper.jvp(residual, {}, {"initial_velocities": simulation.velocities})
+    with pytest.raises(InputError, match="must be named where the step is taken"):
+        stepper.jvp(residual, {}, {"mobility": 1.0})
+    assert np.abs(simulation.jvp(state, {}, {}, {"mobility": 1.0}, steps=2)["mass_fractions"]).max() > 0.0
+    with pytest.raises(InputError, match="must be one that this stepper's step returned"):
+        simulation.stepper(3).vjp(residual, {})
+    with pytest.raises(InputError, match="must be one that this stepper's step returned"):
+        stepper.vjp(3, {})
