@@ -38,7 +38,8 @@ LAYERS = """
     discretise.crowding parameters.checks
     discretise.bodies discretise.packing discretise.sampling discretise.discrete_scene
     discretise.distance
-    sph sph.density sph.free_energy sph.integration sph.order sph.materials sph.emitter_kernels sph.pair_forces
+    sph sph.density sph.free_energy sph.substeps sph.integration sph.order sph.materials sph.emitter_kernels
+    sph.pair_forces
     sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
     sph.gravity sph.makers sph.mixture sph.surface_tension sph.viscosity
     sph.function_text sph.formula sph.packed sph.own_force sph.body sph.pair forces
