@@ -99,7 +99,7 @@ LAYERS = """
     commands.schema commands.study
     commands.sweep commands.view_door commands.view_messages commands.view_server commands.view_window
     commands.view_quantities commands.view_recorded commands.view_live commands.view_task commands.view
-    cli.command cli.arguments cli.parsing cli.gradient_commands cli.commands cli.process cli
+    cli.command cli.arguments cli.parsing cli.shortage cli.gradient_commands cli.commands cli.process cli
     __main__
 """
 """From the foundations to the command line; ``package.*`` stands for modules that do not import one another.
