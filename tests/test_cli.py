@@ -192,16 +192,6 @@ def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(cortado_comm
     assert {path.name for path in there.iterdir()} == RUN_FILES
 
 
-def test_memory_that_runs_out_is_a_sentence(cortado_command, monkeypatch):
-    def too_much(*_):
-        raise MemoryError("Unable to allocate 64 GiB")
-
-    monkeypatch.setattr("cortado.commands.run.write_run_report", too_much)
-    code, _, err = cortado_command("run", "scene.toml", "--steps", 5, "--out", "dam")
-    assert code == 1 and err.splitlines()[-1].startswith("Memory ran out (Unable to allocate 64 GiB); take a larger")
-    assert Path("dam/result.json").exists() and Path("dam/trajectory.vtkhdf").exists()
-
-
 @pytest.mark.parametrize("command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"])
 def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command, monkeypatch, command):
     for module in (cortado.commands.run, cortado.commands.optimise):

@@ -38,7 +38,8 @@ LAYERS = """
     discretise.crowding parameters.checks
     discretise.bodies discretise.packing discretise.sampling discretise.discrete_scene
     discretise.distance
-    sph sph.density sph.free_energy sph.integration sph.order sph.materials sph.emitter_kernels sph.pair_forces
+    sph sph.density sph.free_energy sph.substeps sph.integration sph.order sph.materials sph.emitter_kernels
+    sph.pair_forces
     sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
     sph.gravity sph.makers sph.mixture sph.surface_tension sph.viscosity
     sph.function_text sph.formula sph.packed sph.own_force sph.body sph.pair forces
@@ -99,7 +100,7 @@ LAYERS = """
     commands.schema commands.study
     commands.sweep commands.view_door commands.view_messages commands.view_server commands.view_window
     commands.view_quantities commands.view_recorded commands.view_live commands.view_task commands.view
-    cli.command cli.arguments cli.parsing cli.gradient_commands cli.commands cli.process cli
+    cli.command cli.arguments cli.parsing cli.shortage cli.gradient_commands cli.commands cli.process cli
     __main__
 """
 """From the foundations to the command line; ``package.*`` stands for modules that do not import one another.

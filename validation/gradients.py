@@ -177,7 +177,11 @@ class One:
         self._problem = Problem(case.simulation, case.steps, case.losses[name])
         simulation = case.simulation
         self.simulation = SimpleNamespace(
-            positions=case.start, scene=simulation.scene, batch=None, precision=simulation.precision
+            positions=case.start,
+            scene=simulation.scene,
+            batch=None,
+            precision=simulation.precision,
+            known=simulation.known,
         )
 
     def value(self, values: dict[str, np.ndarray]) -> float:

@@ -55,7 +55,7 @@ class InBlocks:
         self._problem, self._start, self._blocks = problem, start, blocks
         simulation = problem.simulation
         self.simulation = SimpleNamespace(
-            positions=start, scene=simulation.scene, batch=None, precision=simulation.precision
+            positions=start, scene=simulation.scene, batch=None, precision=simulation.precision, known=simulation.known
         )
         self.room = problem.room
 

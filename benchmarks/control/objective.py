@@ -173,7 +173,7 @@ class _Simulation:
 
     def __init__(self, problem: Problem, initial_positions: np.ndarray):
         self.scene, self.positions = problem.simulation.scene, initial_positions
-        self.precision = problem.simulation.precision
+        self.precision, self.known = problem.simulation.precision, problem.simulation.known
 
 
 def first_positions(problem: Problem, seed: int) -> Arrays:

@@ -28,7 +28,6 @@ from cortado.figures.particle_sets import particles
 from cortado.fixed import fixed
 from cortado.io.notebook import with_picture
 from cortado.io.trajectory import Frame, Trajectory
-from cortado.lattice.calibration import diffusion_limit
 from cortado.outcome import trouble
 from cortado.parameters.checks import check_sizes
 from cortado.parameters.restarts import one_for_each
@@ -46,13 +45,12 @@ from cortado.scene.scene import Scene, as_scene
 from cortado.shading.painter import colours_of, painter
 from cortado.solvers.build import first_capacity
 from cortado.solvers.solver import Solver
-from cortado.sph.free_energy import FREE_ENERGIES, MOBILITIES, FreeEnergy
+from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy
 from cortado.sph.makers import ForceMaker, check_own, checked_makers, known_of
+from cortado.sph.substeps import stable_substeps
 from cortado.stepping import Stepping
 from cortado.words import counted
 
-MOST_SUBSTEPS = 10_000
-"""Explicit steps of diffusion in a time step; beyond it the mobility is taken for a mistake."""
 WORTH = {"cpu": 16_000, "cuda": 1_000_000}
 """Particles of all scenes in one launch, beyond which more of them are no faster."""
 
@@ -294,27 +292,11 @@ class Simulation(Stepping):
         self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
     ) -> int:
         """Explicit steps of diffusion within a time step that are stable under these parameters; raises `InputError`
-        where there would be more than `MOST_SUBSTEPS`."""
+        where there would be more than `cortado.sph.substeps.MOST_SUBSTEPS`."""
         if len(self.scene.phase) == 1:
             return 0
-        mixture = self.scene.mixture
-        limit = diffusion_limit(
-            self.smoothing,
-            self.scene.discretisation.spacing,
-            self.scene.discretisation.support_radius,
-            self.dimension,
-            greatest_mobility=float(mobility) * MOBILITIES[mixture.mobility_form].greatest(len(self.scene.phase)),
-            interface_width=float(interface_width),
-            curvature=mixture.strength * self.free_energy.curvature,
-            density_ratio=float(np.max(rest_density) / np.min(rest_density)),
-        )
-        number = float(np.ceil(float(time_step) / limit))
-        if number > MOST_SUBSTEPS:
-            raise InputError(
-                f"mobility is {float(mobility):g} m2/s, which takes {number:.3g} explicit steps of diffusion in a "
-                f"time step, but must not take more than {MOST_SUBSTEPS}: lower it, interface_width or time_step."
-            )
-        return int(number)
+        numbers = (float(time_step), float(mobility), float(interface_width), rest_density)
+        return stable_substeps(self.scene, self.free_energy, *numbers)
 
 
 def _made_again(made_of: tuple[Any, ...], points: str) -> Simulation:

@@ -13,6 +13,7 @@ from cortado import __version__
 from cortado.cli.command import Work
 from cortado.cli.commands import app
 from cortado.cli.parsing import parsed
+from cortado.cli.shortage import shortage
 from cortado.device.kernel_cache import complaint, start_warp
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
 from cortado.io.interruption import Interrupted
@@ -45,16 +46,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(_say(stop, stop.code))
     except BrokenPipeError:
         sys.exit(BROKEN_PIPE)
-    except MemoryError as error:
-        what = f" ({error})" if str(error) else ""
-        say(f"Memory ran out{what}; take a larger spacing, or record fewer frames with --record-every.")
-        sys.exit(1)
     except Exception as error:
-        sentence = complaint(error)
+        sentence = shortage(error) or complaint(error)
         if sentence is None:
             raise
-        say(sentence)
-        sys.exit(1)
+        sys.exit(_say(sentence, 1))
 
 
 def _understood(arguments: Sequence[str]) -> Work:
@@ -77,7 +73,7 @@ def _understood(arguments: Sequence[str]) -> Work:
         raise InputError(usage_sentence(box.getvalue(), arguments)) from None
 
 
-def _say(error: BaseException, code: int) -> int:
+def _say(error: BaseException | str, code: int) -> int:
     say(str(error))
     return code
 

@@ -60,7 +60,7 @@ class Window:
             import viser  # noqa: F401  for the sentence
 
             from cortado.commands.view_server import GuardedServer
-        except ImportError:
+        except ModuleNotFoundError:
             raise InputError("viser is not installed, which shows it: pip install 'cortado-sph[view]'.") from None
         self.scene = scene
         self._guarded = GuardedServer(port, f"Cortado: {scene.name}")

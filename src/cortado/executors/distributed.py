@@ -263,7 +263,7 @@ def distributed_module() -> Any:
     """Dask's distributed; raises `InputError` where it is not installed."""
     try:
         import distributed
-    except ImportError:
+    except ModuleNotFoundError:
         raise InputError(
             "Several processes need Dask's distributed, which is not installed: pip install 'cortado-sph[distributed]'."
         ) from None

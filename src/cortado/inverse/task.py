@@ -12,7 +12,7 @@ from cortado.discretise.sampling import fluid_particles
 from cortado.errors import SceneError, Words
 from cortado.inverse.tables import OptimiseTable, ProblemTable, TaskTables
 from cortado.optimisation.transforms import TimeInterpolation
-from cortado.parameters.registry import BY_NAME, Range, offered
+from cortado.parameters.registry import BY_NAME, Axis, Range, offered
 from cortado.parameters.values import OVER_TIME, SUM_TOLERANCE, Arrays, is_too_small
 from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, scene_from_dict
@@ -161,8 +161,11 @@ def _check_bounds(name: str, pair: np.ndarray, optimise: OptimiseTable, start: M
 
 
 def _shapes(name: str, scene: Scene, steps: int) -> list[tuple[int, ...]]:
-    """The shapes that a parameter may have; () is a number."""
-    return BY_NAME[name].shapes(steps, len(scene.phase), fluid_particles(scene).positions.shape)
+    """The shapes that a parameter may have; () is a number. The scene is cut into particles, which may take a second,
+    only where the parameter has a value for each of them."""
+    parameter = BY_NAME[name]
+    particles = len(fluid_particles(scene).positions) if parameter.axis is Axis.PARTICLE else 0
+    return parameter.shapes(steps, len(scene.phase), (particles, scene.dimension))
 
 
 def _in_words(shapes: Sequence[tuple[int, ...]]) -> str:

@@ -61,7 +61,7 @@ def write_video(path: str | Path, frames: Iterable[ArrayLike], frames_per_second
 def _pyav() -> Any:
     try:
         import av
-    except ImportError as problem:
+    except ModuleNotFoundError as problem:
         raise InputError("Videos need PyAV, which is not installed: pip install 'cortado-sph[video]'.") from problem
     return av
 

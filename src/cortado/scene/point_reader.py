@@ -123,7 +123,7 @@ def main(path: str) -> int:
         np.save(content, READERS[Path(path).suffix](path), allow_pickle=False)
     except Refused as problem:
         code, content = REFUSED, io.BytesIO(str(problem).encode())
-    except ImportError:
+    except ModuleNotFoundError:
         code, content = REFUSED, io.BytesIO(b"needs the package vtk to be read; install it with: pip install vtk")
     with open(output, "wb") as file:
         file.write(content.getbuffer())

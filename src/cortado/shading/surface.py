@@ -43,7 +43,7 @@ def liquid(positions: Points, colours: Points, spacing: float) -> Surface:
     """
     try:
         import pysplashsurf
-    except ImportError as problem:
+    except ModuleNotFoundError as problem:
         raise InputError(MISSING) from problem
     n = len(positions)
     order = np.lexsort(positions.T)  # so that sums are those of the same fluid, whatever the order of its particles
