@@ -68,7 +68,7 @@ LAYERS = """
     shading.painter shading.page shading.labels shading.film shading.scene_view
     outcome
     recorded
-    stepper stepping
+    host_states device_states stepper stepping
     simulation
     forward_pass
     problem

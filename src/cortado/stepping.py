@@ -1,11 +1,13 @@
 """The steps of a simulation as functions: from a state to a later one."""
 
-from typing import cast
+from typing import Any, cast, overload
 
 from cortado.arrays import check_steps
 from cortado.device.threads import Turn, in_turn
+from cortado.device_states import DeviceState
+from cortado.host_states import Given, States
 from cortado.parameters.values import Arrays, Values
-from cortado.stepper import Given, States, Steppable, Stepper
+from cortado.stepper import Steppable, Stepper
 
 KEPT = 4
 """Numbers of steps whose arrays and graphs a simulation keeps for the next call."""
@@ -28,17 +30,39 @@ class Stepping:
         """
         return self.stepper(0).first(parameters)
 
-    def step(self, state: Given, parameters: Values | None = None, steps: int = 1) -> States:
+    def on_device(
+        self, state: Given | DeviceState = None, fields: Values | None = None, parameters: Values | None = None
+    ) -> DeviceState:
+        """A state, the first one if left out, in arrays on the device, which other programs take by DLPack: steps from
+        it give states on the device, and nothing of them passes through the host.
+
+        ``fields`` are arrays that speak DLPack and replace fields of the state, in the precision of the simulation and
+        on its device: vectors (n, 3), fractions (n, phases), numbers (n,), in a batch (batch, n, ...). Such a state is
+        judged as one from a file is, which reads it on the host, once. ``parameters`` are those of the run that the
+        state is of. Raises `InputError` for what does not fit.
+        """
+        return self.stepper(0).on_device(state, fields or {}, parameters)
+
+    @overload
+    def step(self, state: Given, parameters: Values | None = None, steps: int = 1) -> States: ...
+
+    @overload
+    def step(self, state: DeviceState, parameters: Values | None = None, steps: int = 1) -> DeviceState: ...
+
+    def step(self, state: Any, parameters: Values | None = None, steps: int = 1) -> Any:
         """The state after ``steps`` steps from ``state``, with the bits of ``run(steps, parameters, state=state)``; of
         a batch a tuple with one for each scene, with NaN in that of a scene that is lost.
 
         ``parameters`` are any of those of `Problem` but first values, which ``state`` has; one over time has a row for
-        each of these steps. Nothing is recorded on the way. From the second call on with as many steps no array of the
-        device is allocated, and no graph captured. Warns and raises as `Simulation.run` does.
+        each of these steps. Nothing is recorded on the way. From a `DeviceState` it gives another one. From the
+        second call on with as many steps no array of the device is allocated but those of a `DeviceState`, and no graph
+        is captured. Warns and raises as `Simulation.run` does.
         """
         return self.stepper(check_steps(steps)).advance(state, parameters)
 
-    def vjp(self, state: Given, parameters: Values | None, state_bar: Values, steps: int = 1) -> tuple[Arrays, Arrays]:
+    def vjp(
+        self, state: Given | DeviceState, parameters: Values | None, state_bar: Values, steps: int = 1
+    ) -> tuple[dict[str, Any], Arrays]:
         """The derivatives of `step` in reverse: from the adjoint of the state after the steps to those of ``state`` and
         of ``parameters``; see `Stepper.vjp`, which takes the steps once for several adjoints."""
         stepper = self.stepper(check_steps(steps))
@@ -46,12 +70,12 @@ class Stepping:
 
     def jvp(
         self,
-        state: Given,
+        state: Given | DeviceState,
         parameters: Values | None,
         state_dot: Values,
         parameter_dots: Values | None = None,
         steps: int = 1,
-    ) -> Arrays:
+    ) -> dict[str, Any]:
         """The derivative of `step` along tangents of ``state`` and of any parameters, as the tangent of the state after
         the steps; see `Stepper.jvp`."""
         stepper = self.stepper(check_steps(steps))

@@ -1,0 +1,160 @@
+"""States that stay on the device: the bits of those on the host, taken and given by DLPack."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from cortado import InputError, Simulation
+from cortado.device.state import State
+from scenes import jet, plane, pour, scene, two_layers
+from test_stepper import assert_same_state, last_adjoint, scheduled
+
+SCENES = {"one fluid": plane, "in space": scene, "mixture": two_layers, "schedule": scheduled, "jet": jet, "pour": pour}
+
+
+class Foreign:
+    """An array of another program, of which only the memory is known."""
+
+    def __init__(self, values):
+        self._values = values
+
+    def __dlpack__(self, **options):
+        return self._values.__dlpack__(**options)
+
+    def __dlpack_device__(self):
+        return self._values.__dlpack_device__()
+
+
+def vectors(simulation, values):
+    """On the device's side: three components, in its precision."""
+    found = np.zeros((*values.shape[:-1], 3), dtype=simulation.precision.name)
+    found[..., : values.shape[-1]] = values
+    return Foreign(found)
+
+
+def on_host(simulation, values):
+    """What was given by DLPack as the host's derivatives are, in the shapes of a state's fields."""
+    fields = {field.name: field for field in simulation.initial.fields}
+    found = {}
+    for name, value in values.items():
+        array = np.array(np.from_dlpack(value) if isinstance(value, wp.array) else value, dtype=np.float64)
+        is_vector = name in fields and fields[name].entry.name == "VECTOR"
+        found[name] = array[..., : simulation.dimension] if is_vector else array
+    return found
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("name", SCENES)
+def test_steps_and_derivatives_have_the_bits_of_those_on_the_host(name, precision):
+    simulation = Simulation(SCENES[name](), precision=precision)
+    parameters = {"viscosity": 1.1 * np.asarray(simulation.parameters()["viscosity"]), "time_step": 0.0018}
+    first, stepper = simulation.step(simulation.state(), steps=3), simulation.stepper(5)
+    wanted, residual = stepper.step(first, parameters)
+    found, same_residual = stepper.step(simulation.on_device(first), parameters)
+    host = {n: np.from_dlpack(found[n]) for n in wanted.fields}
+    assert on_host(simulation, host).keys() == wanted.fields.keys()
+    for field, array in on_host(simulation, host).items():
+        assert array.tobytes() == np.float64(wanted[field]).tobytes(), field
+    assert (found.scenes[0].clock, found.scenes[0].origin) == (wanted.clock, wanted.origin)
+    x, v = (np.float64(wanted[n]) for n in ("positions", "velocities"))
+    bars, parts = stepper.vjp(residual, last_adjoint(wanted) | {"time": 0.3})
+    adjoint = {"positions": vectors(simulation, 2.0 * x + v), "velocities": vectors(simulation, x), "time": 0.3}
+    same_bars, same_parts = stepper.vjp(same_residual, adjoint)
+    for one, other in ((bars, on_host(simulation, same_bars)), (parts, same_parts)):
+        assert {n: np.asarray(a).tobytes() for n, a in one.items()} == {
+            n: np.asarray(a).tobytes() for n, a in other.items()
+        }
+    dots = stepper.jvp(residual, {"velocities": x}, {"gravity": np.ones(simulation.dimension)})
+    same_dots = stepper.jvp(
+        same_residual, {"velocities": vectors(simulation, x)}, {"gravity": np.ones(simulation.dimension)}
+    )
+    assert {n: np.asarray(a).tobytes() for n, a in dots.items()} == {
+        n: a.tobytes() for n, a in on_host(simulation, same_dots).items()
+    }
+
+
+def test_nothing_of_a_state_passes_through_the_host(monkeypatch):
+    simulation = Simulation(two_layers())
+    state, stepper = simulation.on_device(), simulation.stepper(3)
+    x = simulation.on_device()["positions"]
+    for _ in range(2):
+        end, residual = stepper.step(state)
+        wanted = np.array(np.from_dlpack(end["positions"]))
+        stepper.vjp(residual, {"positions": x})
+        stepper.jvp(residual, {"positions": x})
+    fail = lambda some: pytest.fail("through the host") if some else {}  # noqa: E731
+    monkeypatch.setattr(State, "set", lambda self, values: fail(values))
+    monkeypatch.setattr(State, "numpy", lambda self, dimension, only=("all",): fail(only))
+    end, residual = stepper.step(state)
+    bar = stepper.vjp(residual, {"positions": x})[0]
+    dot = stepper.jvp(residual, {"positions": x})
+    assert np.from_dlpack(end["positions"]).tobytes() == wanted.tobytes()
+    assert bar["velocities"].dtype is wp.float32 and dot["velocities"].shape == x.shape
+
+
+def test_a_batch_on_the_device_has_the_bits_of_one_on_the_host():
+    simulation = Simulation(scheduled(), batch=3)
+    parameters = {"viscosity": [0.05, 0.1, 0.3]}
+    states, on_device = simulation.state(), simulation.on_device()
+    for _ in range(3):
+        states, on_device = (simulation.step(one, parameters, steps=4) for one in (states, on_device))
+    found = np.from_dlpack(on_device["velocities"])
+    assert found.shape == (3, simulation.particles, 3)
+    assert found[..., :2].tobytes() == np.stack([state["velocities"] for state in states]).tobytes()
+    assert [scene.clock for scene in on_device.scenes] == [state.clock for state in states]
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_a_scene_of_a_batch_that_is_lost_has_no_numbers_on_the_device():
+    simulation = Simulation(plane(), batch=2)
+    fast = np.zeros((2, simulation.particles, 2))
+    fast[1, 0] = [400.0, 0.0]
+    state = simulation.step(simulation.on_device(parameters={"initial_velocities": fast}), steps=3)
+    one, lost = np.from_dlpack(state["positions"])
+    assert one[:, :2].tobytes() == Simulation(plane()).run(3).positions[-1].tobytes() and np.isnan(lost).all()
+    with pytest.raises(InputError):
+        simulation.step(state)
+
+
+def test_fields_of_other_programs_replace_those_of_a_state():
+    simulation = Simulation(plane(), precision="float64")
+    state = simulation.step(simulation.state(), steps=4)
+    faster = 1.5 * state["velocities"]
+    found = simulation.step(simulation.on_device(state, {"velocities": vectors(simulation, faster)}), steps=2)
+    wanted = simulation.run(
+        2, state=type(state)({**state.fields, "velocities": faster}, state.clock, state.origin)
+    ).last_state
+    assert np.from_dlpack(found["positions"])[:, :2].tobytes() == wanted["positions"].tobytes()
+    assert_same_state(simulation.step(state, steps=2), simulation.run(2, state=state).last_state)
+
+
+def test_what_does_not_fit_is_a_sentence():
+    simulation = Simulation(plane())
+    state, n = simulation.on_device(), simulation.particles
+    crowded = np.zeros((n, 3), dtype=np.float32)
+    single = np.zeros((n, 3), dtype=np.float32)
+    single[:, :2] = simulation.velocities
+    single[5] = np.nan
+    for fields, words in [
+        ({"velocities": np.zeros((n, 3))}, r"velocities is a float64 array \(64, 3\) on cpu, but must be a float32"),
+        (
+            {"velocities": np.zeros((n, 2), dtype=np.float32)},
+            r"\(64, 2\) on cpu, but must be a float32 array \(64, 3\)",
+        ),
+        ({"velocities": [[0.0, 0.0]]}, "must be an array that speaks DLPack"),
+        ({"velocities": single}, "not finite"),
+        ({"positions": crowded}, "at one place"),
+        ({"pressure": crowded}, "'pressure', but must have only positions"),
+    ]:
+        with pytest.raises(InputError, match=words):
+            simulation.on_device(state, fields)
+    with pytest.raises(InputError, match=r"state_bar velocities is a float32 array \(64, 2\) on cpu"):
+        simulation.vjp(state, {}, {"velocities": np.zeros((n, 2), dtype=np.float32)})
+    with pytest.raises(InputError, match="of a simulation with other arrays"):
+        Simulation(plane(), precision="float64").step(state)
+    with pytest.raises(InputError, match="of a simulation with other arrays"):
+        Simulation(plane(), batch=2).step(state)
+    with pytest.raises(InputError, match="has no 'pressure', but has positions"):
+        state["pressure"]
+    with pytest.raises(InputError, match="to be given again"):
+        simulation.step(state, {"rest_density": 900.0})
