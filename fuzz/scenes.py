@@ -11,6 +11,9 @@ from fuzz.size import is_large
 from fuzz.text_mutations import mutate_text, option, override
 from fuzz.toml_text import to_toml
 
+HELP = "--help"
+"""Whoever says it is shown how a command is called, and nothing is run."""
+
 
 def run_scene(case: Case) -> None:
     """A scene with one to three things changed runs for a few steps."""
@@ -23,7 +26,8 @@ def run_scene(case: Case) -> None:
     if outcome.hung or outcome.swollen:
         _forgive_if_large(case, "scene.toml", overrides[1::2], steps)
     asked = None if odd else steps
-    case.complaints += run_complaints(case.folder / "out", outcome.code == 0, asked, record_every)
+    ran = outcome.code == 0 and HELP not in odd
+    case.complaints += run_complaints(case.folder / "out", ran, asked, record_every)
 
 
 def search_task(case: Case) -> None:
@@ -33,7 +37,7 @@ def search_task(case: Case) -> None:
     outcome = case.cortado("optimise", "task.toml", "--no-pictures", "--out", "out", *precision, *overrides, *odd)
     if outcome.hung or outcome.swollen:
         _forgive_if_large(case, "task.toml", overrides[1::2], 0)
-    case.complaints += search_complaints(case.folder / "out", outcome.code == 0)
+    case.complaints += search_complaints(case.folder / "out", outcome.code == 0 and HELP not in odd)
 
 
 def _write(case: Case, name: str, all_bases: dict[str, bases.Tables]) -> tuple[list[str], list[str]]:

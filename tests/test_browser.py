@@ -239,7 +239,7 @@ def foreign() -> Iterator[tuple[str, list[Any]]]:
             self.send_response(200)
             self.send_header("Content-Type", "text/html")
             self.end_headers()
-            self.wfile.write(b"<!doctype html><title>foreign</title>")
+            self.wfile.write(b"<!doctype html><title>foreign</title><link rel=icon href=data:,>")
 
         def log_message(self, *_: Any) -> None:
             """Says nothing."""

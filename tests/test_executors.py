@@ -159,7 +159,7 @@ def test_a_worker_that_lacks_the_function_says_so(monkeypatch):
     [
         (lambda _: sys.exit(3), r"^An item ended its process, by SystemExit: 3; what is computed may not do so\.$"),
         (lambda _: sys.exit(), r"^An item ended its process, by SystemExit; what is"),
-        (lambda _: signal.raise_signal(signal.SIGINT), "by KeyboardInterrupt; what is"),
+        (lambda _: signal.default_int_handler(signal.SIGINT, None), "by KeyboardInterrupt; what is"),
     ],
 )
 def test_an_item_that_ends_its_process_is_an_error(leave, words):

@@ -7,11 +7,10 @@ import sys
 
 import pytest
 
+from signals import NEEDED, listen
+
 STOPPED = "print('here', flush=True); time.sleep(60)"
 SLOW_IMPORT = f"import time; {STOPPED}"
-NEEDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that a process must not ignore to be interrupted; it ignores those that its parent does, as shells make
-background jobs ignore Ctrl-C, and nohup the end of the terminal."""
 START = "import time; from cortado.io import interruption; interruption.leave_at_once(); "
 KEEPING = f"""{START}
 class Late:
@@ -48,12 +47,6 @@ except KeyboardInterrupt as stop:
     print(stop)
     raise SystemExit(stop.code)
 """
-
-
-def listen() -> None:
-    """What a child does before its program begins."""
-    for number in NEEDED:
-        signal.signal(number, signal.SIG_DFL)
 
 
 def stopped(number: int, *arguments: str, **environment: str) -> tuple[int, str]:

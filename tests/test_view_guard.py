@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -18,6 +19,7 @@ import pytest
 import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.commands.view import opened
+from signals import listen
 
 viser = pytest.importorskip("viser")
 msgspec = pytest.importorskip("msgspec")
@@ -363,7 +365,12 @@ def test_it_ends_within_a_second_while_pages_are_connected(tmp_path, monkeypatch
 def test_ctrl_c_ends_the_command_while_a_page_is_connected(tmp_path):
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     words = [sys.executable, "-m", "cortado", "view", str(tmp_path / "scene.toml"), "--port", str(PORT)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as command:
+    pipe = subprocess.PIPE
+    with (
+        subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, preexec_fn=listen) as command,
+        ExitStack() as ended,
+    ):
+        ended.callback(command.kill)
         assert command.stderr is not None
         line = next(line for line in command.stderr if "shows it" in line)
         parts = urlsplit(line.split()[0])

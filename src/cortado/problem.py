@@ -14,7 +14,7 @@ from cortado.errors import CortadoWarning, DivergedError, InputError, shown
 from cortado.fixed import fixed
 from cortado.forward_pass import ForwardPass
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator, estimate
-from cortado.gradients.estimator import checked_adjoint
+from cortado.gradients.estimator import checked_reverse
 from cortado.io.trajectory import noted
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch, batch, fingerprint
 from cortado.losses.checked import as_loss
@@ -216,7 +216,7 @@ class Problem:
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
         """See `Batchable.room`."""
-        if self.simulation.batch is not None or (estimator is not None and not checked_adjoint(estimator).batches):
+        if self.simulation.batch is not None or (estimator is not None and not checked_reverse(estimator).batches):
             return 1
         return self.simulation.room(self.steps, self.memory_budget if estimator else 0.0)
 
@@ -227,7 +227,7 @@ class Problem:
         """See `Batchable.together`."""
         require_points(points)
         if estimator is not None:
-            checked_adjoint(estimator)
+            checked_reverse(estimator)
         problem = self._batch_of(len(points))
         known = self.simulation.known
         over_time = {n for n in points[0] if n in known.over_time and np.ndim(points[0][n]) == known[n].rank}

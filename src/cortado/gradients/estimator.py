@@ -126,7 +126,7 @@ def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
     return estimator
 
 
-def checked_adjoint(estimator: "AdjointEstimator") -> "AdjointEstimator":
+def checked_reverse(estimator: "AdjointEstimator") -> "AdjointEstimator":
     """The estimator; raises `InputError` for anything but one that goes back through a run."""
     if not isinstance(estimator, AdjointEstimator):
         wanted = "an AdjointEstimator such as cortado.gradients.Exact()"
