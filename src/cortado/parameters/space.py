@@ -81,7 +81,8 @@ class ParameterSpace:
         rollout.begin_evaluation()
         rollout.goes_on = bool(states)
         rollout.clocks = [state.clock for state in states] or [Clock()] * len(rollout.clocks)
-        rollout.initial.assign(simulation.initial)
+        if not states:
+            rollout.initial.assign(simulation.initial)
         firsts = [dict(state.fields) for state in states] or [self._one.first(own) for own in members]
         rollout.initial.set(self._together(firsts))
         if (simulation.scene.schedule.courses or self._known.courses) and len(members) < len(rollout.clocks):
