@@ -42,7 +42,7 @@ LAYERS = """
     sph.pair_forces
     sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
     sph.gravity sph.makers sph.mixture sph.surface_tension sph.viscosity
-    sph.function_text sph.formula sph.packed sph.own_force sph.body sph.pair forces
+    sph.function_text sph.formula sph.packed sph.formula_kernels sph.own_force sph.body sph.pair forces
     solvers solvers.containment_kernels solvers.containment solvers.solver solvers.convergence solvers.loop
     solvers.particles solvers.particle_derivatives solvers.build solvers.pcisph
     solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure solvers.pcisph.pressure

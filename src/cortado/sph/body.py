@@ -5,14 +5,13 @@ that both are exact.
 """
 
 from functools import cache
-from typing import Any
 
 import warp as wp
 
 from cortado.device.kernels import Kernels
 from cortado.device.neighbourhood import Discretisation, neighbourhood_type
-from cortado.device.precision import Precision
 from cortado.sph.formula import Formula
+from cortado.sph.formula_kernels import applied, change_along, work_of
 from cortado.sph.own_force import OwnForce, topic
 from cortado.sph.packed import theta_of
 
@@ -28,7 +27,7 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
     module = discretisation.module(True, name)
     tangent_module, adjoint_module = discretisation.tangent_module(name), discretisation.module(False, name)
     force = applied(text, discretisation.precision, ranks, module)
-    work_tangent = work_of(text, discretisation.precision, ranks, tangent_module)
+    change_of = change_along(text, discretisation.precision, ranks, tangent_module)
     work = work_of(text, discretisation.precision, ranks, adjoint_module)
 
     @wp.kernel(module=module)
@@ -61,13 +60,8 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
     ):
         i = s.first + wp.tid()
         member = i // s.particles
-        change = vector()
-        for axis in range(3):
-            along = vector()
-            along[axis] = plane[axis]
-            x_bar, v_bar, theta_bar, _bar_bar = wp.grad(work_tangent)(x[i], v[i], theta[member], along)
-            change[axis] = wp.dot(x_bar, x_dot[i]) + wp.dot(v_bar, v_dot[i]) + wp.dot(theta_bar, theta_dot[member])
-        acceleration_dot[i] = acceleration_in_dot[i] + change
+        change = change_of(x[i], v[i], theta[member], x_dot[i], v_dot[i], theta_dot[member])
+        acceleration_dot[i] = acceleration_in_dot[i] + wp.cw_mul(plane, change)
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def body_adjoint(
@@ -91,38 +85,6 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
         theta_bar[i] = own_theta_bar
 
     return Kernels(body, body_tangent, body_adjoint)
-
-
-def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], module: Any) -> Any:
-    """The Warp function of two vectors and theta that a user's function is."""
-    timed = len(text.inputs) == 3
-    types = tuple(precision.vector if rank else precision.real for rank in ranks[timed:])
-    terms, first = [], 0
-    for rank in ranks:
-        at = ", ".join(f"theta[{first + k}]" for k in range(3 if rank else 1))
-        terms.append(f"vector({at})" if rank else at)
-        first += 3 if rank else 1
-    source = f"def applied(x: vector, v: vector, theta: numbers):\n    return own({', '.join(['x', 'v', *terms])})\n"
-    scope = {
-        "vector": precision.vector,
-        "numbers": theta_of(precision, ranks),
-        "own": text.function(precision, types, module),
-    }
-    exec(source, scope)
-    made: Any = scope["applied"]
-    return wp.Function(func=made, key="applied", namespace="", module=module, source=source)
-
-
-def work_of(text: Formula, precision: Precision, ranks: tuple[int, ...], module: Any) -> Any:
-    """The Warp function f . bar, whose gradient a user's function f is differentiated by."""
-    vector, theta_type = precision.vector, theta_of(precision, ranks)
-    force = applied(text, precision, ranks, module)
-
-    @wp.func(module=module)
-    def work(x: vector, v: vector, theta: theta_type, bar: vector):
-        return wp.dot(force(x, v, theta), bar)
-
-    return work
 
 
 class Body(OwnForce):

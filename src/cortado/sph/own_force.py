@@ -1,5 +1,6 @@
 """What forces that are one function of a user's have in common: its text, its parameters, how they are made."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from hashlib import sha256
@@ -53,7 +54,7 @@ class OverTime:
 
 
 @fixed
-class OwnForce:
+class OwnForce(ABC):
     """A force that is one function of a user's, given to `Simulation`; see `cortado.forces`."""
 
     kind: ClassVar[str]
@@ -114,9 +115,9 @@ class OwnForce:
             course=course,
         )
 
+    @abstractmethod
     def kernels(self, discretisation: Discretisation) -> Kernels:
         """Of the force, in a precision."""
-        raise NotImplementedError
 
     def force(self, setting: Setting) -> "FunctionForce":
         """The force in a solver; raises `InputError` for a function that Warp cannot compile."""

@@ -13,8 +13,8 @@ import warp as wp
 
 from cortado.device.kernels import Kernels
 from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.sph.body import applied, work_of
 from cortado.sph.formula import Formula
+from cortado.sph.formula_kernels import applied, change_along, work_of
 from cortado.sph.own_force import OwnForce, topic
 from cortado.sph.packed import theta_of
 
@@ -35,7 +35,7 @@ def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
     force = applied(text, precision, ranks, module)
     force_tangent = applied(text, precision, ranks, tangent_module)
     force_adjoint = applied(text, precision, ranks, adjoint_module)
-    work_tangent = work_of(text, precision, ranks, tangent_module)
+    change_of = change_along(text, precision, ranks, tangent_module)
     work_adjoint = work_of(text, precision, ranks, adjoint_module)
 
     @wp.func(module=module)
@@ -65,19 +65,6 @@ def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
         i = s.first + wp.tid()
         total = force_sum(i, theta[i // s.particles], x, v, s)
         acceleration[i] = acceleration_in[i] + wp.cw_mul(plane, total) / (m[i] * s.volume)
-
-    @wp.func(module=tangent_module)
-    def change_of(
-        x: vector, v: vector, theta: theta_type, x_dot: vector, v_dot: vector, theta_dot: theta_type
-    ) -> vector:
-        """Of the function along a direction."""
-        change = vector()
-        for axis in range(3):
-            along = vector()
-            along[axis] = real(1.0)
-            x_bar, v_bar, theta_bar, _along_bar = wp.grad(work_tangent)(x, v, theta, along)
-            change[axis] = wp.dot(x_bar, x_dot) + wp.dot(v_bar, v_dot) + wp.dot(theta_bar, theta_dot)
-        return change
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def pair_tangent(
