@@ -1,5 +1,7 @@
 """States that stay on the device: the bits of those on the host, taken and given by DLPack."""
 
+import pickle
+
 import numpy as np
 import pytest
 import warp as wp
@@ -158,3 +160,18 @@ def test_what_does_not_fit_is_a_sentence():
         state["pressure"]
     with pytest.raises(InputError, match="to be given again"):
         simulation.step(state, {"rest_density": 900.0})
+    with pytest.raises(InputError, match="can be neither pickled nor copied"):
+        pickle.dumps(state)
+    with pytest.raises(InputError, match="state is 3, but must be a DeviceState"):
+        simulation.on_host(3)
+    assert repr(state).startswith("DeviceState(positions (64, 3), velocities (64, 3), ")
+
+
+@pytest.mark.parametrize("batch", [None, 2])
+def test_a_state_comes_back_to_the_host(batch):
+    simulation = Simulation(plane(), batch=batch)
+    found = simulation.on_host(simulation.step(simulation.on_device(), steps=3))
+    wanted = simulation.step(simulation.state(), steps=3)
+    for one, other in zip(found, wanted, strict=True) if batch else [(found, wanted)]:
+        assert_same_state(one, other)
+        assert one in simulation.judged_states

@@ -397,3 +397,8 @@ def test_directions_and_residuals_that_do_not_fit_are_sentences():
         simulation.stepper(3).vjp(residual, {})
     with pytest.raises(InputError, match="must be one that this stepper's step returned"):
         stepper.vjp(3, {})
+    for along, words in (("mobility", "must be a list of names"), (3, "along is 3"), (["mobil"], "'mobil' is unknown")):
+        with pytest.raises(InputError, match=words):
+            stepper.step(state, along=along)
+    with pytest.raises(InputError, match="state is 'state', but must be a RestartState"):
+        simulation.step("state")

@@ -3,23 +3,22 @@ them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import warp as wp
 
 from cortado.device.state import State
 from cortado.errors import InputError, shown
-from cortado.host_states import HostStates, clocks_after, require_fields, time_of
+from cortado.host_states import HostStates, States, clocks_after, require_fields, time_of
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import Arrays, Values
 from cortado.restart import RestartState
 from cortado.rollout import Rollout
-from cortado.words import Brief
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class DeviceState(Brief):
+class DeviceState:
     """A state, or those of all scenes of a batch, that stay on the device: `Simulation.on_device` makes one, and steps
     from it lead to others, each with arrays of its own.
 
@@ -37,6 +36,13 @@ class DeviceState(Brief):
         if name not in self.arrays.names:
             raise InputError(f"state has no {shown(name)}, but has {', '.join(self.arrays.names)}.")
         return self.arrays.numbers(name)
+
+    def __repr__(self) -> str:
+        shapes = ", ".join(f"{name} {self[name].shape}" for name in self.arrays.names)
+        return f"DeviceState({shapes}, {self.arrays.positions.device})"
+
+    def __reduce__(self) -> NoReturn:
+        raise InputError("A state on the device can be neither pickled nor copied, but simulation.on_host(state) can.")
 
 
 class DeviceStates(HostStates):
@@ -76,6 +82,14 @@ class DeviceStates(HostStates):
         values = {"rest_density": densities[0] if self._simulation.batch is None else densities}
         space.check_restarts(self.states(state.arrays, state.scenes), values)
         return state
+
+    def on_host(self, state: DeviceState) -> States:
+        """As NumPy arrays, which nobody can change."""
+        self._require_own(state)
+        found = self.states(state.arrays, state.scenes)
+        judged = zip(found, state.scenes, strict=True)
+        self._simulation.judged_states.update(one for one, scene in judged if scene in self._simulation.judged_states)
+        return found[0] if self._simulation.batch is None else found
 
     def _require_own(self, state: DeviceState) -> None:
         own, found = self._simulation.initial, state.arrays

@@ -72,6 +72,13 @@ class Stepper:
         return place.replaced(self._space, found, fields) if fields else found
 
     @in_turn
+    def on_host(self, state: DeviceState) -> States:
+        """A state on the device as NumPy arrays."""
+        if not isinstance(state, DeviceState):
+            raise InputError(f"state is {shown(state)}, but must be a DeviceState, of simulation.on_device.")
+        return DeviceStates(self._simulation).on_host(state)
+
+    @in_turn
     def advance(self, state: Given | DeviceState, parameters: Values | None = None) -> States | DeviceState:
         """The state after the steps, on the device if the one before them is."""
         place = self._begin(state, self._checked(parameters))
@@ -88,7 +95,7 @@ class Stepper:
         diffuses.
         """
         values = self._checked(parameters)
-        place = self._begin(state, values, {*values, *along})
+        place = self._begin(state, values, {*values, *self._space.checked_names("along", along)})
         last = place.state(self._rollout, self._forward(keep=True), self._rollout.steps)
         return last, StepResidual(Residual(self._rollout), values, place)
 

@@ -43,6 +43,11 @@ class Stepping:
         """
         return self.stepper(0).on_device(state, fields or {}, parameters)
 
+    def on_host(self, state: DeviceState) -> States:
+        """A state on the device as NumPy arrays: what files and other processes take, and ``Simulation.run``. Raises
+        `InputError` for a state of another simulation."""
+        return self.stepper(0).on_host(state)
+
     @overload
     def step(self, state: Given, parameters: Values | None = None, steps: int = 1) -> States: ...
 

@@ -42,7 +42,7 @@ def one_for_each(state: RestartState | Sequence[RestartState] | None, batch: int
     them, and for anything else."""
     if state is None:
         return []
-    states = list(state) if isinstance(state, Sequence) else [state]
+    states = list(state) if isinstance(state, Sequence) and not isinstance(state, str) else [state]
     if len(states) != (batch or 1):
         raise InputError(f"state has {len(states)} states, but must have {batch or 1}, one for each scene.")
     for one in states:

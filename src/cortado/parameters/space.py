@@ -52,6 +52,15 @@ class ParameterSpace:
                 self._check(own, number)
         return found
 
+    def checked_names(self, what: str, names: Iterable[str]) -> list[str]:
+        """Names of parameters that the scene has; raises `InputError` for anything else."""
+        if isinstance(names, str) or not isinstance(names, Iterable):
+            raise InputError(f"{what} is {shown(names)}, but must be a list of names, such as ['mobility'].")
+        found = list(names)
+        for name in found:
+            check_known(name, self._simulation.scene, what, self._known)
+        return found
+
     def members(self, values: Arrays) -> list[Arrays]:
         """Checked values as those of each scene of a batch; of a single scene they are the only ones."""
         different = self._different(values)
