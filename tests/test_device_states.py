@@ -144,6 +144,7 @@ def test_what_does_not_fit_is_a_sentence():
             r"\(64, 2\) on cpu, but must be a float32 array \(64, 3\)",
         ),
         ({"velocities": [[0.0, 0.0]]}, "must be an array that speaks DLPack"),
+        ({"velocities": np.array([["fast"]])}, "velocities cannot be taken: Unsupported"),
         ({"velocities": single}, "not finite"),
         ({"positions": crowded}, "at one place"),
         ({"pressure": crowded}, "'pressure', but must have only positions"),

@@ -119,14 +119,12 @@ def _taken(what: str, value: Any) -> wp.array:
     """An array of another program, in its own memory."""
     if isinstance(value, wp.array):
         return value
-    if isinstance(value, np.ndarray):  # gives nothing that is read-only by DLPack
-        return wp.array(value, device="cpu")
     if not hasattr(value, "__dlpack__"):
         raise InputError(f"{what} is {shown(value)}, but must be an array that speaks DLPack, such as a torch.Tensor.")
-    try:
-        return wp.from_dlpack(value)
+    try:  # NumPy gives nothing that is read-only by DLPack
+        return wp.array(value, device="cpu") if isinstance(value, np.ndarray) else wp.from_dlpack(value)
     except (BufferError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(f"{what} cannot be taken by DLPack: {error}") from error
+        raise InputError(f"{what} cannot be taken: {error}") from error
 
 
 def _without_lost(rollout: Rollout, state: State) -> State:
