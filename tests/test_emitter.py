@@ -133,7 +133,7 @@ def test_same_bits_twice_and_under_a_memory_budget(name):
     for other in (Problem(problem.simulation, STEPS, problem.loss), frugal):
         found, bits = other.value_and_gradient(point)
         assert found == loss and all(bits[key].tobytes() == gradient[key].tobytes() for key in point)
-    assert len(frugal._rollout._states) < 16
+    assert len(frugal._rollout._checkpoints) < 16
 
 
 @scenes

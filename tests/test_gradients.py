@@ -121,7 +121,7 @@ def test_checkpoints_under_a_budget_give_the_same_bits():
     for (_, wanted), (_, found) in [(problem.value_and_gradient(point), frugal.value_and_gradient(point))]:
         for name, gradient in wanted.items():
             assert gradient.tobytes() == found[name].tobytes()
-    assert len(frugal._rollout._states) < 12
+    assert len(frugal._rollout._checkpoints) < 12
 
 
 def test_float32_gradient_is_near_the_float64_one():

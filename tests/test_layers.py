@@ -51,7 +51,7 @@ LAYERS = """
     solvers.pcisph.solver solvers.pcisph.build
     reference.digits reference.engine reference.histories reference.losses reference.simulation reference
     executors.executor executors.calls executors.distributed executors.worker_process executors.local executors
-    evaluation rollout residual
+    checkpoints evaluation rollout residual
     parameters.scene_parameters parameters.first_positions parameters.restarts parameters.space
     losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
     losses.positions losses.recorded losses losses.checked image_losses

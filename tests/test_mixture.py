@@ -122,7 +122,7 @@ def test_same_bits_twice_and_under_a_memory_budget(name):
         found, bits = other.value_and_gradient(point)
         assert found == loss
         assert all(bits[key].tobytes() == gradient[key].tobytes() for key in SIZES)
-    assert len(frugal._rollout._states) < 16
+    assert len(frugal._rollout._checkpoints) < 16
 
 
 def test_float32_is_near_float64():

@@ -8,12 +8,12 @@ of steps, or a step back, is a captured graph on a GPU, and on a CPU where launc
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import count
-from math import isqrt
 from typing import Protocol
 from weakref import WeakSet
 
 import numpy as np
 
+from cortado.checkpoints import Checkpoints, checkpoint_interval
 from cortado.device.compiling import compile_ahead, compile_ahead_adjoint
 from cortado.device.launching import CapturedGraph, add
 from cortado.device.memory import require, step_parts, within
@@ -44,8 +44,7 @@ OF_AN_EVALUATION = (
     "lost",
     "goes_on",
     "evaluation",
-    "_states",
-    "_copies",
+    "_checkpoints",
     "_kept",
     "_run",
 )
@@ -70,15 +69,6 @@ class BackwardStep(Protocol):
 
     def parameters(self) -> Parameters:
         """Adjoints of the parameters, of all steps since `begin`."""
-
-
-def checkpoint_interval(steps: int, affordable: int) -> int:
-    """Steps from one checkpoint to the next: the fewest with which no more states than affordable are alive at a time,
-    those between two checkpoints included; about the square root of the steps where that cannot be."""
-    if steps <= affordable:
-        return 1
-    intervals = range(1, isqrt(steps) + 2)
-    return next((n for n in intervals if -(-steps // n) + n <= affordable), isqrt(steps) + 1)
 
 
 class Rollout:
@@ -108,10 +98,7 @@ class Rollout:
         """What the solver noted of the steps of the last forward run."""
         state_bytes = sum(self.initial[f.name].capacity for f in self.initial.fields if not f.is_constant)
         self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
-        self._states: dict[int, Callable[[], State]] = {}
-        """Checkpoints by their number, each as what gives the state."""
-        self._copies: list[StateSeries] = []
-        """Of whole chunks, which hold them."""
+        self._checkpoints = Checkpoints(self.initial, self._interval)
         self._spare: list[StateSeries] = []
         """Those of earlier runs that nobody will come back to, for the next run that keeps states."""
         self._buffer, self._bar = self.initial.following(), self.initial.like()
@@ -150,10 +137,11 @@ class Rollout:
     def begin_evaluation(self) -> None:
         """Before the first state and the parameters are replaced: whoever will come back to them puts them aside."""
         if len(self.pending) > 1:
-            self._copies = []  # of several owners: not to be used again
+            self._checkpoints.release()  # of several owners: not to be used again
         for pending in list(self.pending):
             pending.put_aside()
-            self._copies = []
+        if self.pending:
+            self._checkpoints = Checkpoints(self.initial, self._interval)
         self.pending.clear()
         self.evaluation = next(self._evaluations)
 
@@ -174,8 +162,9 @@ class Rollout:
         """Run all steps and return the last state, which the next run overwrites. ``observe`` is given every state;
         ``keep`` checkpoints for a way back. Raises `DivergedError` after the good states were observed; a batch goes on
         without the scenes that have ``lost`` a particle."""
-        self._states, self._kept, self._run = {0: lambda: self.initial}, -1, -1
-        self._spare, self._copies = [*self._spare, *self._copies], []
+        self._kept = self._run = -1
+        self._spare += self._checkpoints.release()
+        self._checkpoints = Checkpoints(self.initial, self._interval)
         self.lost = {}
         state, step = self.initial, 0
         self.solver.set_substeps(self.substeps)
@@ -199,7 +188,7 @@ class Rollout:
                     if observe is not None:
                         observe(number, new_state)
                 if keep and not stops:
-                    self._keep(step, chunk)
+                    self._checkpoints.keep(step, chunk, self._series, len(self._chunk), self._spare)
                 if stops:
                     step = lost[0].step + 1
                     raise self.lost[0]
@@ -227,20 +216,6 @@ class Rollout:
         for new_state in self._chunk[:length]:
             self.solver.step(state, new_state, self.parameters, self.log)
             state = new_state
-
-    def _keep(self, step: int, chunk: list[State]) -> None:
-        """Keep checkpoints among the states after a step."""
-        numbers = [n for n in range(step + 1, step + len(chunk) + 1) if n % self._interval == 0]
-        if len(numbers) == len(self._chunk):
-            copy = self._spare.pop() if self._spare else self._series.like()
-            copy.assign(self._series)
-            self._copies.append(copy)
-            self._states |= {n: partial(copy.state, k) for k, n in enumerate(numbers)}
-            return
-        for n in numbers:
-            state = self.initial.following()
-            state.assign(chunk[n - step - 1])
-            self._states[n] = partial(_itself, state)
 
     def _forget_stale_graphs(self) -> None:
         """Begin anew with graphs where arrays of the solver were replaced, by this rollout or by another."""
@@ -291,7 +266,7 @@ class Rollout:
             if observe is not None:
                 observe(n, self._bar)
             if n > 0:
-                self._buffer.assign(self._restore(n - 1))
+                self._buffer.assign(self._checkpoints.state(n - 1, self._replayed))
                 self.solver.step_number.fill_(n - 1)
                 self._step_back(derivative, self.log.seek(n - 1))
         return self._bar
@@ -335,21 +310,10 @@ class Rollout:
                 "states: run forward first, with keep=True."
             )
 
-    def _restore(self, n: int) -> State:
-        """State n: a checkpoint, or recomputed from the one before, with the states in between."""
-        if n not in self._states:
-            start = n - n % self._interval
-            for m in range(start, n):
-                counts = self.log.seek(m)
-                self.solver.step_number.fill_(m)
-                self.solver.replay(self._states[m](), self.parameters, counts)
-                new_state = self.initial.following()
-                self.solver.write_state(counts, self.parameters, new_state)
-                self._states[m + 1] = partial(_itself, new_state)
-        if (n + 1) % self._interval:
-            self._states.pop(n + 1, None)
-        return self._states[n]()
-
-
-def _itself(state: State) -> State:
-    return state
+    def _replayed(self, n: int, state: State) -> State:
+        """The state after state n, computed once more."""
+        counts, new_state = self.log.seek(n), self.initial.following()
+        self.solver.step_number.fill_(n)
+        self.solver.replay(state, self.parameters, counts)
+        self.solver.write_state(counts, self.parameters, new_state)
+        return new_state
