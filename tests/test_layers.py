@@ -43,8 +43,8 @@ LAYERS = """
     sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
     sph.gravity sph.makers sph.mixture sph.surface_tension sph.viscosity
     sph.function_text sph.formula sph.packed sph.own_force sph.body sph.pair forces
-    solvers solvers.containment_kernels solvers.containment solvers.solver solvers.convergence solvers.loop
-    solvers.particles solvers.particle_derivatives solvers.build solvers.pcisph
+    solvers solvers.containment_kernels solvers.containment solvers.solver solvers.makers solvers.named
+    solvers.convergence solvers.loop solvers.particles solvers.particle_derivatives solvers.build solvers.pcisph
     solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure solvers.pcisph.pressure
     solvers.pcisph.pressure_force
     solvers.pcisph.wall_relaxation solvers.pcisph.parts solvers.pcisph.steps solvers.pcisph.derivatives

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationInfo, create_model, field_validator, model
 from cortado.parameters.registry import PARAMETERS
 from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import Emitter
-from cortado.scene.fields import Colour, Flag, OneOf, Several, Text, Vector, count, field_error, quantity
+from cortado.scene.fields import Colour, Flag, Several, Text, Vector, count, field_error, quantity
 from cortado.scene.fluids import AnyFluid
 from cortado.scene.mixture import Mixture
 from cortado.scene.picture import Picture
@@ -71,14 +71,10 @@ Forces: Any = create_model("Forces", __base__=FixedForces, __module__=__name__, 
 """Which forces act: `FixedForces`, and the optional ones of the registry of parameters."""
 
 
-SOLVERS = {"pcisph": "cortado.solvers.pcisph.build"}
-"""By the kind that a scene names, the module whose ``build`` makes the solver of a scene."""
-
-
 class Solver(Table):
     """How a step is solved."""
 
-    kind: Annotated[str, OneOf(SOLVERS)] = "pcisph"
+    kind: Literal["pcisph"] = "pcisph"
     """Name of the algorithm."""
     time_step: Annotated[float, quantity("s", gt=0.0)]
     """Length of a step [s]."""

@@ -66,7 +66,8 @@ class ParticleAdjoint:
 
     def __init__(self, solver: ParticleSolver, steps: int):
         layout, mixture = solver.layout, solver.mixture
-        names = ["time_step", *mixture.shares, *(name for force in solver.forces for name in force.shares)]
+        of_forces = (name for force in solver.forces for name in force.shares)
+        names = ["time_step", *mixture.shares, *solver.shares, *of_forces]
         self._solver = solver
         self.bar = Adjoints(
             Fields.zeros(layout.all_particles, layout.precision, layout.device),

@@ -39,8 +39,8 @@ from cortado.sph.parts import Force, StepContext
 class ParticleSystem:
     """A scene as a solver of particles takes it, on a device: `cortado.solvers.build.particle_system` makes it."""
 
-    kind: str
-    """What scenes call the solver."""
+    called: str
+    """What sentences call the solver."""
     discretisation: Discretisation
     layout: Layout
     lattice: Lattice
@@ -64,6 +64,8 @@ class ParticleSolver:
 
     carried_fields: tuple[StateField, ...] = ()
     """What the solver itself carries from step to step, of particles."""
+    shares: tuple[str, ...] = ()
+    """Parameters of its own to whose adjoints every particle adds a share, as those of a `Force`."""
 
     def __init__(self, system: ParticleSystem, requires_grad: bool = False):
         discretisation, search, layout, nozzle = system.discretisation, system.search, system.layout, system.nozzle
@@ -238,7 +240,7 @@ class ParticleSolver:
         self._lacks("tape", "try gradients.RandomizedSmoothing, which only runs forward")
 
     def _lacks(self, what: str, advice: str) -> NoReturn:
-        raise InputError(f'solver.kind is "{self.system.kind}", which has no {what}: {advice}, or another solver.')
+        raise InputError(f"{self.system.called} has no {what}: {advice}, or another solver.")
 
     def gradient_memory(self, log: IterationLog) -> dict[str, float]:
         iterations = sum(int(record.counts.max(initial=0)) for record in log.records)
