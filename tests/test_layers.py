@@ -28,7 +28,7 @@ LAYERS = """
     scene.mixture scene.picture scene.render scene.toml
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights
-    scene.containers scene.model scene.stability
+    scene.containers scene.entry_points scene.package_tables scene.solvers scene.model scene.stability
     device device.cores device.driver device.kernels device.memory device.precision device.arithmetic device.loads
     device.lanes device.reduction device.host device.silence device.threads device.compiling device.kernel_cache
     device.smoothing

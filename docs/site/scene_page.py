@@ -48,6 +48,7 @@ LINKS = {
     "container": ("[table](#walls-container)", "What holds the fluid."),
     "mixture": ("[table](#fluids-that-mix-mixture)", "How phases mix."),
     "forces": ("[table](#forces-forces)", "Which forces act."),
+    "force": ("[tables](#forces-of-packages-force)", "Forces of installed packages, which act besides."),
     "schedule": ("[table](#changes-over-time-schedule)", "What changes while the scene runs."),
     "solver": ("[table](#time-steps-solver)", "How a step is solved."),
     "render": ("[table](#pictures-render)", "How pictures are taken."),
@@ -211,7 +212,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         "tolerance. A time step beyond the limit of stability is warned of.",
         (
             (
-                "Solver",
+                "PcisphSolver",
                 "",
                 "[solver]\ntime_step = 0.002\nminimum_iterations = 3\nmaximum_iterations = 100\n"
                 "density_tolerance = 0.001",

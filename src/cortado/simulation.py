@@ -39,6 +39,7 @@ from cortado.restart import RestartState
 from cortado.rollout import Rollout
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene, as_scene
+from cortado.scene.solvers import OWN
 from cortado.shading.painter import colours_of, painter
 from cortado.solvers.build import first_capacity
 from cortado.solvers.makers import SolverMaker, SolverSetting, built, checked_solver
@@ -85,11 +86,12 @@ class Simulation(Stepping):
         if free_energy is not None and len(scene.phase) == 1:
             raise InputError("free_energy is given, but must be left out, as the scene has only one phase.")
         self.scene = scene
-        self.forces = checked_makers(forces)
-        """What makes the forces that are not the scene's."""
-        self.own_solver = None if solver is None else checked_solver(solver)
-        """What makes the solver, if it is not that of the scene."""
-        self._maker = self.own_solver or solver_named(scene.solver)
+        self._given = checked_makers(forces), None if solver is None else checked_solver(solver)
+        self.forces = checked_makers([*(table.make() for table in scene.force), *self._given[0]])
+        """What makes the forces that are not Cortado's own: those of packages that the scene names, and those given."""
+        self._maker = self._given[1] or solver_named(scene.solver)
+        self.own_solver = None if self._given[1] is None and scene.solver.kind in OWN else self._maker
+        """What makes the solver, if it is not Cortado's own."""
         self.known = known_of(self.forces, self._maker)
         """Its parameters."""
         self.device = device_named(device)
@@ -136,8 +138,8 @@ class Simulation(Stepping):
     @property
     def _called(self) -> str:
         """What sentences call the solver."""
-        maker, kind = self.own_solver, self.scene.solver.kind
-        return f'solver.kind "{kind}"' if maker is None else f"the solver {type(maker).__name__}"
+        given = self._given[1]
+        return f'solver.kind "{self.scene.solver.kind}"' if given is None else f"the solver {type(given).__name__}"
 
     @property
     def carried_by(self) -> str | None:
@@ -151,7 +153,7 @@ class Simulation(Stepping):
     def _made_of(self, precision: str, batch: int | None) -> tuple[Any, ...]:
         """What a simulation of the same scene is made from."""
         energy = self.free_energy if len(self.scene.phase) > 1 else None
-        return self.scene, self.device.alias, precision, energy, batch, self.forces, self.own_solver
+        return self.scene, self.device.alias, precision, energy, batch, *self._given
 
     def __repr__(self) -> str:
         sizes = f"{counted(self.particles, 'particle')}, {counted(len(self.scene.phase), 'phase')}"

@@ -77,6 +77,10 @@ def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | i
     for step in location:
         if "discriminator" in part:
             part = {"$ref": part["discriminator"]["mapping"][step]}
+        elif "oneOf" in part:  # of which a step names one
+            part = next(
+                one for one in part["oneOf"] if one.get("title") == step or one.get("$ref", "").endswith(str(step))
+            )
         else:
             part = part["items"] if isinstance(step, int) else part["properties"][step]
             path.append(step)
@@ -107,7 +111,7 @@ def wanted(schema: Schema, name: str = "") -> str:
             return "a text that is not empty"
         case {"type": "array", "components": [*first, last]}:
             return f"a list of {len(first) + 1} components: {', '.join(first)} and {last}"
-        case {"type": "array", "items": {"$ref": _} | {"discriminator": _}}:
+        case {"type": "array", "items": {"$ref": _} | {"discriminator": _} | {"type": "object"}}:
             return f"a list of at least one table, each written [[{name}]]"
         case {"type": "array", "items": items, "minItems": 1, "maxItems": most}:
             return f"a list of at most {most} components, each {wanted(items)}"

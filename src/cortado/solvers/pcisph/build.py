@@ -1,8 +1,8 @@
 """The PCISPH solver of a scene."""
 
 from math import inf
-from typing import Any
 
+from cortado.scene.solvers import PcisphSolver
 from cortado.solvers.build import particle_system
 from cortado.solvers.loop import LoopLimits
 from cortado.solvers.makers import SolverSetting
@@ -15,7 +15,7 @@ class PcisphMaker:
 
     batches = True
 
-    def __init__(self, table: Any):
+    def __init__(self, table: PcisphSolver):
         self._table = table
 
     def build(self, setting: SolverSetting) -> Solver:
@@ -27,7 +27,7 @@ class PcisphMaker:
 maker = PcisphMaker
 
 
-def pressure_limits(table: Any) -> LoopLimits:
+def pressure_limits(table: PcisphSolver) -> LoopLimits:
     """When the pressure loop may stop."""
     greatest = table.maximum_density_tolerance
     return LoopLimits(
