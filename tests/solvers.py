@@ -15,7 +15,6 @@ from cortado.parameters.registry import Axis, Parameter
 from cortado.solvers.build import particle_system
 from cortado.solvers.loop import Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver
-from cortado.solvers.pcisph.build import pressure_limits
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint, PcisphTangent
 from cortado.solvers.pcisph.solver import Pcisph
 
@@ -216,7 +215,7 @@ class MakeRemembering:
         return [Parameter("memory.rate", "", "share of the memory", Axis.SCALAR, lambda source: self.rate)]
 
     def build(self, setting):
-        return Remembering(particle_system(setting), pressure_limits(setting.scene.solver))
+        return Remembering(particle_system(setting), LoopLimits(2, 20, tolerance=0.01, greatest_tolerance=inf))
 
 
 class MakeFalling:

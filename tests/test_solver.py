@@ -11,19 +11,16 @@ import cortado
 from cortado import InputError, Problem, Simulation, Trajectory, gradients, losses, reference
 from cortado.commands.run import run_scene
 from cortado.parameters.registry import Axis, Parameter
+from cortado.scene.solvers import PackageSolver
 from cortado.solvers.build import particle_system
 from own_forces import Breeze
+from packages import on_path
 from scenes import plane, scene, two_layers
 from solvers import Falling, MakeFalling, MakeRemembering
 
 STEPS = 30
 NAMES = ["iterations", "density_errors", "greatest_density_errors"]
 MEMORY_NAMES = ["memory_iterations", "memory_errors", "greatest_memory_errors"]
-
-
-def use(monkeypatch, maker):
-    """From now on scenes get the solver that this makes."""
-    monkeypatch.setattr("cortado.solvers.pcisph.build.maker", lambda table: maker)
 
 
 def moving(**changes):
@@ -85,7 +82,7 @@ discretisation = {spacing = 0.05}
 phase = [{name = "water", rest_density = 1000.0, viscosity = 0.05}]
 fluid = [{shape = "box", lower = [0.0, 0.0], upper = [0.4, 0.4], phase = "water", velocity = [0.8, 0.1]}]
 container = {shape = "box", lower = [0.0, 0.0], upper = [0.7, 0.8]}
-solver = {time_step = 0.0021}
+solver = {kind = "KIND", time_step = 0.0021}
 """
 POINT = {
     "gravity": np.array([0.4, -9.5]),
@@ -223,17 +220,17 @@ def test_a_solver_that_does_not_fit_is_a_sentence(solver, options, said):
         Simulation(plane(), solver=solver, **options)
 
 
-def run_command(tmp_path):
+def run_command(tmp_path, monkeypatch, kind):
     """The folder of a run of 20 steps, and the sentence that the command ends with."""
-    (tmp_path / "scene.toml").write_text(SCENE)
+    on_path(tmp_path, monkeypatch)
+    (tmp_path / "scene.toml").write_text(SCENE.replace("KIND", kind))
     out = tmp_path / "out"
     settings = {"device": "cpu", "precision": "float32", "record_every": 4, "overwrite": False, "command": []}
     return out, run_scene(tmp_path / "scene.toml", 20, out, overrides=[], **settings)
 
 
 def test_the_run_command_reports_any_solver(monkeypatch, tmp_path):
-    use(monkeypatch, MakeRemembering())
-    out, _ = run_command(tmp_path)
+    out, _ = run_command(tmp_path, monkeypatch, "remembering")
     assert (out / "figures" / "density_errors.png").exists() and (out / "report.html").exists()
     rows = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert len(rows) == 20 and {*NAMES, *MEMORY_NAMES, "converged"} <= rows[0].keys()
@@ -243,8 +240,7 @@ def test_the_run_command_reports_any_solver(monkeypatch, tmp_path):
 
 
 def test_a_solver_may_have_no_loops(monkeypatch, tmp_path):
-    use(monkeypatch, MakeFalling())
-    out, sentence = run_command(tmp_path)
+    out, sentence = run_command(tmp_path, monkeypatch, "falling")
     assert "The results are in" in sentence and not (out / "figures" / "density_errors.png").exists()
     trajectory = Trajectory.load(out / "trajectory.vtkhdf")
     assert trajectory.diagnostics.keys() == {"converged"} and trajectory.converged.all()
@@ -275,6 +271,6 @@ def test_a_solver_without_derivatives_says_so():
 
 def test_the_reference_engine_is_pcisph_alone():
     made = scene()
-    other = made.model_copy(update={"solver": made.solver.model_copy(update={"kind": "dfsph"})})
+    other = made.model_copy(update={"solver": PackageSolver.model_construct(kind="dfsph", time_step=0.002)})
     with pytest.raises(InputError, match=r"solver\.kind is 'dfsph', but must be pcisph for the reference engine"):
         reference.Simulation(other)

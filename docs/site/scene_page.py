@@ -207,9 +207,20 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         ),
     ),
     (
+        "## Forces of packages: `[[force]]`",
+        "Forces that installed packages register, each with the key `kind`, the name that its package gives it. Its "
+        "other keys are those of the force, which judges them: `k = 2.0`. They act besides those of `[forces]`, in the "
+        "order of the file. [A force, a solver of your own](own_parts.md#a-package-that-scene-files-name) says how a "
+        "package registers one. Their parameters, such as `drag.k`, are differentiated and searched for as others are; "
+        "two forces of one kind need names of their own.",
+        (),
+    ),
+    (
         "## Time steps: `[solver]`",
         "In each step the pressure is computed by iterations, until the fluid is compressed by no more than a "
-        "tolerance. A time step beyond the limit of stability is warned of.",
+        "tolerance. A time step beyond the limit of stability is warned of. These are the keys of PCISPH, which every "
+        "scene has that does not say otherwise. With another `kind`, the name of a solver that an installed package "
+        "registers, the table has `kind`, `time_step` and the keys of that solver.",
         (
             (
                 "PcisphSolver",

@@ -43,7 +43,7 @@ from cortado.scene.solvers import OWN
 from cortado.shading.painter import colours_of, painter
 from cortado.solvers.build import first_capacity
 from cortado.solvers.makers import SolverMaker, SolverSetting, built, checked_solver
-from cortado.solvers.named import solver_named
+from cortado.solvers.named import forces_named, solver_named
 from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy
 from cortado.sph.makers import ForceMaker, check_own, checked_makers, known_of
@@ -87,7 +87,7 @@ class Simulation(Stepping):
             raise InputError("free_energy is given, but must be left out, as the scene has only one phase.")
         self.scene = scene
         self._given = checked_makers(forces), None if solver is None else checked_solver(solver)
-        self.forces = checked_makers([*(table.make() for table in scene.force), *self._given[0]])
+        self.forces = (*forces_named(scene), *self._given[0])
         """What makes the forces that are not Cortado's own: those of packages that the scene names, and those given."""
         self._maker = self._given[1] or solver_named(scene.solver)
         self.own_solver = None if self._given[1] is None and scene.solver.kind in OWN else self._maker

@@ -22,6 +22,8 @@ TYPES = {float: Annotated[float, quantity()], int: Annotated[int, count(-MOST, M
 def registered(group: str, kind: str, own: Collection[str], advice: str) -> EntryPoint:
     """The entry point of a group, such as "cortado.forces", with a name that is none of Cortado's ``own``; raises a
     `SceneError` about ``kind``."""
+    if kind in own:
+        raise SceneError(None, "kind", kind, f"another name, as {kind} is a force of Cortado's own, in [forces]")
     found = entry_points(group=group)
     for entry in found:
         if entry.name in own:

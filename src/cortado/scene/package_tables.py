@@ -8,6 +8,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from cortado.errors import SceneError
+from cortado.parameters.registry import PARAMETERS
 from cortado.scene.entry_points import checked_keys, loaded, made, registered
 from cortado.scene.fields import FieldPath, Text, field_error, without_numpy
 from cortado.scene.tables import Table
@@ -65,7 +66,7 @@ class Inline:
     """Has the JSON schema of a table stand where it is used, and not among the tables whose keys are all known."""
 
     def __get_pydantic_json_schema__(self, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        return dict(handler.resolve_ref_schema(handler(core_schema)))
+        return {"allOf": [handler.resolve_ref_schema(handler(core_schema))]}
 
 
 class PackageForce(PackageTable):
@@ -73,6 +74,7 @@ class PackageForce(PackageTable):
 
     group = "cortado.forces"
     method = "force"
+    own = ("gravity", "viscosity", "pressure", *(p.name for p in PARAMETERS if p.is_optional))
 
 
 AnyForces = tuple[Annotated[PackageForce, Inline()], ...]
