@@ -1,7 +1,8 @@
 """Solvers that are not Cortado's: what the protocol promises holds for them too.
 
 `Remembering` is PCISPH with a second loop and a memory of the fluid's velocity that goes on from step to step, as a
-warm start does, and with a parameter of its own; `Falling` has no loops, and no derivatives.
+warm start does, and with a parameter of its own; `Falling` has no loops, and no derivatives,
+which `Explicit` has.
 """
 
 from functools import cache
@@ -14,6 +15,7 @@ from cortado.device.fields import Entry, StateField
 from cortado.parameters.registry import Axis, Parameter
 from cortado.solvers.build import particle_system
 from cortado.solvers.loop import Loop, LoopLimits
+from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint, PcisphTangent
 from cortado.solvers.pcisph.solver import Pcisph
@@ -141,8 +143,8 @@ class Remembering(Pcisph):
     def tangent(self, parameters_dot):
         return RememberingTangent(self, parameters_dot)
 
-    def adjoint(self, steps, frozen_geometry=False):
-        return RememberingAdjoint(self, steps, frozen_geometry)
+    def adjoint(self, steps):
+        return RememberingAdjoint(self, steps)
 
 
 class RememberingTangent(PcisphTangent):
@@ -163,8 +165,8 @@ class RememberingTangent(PcisphTangent):
 
 
 class RememberingAdjoint(PcisphAdjoint):
-    def __init__(self, solver, steps, frozen_geometry):
-        super().__init__(solver, steps, frozen_geometry)
+    def __init__(self, solver, steps):
+        super().__init__(solver, steps)
         self.memory_bar = solver.vectors()
 
     def step(self, counts, state_bar, parameters):
@@ -204,6 +206,44 @@ class Falling(ParticleSolver):
         self.unsort(self.context(parameters), self.x, self.v, new_state)
 
 
+class Explicit(Falling):
+    """The same with derivatives of both modes, and for a tape."""
+
+    def __init__(self, system, requires_grad=False):
+        ParticleSolver.__init__(self, system, requires_grad)
+        self.x, self.v = self.vectors(), self.vectors()
+
+    def differentiable(self):
+        return Explicit(self.system.of_one_lane(), requires_grad=True)
+
+    def tangent(self, parameters_dot):
+        return ExplicitTangent(self, parameters_dot)
+
+    def adjoint(self, steps):
+        return ExplicitAdjoint(self, steps)
+
+
+class ExplicitTangent(ParticleTangent):
+    def __init__(self, solver, parameters_dot):
+        super().__init__(solver, parameters_dot)
+        self.x_dot, self.v_dot = solver.vectors(), solver.vectors()
+
+    def step(self, counts, state_dot, parameters):
+        context = self._solver.context(parameters)
+        self.sort(context, state_dot)
+        self.predict(context, self._solver.v, self.x_dot, self.v_dot)
+        self.unsort(context, self.x_dot, self.v_dot, state_dot)
+
+
+class ExplicitAdjoint(ParticleAdjoint):
+    def step(self, counts, state_bar, parameters):
+        context = self._solver.context(parameters)
+        self.begin_step(context, self.unsort(context, state_bar), self._solver.v)
+        self.predict(context)
+        self.mix(context, state_bar)
+        self.sort(context, state_bar)
+
+
 class MakeRemembering:
     """With so great a share of the memory taken off the velocity in each step."""
 
@@ -221,3 +261,10 @@ class MakeRemembering:
 class MakeFalling:
     def build(self, setting):
         return Falling(particle_system(setting))
+
+
+class MakeExplicit:
+    batches = True
+
+    def build(self, setting):
+        return Explicit(particle_system(setting))

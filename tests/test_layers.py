@@ -38,15 +38,15 @@ LAYERS = """
     discretise.crowding parameters.checks
     discretise.bodies discretise.packing discretise.sampling discretise.discrete_scene
     discretise.distance
-    sph sph.density sph.free_energy sph.substeps sph.integration sph.order sph.materials sph.emitter_kernels
-    sph.pair_forces
+    sph sph.density sph.free_energy sph.substeps sph.integration sph.begin_adjoint sph.order sph.materials
+    sph.emitter_kernels sph.pair_forces
     sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
     sph.gravity sph.makers sph.mixture sph.surface_tension sph.viscosity
     sph.function_text sph.formula sph.packed sph.own_force sph.body sph.pair forces
     solvers solvers.containment_kernels solvers.containment solvers.solver solvers.makers solvers.named
     solvers.convergence solvers.loop solvers.particles solvers.particle_derivatives solvers.build solvers.pcisph
-    solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure solvers.pcisph.pressure
-    solvers.pcisph.pressure_force
+    solvers.pcisph.begin_adjoint solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure
+    solvers.pcisph.pressure solvers.pcisph.pressure_force
     solvers.pcisph.wall_relaxation solvers.pcisph.parts solvers.pcisph.steps solvers.pcisph.derivatives
     solvers.pcisph.solver solvers.pcisph.build
     reference.digits reference.engine reference.histories reference.losses reference.simulation reference

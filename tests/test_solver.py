@@ -16,7 +16,7 @@ from cortado.solvers.build import particle_system
 from own_forces import Breeze
 from packages import on_path
 from scenes import plane, scene, two_layers
-from solvers import Falling, MakeFalling, MakeRemembering
+from solvers import Falling, MakeExplicit, MakeFalling, MakeRemembering
 
 STEPS = 30
 NAMES = ["iterations", "density_errors", "greatest_density_errors"]
@@ -121,6 +121,21 @@ def test_states_that_are_computed_again_carry_the_same():
 
 def test_the_certificate_judges_any_solver():
     assert cortado.certify(problem_of(), {name: POINT[name] for name in ("gravity", "memory.rate")}).right
+
+
+def test_an_explicit_solver_is_certified():
+    """Without pressure, with forces and two phases; forward mode and the tape agree."""
+    made = two_layers(forces={"gravity": [0.3, -2.0, 0.1], "viscosity": "pairwise"})
+    simulation = Simulation(made, precision="float64", solver=MakeExplicit(), forces=[Breeze()])
+    problem = Problem(simulation, 6, losses.FinalPositions(simulation.positions + 0.01))
+    names = ["gravity", "time_step", "viscosity", "breeze.k"]
+    assert cortado.certify(problem, names).right
+    at = {name: simulation.parameters()[name] for name in names}
+    taped, exact = (problem.value_and_gradient(at, one)[1] for one in (gradients.Tape(), gradients.Exact()))
+    for name in names:
+        np.testing.assert_allclose(taped[name], exact[name], rtol=1e-9)
+    slope = sum(float(np.sum(exact[name])) for name in names)
+    assert problem.tangent(at, {name: np.ones_like(at[name]) for name in names}) == pytest.approx(slope, rel=1e-9)
 
 
 def test_a_parameter_of_a_solver_is_searched_for():
@@ -260,6 +275,7 @@ def test_a_solver_without_derivatives_says_so():
     problem = Problem(Simulation(plane(), solver=MakeFalling()), 3, losses.FinalPositions(np.zeros((64, 2))))
     at = {"gravity": np.array([0.0, -1.0])}
     estimators = {"reverse mode: try gradients.Tape": gradients.Exact(), "tape: try": gradients.Tape()}
+    estimators["reverse mode with a frozen geometry: try"] = gradients.FrozenGeometry()
     for what, estimator in estimators.items():
         with pytest.raises(InputError, match=f"the solver MakeFalling has no {what}"):
             problem.value_and_gradient(at, estimator)

@@ -21,7 +21,7 @@ from cortado.device.neighbours import NeighbourSearch
 from cortado.device.state import Layout, Parameters, State
 from cortado.device.threads import Turn
 from cortado.discretise.discrete_scene import Lattice
-from cortado.errors import InputError
+from cortado.errors import MissingDerivativeError
 from cortado.lattice.calibration import SKIN
 from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.convergence import convergence_kernels
@@ -64,6 +64,8 @@ class ParticleSolver:
 
     carried_fields: tuple[StateField, ...] = ()
     """What the solver itself carries from step to step, of particles."""
+    topic = "density"
+    """Of the Warp modules that have the kernels of the density."""
     shares: tuple[str, ...] = ()
     """Parameters of its own to whose adjoints every particle adds a share, as those of a `Force`."""
 
@@ -77,7 +79,10 @@ class ParticleSolver:
         self.launch = KernelLauncher(particles, device, record_tape=requires_grad)
         self.turn = Turn(device)
         """Whose arrays these are now."""
-        self.density, self.integration = density_kernels(discretisation), integration_kernels(precision, requires_grad)
+        self.density, self.integration = (
+            density_kernels(discretisation, self.topic),
+            integration_kernels(precision, requires_grad),
+        )
         self.mixture = Mixture(system.phases, layout, requires_grad)
         self.emitter = Emitter(nozzle, layout, requires_grad) if nozzle else None
         self.carried = Carried(self.carried_fields, layout, requires_grad)
@@ -233,14 +238,17 @@ class ParticleSolver:
     def tangent(self, parameters_dot: Parameters) -> StepTangent:
         self._lacks("forward mode", "take differences of `Problem.value`")
 
-    def adjoint(self, steps: int, frozen_geometry: bool = False) -> StepAdjoint:
+    def adjoint(self, steps: int) -> StepAdjoint:
         self._lacks("reverse mode", "try gradients.Tape, or gradients.RandomizedSmoothing, which only runs forward")
+
+    def frozen_adjoint(self, steps: int) -> StepAdjoint:
+        self._lacks("reverse mode with a frozen geometry", "try gradients.Exact")
 
     def differentiable(self) -> Self:
         self._lacks("tape", "try gradients.RandomizedSmoothing, which only runs forward")
 
     def _lacks(self, what: str, advice: str) -> NoReturn:
-        raise InputError(f"{self.system.called} has no {what}: {advice}, or another solver.")
+        raise MissingDerivativeError(f"{self.system.called} has no {what}: {advice}, or another solver.")
 
     def gradient_memory(self, log: IterationLog) -> dict[str, float]:
         iterations = sum(int(record.counts.max(initial=0)) for record in log.records)
