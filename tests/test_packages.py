@@ -7,6 +7,7 @@ import pickle
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -250,6 +251,20 @@ def test_what_does_not_fit_in_a_task_is_a_sentence(file, cortado_command, text, 
     code, _, told = cortado_command("optimise", file(DRAG + text), "--out", "out")
     assert code == 2 and len(told.splitlines()) == 1
     assert re.search(said, told), told
+
+
+def test_the_package_of_the_page_is_one(tmp_path, monkeypatch):
+    """Its two files, and the scene, as printed; what pip would make of them is written here."""
+    page = (Path(__file__).parents[1] / "docs" / "own_parts.md").read_text()
+    module, project, table = (
+        re.search(rf"^```{kind}(.*?)^```$", page[page.index("## A package that") :], re.DOTALL | re.MULTILINE)[1]
+        for kind in ("py3\n", r"toml\n(?=\[project)", r"toml\n(?=\[\[force)")
+    )
+    entries = tomllib.loads(project)["project"]["entry-points"]
+    on_path(tmp_path, monkeypatch, name="my-parts", entries=entries)
+    (tmp_path / "my_parts.py").write_text(module)
+    (tmp_path / "scene.toml").write_text(SCENE + OURS + table)
+    assert Simulation(tmp_path / "scene.toml").parameters()["drag.k"] == 3.0
 
 
 def test_the_reference_engine_has_none(file):

@@ -26,7 +26,7 @@ from cortado.lattice.calibration import SKIN
 from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.convergence import convergence_kernels
 from cortado.solvers.loop import IterationLog, Loop
-from cortado.solvers.solver import StepAdjoint, StepTangent
+from cortado.solvers.solver import Counts, StepAdjoint, StepTangent
 from cortado.sph.carried import Carried
 from cortado.sph.density import density_kernels
 from cortado.sph.emitter import Emitter, Nozzle
@@ -58,8 +58,8 @@ class ParticleSystem:
 class ParticleSolver:
     """The steps of one set of particles on one device; their arrays are reused by every step.
 
-    The methods that `Solver` has are explained there. A solver of this kind has `step`, `reserve`, `replay` and
-    `write_state` of its own, and if it has derivatives `tangent`, `adjoint` and `differentiable`.
+    The methods that `Solver` has are explained there. A solver of this kind has `step`, `replay` and `write_state`
+    of its own, with loops also `reserve`, and if it has derivatives `tangent`, `adjoint` and `differentiable`.
     """
 
     carried_fields: tuple[StateField, ...] = ()
@@ -153,6 +153,9 @@ class ParticleSolver:
         wp.copy(self.step_number, other.step_number)
         for own, given in zip(self.loops, other.loops, strict=True):
             wp.copy(own.rounds, given.rounds)
+
+    def reserve(self, counts: Counts) -> None:
+        """Nothing, of a step without loops."""
 
     def reset(self, step: int = 0) -> None:
         for loop in self.loops:
