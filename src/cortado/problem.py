@@ -265,8 +265,7 @@ class Problem:
             checksums.append(f"state {sha256(fields + repr(state.clock).encode()).hexdigest()[:16]}")
         energies = f"free energy {energy.name} {energy.curvature}"
         own = {"forces": simulation.forces, "solver": [simulation.own_solver] if simulation.own_solver else []}
-        texts = {what: parts_fingerprint(makers, simulation) for what, makers in own.items()}
-        told = [f"{what} {text}" for what, text in texts.items() if text]
+        told = [f"{what} {text}" for what, makers in own.items() if (text := parts_fingerprint(makers, simulation))]
         return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies, *told])
 
     def iterations(self) -> np.ndarray:

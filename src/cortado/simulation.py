@@ -42,7 +42,7 @@ from cortado.scene.scene import Scene, as_scene
 from cortado.scene.solvers import OWN
 from cortado.shading.painter import colours_of, painter
 from cortado.solvers.build import first_capacity
-from cortado.solvers.makers import SolverMaker, SolverSetting, built, checked_solver
+from cortado.solvers.makers import SolverMaker, SolverSetting, built, called, checked_solver
 from cortado.solvers.named import forces_named, solver_named
 from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy
@@ -92,6 +92,7 @@ class Simulation(Stepping):
         self._maker = self._given[1] or solver_named(scene.solver)
         self.own_solver = None if self._given[1] is None and scene.solver.kind in OWN else self._maker
         """What makes the solver, if it is not Cortado's own."""
+        self._called = called(scene.solver, self._given[1])
         self.known = known_of(self.forces, self._maker)
         """Its parameters."""
         self.device = device_named(device)
@@ -134,12 +135,6 @@ class Simulation(Stepping):
     def _built(self, discrete: DiscreteScene) -> Solver:
         own = (self.scene, discrete, self.free_energy, self.precision, self.device, self.batch, self.forces, self.known)
         return built(self._maker, SolverSetting(*own, self._called))
-
-    @property
-    def _called(self) -> str:
-        """What sentences call the solver."""
-        given = self._given[1]
-        return f'solver.kind "{self.scene.solver.kind}"' if given is None else f"the solver {type(given).__name__}"
 
     @property
     def carried_by(self) -> str | None:

@@ -9,6 +9,7 @@ from cortado.discretise.discrete_scene import DiscreteScene
 from cortado.errors import InputError, shown
 from cortado.parameters.known import Known
 from cortado.scene.scene import Scene
+from cortado.scene.solvers import Solver as SolverTable
 from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FreeEnergy
 from cortado.sph.makers import ForceMaker, checked_parameters
@@ -52,6 +53,11 @@ def checked_solver(solver: Any) -> SolverMaker:
         raise InputError(f"solver is {shown(solver)}, but must be {WANTED}.")
     checked_parameters("solver", solver, getattr(solver, "parameters", ()))
     return solver
+
+
+def called(table: SolverTable, given: SolverMaker | None) -> str:
+    """What sentences call the solver of a scene with this table, or the one that is given."""
+    return f'solver.kind "{table.kind}"' if given is None else f"the solver {type(given).__name__}"
 
 
 def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
