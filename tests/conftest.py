@@ -124,6 +124,11 @@ SLOW_TESTS = {
     "test_packaging": {
         "test_without_a_compiler_the_wheel_is_pure_python",
     },
+    "test_packages": {
+        "test_a_key_of_one_is_swept",
+        "test_a_task_searches_for_a_parameter_of_one",
+        "test_they_are_there_in_processes_of_their_own",
+    },
     "test_physics": {
         "test_any_number_of_threads_gives_the_same_bits",
     },

@@ -1,7 +1,8 @@
 """Solvers that are not Cortado's: what the protocol promises holds for them too.
 
 `Remembering` is PCISPH with a second loop and a memory of the fluid's velocity that goes on from step to step, as a
-warm start does; `Falling` has no loops, and no derivatives.
+warm start does, and with a parameter of its own; `Falling` has no loops, and no derivatives,
+which `Explicit` has.
 """
 
 from functools import cache
@@ -11,10 +12,11 @@ from types import SimpleNamespace
 import warp as wp
 
 from cortado.device.fields import Entry, StateField
+from cortado.parameters.registry import Axis, Parameter
 from cortado.solvers.build import particle_system
 from cortado.solvers.loop import Loop, LoopLimits
+from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver
-from cortado.solvers.pcisph.build import pressure_limits
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint, PcisphTangent
 from cortado.solvers.pcisph.solver import Pcisph
 
@@ -23,7 +25,7 @@ MEMORY = "memory"
 
 @cache
 def memory_kernels(precision):
-    """w <- (w + v) / 2 until w is near v, and then v <- v - 0.3 w, with derivatives of k rounds at once."""
+    """w <- (w + v) / 2 until w is near v, and then v <- v - rate w, with derivatives of k rounds at once."""
     real, vector, pair = precision.real, precision.vector, precision.pair
     module = wp.get_module(f"tests_memory_{precision.name}")
 
@@ -41,13 +43,23 @@ def memory_kernels(precision):
         error[i] = pair(gap, gap)
 
     @wp.kernel(module=module)
-    def drag(v: wp.array(dtype=vector), w: wp.array(dtype=vector), v_out: wp.array(dtype=vector)):
+    def drag(
+        particles: int,
+        memory_rate: wp.array(dtype=real),
+        v: wp.array(dtype=vector),
+        w: wp.array(dtype=vector),
+        v_out: wp.array(dtype=vector),
+    ):
         i = wp.tid()
-        v_out[i] = v[i] - real(0.3) * w[i]
+        v_out[i] = v[i] - memory_rate[i // particles] * w[i]
 
     @wp.kernel(module=module, enable_backward=False)
     def tangent(
+        particles: int,
+        memory_rate: wp.array(dtype=real),
+        memory_rate_dot: wp.array(dtype=real),
         left: real,
+        w_end: wp.array(dtype=vector),
         v_dot: wp.array(dtype=vector),
         w_dot: wp.array(dtype=vector),
         v_out_dot: wp.array(dtype=vector),
@@ -56,19 +68,25 @@ def memory_kernels(precision):
         i = wp.tid()
         w = left * w_dot[i] + (real(1.0) - left) * v_dot[i]
         w_out_dot[i] = w
-        v_out_dot[i] = v_dot[i] - real(0.3) * w
+        b = i // particles
+        v_out_dot[i] = v_dot[i] - memory_rate[b] * w - memory_rate_dot[b] * w_end[i]
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
+        particles: int,
         order: wp.array(dtype=wp.int32),
+        memory_rate: wp.array(dtype=real),
         left: real,
+        w_end: wp.array(dtype=vector),
         w_out_bar: wp.array(dtype=vector),
         v_scene_bar: wp.array(dtype=vector),
         w_bar: wp.array(dtype=vector),
+        memory_rate_bar: wp.array(dtype=real),
     ):
         i = wp.tid()
         p = order[i]
-        total = w_out_bar[i] - real(0.3) * v_scene_bar[p]
+        memory_rate_bar[i] = memory_rate_bar[i] - wp.dot(w_end[i], v_scene_bar[p])
+        total = w_out_bar[i] - memory_rate[i // particles] * v_scene_bar[p]
         v_scene_bar[p] = v_scene_bar[p] + (real(1.0) - left) * total
         w_bar[i] = left * total
 
@@ -77,6 +95,7 @@ def memory_kernels(precision):
 
 class Remembering(Pcisph):
     carried_fields = (StateField(MEMORY, "m/s", Entry.VECTOR),)
+    shares = ("memory.rate",)
 
     def __init__(self, system, limits, requires_grad=False):
         super().__init__(system, limits, requires_grad)
@@ -112,8 +131,9 @@ class Remembering(Pcisph):
     def write_state(self, counts, parameters, new_state):
         iterations, rounds = counts
         v, memory = self.iterates.v_star[iterations], self.memories[rounds]
-        self.launch(self.memory_kernels.drag, v=v, w=memory, v_out=self.v)
-        self.unsort(self.context(parameters), self.iterates.x_star[iterations], self.v, new_state, memory=memory)
+        context = self.context(parameters)
+        context.launch(self.memory_kernels.drag, v=v, w=memory, v_out=self.v)
+        self.unsort(context, self.iterates.x_star[iterations], self.v, new_state, memory=memory)
 
     def remember(self, k, slot, iterations):
         before = self.carried[MEMORY] if k == 0 else self.memories[max(slot - 1, 0)]
@@ -123,8 +143,8 @@ class Remembering(Pcisph):
     def tangent(self, parameters_dot):
         return RememberingTangent(self, parameters_dot)
 
-    def adjoint(self, steps, frozen_geometry=False):
-        return RememberingAdjoint(self, steps, frozen_geometry)
+    def adjoint(self, steps):
+        return RememberingAdjoint(self, steps)
 
 
 class RememberingTangent(PcisphTangent):
@@ -138,14 +158,15 @@ class RememberingTangent(PcisphTangent):
 
     def unsort(self, context, x_dot, v_dot, state_dot):
         new = {"v_out_dot": self.v_dot, "w_out_dot": self.memory_dot}
-        old = {"v_dot": v_dot, "w_dot": self.carried_dot[MEMORY]}
-        context.launch(self._solver.memory_kernels.tangent, left=0.5**self.rounds, **old, **new)
+        old = {"v_dot": v_dot, "w_dot": self.carried_dot[MEMORY], "w_end": self._solver.memories[self.rounds]}
+        known = self.dot.named
+        context.launch(self._solver.memory_kernels.tangent, *known, left=0.5**self.rounds, **old, **new)
         super().unsort(context, x_dot, self.v_dot, state_dot, memory=self.memory_dot)
 
 
 class RememberingAdjoint(PcisphAdjoint):
-    def __init__(self, solver, steps, frozen_geometry):
-        super().__init__(solver, steps, frozen_geometry)
+    def __init__(self, solver, steps):
+        super().__init__(solver, steps)
         self.memory_bar = solver.vectors()
 
     def step(self, counts, state_bar, parameters):
@@ -155,7 +176,8 @@ class RememberingAdjoint(PcisphAdjoint):
     def unsort(self, context, state_bar):
         free_bar = super().unsort(context, state_bar)
         bars = {"w_out_bar": self.carried_bar[MEMORY], "v_scene_bar": free_bar.velocities, "w_bar": self.memory_bar}
-        context.launch(self._solver.memory_kernels.adjoint, left=0.5**self.rounds, **bars)
+        own = {"left": 0.5**self.rounds, "w_end": self._solver.memories[self.rounds]}
+        context.launch(self._solver.memory_kernels.adjoint, *self.bar.named, **own, **bars)
         return free_bar
 
     def sort(self, context, state_bar):
@@ -184,9 +206,65 @@ class Falling(ParticleSolver):
         self.unsort(self.context(parameters), self.x, self.v, new_state)
 
 
-def build_remembering(scene, discrete, free_energy, precision, device):
-    return Remembering(particle_system(scene, discrete, free_energy, precision, device), pressure_limits(scene))
+class Explicit(Falling):
+    """The same with derivatives of both modes, and for a tape."""
+
+    def __init__(self, system, requires_grad=False):
+        ParticleSolver.__init__(self, system, requires_grad)
+        self.x, self.v = self.vectors(), self.vectors()
+
+    def differentiable(self):
+        return Explicit(self.system.of_one_lane(), requires_grad=True)
+
+    def tangent(self, parameters_dot):
+        return ExplicitTangent(self, parameters_dot)
+
+    def adjoint(self, steps):
+        return ExplicitAdjoint(self, steps)
 
 
-def build_falling(scene, discrete, free_energy, precision, device):
-    return Falling(particle_system(scene, discrete, free_energy, precision, device))
+class ExplicitTangent(ParticleTangent):
+    def __init__(self, solver, parameters_dot):
+        super().__init__(solver, parameters_dot)
+        self.x_dot, self.v_dot = solver.vectors(), solver.vectors()
+
+    def step(self, counts, state_dot, parameters):
+        context = self._solver.context(parameters)
+        self.sort(context, state_dot)
+        self.predict(context, self._solver.v, self.x_dot, self.v_dot)
+        self.unsort(context, self.x_dot, self.v_dot, state_dot)
+
+
+class ExplicitAdjoint(ParticleAdjoint):
+    def step(self, counts, state_bar, parameters):
+        context = self._solver.context(parameters)
+        self.begin_step(context, self.unsort(context, state_bar), self._solver.v)
+        self.predict(context)
+        self.mix(context, state_bar)
+        self.sort(context, state_bar)
+
+
+class MakeRemembering:
+    """With so great a share of the memory taken off the velocity in each step."""
+
+    def __init__(self, rate=0.3):
+        self.rate = rate
+
+    @property
+    def parameters(self):
+        return [Parameter("memory.rate", "", "share of the memory", Axis.SCALAR, lambda source: self.rate)]
+
+    def build(self, setting):
+        return Remembering(particle_system(setting), LoopLimits(2, 20, tolerance=0.01, greatest_tolerance=inf))
+
+
+class MakeFalling:
+    def build(self, setting):
+        return Falling(particle_system(setting))
+
+
+class MakeExplicit:
+    batches = True
+
+    def build(self, setting):
+        return Explicit(particle_system(setting))

@@ -9,7 +9,6 @@ import cortado
 import scenes
 from cortado import CortadoWarning, InputError, Problem, Simulation, gradients
 from cortado.losses import CentreOfMass, FinalPositions, Frames
-from solvers import build_remembering
 
 STEPS = 8
 FREE = {"time_step": 0.0021, "minimum_iterations": 3, "maximum_iterations": 12, "density_tolerance": 1e-3}
@@ -252,12 +251,6 @@ def test_substeps_of_diffusion_must_be_the_same():
     problem = Problem(Simulation(layers(), batch=2), 2, CentreOfMass(np.full(3, 0.1)))
     with pytest.raises(InputError, match="take 2 and 3 explicit steps of diffusion in a time step, but must all"):
         problem.value({"mobility": np.array([0.1, 0.2])})
-
-
-def test_a_solver_without_batches_says_so(monkeypatch):
-    monkeypatch.setattr("cortado.solvers.pcisph.build.build", build_remembering)
-    with pytest.raises(InputError, match=r'batch is 2, but must be left out, as solver\.kind "pcisph" has no batches'):
-        Simulation(scenes.plane(), batch=2)
 
 
 def test_estimators_that_run_batches_are_given_single_scenes():

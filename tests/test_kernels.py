@@ -26,6 +26,7 @@ from cortado.parameters.reference_density import (
     reference_density_adjoint,
     reference_density_tangent,
 )
+from cortado.solvers.pcisph.begin_adjoint import begin_adjoint_kernel
 from cortado.solvers.pcisph.density_ratio_relaxation import density_ratio_kernels
 from cortado.solvers.pcisph.pressure import pressure_kernels
 from cortado.solvers.pcisph.pressure_force import pressure_force_kernels
@@ -58,6 +59,7 @@ class Kernels:
     pressure = pressure_kernels(DISCRETISATION)
     force = pressure_force_kernels(DISCRETISATION)
     integration = integration_kernels(FLOAT64, False)
+    begin_adjoint = begin_adjoint_kernel(DISCRETISATION)
     gravity = gravity_kernels(FLOAT64, False)
     pairwise = viscosity_kernels(DISCRETISATION, pairwise)
     laminar = viscosity_kernels(DISCRETISATION, laminar)
@@ -214,8 +216,8 @@ def dotted(dots: Values) -> Values:
 
 
 def zeros(*names: str) -> Values:
-    """Empty adjoints: vectors for x, v and pushes, reals for the rest."""
-    vectors = ("x_bar", "v_bar", "push_bar", "acceleration_bar")
+    """Empty adjoints: vectors for x, v and accelerations, reals for the rest."""
+    vectors = ("x_bar", "v_bar", "scaled_bar", "acceleration_bar")
     return {name: np.zeros((N, 3) if name in vectors else N) for name in names}
 
 
@@ -447,14 +449,23 @@ class Iterations(Operation):
     def adjoint(self, values, bars):
         states, pressures, cs = self.record(values)
         bar = launch(
-            Kernels.integration.begin_adjoint,
+            Kernels.begin_adjoint,
             order=self.order,
             **values,
             v_star=states[-1]["v_star"],
             x_scene_bar=bars["x_new"],
             v_scene_bar=bars["v_new"],
             **zeros(
-                "time_step_bar", "x_bar", "v_bar", "n_bar", "m_bar", "rho_0_bar", "mu_bar", "push_bar", "y_bar", "p_bar"
+                "time_step_bar",
+                "x_bar",
+                "v_bar",
+                "n_bar",
+                "m_bar",
+                "rho_0_bar",
+                "mu_bar",
+                "scaled_bar",
+                "y_bar",
+                "p_bar",
             ),
         )
         bar = {name: value for name, value in bar.items() if name.endswith("_bar")}

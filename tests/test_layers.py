@@ -28,7 +28,7 @@ LAYERS = """
     scene.mixture scene.picture scene.render scene.toml
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights
-    scene.containers scene.model scene.stability
+    scene.containers scene.entry_points scene.package_tables scene.solvers scene.model scene.stability
     device device.cores device.driver device.kernels device.memory device.precision device.arithmetic device.loads
     device.lanes device.reduction device.host device.silence device.threads device.compiling device.kernel_cache
     device.smoothing
@@ -38,15 +38,15 @@ LAYERS = """
     discretise.crowding parameters.checks
     discretise.bodies discretise.packing discretise.sampling discretise.discrete_scene
     discretise.distance
-    sph sph.density sph.free_energy sph.substeps sph.integration sph.order sph.materials sph.emitter_kernels
-    sph.pair_forces
+    sph sph.density sph.free_energy sph.substeps sph.integration sph.begin_adjoint sph.order sph.materials
+    sph.emitter_kernels sph.pair_forces
     sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
     sph.gravity sph.makers sph.mixture sph.surface_tension sph.viscosity
     sph.function_text sph.formula sph.packed sph.formula_kernels sph.own_force sph.body sph.pair forces
-    solvers solvers.containment_kernels solvers.containment solvers.solver solvers.convergence solvers.loop
-    solvers.particles solvers.particle_derivatives solvers.build solvers.pcisph
-    solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure solvers.pcisph.pressure
-    solvers.pcisph.pressure_force
+    solvers solvers.containment_kernels solvers.containment solvers.solver solvers.makers solvers.named
+    solvers.convergence solvers.loop solvers.particles solvers.particle_derivatives solvers.build solvers.pcisph
+    solvers.pcisph.begin_adjoint solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure
+    solvers.pcisph.pressure solvers.pcisph.pressure_force
     solvers.pcisph.wall_relaxation solvers.pcisph.parts solvers.pcisph.steps solvers.pcisph.derivatives
     solvers.pcisph.solver solvers.pcisph.build
     reference.digits reference.engine reference.histories reference.losses reference.simulation reference

@@ -289,7 +289,7 @@ def test_a_crowd_in_one_cell(precision):
 class FewLanes(Discretisation):
     """Scans as with a few lanes, of which a CPU has one."""
 
-    def module(self, forward, topic="pcisph"):
+    def module(self, forward, topic):
         return super().module(forward, f"{topic}_{type(self).__name__}")
 
 

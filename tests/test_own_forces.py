@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 import cortado
-import solvers
 from cortado import InputError, Problem, Simulation, gradients
 from cortado.parameters.registry import Axis, Parameter
-from cortado.scene.model import SOLVERS
 from own_forces import Breeze
 from scenes import plane, splash
 
@@ -105,9 +103,18 @@ def test_it_goes_to_other_processes():
     assert again.fingerprint == judged.fingerprint
 
 
+class Gusts(Breeze):
+    """With a setting that is no parameter."""
+
+    def __init__(self, gusts):
+        super().__init__()
+        self.gusts = gusts
+
+
 def test_another_force_is_another_problem():
-    texts = {problem(forces).fingerprint for forces in ([], [Breeze()], [Breeze(2.0)])}
-    assert len(texts) == 3
+    different = ([], [Breeze()], [Breeze(2.0)], [Gusts(1)], [Gusts(2)])
+    texts = {problem(forces).fingerprint for forces in different}
+    assert len(texts) == len(different)
 
 
 class Named(Breeze):
@@ -156,13 +163,6 @@ def test_a_force_that_does_not_fit_is_a_sentence(forces, said):
 def test_a_value_that_does_not_fit_is_a_sentence(values, said):
     with pytest.raises(InputError, match=said):
         problem([Breeze()]).value(values)
-
-
-def test_a_solver_without_room_for_them_says_so(monkeypatch):
-    monkeypatch.setitem(SOLVERS, "pcisph", "solvers")
-    monkeypatch.setattr(solvers, "build", solvers.build_falling, raising=False)
-    with pytest.raises(InputError, match="forces is given, but must be left out, as solver"):
-        problem([Breeze()])
 
 
 def test_a_scene_without_them_has_no_more_parameters():

@@ -90,4 +90,4 @@ def test_what_the_schema_of_a_scene_says():
     assert (gravity["items"]["unit"], gravity["default"]) == ("m/s2", [0.0, -9.81, 0.0])
     assert schema["Forces"]["properties"]["surface_tension"]["description"] == "tension of the free surface"
     assert schema["Mixture"]["properties"]["free_energy"]["enum"] == ["double_well", "miscible"]
-    assert schema["Solver"]["properties"]["time_step"]["description"] == "Length of a step [s]."
+    assert schema["PcisphSolver"]["properties"]["time_step"]["description"] == "Length of a step [s]."

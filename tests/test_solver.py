@@ -1,9 +1,8 @@
 """Runs, restarts, gradients, files and reports know solvers by their protocol, and not PCISPH."""
 
 import json
-import sys
+import pickle
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,19 +10,17 @@ import pytest
 import cortado
 from cortado import InputError, Problem, Simulation, Trajectory, gradients, losses, reference
 from cortado.commands.run import run_scene
-from cortado.scene.model import SOLVERS
+from cortado.parameters.registry import Axis, Parameter
+from cortado.scene.solvers import PackageSolver
+from cortado.solvers.build import particle_system
+from own_forces import Breeze
+from packages import on_path
 from scenes import plane, scene, two_layers
-from solvers import build_falling, build_remembering
+from solvers import Falling, MakeExplicit, MakeFalling, MakeRemembering
 
 STEPS = 30
 NAMES = ["iterations", "density_errors", "greatest_density_errors"]
 MEMORY_NAMES = ["memory_iterations", "memory_errors", "greatest_memory_errors"]
-
-
-def use(monkeypatch, build):
-    """From now on scenes get the solver that ``build`` makes."""
-    monkeypatch.setitem(sys.modules, "a_solver", SimpleNamespace(build=build))
-    monkeypatch.setitem(SOLVERS, "pcisph", "a_solver")
 
 
 def moving(**changes):
@@ -35,9 +32,8 @@ def moving(**changes):
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("make", [moving, two_layers])
-def test_a_run_goes_on_with_what_the_solver_carries(monkeypatch, make, precision, tmp_path):
-    use(monkeypatch, build_remembering)
-    simulation = Simulation(make(), precision=precision)
+def test_a_run_goes_on_with_what_the_solver_carries(make, precision, tmp_path):
+    simulation = Simulation(make(), precision=precision, solver=MakeRemembering())
     whole = simulation.run(STEPS)
     assert list(whole.diagnostics) == [*NAMES, *MEMORY_NAMES, "converged"]
     assert len(set(whole.diagnostics["memory_iterations"])) > 1
@@ -55,9 +51,8 @@ def test_a_run_goes_on_with_what_the_solver_carries(monkeypatch, make, precision
             assert column.tobytes() == whole.diagnostics[name][11:].tobytes(), name
 
 
-def test_what_the_solver_carries_cannot_be_left_out(monkeypatch):
-    use(monkeypatch, build_remembering)
-    simulation = Simulation(moving())
+def test_what_the_solver_carries_cannot_be_left_out():
+    simulation = Simulation(moving(), solver=MakeRemembering())
     state = simulation.run(11).last_state
     forgetful = replace(state, fields={**state.fields, "memory": np.zeros_like(state["memory"])})
     assert simulation.run(5, state=forgetful).positions.tobytes() != simulation.run(5, state=state).positions.tobytes()
@@ -66,8 +61,12 @@ def test_what_the_solver_carries_cannot_be_left_out(monkeypatch):
         simulation.run(5, state=without)
 
 
-def problem_of(steps=12, **options):
-    simulation = Simulation(moving(), precision="float64")
+def number(name):
+    return Parameter(name, "", "", Axis.SCALAR, lambda source: 1.0)
+
+
+def problem_of(steps=12, solver=None, **options):
+    simulation = Simulation(moving(), precision="float64", solver=solver or MakeRemembering())
     target = simulation.positions + 0.05 * np.sin(np.arange(simulation.positions.size)).reshape(-1, 2)
     return Problem(
         simulation,
@@ -83,18 +82,23 @@ discretisation = {spacing = 0.05}
 phase = [{name = "water", rest_density = 1000.0, viscosity = 0.05}]
 fluid = [{shape = "box", lower = [0.0, 0.0], upper = [0.4, 0.4], phase = "water", velocity = [0.8, 0.1]}]
 container = {shape = "box", lower = [0.0, 0.0], upper = [0.7, 0.8]}
-solver = {time_step = 0.0021}
+solver = {kind = "KIND", time_step = 0.0021}
 """
-POINT = {"gravity": np.array([0.4, -9.5]), "viscosity": np.array(0.06), "time_step": np.array(0.002)}
+POINT = {
+    "gravity": np.array([0.4, -9.5]),
+    "viscosity": np.array(0.06),
+    "time_step": np.array(0.002),
+    "memory.rate": np.array(0.25),
+}
 
 
-def test_derivatives_go_through_what_the_solver_carries(monkeypatch):
-    use(monkeypatch, build_remembering)
+def test_derivatives_go_through_what_the_solver_carries():
     problem = problem_of()
     random = np.random.default_rng(4)
     velocities = problem.simulation.velocities + 0.05 * random.standard_normal((64, 2))
     at = {**POINT, "initial_velocities": velocities}
     along = {"gravity": np.array([1.0, -2.0]), "viscosity": np.array(0.01), "time_step": np.array(1e-4)}
+    along["memory.rate"] = np.array(0.1)
     along["initial_velocities"] = 0.1 * random.standard_normal((64, 2))
     _, gradient = problem.value_and_gradient(at)
     assert len(set(problem.diagnostics["memory_iterations"])) > 1
@@ -108,30 +112,140 @@ def test_derivatives_go_through_what_the_solver_carries(monkeypatch):
     assert (ends[0] - ends[1]) / (2.0 * h) == pytest.approx(slope, rel=1e-6)
 
 
-def test_states_that_are_computed_again_carry_the_same(monkeypatch):
-    use(monkeypatch, build_remembering)
+def test_states_that_are_computed_again_carry_the_same():
     kept, again = problem_of(), problem_of(memory_budget=0)
     assert again._rollout._interval > 1
     for name, gradient in kept.value_and_gradient(POINT)[1].items():
         assert again.value_and_gradient(POINT)[1][name].tobytes() == gradient.tobytes()
 
 
-def test_the_certificate_judges_any_solver(monkeypatch):
-    use(monkeypatch, build_remembering)
-    assert cortado.certify(problem_of(), {"gravity": POINT["gravity"]}).right
+def test_the_certificate_judges_any_solver():
+    assert cortado.certify(problem_of(), {name: POINT[name] for name in ("gravity", "memory.rate")}).right
 
 
-def run_command(tmp_path):
+def test_an_explicit_solver_is_certified():
+    """Without pressure, with forces and two phases; forward mode and the tape agree."""
+    made = two_layers(forces={"gravity": [0.3, -2.0, 0.1], "viscosity": "pairwise"})
+    simulation = Simulation(made, precision="float64", solver=MakeExplicit(), forces=[Breeze()])
+    problem = Problem(simulation, 6, losses.FinalPositions(simulation.positions + 0.01))
+    names = ["gravity", "time_step", "viscosity", "breeze.k"]
+    assert cortado.certify(problem, names).right
+    at = {name: simulation.parameters()[name] for name in names}
+    taped, exact = (problem.value_and_gradient(at, one)[1] for one in (gradients.Tape(), gradients.Exact()))
+    for name in names:
+        np.testing.assert_allclose(taped[name], exact[name], rtol=1e-9)
+    slope = sum(float(np.sum(exact[name])) for name in names)
+    assert problem.tangent(at, {name: np.ones_like(at[name]) for name in names}) == pytest.approx(slope, rel=1e-9)
+
+
+def test_a_parameter_of_a_solver_is_searched_for():
+    judged = problem_of()
+    goal = judged.end({"memory.rate": 0.15}).positions
+    judged = Problem(judged.simulation, 12, losses.FinalPositions(goal))
+    found = cortado.optimise(judged, {"memory.rate": 0.3}, optimiser=cortado.optimisers.LBFGS(), iterations=12)
+    np.testing.assert_allclose(found.parameters["memory.rate"], 0.15, rtol=1e-3)
+
+
+def test_a_solver_goes_to_other_processes_and_other_precisions():
+    judged = problem_of(solver=MakeRemembering(0.2))
+    again = pickle.loads(pickle.dumps(judged))
+    assert again.value({}) == judged.value({}) and again.fingerprint == judged.fingerprint
+    other = judged.simulation.in_precision("float32")
+    assert other.parameters()["memory.rate"] == 0.2 and "memory" in other.state().fields
+
+
+def test_another_solver_is_another_problem():
+    simulations = [Simulation(moving(), solver=maker) for maker in (None, MakeFalling(), MakeRemembering())]
+    simulations.append(Simulation(moving(), solver=MakeRemembering(0.2)))
+    loss = losses.FinalPositions(simulations[0].positions)
+    assert len({Problem(simulation, 3, loss).fingerprint for simulation in simulations}) == 4
+
+
+class Stiff:
+    """A solver with a setting that is no parameter."""
+
+    def __init__(self, stiffness):
+        self.stiffness = stiffness
+
+    def build(self, setting):
+        return Falling(particle_system(setting))
+
+
+def test_a_setting_that_is_no_parameter_tells_solvers_apart():
+    loss = losses.FinalPositions(np.zeros((64, 2)))
+    made = [Problem(Simulation(plane(), solver=Stiff(np.array(k))), 1, loss) for k in (1.0, 2.0, 2.0)]
+    one, other, same = (problem.fingerprint for problem in made)
+    assert one != other and other == same
+
+
+def test_a_state_that_another_solver_carried_is_refused():
+    class MakeOther(MakeRemembering):
+        pass
+
+    state = Simulation(moving(), solver=MakeRemembering()).run(3).last_state
+    with pytest.raises(InputError, match=r"what the solver MakeRemembering carries .*, but must be of .*MakeOther"):
+        Simulation(moving(), solver=MakeOther()).run(2, state=state)
+    with pytest.raises(InputError, match=r"state has .*memory, .*, but must have positions"):
+        Simulation(moving()).run(2, state=state)
+
+
+def test_a_state_that_nothing_is_carried_in_goes_on_with_any_solver():
+    state = Simulation(moving()).run(3).last_state
+    assert Simulation(moving(), solver=MakeFalling()).run(2, state=state).positions.shape == (3, 64, 2)
+
+
+def test_forces_of_ones_own_act_in_a_solver_of_ones_own():
+    free = plane(forces={"gravity": [0.0, -9.81], "viscosity": "none", "pressure": False})
+    options = {"precision": "float64", "forces": [Breeze()]}
+    given, scenes = (Simulation(free, **options, solver=maker).run(5).velocities for maker in (MakeFalling(), None))
+    np.testing.assert_allclose(given, scenes, rtol=1e-14)
+
+
+class Wrong:
+    def __init__(self, made, parameters=()):
+        self.made, self.parameters = made, parameters
+
+    def build(self, setting):
+        return self.made
+
+
+class Alone:
+    """A solver that is none of particles, and takes no forces."""
+
+    def new_state(self):
+        raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("solver", "options", "said"),
+    [
+        (3.0, {}, r"solver is 3.0, but must be an object with a method build\(setting\)"),
+        ("pcisph", {}, "solver is 'pcisph', but must be an object"),
+        (MakeFalling, {}, "solver is <class .*>, but must be an object"),
+        (Wrong(None), {}, "build of the solver Wrong returned None, but must return a solver"),
+        (Wrong(None, "k"), {}, "the solver <.*> has parameters 'k', but must have a list"),
+        (Wrong(None, [number("gravity")]), {}, "parameter gravity of a solver has the name of another one"),
+        (MakeRemembering(np.nan), {}, "parameter memory.rate has a value that is not finite"),
+        (MakeFalling(), {"batch": 2}, "batch is 2, but must be left out, as the solver MakeFalling has no batches"),
+        (Wrong(Alone()), {"forces": [Breeze()]}, "forces is given, but must be left out, as the solver Wrong takes no"),
+    ],
+)
+def test_a_solver_that_does_not_fit_is_a_sentence(solver, options, said):
+    with pytest.raises(InputError, match=said):
+        Simulation(plane(), solver=solver, **options)
+
+
+def run_command(tmp_path, monkeypatch, kind):
     """The folder of a run of 20 steps, and the sentence that the command ends with."""
-    (tmp_path / "scene.toml").write_text(SCENE)
+    on_path(tmp_path, monkeypatch)
+    (tmp_path / "scene.toml").write_text(SCENE.replace("KIND", kind))
     out = tmp_path / "out"
     settings = {"device": "cpu", "precision": "float32", "record_every": 4, "overwrite": False, "command": []}
     return out, run_scene(tmp_path / "scene.toml", 20, out, overrides=[], **settings)
 
 
 def test_the_run_command_reports_any_solver(monkeypatch, tmp_path):
-    use(monkeypatch, build_remembering)
-    out, _ = run_command(tmp_path)
+    out, _ = run_command(tmp_path, monkeypatch, "remembering")
     assert (out / "figures" / "density_errors.png").exists() and (out / "report.html").exists()
     rows = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert len(rows) == 20 and {*NAMES, *MEMORY_NAMES, "converged"} <= rows[0].keys()
@@ -141,8 +255,7 @@ def test_the_run_command_reports_any_solver(monkeypatch, tmp_path):
 
 
 def test_a_solver_may_have_no_loops(monkeypatch, tmp_path):
-    use(monkeypatch, build_falling)
-    out, sentence = run_command(tmp_path)
+    out, sentence = run_command(tmp_path, monkeypatch, "falling")
     assert "The results are in" in sentence and not (out / "figures" / "density_errors.png").exists()
     trajectory = Trajectory.load(out / "trajectory.vtkhdf")
     assert trajectory.diagnostics.keys() == {"converged"} and trajectory.converged.all()
@@ -152,20 +265,19 @@ def test_a_solver_may_have_no_loops(monkeypatch, tmp_path):
             getattr(trajectory, name)
 
 
-def test_lost_particles_are_noticed_without_loops(monkeypatch):
-    use(monkeypatch, build_falling)
+def test_lost_particles_are_noticed_without_loops():
     with pytest.raises(cortado.DivergedError) as caught:
-        Simulation(moving()).run(60)
+        Simulation(moving(), solver=MakeFalling()).run(60)
     assert caught.value.step > 1 and "left the container" in str(caught.value)
 
 
-def test_a_solver_without_derivatives_says_so(monkeypatch):
-    use(monkeypatch, build_falling)
-    problem = Problem(Simulation(plane()), 3, losses.FinalPositions(np.zeros((64, 2))))
+def test_a_solver_without_derivatives_says_so():
+    problem = Problem(Simulation(plane(), solver=MakeFalling()), 3, losses.FinalPositions(np.zeros((64, 2))))
     at = {"gravity": np.array([0.0, -1.0])}
     estimators = {"reverse mode: try gradients.Tape": gradients.Exact(), "tape: try": gradients.Tape()}
+    estimators["reverse mode with a frozen geometry: try"] = gradients.FrozenGeometry()
     for what, estimator in estimators.items():
-        with pytest.raises(InputError, match=f'solver.kind is "pcisph", which has no {what}'):
+        with pytest.raises(InputError, match=f"the solver MakeFalling has no {what}"):
             problem.value_and_gradient(at, estimator)
     with pytest.raises(InputError, match="no forward mode"):
         problem.tangent(at, at)
@@ -175,6 +287,6 @@ def test_a_solver_without_derivatives_says_so(monkeypatch):
 
 def test_the_reference_engine_is_pcisph_alone():
     made = scene()
-    other = made.model_copy(update={"solver": made.solver.model_copy(update={"kind": "dfsph"})})
+    other = made.model_copy(update={"solver": PackageSolver.model_construct(kind="dfsph", time_step=0.002)})
     with pytest.raises(InputError, match=r"solver\.kind is 'dfsph', but must be pcisph for the reference engine"):
         reference.Simulation(other)

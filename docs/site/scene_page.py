@@ -48,6 +48,7 @@ LINKS = {
     "container": ("[table](#walls-container)", "What holds the fluid."),
     "mixture": ("[table](#fluids-that-mix-mixture)", "How phases mix."),
     "forces": ("[table](#forces-forces)", "Which forces act."),
+    "force": ("[tables](#forces-of-packages-force)", "Forces of installed packages, which act besides."),
     "schedule": ("[table](#changes-over-time-schedule)", "What changes while the scene runs."),
     "solver": ("[table](#time-steps-solver)", "How a step is solved."),
     "render": ("[table](#pictures-render)", "How pictures are taken."),
@@ -206,12 +207,23 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         ),
     ),
     (
+        "## Forces of packages: `[[force]]`",
+        "Forces that installed packages register, each with the key `kind`, the name that its package gives it. Its "
+        "other keys are those of the force, which judges them: `k = 2.0`. They act besides those of `[forces]`, in the "
+        "order of the file. [A force, a solver of your own](own_parts.md#a-package-that-scene-files-name) says how a "
+        "package registers one. Their parameters, such as `drag.k`, are differentiated and searched for as others are; "
+        "two forces of one kind need names of their own.",
+        (),
+    ),
+    (
         "## Time steps: `[solver]`",
         "In each step the pressure is computed by iterations, until the fluid is compressed by no more than a "
-        "tolerance. A time step beyond the limit of stability is warned of.",
+        "tolerance. A time step beyond the limit of stability is warned of. These are the keys of PCISPH, which every "
+        "scene has that does not say otherwise. With another `kind`, the name of a solver that an installed package "
+        "registers, the table has `kind`, `time_step` and the keys of that solver.",
         (
             (
-                "Solver",
+                "PcisphSolver",
                 "",
                 "[solver]\ntime_step = 0.002\nminimum_iterations = 3\nmaximum_iterations = 100\n"
                 "density_tolerance = 0.001",

@@ -23,6 +23,10 @@ class Words(str):
     """Words of a sentence that describe what was found; a plain ``str`` is a text of the user, and is quoted."""
 
 
+class MissingDerivativeError(InputError):
+    """A solver has no such derivative."""
+
+
 class SceneError(CortadoError):
     """A scene is wrong: where, what was found and what was wanted. Exit code 2."""
 

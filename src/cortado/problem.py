@@ -26,7 +26,7 @@ from cortado.residual import Residual
 from cortado.restart import RestartState
 from cortado.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
 from cortado.simulation import Simulation
-from cortado.sph.makers import fingerprint as forces_fingerprint
+from cortado.sph.makers import fingerprint as parts_fingerprint
 from cortado.words import counted
 
 __all__ = ["NAMES", "UNITS", "Problem"]
@@ -251,8 +251,8 @@ class Problem:
     @property
     def fingerprint(self) -> str:
         """Which problem this is, part by part, in words and checksums: steps, precision, scene, first positions (which
-        may be in a file), free energy (by its name and curvature), forces of one's own, ``fingerprint`` of the loss;
-        for a loss without one only its type is known."""
+        may be in a file), free energy (by its name and curvature), forces and solver of one's own, ``fingerprint`` of
+        the loss; for a loss without one only its type is known."""
         simulation, energy = self.simulation, self.simulation.free_energy
         parts = {
             "scene": simulation.scene.computed_json().encode(),
@@ -264,8 +264,9 @@ class Problem:
             fields = b"".join(np.asarray(state[name]).tobytes() for name in sorted(state.fields))
             checksums.append(f"state {sha256(fields + repr(state.clock).encode()).hexdigest()[:16]}")
         energies = f"free energy {energy.name} {energy.curvature}"
-        forces = [f"forces {text}"] if (text := forces_fingerprint(simulation.forces, simulation)) else []
-        return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies, *forces])
+        own = {"forces": simulation.forces, "solver": [simulation.own_solver] if simulation.own_solver else []}
+        told = [f"{what} {text}" for what, makers in own.items() if (text := parts_fingerprint(makers, simulation))]
+        return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies, *told])
 
     def iterations(self) -> np.ndarray:
         """(steps,) pressure iterations of the last evaluation, of a solver with one loop; see `diagnostics`."""

@@ -29,7 +29,8 @@ class Clock:
 
 @dataclass(frozen=True)
 class Origin:
-    """Of which particles a state is: what is the same in every run that goes on from it."""
+    """Of which particles a state is: what is the same in every run that goes on from it. Forces, walls and the length
+    of a step may be others there, as they may change within a run."""
 
     spacing: float
     """[m]"""
@@ -43,6 +44,8 @@ class Origin:
     """How many particles, the last ones, are an emitter's."""
     rest_density: tuple[float, ...]
     """(phases,) that the run had [kg/m3]."""
+    solver: str | None = None
+    """What sentences call the solver whose own fields the state has; None of a state that has none of such."""
 
     def to_json(self) -> str:
         """To be read by `from_json`."""

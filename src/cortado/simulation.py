@@ -3,8 +3,6 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
-from importlib import import_module
-from inspect import signature
 from math import isqrt, prod
 from os import PathLike
 from typing import Any
@@ -39,11 +37,13 @@ from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
 from cortado.restart import RestartState
 from cortado.rollout import Rollout
-from cortado.scene.model import SOLVERS
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene, as_scene
+from cortado.scene.solvers import OWN
 from cortado.shading.painter import colours_of, painter
 from cortado.solvers.build import first_capacity
+from cortado.solvers.makers import SolverMaker, SolverSetting, built, called, checked_solver
+from cortado.solvers.named import forces_named, solver_named
 from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy
 from cortado.sph.makers import ForceMaker, check_own, checked_makers, known_of
@@ -71,11 +71,13 @@ class Simulation(Stepping):
         free_energy: FreeEnergy | None = None,
         batch: int | None = None,
         forces: Sequence[ForceMaker] = (),
+        solver: SolverMaker | None = None,
     ):
         """``scene``: one, or the path of its file; ``device`` as Warp names it ("cpu", "cuda:0"), ``precision``
         "float32" or "float64"; ``free_energy`` replaces the one that the scene names. ``batch``: run so many of it in
         one launch, each with parameters of its own; see `docs/batches.md`. ``forces``: forces of one's own, such as
-        `cortado.forces.Body`, which act besides the scene's; see `docs/own_parts.md`."""
+        `cortado.forces.Body`, which act besides the scene's; ``solver``: what makes a solver of one's own, instead of
+        the one that the scene names; see `docs/own_parts.md`."""
         scene, self.batch = as_scene(scene), None if batch is None else whole_number("batch", batch, 1)
         start_warp()
         if free_energy is not None and not isinstance(free_energy, FreeEnergy):
@@ -84,9 +86,14 @@ class Simulation(Stepping):
         if free_energy is not None and len(scene.phase) == 1:
             raise InputError("free_energy is given, but must be left out, as the scene has only one phase.")
         self.scene = scene
-        self.forces = checked_makers(forces)
-        """What makes the forces that are not the scene's."""
-        self.known = known_of(self.forces)
+        self._given = checked_makers(forces), None if solver is None else checked_solver(solver)
+        self.forces = (*forces_named(scene), *self._given[0])
+        """What makes the forces that are not Cortado's own: those of packages that the scene names, and those given."""
+        self._maker = self._given[1] or solver_named(scene.solver)
+        self.own_solver = None if self._given[1] is None and scene.solver.kind in OWN else self._maker
+        """What makes the solver, if it is not Cortado's own."""
+        self._called = called(scene.solver, self._given[1])
+        self.known = known_of(self.forces, self._maker)
         """Its parameters."""
         self.device = device_named(device)
         self.precision = precision_named(precision)
@@ -126,15 +133,13 @@ class Simulation(Stepping):
         check_sizes(self.parameters(), self.precision, self.known)
 
     def _built(self, discrete: DiscreteScene) -> Solver:
-        kind = self.scene.solver.kind
-        build = import_module(SOLVERS[kind]).build
-        own = (self.scene, discrete, self.free_energy, self.precision, self.device)
-        asked = {"batch": self.batch} if self.batch is not None else {}
-        if asked and "batch" not in signature(build).parameters:
-            raise InputError(f'batch is {self.batch}, but must be left out, as solver.kind "{kind}" has no batches.')
-        if self.forces and "makers" not in signature(build).parameters:
-            raise InputError(f'forces is given, but must be left out, as solver.kind "{kind}" takes no others.')
-        return build(*own, **asked, **({"makers": self.forces} if self.forces else {}))
+        own = (self.scene, discrete, self.free_energy, self.precision, self.device, self.batch, self.forces, self.known)
+        return built(self._maker, SolverSetting(*own, self._called))
+
+    @property
+    def carried_by(self) -> str | None:
+        """What sentences call the solver, if it has fields of its own in states: then no other goes on from them."""
+        return self._called if getattr(self.solver, "carried_fields", ()) else None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled and copied as what it is made from."""
@@ -143,7 +148,7 @@ class Simulation(Stepping):
     def _made_of(self, precision: str, batch: int | None) -> tuple[Any, ...]:
         """What a simulation of the same scene is made from."""
         energy = self.free_energy if len(self.scene.phase) > 1 else None
-        return self.scene, self.device.alias, precision, energy, batch, self.forces
+        return self.scene, self.device.alias, precision, energy, batch, *self._given
 
     def __repr__(self) -> str:
         sizes = f"{counted(self.particles, 'particle')}, {counted(len(self.scene.phase), 'phase')}"

@@ -3,8 +3,9 @@
 from cortado.device.neighbours import NeighbourSearch
 from cortado.scene.containers import BoxContainer
 from cortado.scene.fluids import BoxFluid
-from cortado.scene.model import Discretisation, Forces, Phase, Solver
+from cortado.scene.model import Discretisation, Forces, Phase
 from cortado.scene.scene import Scene
+from cortado.scene.solvers import PcisphSolver
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 
@@ -24,7 +25,7 @@ def dam_break(particles: int) -> Scene:
         fluid=(BoxFluid(lower=(0.0, 0.0, 0.0), upper=(1.0, 1.0, 1.0), phase="water"),),
         container=BoxContainer(lower=(0.0, 0.0, 0.0), upper=(2.0, 1.5, 1.0)),
         forces=Forces(gravity=(0.0, -9.81, 0.0)),
-        solver=Solver(time_step=0.02 * spacing, minimum_iterations=ITERATIONS, maximum_iterations=ITERATIONS),
+        solver=PcisphSolver(time_step=0.02 * spacing, minimum_iterations=ITERATIONS, maximum_iterations=ITERATIONS),
     )
 
 

@@ -9,7 +9,6 @@ from cortado.inverse.figures import component_names
 from cortado.inverse.knots import KnotValues
 from cortado.inverse.setup import Setup
 from cortado.io.report import MOST_NUMBERS, written
-from cortado.parameters.values import UNITS
 
 Rows = list[tuple[object, ...]]
 
@@ -33,7 +32,7 @@ def found_lines(made: Setup, estimate: Mapping[str, np.ndarray], knots: Mapping[
         else:
             continue
         for label, one, true in found:
-            unit = f" {UNITS[name]}".rstrip()
+            unit = f" {made.task.known[name].unit}".rstrip()
             hidden = "" if true is None else f"; true {written(true)}{unit}"
             lines.append(f"  {label}: {written(one)}{unit}{hidden}")
     return lines
@@ -50,14 +49,14 @@ def found_rows(
     rows: Rows = []
     start = made.search.parameters(made.start)
     for name, value in estimate.items():
-        unit, true = UNITS[name], made.true_parameter(name)
+        unit, true = made.task.known[name].unit, made.true_parameter(name)
         if name in knots:
-            rows += _knot_rows(name, knots[name])
+            rows += _knot_rows(name, unit, knots[name])
             continue
         known = [np.asarray(start[name]), np.asarray(value), *([] if true is None else [true])]
         error = f"{errors[name]:.3%}" if name in errors else ""
         columns = np.broadcast_arrays(*known)
-        names = component_names(made.task.scene, name, columns[0])
+        names = component_names(made.task, name, columns[0])
         if len(names) != columns[0].size or len(names) > MOST_NUMBERS:
             rows.append((_words(name), unit, *known[:2], "" if true is None else true, error))
             continue
@@ -71,7 +70,7 @@ def found_rows(
 def worst_in_words(made: Setup, name: str, estimate: np.ndarray, error: float) -> str:
     """Which number of a few is farther off than twice the error of all of them together, and how far; empty where none
     is, or where the true ones are not known or 0."""
-    true, names = made.true_parameter(name), component_names(made.task.scene, name, estimate)
+    true, names = made.true_parameter(name), component_names(made.task, name, estimate)
     if true is None or not 1 < len(names) == np.size(true) == np.size(estimate) <= MOST_NUMBERS or not np.all(true):
         return ""
     errors = [distance(*pair) for pair in zip(np.ravel(estimate), np.ravel(true), strict=True)]
@@ -79,13 +78,13 @@ def worst_in_words(made: Setup, name: str, estimate: np.ndarray, error: float) -
     return f" ({names[worst]}: {100 * errors[worst]:.2g}%)" if errors[worst] > 2.0 * error else ""
 
 
-def _knot_rows(name: str, knots: KnotValues) -> Rows:
+def _knot_rows(name: str, unit: str, knots: KnotValues) -> Rows:
     rows: Rows = []
     for k, time in enumerate(knots.times):
         hidden, error = "", ""
         if knots.true is not None:
             hidden, error = written(knots.true[k]), f"{distance(knots.estimate[k], knots.true[k]):.3%}"
-        rows.append((_at(name, time), UNITS[name], knots.start[k], knots.estimate[k], hidden, error))
+        rows.append((_at(name, time), unit, knots.start[k], knots.estimate[k], hidden, error))
     return rows
 
 

@@ -98,7 +98,7 @@ def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunF
     figures: Figures = []
     if len(trajectory.converged) and "density_errors" in trajectory.diagnostics and scene.forces.pressure:
         path = folder.figures / "density_errors.png"
-        density_errors(trajectory, path, tolerance=scene.solver.density_tolerance)
+        density_errors(trajectory, path, tolerance=getattr(scene.solver, "density_tolerance", None))
         figures.append(("Average density error of each step, and the tolerance asked.", path))
     converged = rollout.diagnostics["converged"]
     if not len(converged):

@@ -20,7 +20,6 @@ from cortado.io.trajectory import Trajectory
 from cortado.optimisation.optimise import optimise
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.parameters.registry import Role, names
-from cortado.parameters.values import UNITS as PARAMETER_UNITS
 from cortado.parameters.values import Arrays
 
 FRAMES = 60
@@ -152,10 +151,10 @@ class TaskView:
     def _rows(self, before: Arrays) -> list[tuple[str, ...]]:
         """Of each number that is searched, and of a parameter with very many of them one row."""
         rows: list[tuple[str, ...]] = []
-        search, scene = self.made.search, self.made.task.scene
+        search, task = self.made.search, self.made.task
         old, new = search.parameters(before), search.parameters(self._coordinates)
         for name, value in new.items():
-            unit, hidden = PARAMETER_UNITS[name], self.made.true_parameter(name)
+            unit, hidden = task.known[name].unit, self.made.true_parameter(name)
             was, now, knots = np.asarray(old[name]), np.asarray(value), ""
             interpolation = search.coordinates.get(name)
             if isinstance(interpolation, TimeInterpolation):
@@ -165,7 +164,7 @@ class TaskView:
                 change = f"changed by up to {np.abs(now - was).max():.3g}"
                 rows.append((name.replace("_", " "), unit, f"{now.size} numbers", change, ""))
                 continue
-            labels = component_names(scene, name, now)
+            labels = component_names(task, name, now)
             labels = [f"{label}{knots} {k}" for k in range(len(now)) for label in labels] if knots else labels
             columns = [was, now, np.nan if hidden is None else hidden]
             written = [_written(np.broadcast_to(column, now.shape)) for column in columns]

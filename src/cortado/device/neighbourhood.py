@@ -32,11 +32,12 @@ class Discretisation:
     taped: bool = False
     """Whether a tape can differentiate the forward kernels: they get Warp's own adjoint, which takes one lane."""
 
-    def module(self, forward: bool, topic: str = "pcisph") -> Any:
-        """The Warp module of forward kernels, or of those of the adjoint; `tangent_module` has the others."""
+    def module(self, forward: bool, topic: str) -> Any:
+        """The Warp module of forward kernels, or of those of the adjoint; `tangent_module` has the others. ``topic``
+        tells the modules of one file or solver from those of others."""
         return self._module(kind_of(forward, self.taped), topic, forward and self.taped)
 
-    def tangent_module(self, topic: str = "pcisph") -> Any:
+    def tangent_module(self, topic: str) -> Any:
         """The Warp module of the kernels of forward mode, which no gradient needs."""
         return self._module("tangent", topic, False)
 

@@ -8,7 +8,7 @@ import warp as wp
 from cortado.device.state import Parameters, State
 from cortado.gradients.estimator import AdjointEstimator
 from cortado.rollout import BackwardStep, Rollout
-from cortado.solvers.solver import Counts
+from cortado.solvers.solver import Counts, StepAdjoint
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Exact(AdjointEstimator):
     batches = True
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
-        return _AdjointStep(rollout, frozen_geometry=False)
+        return _AdjointStep(rollout, rollout.solver.adjoint(rollout.steps))
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class FrozenGeometry(AdjointEstimator):
     batches = True
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
-        return _AdjointStep(rollout, frozen_geometry=True)
+        return _AdjointStep(rollout, rollout.solver.frozen_adjoint(rollout.steps))
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,9 @@ class Tape(AdjointEstimator):
 class _AdjointStep:
     capturable = True
 
-    def __init__(self, rollout: Rollout, frozen_geometry: bool):
-        solver = rollout.solver
-        self.rollout, self.solver, self._parameters = rollout, solver, rollout.parameters
-        self._adjoint = solver.adjoint(rollout.steps, frozen_geometry)
+    def __init__(self, rollout: Rollout, adjoint: StepAdjoint):
+        self.rollout, self.solver, self._parameters = rollout, rollout.solver, rollout.parameters
+        self._adjoint = adjoint
 
     def begin(self) -> None:
         self._adjoint.begin()

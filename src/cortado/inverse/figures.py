@@ -8,14 +8,13 @@ import numpy as np
 from cortado.figures import images, loss_curve, panels, particles
 from cortado.inverse.chapters import Chapters
 from cortado.inverse.setup import Setup
+from cortado.inverse.task import Task
 from cortado.io.report import Figures
 from cortado.io.video import MOST_FRAMES, write_video
 from cortado.optimisation.optimise import Result
-from cortado.parameters.registry import BY_NAME, Axis
+from cortado.parameters.registry import Axis
 from cortado.parameters.tilt import Tilt
-from cortado.parameters.values import OVER_TIME, UNITS
 from cortado.scene.picture import Picture
-from cortado.scene.scene import Scene
 from cortado.shading.painter import colours_of
 
 MOST_CURVES = 12
@@ -74,8 +73,8 @@ def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
     """The estimate of a parameter over the evaluations; of one that changes over time, the last estimate over time."""
     estimate, true = made.search.parameters(result.parameters)[name], made.true_parameter(name)
     path, first = folder / f"{name}.png", np.asarray(made.search.parameters(made.start)[name])
-    names = component_names(made.task.scene, name, estimate)
-    if name in OVER_TIME and np.ndim(estimate) == 2:
+    names = component_names(made.task, name, estimate)
+    if name in made.task.known.over_time and np.ndim(estimate) == 2:
         x, found, x_label, words = np.arange(len(estimate)), np.asarray(estimate), "step", "over time"
     elif true is None or max(np.size(estimate), true.size) > MOST_CURVES:
         return []
@@ -86,15 +85,15 @@ def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
         true, first = (np.broadcast_to(value, shape).ravel() for value in (true, first))
         x, x_label, words = np.arange(len(found)), "evaluation", "during the optimisation"
         names = names if len(names) == found.shape[1] else [str(k) for k in range(found.shape[1])]
-    label = name.replace("_", " ")
-    panels(x, found, path, names=names, title=label, x_label=x_label, unit=UNITS[name], true=true, start=first)
+    label, unit = name.replace("_", " "), made.task.known[name].unit
+    panels(x, found, path, names=names, title=label, x_label=x_label, unit=unit, true=true, start=first)
     hidden = "" if true is None else ", and its hidden value"
     return [(f"The parameter {label} {words}{hidden}.", path)]
 
 
-def component_names(scene: Scene, name: str, value: np.ndarray) -> list[str]:
+def component_names(task: Task, name: str, value: np.ndarray) -> list[str]:
     """Of the numbers of a parameter, of one over time those of a row: its axes, its phases, or else counted."""
-    parameter, last = BY_NAME[name], np.shape(value)[-1:]
+    scene, parameter, last = task.scene, task.known[name], np.shape(value)[-1:]
     count = int(np.prod(np.shape(value))) if parameter.axis is not Axis.STEP else int(np.prod(last))
     label = name.replace("_", " ")
     if count == 1:

@@ -11,8 +11,8 @@ from cortado.inverse.task import Task
 from cortado.io.pictures import heart, read_picture, rosetta
 from cortado.losses import FinalPositions, Frames, Image, Loss, Snapshot
 from cortado.optimisation.transforms import Bijector, Logarithm, Softmax, TimeInterpolation, Transformed
-from cortado.parameters.registry import BY_NAME, Range
-from cortado.parameters.values import OVER_TIME, Arrays
+from cortado.parameters.registry import Range
+from cortado.parameters.values import Arrays
 from cortado.problem import Problem
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
@@ -141,7 +141,7 @@ def _coordinates(task: Task, start: Arrays) -> dict[str, Bijector]:
     for name, value in start.items():
         if name == "mass_fractions":
             found[name] = Softmax()
-        elif name in OVER_TIME and value.ndim == 2 and task.optimise.knots is not None:
+        elif name in task.known.over_time and value.ndim == 2 and task.optimise.knots is not None:
             found[name] = TimeInterpolation(task.problem.steps, task.optimise.knots)
     return found
 
@@ -152,7 +152,7 @@ def _bounds(task: Task) -> dict[str, tuple[Any, Any]]:
     Those of a parameter over time hold for its knots, and so for what is interpolated between them; those of a
     logarithmic parameter are logarithms. A parameter that cannot be negative has 0 as a lower bound.
     """
-    with_zero = [name for name in task.start if BY_NAME[name].range is Range.NOT_NEGATIVE]
+    with_zero = [name for name in task.start if task.known[name].range is Range.NOT_NEGATIVE]
     free = [name for name in with_zero if name not in task.optimise.logarithmic]
     found: dict[str, tuple[Any, Any]] = dict.fromkeys(free, (0.0, None))
     for name, pair in (task.optimise.bounds or {}).items():

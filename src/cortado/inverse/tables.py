@@ -1,6 +1,6 @@
 """The tables [problem] and [optimise] of a task, with the field types that only they have."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -52,12 +52,27 @@ def _arrays(values: Any, info: ValidationInfo, words: tuple[str, ...] = ()) -> d
     if not isinstance(values, Mapping) or not values:
         raise field_error((), Words("empty") if values == {} else values, wanted(_VALUES))
     found = {}
-    for name, value in values.items():
-        if name not in NAMES:
+    names = _names(info)
+    for name, value in _flat(values, names).items():
+        if name not in names:
             raise field_error((name,), Words("unknown"), _offered(info))
         is_word = name in CAN_BE_RANDOM and isinstance(value, str) and value in words
         found[name] = value if is_word else _array(name, value)
     return found
+
+
+def _flat(values: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Values by name, where ``drag.k = 2.0`` is a table in a table."""
+    found = {}
+    for name, value in values.items():
+        deeper = isinstance(value, Mapping) and any(known.startswith(f"{name}.") for known in names)
+        found.update({f"{name}.{key}": entry for key, entry in value.items()} if deeper else {name: value})
+    return found
+
+
+def _names(info: ValidationInfo) -> Collection[str]:
+    """Of all parameters, those of parts of packages among them where whoever reads the tables says which."""
+    return (*NAMES, *(info.context or {}).get("names", ()))
 
 
 def _offered(info: ValidationInfo) -> str:
@@ -65,11 +80,11 @@ def _offered(info: ValidationInfo) -> str:
     return f"one of {', '.join((info.context or {}).get('names', NAMES))}"
 
 
-def _known(name: Any, info: ValidationInfo) -> Any:
+def _known(name: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
     """The name of a parameter; raises a `field_error` where whoever reads the tables says which names are right."""
-    if info.context and name not in NAMES:
+    if info.context and name not in _names(info):
         raise field_error((), name, _offered(info))
-    return name
+    return name if info.context else check(name)
 
 
 def _array(name: str, value: Any) -> Any:
@@ -109,7 +124,9 @@ def _schema(words: tuple[str, ...] = ()) -> dict[str, Any]:
         name: {"anyOf": [*_NUMBERS, *allowed] if name in CAN_BE_RANDOM else _NUMBERS, "unit": unit or "-"}
         for name, unit in UNITS.items()
     }
-    return {"type": "object", "minProperties": 1, "additionalProperties": False, "properties": properties}
+    dotted = {r"\.": {"anyOf": _NUMBERS, "unit": "-"}}  # of parts of packages, also written as tables
+    others = {"patternProperties": dotted, "additionalProperties": {"type": "object"}}
+    return {"type": "object", "minProperties": 1, "properties": properties, **others}
 
 
 _VALUES = _schema()
@@ -234,7 +251,7 @@ class OptimiseTable(Table):
     word "random"."""
     knots: Annotated[int, count(2, 10_000_000)] | None = None
     """Number of free rows between which parameters over time are interpolated; if left out, one row for each step."""
-    logarithmic: tuple[Annotated[str, OneOf(NAMES), BeforeValidator(_known)], ...] = ()
+    logarithmic: tuple[Annotated[str, OneOf(NAMES), WrapValidator(_known)], ...] = ()
     """Parameters that are searched by their logarithm."""
     bounds: Values | None = None
     """By the name of a parameter the lower and the upper bound; viscosity, mobility and fractions never go below 0

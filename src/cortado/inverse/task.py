@@ -9,15 +9,17 @@ from typing import Any
 import numpy as np
 
 from cortado.discretise.sampling import fluid_particles
-from cortado.errors import SceneError, Words
+from cortado.errors import InputError, SceneError, Words
 from cortado.inverse.tables import OptimiseTable, ProblemTable, TaskTables
 from cortado.optimisation.transforms import TimeInterpolation
-from cortado.parameters.registry import BY_NAME, Axis, Range, offered
-from cortado.parameters.values import OVER_TIME, SUM_TOLERANCE, Arrays, is_too_small
+from cortado.parameters.known import Known
+from cortado.parameters.registry import Axis, Parameter, Range, Role, offered
+from cortado.parameters.values import SUM_TOLERANCE, Arrays, is_too_small
 from cortado.scene.fields import MISSING
 from cortado.scene.scene import Scene, scene_from_dict
 from cortado.scene.sentences import sentences
 from cortado.scene.toml import read_toml
+from cortado.solvers.named import known_in
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,8 @@ class Task:
     """Those of the run that made the target; none where the target is a picture."""
     start: dict[str, Any]
     """Parameters with which the search starts; arrays, or the word "random"."""
+    known: Known
+    """The parameters of the scene."""
     folder: Path = Path()
     """The folder of the task's file; paths in the task are relative to it."""
 
@@ -42,31 +46,41 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
     scene = scene_from_dict(data, file)
     if not any(key in data for key in TaskTables.model_fields):
         raise SceneError(file, "problem", MISSING, "a table; a scene without one is run by cortado run")
+    known = _known(scene, file)
+    names = (*offered(scene), *(p.name for p in known.own if p.role is not Role.CLOCK))
     try:
         with sentences(TaskTables):
             given = {key: data[key] for key in TaskTables.model_fields if key in data}
-            tables = TaskTables.model_validate(given, context={"names": offered(scene)})
+            tables = TaskTables.model_validate(given, context={"names": names})
         problem, optimise = tables.problem, tables.optimise
         true, steps = problem.target or {}, problem.steps
         for name in optimise.start:
             if problem.picture is None and name not in true:
                 raise SceneError(None, f"problem.target.{name}", MISSING, "given, as optimise.start has it")
-        true = _resolved("problem.target", true, scene, steps)
-        start = _resolved("optimise.start", optimise.start, scene, steps)
-        _check_options(problem, optimise, start)
+        true = _resolved("problem.target", true, scene, steps, known)
+        start = _resolved("optimise.start", optimise.start, scene, steps, known)
+        _check_options(problem, optimise, start, known)
         for name, pair in (optimise.bounds or {}).items():
-            _check_bounds(name, pair, optimise, start, scene)
+            _check_bounds(name, pair, optimise, start, scene, known)
     except SceneError as error:
         raise error.in_file(file) from None
-    return Task(scene, problem, optimise, true, start, Path(file).parent)
+    return Task(scene, problem, optimise, true, start, known, Path(file).parent)
 
 
-def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int) -> dict[str, Any]:
+def _known(scene: Scene, file: str) -> Known:
+    """The parameters of a scene; raises `SceneError`."""
+    try:
+        return known_in(scene)
+    except InputError as error:
+        raise SceneError(file, "", sentence=f"cannot be a task: {error}") from None
+
+
+def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, known: Known) -> dict[str, Any]:
     """Values with a row for each step where they change over time; raises `SceneError` for one that does not fit."""
     found = {}
     for name, array in values.items():
         field = f"{table}.{name}"
-        parameter = BY_NAME[name]
+        parameter = known[name]
         if not parameter.present(scene):
             raise SceneError(None, field, Words("given"), f"left out, as the scene {parameter.absent}")
         if name == "gravity" and "tilt" in values:
@@ -75,21 +89,21 @@ def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int) -
         if isinstance(array, str):
             found[name] = array
             continue
-        shapes = _shapes(name, scene, steps)
-        if name in OVER_TIME and array.ndim == 2 and 2 <= len(array) <= steps and array.shape[1:] == shapes[0]:
+        shapes = _shapes(known[name], scene, steps)
+        if name in known.over_time and array.ndim == 2 and 2 <= len(array) <= steps and array.shape[1:] == shapes[0]:
             array = TimeInterpolation(steps, len(array)).parameter(array)
         if array.shape not in shapes:
             wanted = _in_words(shapes)
-            if name in OVER_TIME and steps > 1:
+            if name in known.over_time and steps > 1:
                 wanted = f"{_in_words(shapes[:1])}, or 2 to {steps} rows of it"
             raise SceneError(None, field, Words(_in_words([array.shape])), wanted)
-        _check_range(name, field, array)
+        _check_range(parameter, field, array)
         found[name] = array
     return found
 
 
-def _check_range(name: str, field: str, array: np.ndarray) -> None:
-    allowed = BY_NAME[name].range
+def _check_range(parameter: Parameter, field: str, array: np.ndarray) -> None:
+    allowed = parameter.range
     if is_too_small(array, allowed):
         raise SceneError(None, field, float(array.min()), allowed.value)
     if allowed is Range.FRACTIONS:
@@ -100,9 +114,9 @@ def _check_range(name: str, field: str, array: np.ndarray) -> None:
             raise SceneError(None, field, float(array.min()), "at least 0")
 
 
-def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mapping[str, Any]) -> None:
+def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mapping[str, Any], known: Known) -> None:
     """Raises `SceneError` for an option that does not fit the others, so that none is silently ignored."""
-    over_time = [name for name in OVER_TIME if name in start and start[name].ndim == 2]
+    over_time = [name for name in known.over_time if name in start and start[name].ndim == 2]
     if optimise.knots is not None and not over_time:
         raise SceneError(None, "optimise.knots", optimise.knots, "left out, as nothing that is optimised has rows")
     if optimise.knots is not None and optimise.knots > problem.steps:
@@ -130,7 +144,9 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
         raise SceneError(None, "optimise.check.parameter_error", optimise.check.parameter_error, wanted)
 
 
-def _check_bounds(name: str, pair: np.ndarray, optimise: OptimiseTable, start: Mapping[str, Any], scene: Scene) -> None:
+def _check_bounds(
+    name: str, pair: np.ndarray, optimise: OptimiseTable, start: Mapping[str, Any], scene: Scene, known: Known
+) -> None:
     """Raises `SceneError` for bounds that do not fit the start."""
     field = f"optimise.bounds.{name}"
     if name not in start:
@@ -145,9 +161,9 @@ def _check_bounds(name: str, pair: np.ndarray, optimise: OptimiseTable, start: M
         raise SceneError(None, field, pair.tolist(), "two entries, the lower one not above the upper one")
     if name in optimise.logarithmic and (pair <= 0.0).any():
         raise SceneError(None, field, pair.tolist(), "greater than 0, as the parameter is changed by factors")
-    _check_range(name, field, pair)
-    shape = _shapes(name, scene, 0)[0] if isinstance(value, str) else value.shape
-    if optimise.knots is not None and name in OVER_TIME and len(shape) == 2:
+    _check_range(known[name], field, pair)
+    shape = _shapes(known[name], scene, 0)[0] if isinstance(value, str) else value.shape
+    if optimise.knots is not None and name in known.over_time and len(shape) == 2:
         shape = (optimise.knots, shape[1])
     try:
         np.broadcast_to(pair[0], shape)
@@ -160,10 +176,9 @@ def _check_bounds(name: str, pair: np.ndarray, optimise: OptimiseTable, start: M
         raise SceneError(None, f"optimise.start.{name}", value.tolist(), f"within {field}, {pair.tolist()}")
 
 
-def _shapes(name: str, scene: Scene, steps: int) -> list[tuple[int, ...]]:
+def _shapes(parameter: Parameter, scene: Scene, steps: int) -> list[tuple[int, ...]]:
     """The shapes that a parameter may have; () is a number. The scene is cut into particles, which may take a second,
     only where the parameter has a value for each of them."""
-    parameter = BY_NAME[name]
     particles = len(fluid_particles(scene).positions) if parameter.axis is Axis.PARTICLE else 0
     return parameter.shapes(steps, len(scene.phase), (particles, scene.dimension))
 

@@ -1,4 +1,6 @@
-"""The parameters of one simulation: those of the registry, and those that its own forces bring. Without Warp."""
+"""The parameters of one simulation: those of the registry, and those that its own forces and solver bring.
+
+Without Warp."""
 
 from collections.abc import Iterable, Iterator, Mapping
 
@@ -14,22 +16,22 @@ class Known(Mapping[str, Parameter]):
 
     __eq__, __hash__ = object.__eq__, object.__hash__
 
-    def __init__(self, own: Iterable[Parameter] = ()):
-        """``own``: those of forces; `TIME` may be among them several times. Raises `InputError` where two parameters
-        have one name, or the same arguments of kernels."""
+    def __init__(self, own: Iterable[tuple[Parameter, str]] = ()):
+        """``own``: those of forces and of a solver, each with whose it is, in words; `TIME` may be among them several
+        times. Raises `InputError` where two parameters have one name, or the same arguments of kernels."""
         self._by_name = dict(BY_NAME)
         arguments = {argument(name): name for name in BY_NAME}
-        for parameter in dict.fromkeys(own):
+        for parameter, whose in dict(own).items():
             name = parameter.name
             if argument(name) in arguments:
                 raise InputError(
-                    f"parameter {name} of a force has the name of another one, {arguments[argument(name)]}, but must "
-                    "have its own: give the force another name."
+                    f"parameter {name} of {whose} has the name of another one, {arguments[argument(name)]}, but must "
+                    f"have its own: give {whose.replace('a ', 'the ')} another name."
                 )
             arguments[argument(name)] = name
             self._by_name[name] = parameter
         self.own = tuple(p for p in self._by_name.values() if p.name not in BY_NAME)
-        """Those of forces."""
+        """Those of forces and of a solver."""
         self.run = tuple(name for name, p in self.items() if p.role in (Role.RUN, Role.CLOCK))
         """Names of what steps depend on."""
         self.over_time = tuple(name for name, p in self.items() if p.axis is Axis.STEP)
@@ -37,7 +39,7 @@ class Known(Mapping[str, Parameter]):
         self.vectors = tuple(name for name in self.run if self[name].components is not None)
         """Names of what steps depend on and has the components of a vector."""
         self.courses = {p.name: p.course for p in self.own if p.course is not None}
-        """How those of forces change while a scene runs."""
+        """How these change while a scene runs."""
 
     def __getitem__(self, name: str) -> Parameter:
         return self._by_name[name]

@@ -34,6 +34,7 @@ def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:
         periods=tuple(map(float, scene.container.periods(scene.dimension)[1])),
         waiting=len(simulation.positions) - simulation.free_particles,
         rest_density=tuple(map(float, rest_density)),
+        solver=simulation.carried_by,
     )
 
 
@@ -102,7 +103,7 @@ def _check_origin(found: Origin, wanted: Origin) -> None:
     """Both are of the same particles."""
     for name, words in WORDS.items() if found != wanted else ():
         one, other = getattr(found, name), getattr(wanted, name)
-        if not _is_same(one, other):
+        if one is not None and not _is_same(one, other):
             raise InputError(
                 f"state is of a run with {words.format(_listed(one))}, but must be of one with "
                 f"{words.format(_listed(other))}, as this simulation has{ADVICE.get(name, '')}."
@@ -116,6 +117,7 @@ WORDS = {
     "periods": "periods of {} m",
     "waiting": "{} particles in the emitter",
     "rest_density": "a rest density of {} kg/m3",
+    "solver": "what {} carries from step to step",
 }
 """What each field of an `Origin` is called."""
 ADVICE = {"rest_density": "; a rest density that a run was given is to be given again where it goes on"}

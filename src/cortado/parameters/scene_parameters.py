@@ -63,6 +63,10 @@ class Simulated(Source, Protocol):
     def free_particles(self) -> int:
         """How many particles, the first ones, do not wait in an emitter."""
 
+    @property
+    def carried_by(self) -> str | None:
+        """What sentences call its solver, if this has fields of its own in states."""
+
     def substeps(self, time_step: NDArray, mobility: NDArray, interface_width: NDArray, rest_density: NDArray) -> int:
         """Explicit steps of diffusion within a time step that are stable with these parameters."""
 

@@ -19,6 +19,7 @@ from cortado.reference.engine import extension, precisions
 from cortado.reference.histories import Gradient, History
 from cortado.reference.losses import Loss
 from cortado.scene.scene import Scene, as_scene
+from cortado.scene.solvers import PcisphSolver
 from cortado.scene.stability import divergence_advice
 
 METHODS = (
@@ -64,13 +65,15 @@ class Simulation:
         all cores unless said, or one where there are too few particles. The bits of the results do not depend on them.
         """
         scene = as_scene(scene)
-        if scene.solver.kind != "pcisph":
+        if not isinstance(scene.solver, PcisphSolver):
             raise InputError(f"solver.kind is {shown(scene.solver.kind)}, but must be pcisph for the reference engine.")
         if len(scene.phase) > 1 or scene.emitter is not None:
             raise InputError("scene has several phases or an emitter, but must have neither for the reference engine.")
         unknown = [p.name for p in BY_NAME.values() if p.is_optional and p.present(scene)]
         if unknown:
             raise InputError(f"scene has forces.{unknown[0]}, but must leave it out for the reference engine.")
+        if scene.force:
+            raise InputError("scene has [[force]], but must leave it out for the reference engine.")
         if scene.schedule.courses:
             raise InputError(
                 "scene has a schedule, but must leave it out for the reference engine, which takes a gravity for each "
@@ -241,6 +244,7 @@ def _float64(value: Any) -> np.ndarray:
 
 def _engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:
     lattice, solver, form = discrete.lattice, scene.solver, scene.forces.viscosity
+    assert isinstance(solver, PcisphSolver)
     no_slip = getattr(scene.container, "slip", "free") == "no"
     greatest = solver.maximum_density_tolerance
     values = {

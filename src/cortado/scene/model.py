@@ -3,19 +3,21 @@
 Vectors have as many components as the scene has dimensions. Whatever is wrong raises a `SceneError`, one sentence.
 """
 
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, ValidationInfo, create_model, field_validator, model_validator
+from pydantic import Field, ValidationInfo, create_model, field_validator
 
 from cortado.parameters.registry import PARAMETERS
 from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import Emitter
-from cortado.scene.fields import Colour, Flag, OneOf, Several, Text, Vector, count, field_error, quantity
+from cortado.scene.fields import Colour, Flag, Several, Text, Vector, count, quantity
 from cortado.scene.fluids import AnyFluid
 from cortado.scene.mixture import Mixture
+from cortado.scene.package_tables import AnyForces
 from cortado.scene.picture import Picture
 from cortado.scene.render import Render
 from cortado.scene.schedule import Schedule
+from cortado.scene.solvers import AnySolver
 from cortado.scene.tables import Table
 
 OTHER_TABLES = ("problem", "optimise")
@@ -71,34 +73,6 @@ Forces: Any = create_model("Forces", __base__=FixedForces, __module__=__name__, 
 """Which forces act: `FixedForces`, and the optional ones of the registry of parameters."""
 
 
-SOLVERS = {"pcisph": "cortado.solvers.pcisph.build"}
-"""By the kind that a scene names, the module whose ``build`` makes the solver of a scene."""
-
-
-class Solver(Table):
-    """How a step is solved."""
-
-    kind: Annotated[str, OneOf(SOLVERS)] = "pcisph"
-    """Name of the algorithm."""
-    time_step: Annotated[float, quantity("s", gt=0.0)]
-    """Length of a step [s]."""
-    minimum_iterations: Annotated[int, count(1, 1_000_000)] = 3
-    """Pressure iterations of a step, at least."""
-    maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
-    """Pressure iterations of a step, at most."""
-    density_tolerance: Annotated[float, quantity(ge=0.0)] = 0.01
-    """Iterations end once the average of (rho - rho_0) / rho_0 is below it."""
-    maximum_density_tolerance: Annotated[float, quantity(ge=0.0)] | None = None
-    """The same for the maximum of (rho - rho_0) / rho_0; not asked for if left out."""
-
-    @model_validator(mode="after")
-    def _check_iterations(self) -> Self:
-        if self.minimum_iterations > self.maximum_iterations:
-            wanted = f"at most maximum_iterations, {self.maximum_iterations}"
-            raise field_error(("minimum_iterations",), self.minimum_iterations, wanted)
-        return self
-
-
 class SceneTables(Table):
     """Everything that a simulation starts from, each table right in itself."""
 
@@ -121,7 +95,9 @@ class SceneTables(Table):
     """How phases mix; the default if there is only one."""
     forces: Forces = Field(default=Forces(), validate_default=True)
     """Which forces act."""
-    solver: Solver
+    force: AnyForces = ()
+    """Forces of installed packages, which act besides the scene's own."""
+    solver: AnySolver
     """How a step is solved."""
     schedule: Schedule = Schedule()
     """What changes while the scene runs."""

@@ -52,8 +52,9 @@ class Scene(SceneTables):
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
-        """The same without [picture]: what results depend on."""
-        return json.dumps(self.model_dump(mode="json", exclude={"picture"}), indent=2)
+        """The same without [picture], and without [[force]] where there is none: what results depend on."""
+        aside = {"picture"} if self.force else {"picture", "force"}
+        return json.dumps(self.model_dump(mode="json", exclude=aside), indent=2)
 
     @classmethod
     def from_json(cls, text: str | bytes, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":

@@ -77,14 +77,23 @@ def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | i
     for step in location:
         if "discriminator" in part:
             part = {"$ref": part["discriminator"]["mapping"][step]}
+        elif "oneOf" in part:  # tables, of which a step names one
+            tables = map(_whole, part["oneOf"])
+            part = {one.get("title", one.get("$ref", "").rpartition("/")[2]): one for one in tables}[str(step)]
         else:
             part = part["items"] if isinstance(step, int) else part["properties"][step]
             path.append(step)
         if "anyOf" in part:  # a value, or nothing
             part = part["anyOf"][0]
+        part = _whole(part)
         if "$ref" in part:
             part = whole["$defs"][part["$ref"].rpartition("/")[2]]
     return part, path
+
+
+def _whole(part: Schema) -> Schema:
+    """A table that stands where it is used, and not among those that have a name."""
+    return part["allOf"][0] if "allOf" in part else part
 
 
 # ---- words -------------------------------------------------------------------------------------------------------
@@ -107,7 +116,7 @@ def wanted(schema: Schema, name: str = "") -> str:
             return "a text that is not empty"
         case {"type": "array", "components": [*first, last]}:
             return f"a list of {len(first) + 1} components: {', '.join(first)} and {last}"
-        case {"type": "array", "items": {"$ref": _} | {"discriminator": _}}:
+        case {"type": "array", "items": {"$ref": _} | {"discriminator": _} | {"allOf": _}}:
             return f"a list of at least one table, each written [[{name}]]"
         case {"type": "array", "items": items, "minItems": 1, "maxItems": most}:
             return f"a list of at most {most} components, each {wanted(items)}"

@@ -121,16 +121,22 @@ def _entry(tables: list[Any], part: str) -> int | None:
     """Where an entry is in a list, given its index or its name; None if there is none."""
     if part.isdecimal():
         return int(part) if len(part) <= 9 and int(part) < len(tables) else None
-    return next((k for k, table in enumerate(tables) if isinstance(table, dict) and table.get("name") == part), None)
+    return next((k for k, table in enumerate(tables) if part in _names([table])), None)
 
 
 def _entries(tables: list[Any]) -> str:
     """How the entries of a list are addressed."""
     if not tables:
         return "left out, as the list is empty"
-    names = [str(table["name"]) for table in tables if isinstance(table, dict) and "name" in table]
+    names = _names(tables)
     wanted = f"an index from 0 to {len(tables) - 1}"
     return f"{wanted}, or the name {' or '.join(names)}" if names else wanted
+
+
+def _names(tables: list[Any]) -> list[str]:
+    """Of the entries that have one: their names, or the kinds of forces that have no other name."""
+    found = (table.get("name", table.get("kind")) for table in tables if isinstance(table, dict))
+    return [str(name) for name in found if name is not None]
 
 
 def _value(text: str) -> Any:

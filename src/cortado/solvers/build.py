@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,6 @@ from cortado.device.cells import Grid
 from cortado.device.lanes import lanes_for
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.neighbours import NeighbourSearch
-from cortado.device.precision import Precision
 from cortado.device.state import Layout
 from cortado.discretise.discrete_scene import DiscreteScene
 from cortado.errors import InputError
@@ -21,11 +19,12 @@ from cortado.parameters.registry import PARAMETERS
 from cortado.scene.containers import NoContainer
 from cortado.scene.scene import Scene
 from cortado.solvers.containment import Walled
+from cortado.solvers.makers import SolverSetting
 from cortado.solvers.particles import ParticleSystem
 from cortado.sph.diffusion import Diffusion
 from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy
-from cortado.sph.makers import ForceMaker, known_of
+from cortado.sph.makers import ForceMaker
 from cortado.sph.mixture import Phases
 from cortado.sph.parts import Force, Setting
 
@@ -36,31 +35,23 @@ def first_capacity(support: float, dimension: int) -> int:
     return int(1.5 * filled) + 6
 
 
-def particle_system(
-    scene: Scene,
-    discrete: DiscreteScene,
-    free_energy: FreeEnergy,
-    precision: Precision,
-    device: Any,
-    batch: int | None = None,
-    makers: Sequence[ForceMaker] = (),
-) -> ParticleSystem:
-    """A scene that is cut into particles, on a device; ``batch`` of it in one launch. ``makers`` make forces that are
-    not the scene's."""
-    layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, batch, known_of(makers))
+def particle_system(setting: SolverSetting) -> ParticleSystem:
+    """A scene that is cut into particles, on a device, with the forces of the scene and those that it was given."""
+    scene, discrete, precision, device = setting.scene, setting.discrete, setting.precision, setting.device
+    layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, setting.batch, setting.known)
     shared = Discretisation(discrete.kernel, precision, lanes_for(layout.particles, device), any(discrete.periods))
     search = _search(scene, discrete, shared, layout)
 
     def system(discretisation: Discretisation) -> ParticleSystem:
         return ParticleSystem(
-            scene.solver.kind,
+            setting.called,
             discretisation,
             layout,
             discrete.lattice,
             search,
-            _forces(scene, discrete, discretisation, layout, makers),
+            _forces(scene, discrete, discretisation, layout, setting.forces),
             [*discrete.periods, *[0.0] * (3 - scene.dimension)],
-            _phases(scene, discretisation, free_energy),
+            _phases(scene, discretisation, setting.free_energy),
             _nozzle(scene, discrete),
             _walled(scene, discrete),
             of_one_lane=lambda: system(replace(discretisation, lanes=1, taped=True)),

@@ -7,6 +7,7 @@ import warp as wp
 from cortado.device.arrays import Fields
 from cortado.device.state import Parameters, State
 from cortado.solvers.particles import ParticleSolver
+from cortado.sph.begin_adjoint import begin_adjoint_kernel
 from cortado.sph.carried import Carried
 from cortado.sph.emitter import EmitterAdjoint
 from cortado.sph.mixture import MixtureAdjoint, MixtureTangent
@@ -47,6 +48,12 @@ class ParticleTangent:
             force.tangent(context, self.dot, self._accelerations_dot[t], self._accelerations_dot[t + 1])
         return self._accelerations_dot[-1]
 
+    def predict(self, context: StepContext, v_star: wp.array, x_star_dot: wp.array, v_star_dot: wp.array) -> None:
+        """Of `accelerate`, and of a prediction v* = v + dt a, x* = x + dt v*, which are written."""
+        accelerations = {"acceleration": self._solver.accelerations[-1], "acceleration_dot": self.accelerate(context)}
+        out = {"v_star": v_star, "x_star_dot": x_star_dot, "v_star_dot": v_star_dot}
+        context.launch(self._solver.integration.predict_tangent, *self.dot.named, **accelerations, **out)
+
     def unsort(
         self, context: StepContext, x_dot: wp.array, v_dot: wp.array, state_dot: State, **carried_dot: wp.array
     ) -> None:
@@ -66,7 +73,8 @@ class ParticleAdjoint:
 
     def __init__(self, solver: ParticleSolver, steps: int):
         layout, mixture = solver.layout, solver.mixture
-        names = ["time_step", *mixture.shares, *(name for force in solver.forces for name in force.shares)]
+        of_forces = (name for force in solver.forces for name in force.shares)
+        names = ["time_step", *mixture.shares, *solver.shares, *of_forces]
         self._solver = solver
         self.bar = Adjoints(
             Fields.zeros(layout.all_particles, layout.precision, layout.device),
@@ -76,6 +84,7 @@ class ParticleAdjoint:
         """Adjoints; those of the parameters are complete after `collect`."""
         self.carried_bar = Carried(solver.carried_fields, solver.layout)
         """Of what the step carries on, once `unsort` has been called."""
+        self._acceleration_bar = solver.vectors()
         self._mixture = MixtureAdjoint(mixture)
         self._emitter = EmitterAdjoint(solver.emitter) if solver.emitter else None
 
@@ -97,6 +106,18 @@ class ParticleAdjoint:
             return state_bar
         self._emitter.step(context, state_bar, self.bar.parameters)
         return self._emitter.free
+
+    def begin_step(self, context: StepContext, free_bar: State, v_star: wp.array) -> None:
+        """Of a step that ends with x' = x + dt v', where v' is the ``v_star`` of an explicit prediction, given what
+        `unsort` returns: the adjoints of the fields, without what they had before."""
+        scene = {"x_scene_bar": free_bar.positions, "v_scene_bar": free_bar.velocities}
+        context.launch(begin_adjoint_kernel(self._solver.layout.precision), *self.bar.named, v_star=v_star, **scene)
+
+    def predict(self, context: StepContext) -> None:
+        """Of a prediction v* = v + dt a, and of `accelerate`."""
+        own = {"acceleration_bar": self._acceleration_bar}
+        context.launch(self._solver.integration.acceleration_adjoint, *self.bar.named, **own)
+        self.accelerate(context, self._acceleration_bar)
 
     def accelerate(self, context: StepContext, acceleration_bar: wp.array) -> None:
         """Of `ParticleSolver.accelerate`, for the adjoint of its accelerations, (n,) vectors."""

@@ -21,12 +21,12 @@ from cortado.device.neighbours import NeighbourSearch
 from cortado.device.state import Layout, Parameters, State
 from cortado.device.threads import Turn
 from cortado.discretise.discrete_scene import Lattice
-from cortado.errors import InputError
+from cortado.errors import MissingDerivativeError
 from cortado.lattice.calibration import SKIN
 from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.convergence import convergence_kernels
 from cortado.solvers.loop import IterationLog, Loop
-from cortado.solvers.solver import StepAdjoint, StepTangent
+from cortado.solvers.solver import Counts, StepAdjoint, StepTangent
 from cortado.sph.carried import Carried
 from cortado.sph.density import density_kernels
 from cortado.sph.emitter import Emitter, Nozzle
@@ -39,8 +39,8 @@ from cortado.sph.parts import Force, StepContext
 class ParticleSystem:
     """A scene as a solver of particles takes it, on a device: `cortado.solvers.build.particle_system` makes it."""
 
-    kind: str
-    """What scenes call the solver."""
+    called: str
+    """What sentences call the solver."""
     discretisation: Discretisation
     layout: Layout
     lattice: Lattice
@@ -58,12 +58,16 @@ class ParticleSystem:
 class ParticleSolver:
     """The steps of one set of particles on one device; their arrays are reused by every step.
 
-    The methods that `Solver` has are explained there. A solver of this kind has `step`, `reserve`, `replay` and
-    `write_state` of its own, and if it has derivatives `tangent`, `adjoint` and `differentiable`.
+    The methods that `Solver` has are explained there. A solver of this kind has `step`, `replay` and `write_state`
+    of its own, with loops also `reserve`, and if it has derivatives `tangent`, `adjoint` and `differentiable`.
     """
 
     carried_fields: tuple[StateField, ...] = ()
     """What the solver itself carries from step to step, of particles."""
+    topic = "density"
+    """Of the Warp modules that have the kernels of the density."""
+    shares: tuple[str, ...] = ()
+    """Parameters of its own to whose adjoints every particle adds a share, as those of a `Force`."""
 
     def __init__(self, system: ParticleSystem, requires_grad: bool = False):
         discretisation, search, layout, nozzle = system.discretisation, system.search, system.layout, system.nozzle
@@ -75,7 +79,10 @@ class ParticleSolver:
         self.launch = KernelLauncher(particles, device, record_tape=requires_grad)
         self.turn = Turn(device)
         """Whose arrays these are now."""
-        self.density, self.integration = density_kernels(discretisation), integration_kernels(precision, requires_grad)
+        self.density, self.integration = (
+            density_kernels(discretisation, self.topic),
+            integration_kernels(precision, requires_grad),
+        )
         self.mixture = Mixture(system.phases, layout, requires_grad)
         self.emitter = Emitter(nozzle, layout, requires_grad) if nozzle else None
         self.carried = Carried(self.carried_fields, layout, requires_grad)
@@ -146,6 +153,9 @@ class ParticleSolver:
         wp.copy(self.step_number, other.step_number)
         for own, given in zip(self.loops, other.loops, strict=True):
             wp.copy(own.rounds, given.rounds)
+
+    def reserve(self, counts: Counts) -> None:
+        """Nothing, of a step without loops."""
 
     def reset(self, step: int = 0) -> None:
         for loop in self.loops:
@@ -231,14 +241,17 @@ class ParticleSolver:
     def tangent(self, parameters_dot: Parameters) -> StepTangent:
         self._lacks("forward mode", "take differences of `Problem.value`")
 
-    def adjoint(self, steps: int, frozen_geometry: bool = False) -> StepAdjoint:
+    def adjoint(self, steps: int) -> StepAdjoint:
         self._lacks("reverse mode", "try gradients.Tape, or gradients.RandomizedSmoothing, which only runs forward")
+
+    def frozen_adjoint(self, steps: int) -> StepAdjoint:
+        self._lacks("reverse mode with a frozen geometry", "try gradients.Exact")
 
     def differentiable(self) -> Self:
         self._lacks("tape", "try gradients.RandomizedSmoothing, which only runs forward")
 
     def _lacks(self, what: str, advice: str) -> NoReturn:
-        raise InputError(f'solver.kind is "{self.system.kind}", which has no {what}: {advice}, or another solver.')
+        raise MissingDerivativeError(f"{self.system.called} has no {what}: {advice}, or another solver.")
 
     def gradient_memory(self, log: IterationLog) -> dict[str, float]:
         iterations = sum(int(record.counts.max(initial=0)) for record in log.records)

@@ -64,8 +64,8 @@ class StepAdjoint(Protocol):
 
 class Solver(Protocol):
     """The solver of a scene, or of a batch of scenes, on one device, which rollouts share. Of its methods `make_room`
-    and `reset` alone wait for the device and read from it. `tangent`, `adjoint` and `differentiable` raise
-    `InputError`, one sentence, where a solver has no such derivative.
+    and `reset` alone wait for the device and read from it. `tangent`, `adjoint`, `frozen_adjoint` and `differentiable`
+    raise `InputError`, one sentence, where a solver has no such derivative.
     """
 
     discretisation: Discretisation
@@ -115,8 +115,11 @@ class Solver(Protocol):
     def tangent(self, parameters_dot: Parameters) -> StepTangent:
         """Forward mode along tangents of the parameters."""
 
-    def adjoint(self, steps: int, frozen_geometry: bool = False) -> StepAdjoint:
-        """Reverse mode of a run of so many steps; with a frozen geometry no force depends on positions."""
+    def adjoint(self, steps: int) -> StepAdjoint:
+        """Reverse mode of a run of so many steps."""
+
+    def frozen_adjoint(self, steps: int) -> StepAdjoint:
+        """The same with a frozen geometry, in which no force depends on positions: for `FrozenGeometry`."""
 
     def differentiable(self) -> Self:
         """The same solver, with arrays that Warp's tape can differentiate."""

@@ -89,8 +89,9 @@ def density_sums(discretisation: Discretisation) -> DensitySums:
 
 
 @cache
-def density_kernels(discretisation: Discretisation) -> Kernels:
-    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the number density at given positions."""
+def density_kernels(discretisation: Discretisation, topic: str = "density") -> Kernels:
+    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the number density at given positions, in the Warp modules of
+    a topic: one that a solver has of its own saves it a module to load."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     sums = density_sums(discretisation)
@@ -98,7 +99,7 @@ def density_kernels(discretisation: Discretisation) -> Kernels:
     LANES = discretisation.lanes
     lane = lane_functions(discretisation.precision, LANES).lane
 
-    @wp.kernel(module=discretisation.module(True))
+    @wp.kernel(module=discretisation.module(True, topic))
     def density(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -111,7 +112,7 @@ def density_kernels(discretisation: Discretisation) -> Kernels:
             return
         n[i] = s.volume * (real(1 - s.filling[i]) * s.self_weight + total)
 
-    @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module(topic), enable_backward=False)
     def density_tangent(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -125,7 +126,7 @@ def density_kernels(discretisation: Discretisation) -> Kernels:
             return
         n_dot[i] = s.volume * total
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, topic), enable_backward=False)
     def density_adjoint(
         s: neighbourhood,
         x: wp.array(dtype=vector),

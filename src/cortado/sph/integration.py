@@ -29,6 +29,21 @@ def prediction_share(precision: Precision) -> Any:
     return adjoint
 
 
+@cache
+def new_state_adjoint(precision: Precision) -> Any:
+    """The Warp function from the adjoints of x' = x + dt v' and of v' to those of x and of the last prediction of v',
+    and to that of the time step, to which they add."""
+    real, vector = precision.real, precision.vector
+    adjoin_prediction = prediction_share(precision)
+
+    @wp.func
+    def adjoint(x_new_bar: vector, v_new_bar: vector, dt_bar: real, v: vector, v_star: vector, dt: real):
+        speed_bar = v_new_bar + dt * x_new_bar
+        return x_new_bar, speed_bar, dt_bar + adjoin_prediction(x_new_bar, speed_bar, v, v_star, dt)
+
+    return adjoint
+
+
 @dataclass(frozen=True)
 class IntegrationKernels:
     """The kernels of the time step."""
@@ -37,7 +52,6 @@ class IntegrationKernels:
     unsort: Any
     predict: Any
     predict_tangent: Any
-    begin_adjoint: Any
     acceleration_adjoint: Any
     collect_masses: Any
 
@@ -47,7 +61,6 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
     """Kernels of the time step: ``sort`` and ``unsort`` a state, ``predict`` without pressure, and derivatives; a tape
     can differentiate ``taped`` ones."""
     real, vector = precision.real, precision.vector
-    adjoin_prediction = prediction_share(precision)
 
     @wp.kernel(module=integration_module(precision, True, taped))
     def sort(
@@ -117,46 +130,6 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
         x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[member] * v_star[i]
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
-    def begin_adjoint(
-        particles: int,
-        order: wp.array(dtype=wp.int32),
-        time_step: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        v: wp.array(dtype=vector),
-        v_star: wp.array(dtype=vector),
-        x_scene_bar: wp.array(dtype=vector),
-        v_scene_bar: wp.array(dtype=vector),
-        # in and out
-        time_step_bar: wp.array(dtype=real),
-        # out
-        x_bar: wp.array(dtype=vector),
-        v_bar: wp.array(dtype=vector),
-        n_bar: wp.array(dtype=real),
-        m_bar: wp.array(dtype=real),
-        rho_0_bar: wp.array(dtype=real),
-        mu_bar: wp.array(dtype=real),
-        push_bar: wp.array(dtype=vector),
-        y_bar: wp.array(dtype=real),
-        p_bar: wp.array(dtype=real),
-    ):
-        """From the adjoint of the new state, in scene order, to that of the last prediction; others begin at 0."""
-        i = wp.tid()
-        member = i // particles
-        dt = time_step[member]
-        x_star_bar = x_scene_bar[order[i]]
-        speed_bar = v_scene_bar[order[i]] + dt * x_star_bar
-        x_bar[i] = x_star_bar
-        v_bar[i] = speed_bar
-        push_bar[i] = (dt / m[i]) * speed_bar
-        n_bar[i] = real(0.0)
-        m_bar[i] = real(0.0)
-        rho_0_bar[i] = real(0.0)
-        mu_bar[i] = real(0.0)
-        y_bar[i] = real(0.0)
-        p_bar[i] = real(0.0)
-        time_step_bar[i] = time_step_bar[i] + adjoin_prediction(x_star_bar, speed_bar, v[i], v_star[i], dt)
-
-    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def acceleration_adjoint(
         particles: int,
         time_step: wp.array(dtype=real),
@@ -184,7 +157,6 @@ def integration_kernels(precision: Precision, taped: bool) -> IntegrationKernels
         unsort=unsort,
         predict=predict,
         predict_tangent=predict_tangent,
-        begin_adjoint=begin_adjoint,
         acceleration_adjoint=acceleration_adjoint,
         collect_masses=collect_masses,
     )

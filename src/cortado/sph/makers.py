@@ -1,6 +1,6 @@
 """Forces from outside: what `Simulation` takes in ``forces``."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from typing import Any, Protocol
 
@@ -16,8 +16,8 @@ from cortado.sph.parts import Force, Setting
 class ForceMaker(Protocol):
     """Makes a force for each solver of a simulation that is given it, and says which parameters the force has.
 
-    It is pickled with the simulation. One with a ``fingerprint``, a text, is told from others of its type by it, so
-    that a search is not resumed with another force.
+    It is pickled with the simulation. A ``fingerprint``, a text, tells it from others, so that a search is not resumed
+    with another force; without one its type and its attributes do.
     """
 
     parameters: Sequence[Parameter]
@@ -38,30 +38,52 @@ def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
     for k, maker in enumerate(forces):
         if isinstance(maker, type) or not callable(getattr(maker, "force", None)):
             raise InputError(f"forces has {shown(maker)} at place {k}, but must be {WANTED}.")
-        parameters = getattr(maker, "parameters", None)
-        if not isinstance(parameters, (list, tuple)) or not all(isinstance(p, Parameter) for p in parameters):
-            wanted = "a list of cortado.parameters.registry.Parameter, which may be empty"
-            raise InputError(f"the force {shown(maker)} has parameters {shown(parameters)}, but must have {wanted}.")
+        checked_parameters("force", maker, getattr(maker, "parameters", None))
     return tuple(forces)
 
 
-def known_of(makers: Sequence[ForceMaker]) -> Known:
-    """The parameters of a simulation with these forces; raises `InputError` where two have one name."""
-    return Known(parameter for maker in makers for parameter in maker.parameters)
+def checked_parameters(what: str, maker: Any, parameters: Any) -> Sequence[Parameter]:
+    """Those of a maker of ``what``; raises `InputError`."""
+    if not isinstance(parameters, (list, tuple)) or not all(isinstance(p, Parameter) for p in parameters):
+        wanted = "a list of cortado.parameters.registry.Parameter, which may be empty"
+        raise InputError(f"the {what} {shown(maker)} has parameters {shown(parameters)}, but must have {wanted}.")
+    return parameters
+
+
+def known_of(forces: Sequence[ForceMaker], solver: Any = None) -> Known:
+    """The parameters of a simulation with these forces and the solver that this makes; raises `InputError` where two
+    have one name."""
+    own = [(parameter, "a solver") for parameter in getattr(solver, "parameters", ())]
+    return Known([*own, *((parameter, "a force") for maker in forces for parameter in maker.parameters)])
 
 
 def check_own(known: Known, source: Source) -> None:
-    """The values that forces give their parameters are numbers of a shape that a scene can have; raises
+    """The values that forces and a solver give their parameters are numbers of a shape that a scene can have; raises
     `InputError`."""
     for parameter in known.own:
         shapes = parameter.shapes(0, len(source.scene.phase), source.positions.shape)
         checked_value(parameter.name, parameter.value(source), shapes, known=known)
 
 
-def fingerprint(makers: Sequence[ForceMaker], source: Source) -> str:
-    """Which forces these are, with the values that they give their parameters; empty without any."""
+def fingerprint(makers: Sequence[Any], source: Source) -> str:
+    """Which forces or solvers these make, with the values that they give their parameters; empty without any."""
     words = []
     for maker in makers:
-        values = [(p.name, np.asarray(p.value(source), dtype=np.float64).tolist()) for p in maker.parameters]
-        words.append(f"{getattr(maker, 'fingerprint', type(maker).__qualname__)} {values}")
+        parameters = getattr(maker, "parameters", ())
+        values = [(p.name, np.asarray(p.value(source), dtype=np.float64).tolist()) for p in parameters]
+        words.append(f"{getattr(maker, 'fingerprint', None) or _told(maker)} {values}")
     return sha256("\n".join(words).encode()).hexdigest()[:16] if words else ""
+
+
+def _told(value: Any) -> str:
+    """What an object consists of, as far as it can be told in the same words by another process."""
+    if value is None or isinstance(value, (bool, int, float, complex, str, bytes)):
+        return repr(value)
+    if isinstance(value, (np.ndarray, np.generic)):
+        return f"{value.dtype} {value.shape} {sha256(np.ascontiguousarray(value).tobytes()).hexdigest()}"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_told, value))}]"
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{key!r}: {_told(entry)}' for key, entry in value.items())}}}"
+    own = "" if callable(value) else _told(dict(getattr(value, "__dict__", {})))
+    return f"{getattr(value, '__qualname__', type(value).__qualname__)} {own}"

@@ -1,44 +1,38 @@
 """The PCISPH solver of a scene."""
 
-from collections.abc import Sequence
 from math import inf
-from typing import Any
 
-from cortado.device.precision import Precision
-from cortado.discretise.discrete_scene import DiscreteScene
-from cortado.scene.scene import Scene
+from cortado.scene.solvers import PcisphSolver
 from cortado.solvers.build import particle_system
 from cortado.solvers.loop import LoopLimits
+from cortado.solvers.makers import SolverSetting
 from cortado.solvers.pcisph.solver import Pcisph
 from cortado.solvers.solver import Solver
-from cortado.sph.free_energy import FreeEnergy
-from cortado.sph.makers import ForceMaker
 
 
-def build(
-    scene: Scene,
-    discrete: DiscreteScene,
-    free_energy: FreeEnergy,
-    precision: Precision,
-    device: Any,
-    batch: int | None = None,
-    makers: Sequence[ForceMaker] = (),
-) -> Solver:
-    """The solver of a scene that is cut into particles, on a device; ``batch`` of it in one launch, with the forces of
-    ``makers`` besides the scene's."""
-    system = particle_system(scene, discrete, free_energy, precision, device, batch, makers)
-    return Pcisph(system, pressure_limits(scene))
+class PcisphMaker:
+    """Makes the solver as the table [solver] of a scene says."""
+
+    batches = True
+
+    def __init__(self, table: PcisphSolver):
+        self._table = table
+
+    def build(self, setting: SolverSetting) -> Solver:
+        """The solver of a scene that is cut into particles, on a device."""
+        limits = pressure_limits(self._table) if setting.scene.forces.pressure else None
+        return Pcisph(particle_system(setting), limits)
 
 
-def pressure_limits(scene: Scene) -> LoopLimits | None:
-    """When the pressure loop may stop; None where no pressure acts."""
-    solver = scene.solver
-    if not scene.forces.pressure:
-        return None
-    greatest = solver.maximum_density_tolerance
+maker = PcisphMaker
+
+
+def pressure_limits(table: PcisphSolver) -> LoopLimits:
+    """When the pressure loop may stop."""
+    greatest = table.maximum_density_tolerance
     return LoopLimits(
-        solver.minimum_iterations,
-        solver.maximum_iterations,
-        solver.density_tolerance,
+        table.minimum_iterations,
+        table.maximum_iterations,
+        table.density_tolerance,
         inf if greatest is None else greatest,
     )

@@ -12,33 +12,29 @@ from cortado.sph.parts import StepContext
 
 
 class PcisphAdjoint(ParticleAdjoint):
-    """Reverse mode, one step at a time, of a run with some parameters.
+    """Reverse mode, one step at a time, of a run with some parameters."""
 
-    With a frozen geometry accelerations do not depend on x(t): v' does on v alone, x' = x + dt v' on both.
-    """
-
-    def __init__(self, solver: PcisphSteps, steps: int, frozen_geometry: bool = False):
+    def __init__(self, solver: PcisphSteps, steps: int):
         super().__init__(solver, steps)
-        self._solver, self._frozen = solver, frozen_geometry
-        self._force = frozen_force_adjoint(solver.discretisation) if frozen_geometry else solver.kernels.force.adjoint
-        self._push_bar, self._acceleration_bar = solver.vectors(), solver.vectors()
+        self._solver, self._force = solver, solver.kernels.force.adjoint
+        self._scaled_bar = solver.vectors()
         self._p_bar, self._y_bar, self._r, self._t_bar = (solver.numbers() for _ in range(4))
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         """Replace the adjoint of the replayed step's result by that of its state; adjoints of the parameters are added
         to ``bar``."""
         (iterations,) = counts
-        solver, it, kernels, push_bar = self._solver, self._solver.iterates, self._solver.kernels, self._push_bar
+        solver, it, kernels, scaled_bar = self._solver, self._solver.iterates, self._solver.kernels, self._scaled_bar
         context, known = solver.context(parameters), self.bar.named
         pressure_bar = {"y_bar": self._y_bar, "p_bar": self._p_bar}
         free_bar = self.unsort(context, state_bar)
         context.launch(
-            solver.integration.begin_adjoint,
+            kernels.begin_adjoint,
             *known,
             v_star=it.v_star[iterations],
             x_scene_bar=free_bar.positions,
             v_scene_bar=free_bar.velocities,
-            push_bar=push_bar,
+            scaled_bar=scaled_bar,
             **pressure_bar,
         )
         for k in reversed(range(iterations)):
@@ -52,34 +48,51 @@ class PcisphAdjoint(ParticleAdjoint):
                 p_in=it.p[k],
                 p_out=it.p[k + 1],
                 c=it.c[k],
-                push_bar=push_bar,
+                scaled_bar=scaled_bar,
                 r=self._r,
                 **pressure_bar,
             )
             predicted = {"x_star": it.x_star[k], "v_star": it.v_star[k]}
-            context.launch(kernels.pressure.adjoint, going, *known, r=self._r, push_bar=push_bar, **predicted)
-        context.launch(solver.integration.acceleration_adjoint, *known, acceleration_bar=self._acceleration_bar)
-        self.accelerate(context, self._acceleration_bar)
+            context.launch(kernels.pressure.adjoint, going, *known, r=self._r, scaled_bar=scaled_bar, **predicted)
+        self.predict(context)
         if kernels.density_ratio:
             factors = {"t": solver.density_ratio, "y": solver.pressure_relaxation, "y_bar": self._y_bar}
             context.launch(kernels.density_ratio.factor_adjoint, **factors, t_bar=self._t_bar)
             context.launch(kernels.density_ratio.adjoint, *known, t_bar=self._t_bar)
-        if not self._frozen:
-            context.launch(kernels.wall_relaxation.adjoint, *known, y=solver.wall_relaxation, y_bar=self._y_bar)
+        self.relax_beside_walls(context)
         self.mix(context, state_bar)
-        if self._frozen:
-            self._sort_frozen(context, state_bar, free_bar)
-        else:
-            self.sort(context, state_bar)
+        self.sort(context, state_bar)
 
-    def _sort_frozen(self, context: StepContext, state_bar: State, free_bar: State) -> None:
+    def relax_beside_walls(self, context: StepContext) -> None:
+        """Of the relaxation beside walls, which depends on positions alone."""
+        solver, y = self._solver, {"y": self._solver.wall_relaxation, "y_bar": self._y_bar}
+        context.launch(solver.kernels.wall_relaxation.adjoint, *self.bar.named, **y)
+
+
+class FrozenPcisphAdjoint(PcisphAdjoint):
+    """The same with a frozen geometry: accelerations do not depend on x(t), v' does on v alone, x' = x + dt v' on
+    both."""
+
+    def __init__(self, solver: PcisphSteps, steps: int):
+        super().__init__(solver, steps)
+        self._force = frozen_force_adjoint(solver.discretisation)
+
+    def unsort(self, context: StepContext, state_bar: State) -> State:
+        self._free_bar = super().unsort(context, state_bar)
+        return self._free_bar
+
+    def relax_beside_walls(self, context: StepContext) -> None:
+        pass
+
+    def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:
         """The adjoint of x' = x + dt v' goes to x as it is, and not with ``x_bar``, to which others have added."""
         b = self.bar.fields
-        unsorted = {"x_scene": self._push_bar, "v_scene": state_bar.velocities}
+        unsorted = {"x_scene": self._scaled_bar, "v_scene": state_bar.velocities}
         context.launch(self._solver.integration.unsort, x=b["x"], v=b["v"], **unsorted)
+        self.carried_bar.unsort(context, carried_bar, state_bar)
         context.join()
-        if free_bar is not state_bar:
-            wp.copy(state_bar.positions, free_bar.positions)
+        if self._free_bar is not state_bar:
+            wp.copy(state_bar.positions, self._free_bar.positions)
 
 
 class PcisphTangent(ParticleTangent):

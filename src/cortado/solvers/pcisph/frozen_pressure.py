@@ -40,7 +40,7 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
         p_in: wp.array(dtype=real),
         p_out: wp.array(dtype=real),
         c: wp.array(dtype=real),
-        push_bar: wp.array(dtype=vector),
+        scaled_bar: wp.array(dtype=vector),
         # in and out
         m_bar: wp.array(dtype=real),
         rho_0_bar: wp.array(dtype=real),
@@ -50,29 +50,29 @@ def frozen_force_adjoint(discretisation: Discretisation) -> Any:
         # out
         r: wp.array(dtype=real),
     ):
-        """From ``push_bar``, the adjoint of the pressure acceleration over m, to those of p and (r) of n*."""
+        """From ``scaled_bar``, the adjoint of the pressure acceleration over m, to those of p and (r) of n*."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:
             return
         x_i = x[i]
         c_i = c[i]
-        push_bar_i = push_bar[i]
+        scaled_bar_i = scaled_bar[i]
         divergence = real(0.0)
         work = real(0.0)
         for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             c_j = numbers(c, k, i, s)
-            push_bar_j = vectors(push_bar, k, i, s)
+            scaled_bar_j = vectors(scaled_bar, k, i, s)
             for u in range(UNROLL):
                 x_ij = separation(x_i, x_j[u], s)
                 a = slope(x_ij, s)
-                divergence += a * wp.dot(x_ij, push_bar_i - push_bar_j[u])
-                work += ((c_i + c_j[u]) * a) * wp.dot(x_ij, push_bar_i)
+                divergence += a * wp.dot(x_ij, scaled_bar_i - scaled_bar_j[u])
+                work += ((c_i + c_j[u]) * a) * wp.dot(x_ij, scaled_bar_i)
         for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
             b = neighbour(k, i, s)
             g_ib = gradient(separation(x_i, wall_position(b, s), s), s)
-            wall_divergence = wall_weight(b, s) * wp.dot(g_ib, push_bar_i)
+            wall_divergence = wall_weight(b, s) * wp.dot(g_ib, scaled_bar_i)
             divergence += wall_divergence
             work += c_i * wall_divergence
         divergence = add_up(divergence)

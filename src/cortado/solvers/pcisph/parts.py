@@ -7,6 +7,7 @@ import warp as wp
 
 from cortado.device.kernels import Kernels
 from cortado.device.neighbourhood import Discretisation
+from cortado.solvers.pcisph.begin_adjoint import begin_adjoint_kernel
 from cortado.solvers.pcisph.density_ratio_relaxation import DensityRatioKernels, density_ratio_kernels
 from cortado.solvers.pcisph.pressure import pressure_kernels
 from cortado.solvers.pcisph.pressure_force import pressure_force_kernels
@@ -22,6 +23,8 @@ class PcisphKernels:
     """Only where there are several phases."""
     pressure: Kernels
     force: Kernels
+    begin_adjoint: wp.Kernel
+    """With which the way back through a step begins."""
 
     @classmethod
     def of(cls, discretisation: Discretisation, phases: int) -> "PcisphKernels":
@@ -31,6 +34,7 @@ class PcisphKernels:
             density_ratio_kernels(discretisation) if phases > 1 else None,
             pressure_kernels(discretisation),
             pressure_force_kernels(discretisation),
+            begin_adjoint_kernel(discretisation),
         )
 
 

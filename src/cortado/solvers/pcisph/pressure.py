@@ -38,7 +38,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     LANES = discretisation.lanes
     lane = lane_functions(discretisation.precision, LANES).lane
 
-    @wp.kernel(module=discretisation.module(True))
+    @wp.kernel(module=discretisation.module(True, "pcisph"))
     def pressure(
         s: neighbourhood,
         k: int,
@@ -79,7 +79,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         c[i] = p_i / (n_i * n_i)
         error[i] = pair_of(compression, compression)
 
-    @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module("pcisph"), enable_backward=False)
     def pressure_tangent(
         s: neighbourhood,
         k: int,
@@ -123,7 +123,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         p_out_dot[i] = p_dot_i
         c_dot[i] = (p_dot_i - real(2.0) * p_i / n_i * n_dot[i]) / (n_i * n_i)
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
     def pressure_adjoint(
         s: neighbourhood,
         k: int,
@@ -139,7 +139,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         v_bar: wp.array(dtype=vector),
         time_step_bar: wp.array(dtype=real),
         # out
-        push_bar: wp.array(dtype=vector),
+        scaled_bar: wp.array(dtype=vector),
     ):
         """From the adjoint r of n* to that of x*, and on to what x* was predicted from."""
         i = s.first + wp.tid() // LANES
@@ -153,7 +153,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         speed_bar = dt * x_star_bar
         x_bar[i] = x_bar[i] + x_star_bar
         v_bar[i] = v_bar[i] + speed_bar
-        push_bar[i] = (dt / m[i]) * speed_bar
+        scaled_bar[i] = (dt / m[i]) * speed_bar
         time_step_bar[i] = time_step_bar[i] + adjoin_prediction(x_star_bar, speed_bar, v[i], v_star[i], dt)
 
     return Kernels(pressure, pressure_tangent, pressure_adjoint)

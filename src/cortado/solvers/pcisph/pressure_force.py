@@ -66,7 +66,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
             total += (wall_weight(b, s) * c_i) * hessian_product(x_ib, x_dot_i, s)
         return add_up_vectors(total)
 
-    @wp.kernel(module=discretisation.module(True))
+    @wp.kernel(module=discretisation.module(True, "pcisph"))
     def pressure_force(
         s: neighbourhood,
         k: int,
@@ -102,7 +102,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         v_star[i] = velocity
         x_star[i] = x_i + dt * velocity
 
-    @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module("pcisph"), enable_backward=False)
     def pressure_force_tangent(
         s: neighbourhood,
         k: int,
@@ -139,7 +139,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         v_star_dot[i] = velocity_dot
         x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[member] * v_star[i]
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
     def pressure_force_adjoint(
         s: neighbourhood,
         k: int,
@@ -154,7 +154,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         p_in: wp.array(dtype=real),
         p_out: wp.array(dtype=real),
         c: wp.array(dtype=real),
-        push_bar: wp.array(dtype=vector),
+        scaled_bar: wp.array(dtype=vector),
         # in and out
         x_bar: wp.array(dtype=vector),
         n_bar: wp.array(dtype=real),
@@ -166,7 +166,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         # out
         r: wp.array(dtype=real),
     ):
-        """From ``push_bar``, the adjoint of the pressure acceleration over m, to those of c, p and (r) of n*: every
+        """From ``scaled_bar``, the adjoint of the pressure acceleration over m, to those of c, p and (r) of n*: every
         sum a gather."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
@@ -174,29 +174,29 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
             return
         x_i = x[i]
         c_i = c[i]
-        push_bar_i = push_bar[i]
+        scaled_bar_i = scaled_bar[i]
         divergence = real(0.0)
         hessian_products = vector()
         work = real(0.0)
         for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
             x_j = vectors(x, k, i, s)
             c_j = numbers(c, k, i, s)
-            push_bar_j = vectors(push_bar, k, i, s)
+            scaled_bar_j = vectors(scaled_bar, k, i, s)
             for u in range(UNROLL):
                 x_ij = separation(x_i, x_j[u], s)
-                u_ij = push_bar_i - push_bar_j[u]
+                u_ij = scaled_bar_i - scaled_bar_j[u]
                 a = slope(x_ij, s)
                 c_ij = c_i + c_j[u]
                 divergence += a * wp.dot(x_ij, u_ij)
                 hessian_products += (c_ij * a) * u_ij + (c_ij * slope_change(x_ij, u_ij, s)) * x_ij
-                work += (c_ij * a) * wp.dot(x_ij, push_bar_i)
+                work += (c_ij * a) * wp.dot(x_ij, scaled_bar_i)
         for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
             b = neighbour(k, i, s)
             x_ib = separation(x_i, wall_position(b, s), s)
             weight = wall_weight(b, s)
-            wall_divergence = weight * wp.dot(gradient(x_ib, s), push_bar_i)
+            wall_divergence = weight * wp.dot(gradient(x_ib, s), scaled_bar_i)
             divergence += wall_divergence
-            hessian_products += (weight * c_i) * hessian_product(x_ib, push_bar_i, s)
+            hessian_products += (weight * c_i) * hessian_product(x_ib, scaled_bar_i, s)
             work += c_i * wall_divergence
         divergence = add_up(divergence)
         hessian_products = add_up_vectors(hessian_products)

@@ -17,6 +17,8 @@ from cortado.sph.parts import StepContext
 class PcisphSteps(ParticleSolver):
     """The steps of one set of particles, forward."""
 
+    topic = "pcisph"
+
     def __init__(self, system: ParticleSystem, limits: LoopLimits | None, requires_grad: bool = False):
         """``limits`` None leaves the pressure out."""
         super().__init__(system, requires_grad)

@@ -52,7 +52,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
             )
         return add_up_vectors(total)
 
-    @wp.kernel(module=discretisation.module(True))
+    @wp.kernel(module=discretisation.module(True, "pcisph"))
     def wall_relaxation(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -65,7 +65,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
             return
         y[i] = real(1.0) / (real(1.0) + wp.dot(total, total))
 
-    @wp.kernel(module=discretisation.tangent_module(), enable_backward=False)
+    @wp.kernel(module=discretisation.tangent_module("pcisph"), enable_backward=False)
     def wall_relaxation_tangent(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -81,7 +81,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
             return
         y_dot[i] = real(-2.0) * y[i] * y[i] * wp.dot(total, total_dot)
 
-    @wp.kernel(module=discretisation.module(False), enable_backward=False)
+    @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
     def wall_relaxation_adjoint(
         s: neighbourhood,
         x: wp.array(dtype=vector),

@@ -1,0 +1,67 @@
+"""The table [solver] of a scene: which algorithm takes a step, with the keys of that algorithm."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from cortado.scene.fields import Text, count, field_error, quantity
+from cortado.scene.package_tables import Inline, PackageTable
+from cortado.scene.tables import Table
+
+OWN = ("pcisph",)
+"""The kinds that are Cortado's own."""
+
+
+class Solver(Table):
+    """How a step is solved."""
+
+    kind: str
+    """Name of the algorithm."""
+    time_step: Annotated[float, quantity("s", gt=0.0)]
+    """Length of a step [s]."""
+
+
+class PcisphSolver(Solver):
+    """How a step is solved by PCISPH."""
+
+    kind: Literal["pcisph"] = "pcisph"
+    """Name of the algorithm."""
+    minimum_iterations: Annotated[int, count(1, 1_000_000)] = 3
+    """Pressure iterations of a step, at least."""
+    maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
+    """Pressure iterations of a step, at most."""
+    density_tolerance: Annotated[float, quantity(ge=0.0)] = 0.01
+    """Iterations end once the average of (rho - rho_0) / rho_0 is below it."""
+    maximum_density_tolerance: Annotated[float, quantity(ge=0.0)] | None = None
+    """The same for the maximum of (rho - rho_0) / rho_0; not asked for if left out."""
+
+    @model_validator(mode="after")
+    def _check_iterations(self) -> Self:
+        if self.minimum_iterations > self.maximum_iterations:
+            wanted = f"at most maximum_iterations, {self.maximum_iterations}"
+            raise field_error(("minimum_iterations",), self.minimum_iterations, wanted)
+        return self
+
+
+class PackageSolver(Solver, PackageTable):
+    """How a step is solved by a solver that an installed package registers."""
+
+    group = "cortado.solvers"
+    method = "build"
+    own = OWN
+    kind: Annotated[Text, Field(json_schema_extra={"not": {"enum": list(OWN)}})]
+    """The name that the package gives it."""
+    advice = f"{' or '.join(f'{chr(34)}{name}{chr(34)}' for name in OWN)}, or "
+
+
+def _table_of(solver: Any) -> str:
+    """Which table a solver is, by its kind."""
+    kind = solver.get("kind", OWN[0]) if isinstance(solver, Mapping) else getattr(solver, "kind", OWN[0])
+    return "PackageSolver" if isinstance(kind, str) and kind.strip() and kind not in OWN else "PcisphSolver"
+
+
+AnySolver = Annotated[
+    Annotated[PcisphSolver, Tag("PcisphSolver")] | Annotated[PackageSolver, Tag("PackageSolver"), Inline()],
+    Discriminator(_table_of),
+]

@@ -1,0 +1,72 @@
+"""Solvers from outside: what `Simulation` takes as ``solver``, and what it is given to make one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from cortado.device.precision import Precision
+from cortado.discretise.discrete_scene import DiscreteScene
+from cortado.errors import InputError, shown
+from cortado.parameters.known import Known
+from cortado.scene.scene import Scene
+from cortado.scene.solvers import Solver as SolverTable
+from cortado.solvers.solver import Solver
+from cortado.sph.free_energy import FreeEnergy
+from cortado.sph.makers import ForceMaker, checked_parameters
+
+
+@dataclass(frozen=True)
+class SolverSetting:
+    """What a solver is made for: ``particle_system(setting)`` of `cortado.solvers.build` is all of it on a device."""
+
+    scene: Scene
+    discrete: DiscreteScene
+    free_energy: FreeEnergy
+    precision: Precision
+    device: Any
+    batch: int | None
+    forces: Sequence[ForceMaker]
+    """Make the forces that are not the scene's."""
+    known: Known
+    """The parameters of the simulation, those of these forces and of the solver among them."""
+    called: str
+    """What sentences call the solver."""
+
+
+class SolverMaker(Protocol):
+    """Makes the solver of a simulation that is given it, and of each that is made from it in another precision or size.
+
+    It is pickled with the simulation, and may have, as makers of forces do, ``parameters``, which kernels find by their
+    names, and a ``fingerprint``. ``batches = True`` says that its solver runs in batches.
+    """
+
+    def build(self, setting: SolverSetting) -> Solver:
+        """The solver in one precision and on one device."""
+
+
+WANTED = "an object with a method build(setting), which returns a solver: see docs/own_parts.md"
+
+
+def checked_solver(solver: Any) -> SolverMaker:
+    """What a user gives as ``solver``; raises `InputError`."""
+    if isinstance(solver, type) or not callable(getattr(solver, "build", None)):
+        raise InputError(f"solver is {shown(solver)}, but must be {WANTED}.")
+    checked_parameters("solver", solver, getattr(solver, "parameters", ()))
+    return solver
+
+
+def called(table: SolverTable, given: SolverMaker | None) -> str:
+    """What sentences call the solver of a scene with this table, or the one that is given."""
+    return f'solver.kind "{table.kind}"' if given is None else f"the solver {type(given).__name__}"
+
+
+def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
+    """The solver that a maker makes; raises `InputError` where it does not fit the simulation."""
+    if setting.batch is not None and not getattr(maker, "batches", False):
+        raise InputError(f"batch is {setting.batch}, but must be left out, as {setting.called} has no batches.")
+    solver = maker.build(setting)
+    if not callable(getattr(solver, "new_state", None)):
+        raise InputError(f"build of {setting.called} returned {shown(solver)}, but must return a solver.")
+    if setting.forces and not hasattr(solver, "forces"):
+        raise InputError(f"forces is given, but must be left out, as {setting.called} takes no others.")
+    return solver

@@ -1,0 +1,33 @@
+"""What makes the solver and the forces that a scene names by their kinds, and the parameters that these bring."""
+
+from importlib import import_module
+
+from cortado.parameters.known import REGISTRY, Known
+from cortado.scene.scene import Scene
+from cortado.scene.solvers import PackageSolver, Solver
+from cortado.solvers.makers import SolverMaker, checked_solver
+from cortado.sph.makers import ForceMaker, checked_makers, known_of
+
+MODULES = {"pcisph": "cortado.solvers.pcisph.build"}
+"""By the kind of Cortado's own, the module whose ``maker`` takes the table."""
+
+
+def solver_named(table: Solver) -> SolverMaker:
+    """What builds the solver of a scene with this table."""
+    if isinstance(table, PackageSolver):
+        return checked_solver(table.make())
+    made: SolverMaker = import_module(MODULES[table.kind]).maker(table)
+    return made
+
+
+def forces_named(scene: Scene) -> tuple[ForceMaker, ...]:
+    """What makes the forces of installed packages that a scene names."""
+    return checked_makers([table.make() for table in scene.force])
+
+
+def known_in(scene: Scene) -> Known:
+    """The parameters of a scene by itself, those of parts of packages among them; raises `InputError` where two of them
+    have one name."""
+    if not scene.force and not isinstance(scene.solver, PackageSolver):
+        return REGISTRY
+    return known_of(forces_named(scene), solver_named(scene.solver))

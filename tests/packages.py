@@ -1,0 +1,77 @@
+"""Packages that register solvers and forces, as pip would have installed them."""
+
+import sys
+from pathlib import Path
+
+TOY = '''
+from typing import Annotated
+
+import cortado
+from cortado.errors import InputError, SceneError
+from cortado.scene.fields import quantity
+from own_forces import Breeze
+from solvers import MakeFalling, MakeRemembering
+
+
+def law(x, v, k):
+    return -k * v
+
+
+def drag(k: Annotated[float, quantity("1/s", ge=0.0)] = 2.0, name: str = "drag"):
+    return cortado.forces.Body(law, name, k=k)
+
+
+class Settings:
+    """Its keys are judged by it: ``count`` and ``way`` by their types, ``most`` by what it says itself."""
+
+    parameters = ()
+
+    def __init__(self, count: int, way: bool = True, most=1.0):
+        if most == 0.0:
+            raise InputError("most is 0, but there must be some.")
+        if most < 0.0:
+            raise SceneError(None, "most", most, "at least 0")
+        self.most = 1.0 / (most - 13.0)
+
+    def force(self, setting):
+        return None
+
+
+def clashing(kind=1):
+    return Settings(1)
+
+
+nothing = None
+'''
+ENTRIES = {
+    "cortado.forces": {
+        "drag": "toy_parts:drag",
+        "breeze": "toy_parts:Breeze",
+        "settings": "toy_parts:Settings",
+        "clashing": "toy_parts:clashing",
+        "number": "toy_parts:MakeFalling",
+        "nothing": "toy_parts:nothing",
+        "lost": "toy_parts:lost",
+        "broken": "toy_broken",
+    },
+    "cortado.solvers": {"remembering": "toy_parts:MakeRemembering", "falling": "toy_parts:MakeFalling"},
+}
+
+
+def install(folder: Path, name: str = "toy", entries=ENTRIES) -> None:
+    """Put a package into a folder that is, or will be, on the path of modules."""
+    (folder / "toy_parts.py").write_text(TOY)
+    (folder / "toy_broken.py").write_text("import a_module_that_there_is_not\n")
+    info = folder / f"{name}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    groups = (f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in own.items()) for group, own in entries.items())
+    (info / "entry_points.txt").write_text("\n".join(groups))
+
+
+def on_path(folder: Path, monkeypatch, **options) -> None:
+    """Install it for one test of this process."""
+    install(folder, **options)
+    monkeypatch.syspath_prepend(folder)
+    for module in ("toy_parts", "toy_broken"):
+        monkeypatch.delitem(sys.modules, module, raising=False)

@@ -1,0 +1,272 @@
+"""Solvers and forces of installed packages: named in scene files and tasks, run, searched for, judged in sentences."""
+
+import importlib.metadata
+import json
+import os
+import pickle
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado import InputError, Problem, Scene, SceneError, Simulation, load_scene, losses, reference
+from own_forces import Breeze
+from packages import install, on_path
+from solvers import MakeRemembering
+
+SCENE = """
+dimension = 2
+discretisation = {spacing = 0.05}
+phase = [{name = "water", rest_density = 1000.0, viscosity = 0.05}]
+fluid = [{shape = "box", lower = [0.0, 0.0], upper = [0.4, 0.4], phase = "water", velocity = [0.8, 0.1]}]
+container = {shape = "box", lower = [0.0, 0.0], upper = [0.7, 0.8]}
+"""
+OURS = '[solver]\nkind = "pcisph"\ntime_step = 0.0021\n'
+THEIRS = '[solver]\nkind = "remembering"\ntime_step = 0.0021\nrate = 0.2\n\n[[force]]\nkind = "breeze"\nk = 2.0\n'
+DRAG = OURS + '\n[[force]]\nkind = "drag"\nk = 3.0\n'
+TASK = """
+[problem]
+steps = 6
+target.drag.k = 5.0
+
+[optimise]
+start."drag.k" = 3.0
+bounds.drag.k = [1.0, 20.0]
+logarithmic = ["drag.k"]
+optimiser = "lbfgs"
+learning_rate = 0.3
+iterations = 12
+
+[optimise.check]
+parameter_error = 0.01
+"""
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """Writes a scene file with a [solver] and what follows; the toy package is installed."""
+    on_path(tmp_path, monkeypatch)
+
+    def write(text):
+        path = tmp_path / "scene.toml"
+        path.write_text(SCENE + text)
+        return path
+
+    return write
+
+
+def problem(simulation, steps=6):
+    target = simulation.positions + 0.02 * np.sin(7.0 * simulation.positions)
+    return Problem(simulation, steps, losses.FinalPositions(target))
+
+
+def test_a_scene_names_them_with_the_bits_of_those_that_are_given(file):
+    named = Simulation(file(THEIRS), precision="float64")
+    plain = Scene.from_json(Simulation(file(OURS)).scene.to_json())
+    given = Simulation(plain, precision="float64", solver=MakeRemembering(0.2), forces=[Breeze(2.0)])
+    one, other = named.run(5), given.run(5)
+    assert one.positions.tobytes() == other.positions.tobytes()
+    assert one.others["memory"].tobytes() == other.others["memory"].tobytes()
+    assert named.parameters()["breeze.k"] == 2.0 and named.parameters()["memory.rate"] == 0.2
+    assert cortado.certify(problem(named), ["breeze.k", "memory.rate"]).right
+
+
+def test_such_a_scene_is_written_and_read_and_goes_to_other_processes(file):
+    made = load_scene(file(THEIRS))
+    for again in (Scene.from_json(made.to_json()), pickle.loads(pickle.dumps(made))):
+        assert again == made and again.force[0].k == 2.0 and again.solver.rate == 0.2
+    changed = made.replaced("force.breeze.k=4", "solver.rate=0.1")
+    assert (changed.force[0].k, changed.solver.rate, made.force[0].k) == (4, 0.1, 2.0)
+    judged = problem(Simulation(made, precision="float64"))
+    again = pickle.loads(pickle.dumps(judged))
+    assert again.value({"breeze.k": 1.5}) == judged.value({"breeze.k": 1.5})
+    assert again.fingerprint == judged.fingerprint
+    assert problem(Simulation(changed, precision="float64")).fingerprint != judged.fingerprint
+
+
+def test_a_force_that_is_named_and_one_that_is_given_act_together(file):
+    both = Simulation(file(DRAG), precision="float64", forces=[Breeze(2.0)], batch=2)
+    assert [p.name for p in both.known.own] == ["drag.k", "breeze.k", "breeze.wind", "time"]
+    alone = both.in_precision("float64")
+    assert len(alone.forces) == 2
+    assert alone.run(3).positions.tobytes() == both.run(3)[0].positions.tobytes()
+
+
+def test_a_task_searches_for_a_parameter_of_one(file, tmp_path, cortado_command):
+    out = tmp_path / "out"
+    code, words, told = cortado_command("optimise", file(DRAG + TASK), "--out", out, "--precision", "float64")
+    assert code == 0, told
+    found = json.loads((out / "result.json").read_text())["parameters"]["drag.k"]
+    assert abs(found - 5.0) < 0.05 and "drag.k" in words
+
+
+def test_the_solver_of_a_package_is_reported(file, tmp_path, cortado_command):
+    out = tmp_path / "out"
+    code, _, told = cortado_command("run", file(THEIRS), "--steps", 4, "--out", out)
+    assert code == 0 and (out / "figures" / "density_errors.png").exists(), told
+    assert Scene.from_json((out / "scene.json").read_text()).force[0].kind == "breeze"
+
+
+def test_a_key_of_one_is_swept(file, tmp_path, cortado_command):
+    sweep = ("sweep", file(DRAG), "--set", "force.drag.k=1.0,4.0", "--steps", 2, "--out", tmp_path / "runs")
+    code, _, told = cortado_command(*sweep)
+    assert code == 0, told
+    found = {Scene.from_json(path.read_text()).force[0].k for path in (tmp_path / "runs").rglob("scene.json")}
+    assert found == {1.0, 4.0}
+
+
+def test_they_are_there_in_processes_of_their_own(tmp_path):
+    install(tmp_path)
+    scene = tmp_path / "scene.toml"
+    scene.write_text(SCENE + DRAG)
+    paths = [str(tmp_path), str(Path(__file__).parent)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    run = [sys.executable, "-m", "cortado", "run", str(scene), "--steps", "2", "--out", str(tmp_path / "out")]
+    done = subprocess.run(run, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "out" / "scene.json").read_text())["force"] == [{"kind": "drag", "k": 3.0}]
+
+
+def test_a_scene_without_them_reads_no_entry_points(tmp_path, monkeypatch):
+    def read(**group):
+        raise AssertionError
+
+    monkeypatch.setattr("cortado.scene.entry_points.entry_points", read)
+    monkeypatch.setattr(importlib.metadata, "entry_points", read)
+    (tmp_path / "scene.toml").write_text(SCENE + OURS)
+    assert Simulation(tmp_path / "scene.toml").run(1).positions.shape == (2, 64, 2)
+
+
+def solver(*lines):
+    return "[solver]\ntime_step = 0.002\n" + "\n".join(lines)
+
+
+def force(*lines):
+    return OURS + "[[force]]\n" + "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (force('kind = "drg"'), r"force\[0\].kind is .drg., but must be a name that an installed package registers "),
+        (
+            solver('kind = "dfsph"'),
+            r'solver.kind is .dfsph., but must be "pcisph", or a name .*"falling", "remembering"',
+        ),
+        (solver("rate = 0.1"), r"solver.rate is not a key of \[solver\]; its keys are kind, time_step, minimum_iter"),
+        (solver('kind = "remembering"', "minimum_iterations = 2"), r"solver.minimum_iterations is not a key .* rate\."),
+        (
+            solver('kind = "remembering"').replace("0.002", "-1.0"),
+            r"solver.time_step is -1.0, but must be greater than",
+        ),
+        (force("k = 1.0"), r"force\[0\].kind is missing, but must be a text"),
+        (force("kind = 3"), r"force\[0\].kind is 3, but must be a text"),
+        ("force = 3\n" + OURS, r"force is 3, but must be a list of at least one table, each written \[\[force\]\]"),
+        (
+            force('kind = "gravity"'),
+            r"force\[0\].kind is 'gravity', but must be another name, as gravity is a force",
+        ),
+        (force('kind = "drag"', "q = 1"), r"force\[0\].q is not a key of \[force\[0\]\]; its keys are kind, k, name"),
+        (force('kind = "drag"', "k = -1.0"), r"force\[0\].k is -1.0, but must be at least 0 1/s"),
+        (force('kind = "drag"', 'k = "a"'), r"force\[0\].k is 'a', but must be at least 0 1/s"),
+        (force('kind = "drag"', "k = nan"), r"force\[0\].k is nan, but must be"),
+        (force('kind = "settings"'), r"force\[0\].count is missing, but must be a whole number"),
+        (force('kind = "settings"', "count = 1.5"), r"force\[0\].count is 1.5, but must be a whole number"),
+        (force('kind = "settings"', "count = 1", "way = 1"), r"force\[0\].way is 1, but must be true or false"),
+        (force('kind = "settings"', "count = 1", "most = -1"), r"force\[0\].most is -1, but must be at least 0"),
+        (
+            force('kind = "settings"', "count = 1", "most = 0"),
+            r'force\[0\] of the kind "settings" cannot be made: most',
+        ),
+        (
+            force('kind = "settings"', "count = 1", "most = 13.0"),
+            r'"settings" cannot be made: ZeroDivisionError:',
+        ),
+        (force('kind = "clashing"'), r"force\[0\].kind clashing has an argument kind, which is a key of every such"),
+        (
+            force('kind = "number"'),
+            r"is made by toy_parts:MakeFalling, but that returned <.*must .* method force",
+        ),
+        (
+            force('kind = "nothing"'),
+            r"the package toy registers toy_parts:nothing, but that is None, and must be",
+        ),
+        (force('kind = "lost"'), r"force\[0\].kind is 'lost', for which the package toy registers toy_parts:lost, but"),
+        (force('kind = "broken"'), r"cannot be imported: ModuleNotFoundError: No module named 'a_module_that_there_is"),
+    ],
+)
+def test_what_does_not_fit_is_a_sentence(file, text, said):
+    path = file(text) if text.startswith("[") else file("").with_name("scene.toml")
+    if not text.startswith("["):
+        path.write_text(text.split("\n", 1)[0] + "\n" + SCENE + text.split("\n", 1)[1])
+    with pytest.raises(SceneError, match=f"^{path}: .*{said}") as caught:
+        load_scene(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_two_packages_of_one_name_are_told(tmp_path, monkeypatch):
+    on_path(tmp_path, monkeypatch)
+    install(tmp_path, "other", {"cortado.forces": {"drag": "toy_parts:law"}})
+    (tmp_path / "scene.toml").write_text(SCENE + DRAG)
+    with pytest.raises(SceneError, match=r"a name that one package has: the package .* and the package .* register it"):
+        load_scene(tmp_path / "scene.toml")
+
+
+def test_a_package_that_takes_a_name_of_ours_is_told(tmp_path, monkeypatch):
+    on_path(tmp_path, monkeypatch, entries={"cortado.solvers": {"pcisph": "a:b", "falling": "toy_parts:MakeFalling"}})
+    (tmp_path / "scene.toml").write_text(SCENE + solver('kind = "falling"'))
+    with pytest.raises(SceneError, match='the package toy registers "pcisph" under '):
+        load_scene(tmp_path / "scene.toml")
+
+
+def test_two_forces_of_one_kind_need_names(file):
+    twice = DRAG + '[[force]]\nkind = "drag"\n'
+    with pytest.raises(InputError, match=r"parameter drag\.k of a force has the name of another one"):
+        Simulation(file(twice))
+    named = Simulation(file(twice + 'name = "air"\n'))
+    assert [p.name for p in named.known.own] == ["drag.k", "air.k"]
+    assert load_scene(file(twice + 'name = "air"\n'), ["force.air.k=7.0"]).force[1].k == 7.0
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            TASK.replace('"drag.k" = 3.0', '"drag.q" = 3.0'),
+            r"start.'drag.q' is unknown, but must be one of .*drag.k",
+        ),
+        (TASK.replace("5.0", "[1.0, 2.0]", 1), r"problem.target.*drag.k.* is of shape"),
+        (
+            TASK.replace('["drag.k"]', '["drag.q"]'),
+            r"optimise.logarithmic\[0\] is 'drag.q', but must be one of .*drag.k",
+        ),
+    ],
+)
+def test_what_does_not_fit_in_a_task_is_a_sentence(file, cortado_command, text, said):
+    code, _, told = cortado_command("optimise", file(DRAG + text), "--out", "out")
+    assert code == 2 and len(told.splitlines()) == 1
+    assert re.search(said, told), told
+
+
+def test_the_package_of_the_page_is_one(tmp_path, monkeypatch):
+    """Its two files, and the scene, as printed; what pip would make of them is written here."""
+    page = (Path(__file__).parents[1] / "docs" / "own_parts.md").read_text()
+    module, project, table = (
+        re.search(rf"^```{kind}(.*?)^```$", page[page.index("## A package that") :], re.DOTALL | re.MULTILINE)[1]
+        for kind in ("py3\n", r"toml\n(?=\[project)", r"toml\n(?=\[\[force)")
+    )
+    entries = tomllib.loads(project)["project"]["entry-points"]
+    on_path(tmp_path, monkeypatch, name="my-parts", entries=entries)
+    (tmp_path / "my_parts.py").write_text(module)
+    (tmp_path / "scene.toml").write_text(SCENE + OURS + table)
+    assert Simulation(tmp_path / "scene.toml").parameters()["drag.k"] == 3.0
+
+
+def test_the_reference_engine_has_none(file):
+    with pytest.raises(InputError, match=r"scene has \[\[force\]\], but must leave it out for the reference engine"):
+        reference.Simulation(file(DRAG))
