@@ -17,6 +17,7 @@ LAYERS = """
     fixed
     words
     arrays
+    quantities quantities.known
     restart
     io io.file_lock io.files io.folder_lock io.input_files io.interruption io.terminal io.progress
     io.run_environment io.shipped io.srgb io.particle_view io.notebook io.usage io.video io.vtkhdf_layout io.vtkhdf
@@ -39,7 +40,7 @@ LAYERS = """
     discretise.bodies discretise.packing discretise.sampling discretise.discrete_scene
     discretise.distance
     sph sph.density sph.free_energy sph.substeps sph.integration sph.order sph.materials sph.emitter_kernels
-    sph.pair_forces
+    sph.pair_forces sph.vorticity sph.wall_slope
     sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
     sph.gravity sph.makers sph.mixture sph.surface_tension sph.viscosity
     sph.function_text sph.formula sph.packed sph.own_force sph.body sph.pair forces
@@ -53,6 +54,7 @@ LAYERS = """
     executors.executor executors.calls executors.distributed executors.worker_process executors.local executors
     evaluation rollout residual
     parameters.scene_parameters parameters.first_positions parameters.restarts parameters.space
+    quantities.moment quantities.formulas quantities.evaluator
     losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
     losses.positions losses.recorded losses losses.checked image_losses
     gradients.estimator gradients.points gradients.ensemble_members gradients.exact
@@ -68,7 +70,7 @@ LAYERS = """
     shading.painter shading.page shading.labels shading.film shading.scene_view
     outcome
     recorded
-    stepper stepping
+    stepper stepping measuring
     simulation
     forward_pass
     problem

@@ -28,6 +28,7 @@ from cortado.figures.particle_sets import particles
 from cortado.fixed import fixed
 from cortado.io.notebook import with_picture
 from cortado.io.trajectory import Frame, Trajectory
+from cortado.measuring import Measuring
 from cortado.outcome import trouble
 from cortado.parameters.checks import check_sizes
 from cortado.parameters.restarts import one_for_each
@@ -56,7 +57,7 @@ WORTH = {"cpu": 16_000, "cuda": 1_000_000}
 
 
 @fixed
-class Simulation(Stepping):
+class Simulation(Stepping, Measuring):
     """A scene made ready to run: particles sampled, masses calibrated, kernels chosen.
 
     Threads that use it take turns, and other processes can have it, pickled or by a fork: see `docs/processes.md`.

@@ -1,5 +1,6 @@
 """A copy of a problem in float64: in float32 the round-off is far greater than the errors a certificate looks for."""
 
+from dataclasses import replace
 from typing import Any
 
 from cortado.device.precision import FLOAT64
@@ -70,4 +71,7 @@ class Rounded:
     def _rounded(self, end: Snapshot) -> Snapshot:
         state = self._single.solver.new_state()
         state.set(end.state.numpy(end.dimension))
-        return Snapshot(state, end.dimension, end.colours)
+        if end.moment is None:
+            return Snapshot(state, end.dimension, end.colours)
+        single = replace(end.moment, state=state, evaluator=self._single.evaluator, _values={})
+        return Snapshot(state, end.dimension, end.colours, single)
