@@ -54,7 +54,7 @@ LAYERS = """
     executors.executor executors.calls executors.distributed executors.worker_process executors.local executors
     evaluation rollout residual
     parameters.scene_parameters parameters.first_positions parameters.restarts parameters.space
-    quantities.moment quantities.formulas quantities.evaluator
+    quantities.moment quantities.formulas quantities.evaluator quantities.recorder
     losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
     losses.positions losses.recorded losses losses.checked image_losses
     gradients.estimator gradients.points gradients.ensemble_members gradients.exact
@@ -67,7 +67,7 @@ LAYERS = """
     io.trajectory io.trajectory_batch
     shading shading.surface shading.stage shading.shadow shading.surroundings shading.glass shading.meeting
     shading.scenery shading.trace shading.space shading.plane
-    shading.painter shading.page shading.labels shading.film shading.scene_view
+    shading.painter shading.page shading.labels shading.scale shading.film shading.scene_view
     outcome
     recorded
     stepper stepping measuring

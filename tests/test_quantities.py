@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import cortado
+from bad_tasks import TINY_SCENE
+from cortado.cli import main
 from cortado.errors import InputError
 from cortado.quantities.known import NAMES, QUANTITIES
 from finite_differences import distance
@@ -189,3 +191,84 @@ def test_a_trajectory_is_looked_at_frame_by_frame(name):
     ends = cortado.Problem(simulation, 7, Weighted(name, 1.0)).states({"gravity": gravity}, [0, 3, 6, 7])
     for own, end in zip(found, ends.values(), strict=True):
         np.testing.assert_array_equal(own, end[name])
+
+
+@pytest.mark.parametrize("make", [plane, scene, two_layers])
+def test_recorded_quantities_are_those_of_the_states_and_change_no_other_bit(make, tmp_path):
+    simulation = cortado.Simulation(make(), precision="float64")
+    bare, found = simulation.run(6, record_every=2), simulation.run(6, record_every=2, record=NAMES)
+    assert np.array_equal(bare.positions, found.positions) and not bare.quantities
+    for name in NAMES:
+        np.testing.assert_array_equal(found.quantity(name), simulation.quantity(name, found))
+        np.testing.assert_array_equal(found[2][name], found[1:].quantity(name)[1])
+    found.save(tmp_path / "run.vtkhdf")
+    read = cortado.Trajectory.load(tmp_path / "run.vtkhdf")
+    assert read.quantities.keys() == set(NAMES)
+    for name in NAMES:
+        np.testing.assert_array_equal(read.quantity(name), found.quantity(name))
+    bare.save(tmp_path / "bare.vtkhdf")
+    assert not cortado.Trajectory.load(tmp_path / "bare.vtkhdf").quantities
+    np.testing.assert_array_equal(simulation.run(1, state=read.last_state).positions[0], found.positions[-1])
+
+
+def test_recorded_quantities_of_a_batch_are_those_of_its_scenes():
+    simulation = cortado.Simulation(plane())
+    found = simulation.batch_of(2).run(4, {"gravity": [[[0.0, -9.81]], [[1.0, -5.0]]]}, record=["pressure"])
+    for own, gravity in zip(found, ([0.0, -9.81], [1.0, -5.0]), strict=True):
+        alone = simulation.run(4, {"gravity": gravity}, record=["pressure"])
+        np.testing.assert_array_equal(own.quantity("pressure"), alone.quantity("pressure"))
+
+
+def test_what_was_not_recorded_is_told_how():
+    simulation = cortado.Simulation(plane())
+    trajectory = simulation.run(1)
+    np.testing.assert_allclose(trajectory[1]["speed"], np.linalg.norm(trajectory.velocities[1], axis=1))
+    with pytest.raises(InputError, match=r'density was not recorded.*record=\["density"\]'):
+        trajectory[0]["density"]
+    with pytest.raises(InputError, match="quantity is 'rho', but must be one of density"):
+        trajectory.quantity("rho")
+    with pytest.raises(InputError, match="record is 'rho', but must be one of density"):
+        simulation.run(1, record=["rho"])
+    with pytest.raises(InputError, match="record is 'density', but must be a list of names"):
+        simulation.run(1, record="density")
+
+
+def test_the_command_records_what_is_asked_for(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(TINY_SCENE)
+    wished = ["--record", "density", "--record", "vorticity"]
+    plain = ["run", "scene.toml", "--steps", "3", "--no-pictures"]
+    main([*plain, "--out", "looked", *wished])
+    main([*plain, "--out", "plain"])
+    looked, bare = (cortado.Trajectory.load(tmp_path / name / "trajectory.vtkhdf") for name in ("looked", "plain"))
+    assert set(looked.quantities) == {"density", "vorticity"} and not bare.quantities
+    assert np.array_equal(looked.positions, bare.positions)
+    with pytest.raises(SystemExit) as end:
+        main([*plain, "--out", "wrong", "--record", "rho"])
+    assert end.value.code == 2
+    assert "record is 'rho', but must be one of density, pressure" in capsys.readouterr().err
+
+
+def test_pictures_are_coloured_by_a_quantity_on_a_scale():
+    simulation = cortado.Simulation(plane(picture={"width": 160, "height": 120, "colour_by": "vorticity"}))
+    frame = simulation.run(5, record=["vorticity"])[-1]
+    found, plain = simulation.picture(frame), simulation.picture(frame, colour_by=None)
+    assert found.shape == plain.shape == (120, 160, 3)
+    assert np.abs(found - plain).max() > 0.1
+    bar = found[-6, 4:-4]
+    assert np.linalg.norm(bar[0] - bar[-1]) > 0.5
+    with pytest.raises(InputError, match="density was not recorded"):
+        simulation.picture(frame, colour_by="density")
+    with pytest.raises(cortado.SceneError, match="colour_by"):
+        simulation.picture(frame, colour_by="rho")
+
+
+def test_the_pictures_of_a_run_are_coloured_by_what_was_not_recorded_too(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(TINY_SCENE)
+    main(["run", "scene.toml", "--steps", "2", "--no-pictures", "--out", "run"])
+    main(["picture", "run", "--out", "plain.png", "--set", "picture.width=160", "--set", "picture.height=120"])
+    for name in ("speed", "pressure"):
+        sizes = ["--set", "picture.width=160", "--set", "picture.height=120", "--set", f"picture.colour_by={name}"]
+        main(["picture", "run", "--out", f"{name}.png", *sizes])
+        assert (tmp_path / f"{name}.png").read_bytes() != (tmp_path / "plain.png").read_bytes()

@@ -1,6 +1,6 @@
 """What can be read of a simulation's states: quantities of its particles."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -12,10 +12,12 @@ from cortado.lattice.calibration import circulation_factor
 from cortado.parameters.registry import Role, names
 from cortado.parameters.values import OVER_TIME
 from cortado.quantities.evaluator import Evaluator
-from cortado.quantities.known import check_quantity
+from cortado.quantities.known import check_quantity, sizes
 from cortado.quantities.moment import Moment
+from cortado.quantities.recorder import Recorder
 from cortado.restart import RestartState
 from cortado.rollout import Rollout
+from cortado.scene.scene import Scene
 from cortado.stepper import Steppable
 
 FIRST = names(Role.STATE)
@@ -27,6 +29,12 @@ class Measured(Steppable, Protocol):
 
     def rollout(self, steps: int, controls: Mapping[str, Any] | None, state: Any) -> Rollout:
         """A rollout that is ready to go forward."""
+
+    def in_precision(self, precision: str) -> Any:
+        """A single one of the same scene in a precision."""
+
+    def batch_of(self, size: int) -> Any:
+        """The same scene so many times in one launch."""
 
 
 class Measuring:
@@ -48,6 +56,16 @@ class Measuring:
             factor = circulation_factor(own.smoothing, spacing, lattice.support, dimension)
             made = self.__dict__["_evaluator"] = Evaluator(own.solver, dimension, factor)
         return made
+
+    def recorder(self, rollout: Rollout, names: Iterable[str]) -> Recorder:
+        """What computes quantities of a rollout's states while it runs, in arrays of its own."""
+        own = cast(Measured, self)
+
+        def of_another() -> Evaluator:
+            other = own.in_precision(own.precision.name) if own.batch is None else own.batch_of(own.batch)
+            return other.evaluator()
+
+        return Recorder(rollout, names, of_another)
 
     def quantity(
         self,
@@ -81,6 +99,17 @@ class Measuring:
     def _quantity(self, name: str, state: Any, controls: Mapping[str, Any] | None) -> NDArray:
         rollout = cast(Measured, self).rollout(1, controls, state)
         return Moment.of(rollout, 0, rollout.initial, self.evaluator).value(name)
+
+
+def coloured_by(scene: Scene, trajectory: Trajectory, simulation: Callable[[], Measuring]) -> NDArray | None:
+    """(frames, n) what the pictures of a scene colour particles by, recorded or computed by a simulation of it; None
+    where they have the colours of phases."""
+    name = None if scene.picture is None else scene.picture.colour_by
+    if name is None:
+        return None
+    is_there = name == "speed" or name in trajectory.quantities
+    values = trajectory.quantity(name) if is_there else simulation().quantity(name, trajectory)
+    return sizes(name, values, scene.dimension)
 
 
 def _at(controls: Mapping[str, Any] | None, trajectory: Trajectory, frame: int) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from cortado.io.run_folder import RunFolder
 from cortado.io.terminal import say
 from cortado.io.trajectory import Trajectory
 from cortado.io.video import MOST_FRAMES, write_video
+from cortado.measuring import coloured_by
 from cortado.outcome import not_converged_sentence
 from cortado.rollout import Rollout
 from cortado.scene.in_words import scene_in_words
@@ -45,7 +46,8 @@ def write_run_report(
         with keeping(
             lambda: f"the run has ended, and is in {folder.path}; cortado picture {folder.path} --film draws it"
         ):
-            write(run_pictures(scene, trajectory, folder.figures, simulation.device))
+            values = coloured_by(scene, trajectory, lambda: simulation)
+            write(run_pictures(scene, trajectory, folder.figures, simulation.device, values))
 
 
 def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Figures:

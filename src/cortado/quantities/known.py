@@ -2,6 +2,10 @@
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cortado.errors import InputError, shown
 
@@ -42,6 +46,12 @@ QUANTITIES = {
 }
 """Every quantity by its name."""
 NAMES = tuple(QUANTITIES)
+
+
+def sizes(name: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
+    """Numbers (..., n) of a quantity's values, of vectors (..., n, k) their lengths."""
+    is_vector = len(QUANTITIES[name].shape(1, dimension)) == 2
+    return np.linalg.norm(values, axis=-1) if is_vector else values
 
 
 def check_quantity(name: object, what: str = "quantity", others: tuple[str, ...] = ()) -> str:

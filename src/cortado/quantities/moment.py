@@ -1,6 +1,6 @@
 """A state together with what the step after it depends on, and the quantities of both."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -15,10 +15,10 @@ from cortado.rollout import Rollout
 class Evaluates(Protocol):
     """What computes quantities: see `cortado.quantities.evaluator.Evaluator`."""
 
-    def values(self, names: list[str], moment: "Moment") -> Arrays: ...
+    def values(self, names: Iterable[str], moment: "Moment") -> Arrays: ...
 
     def tangents(
-        self, names: list[str], moment: "Moment", dot: Mapping[str, NDArray], parameters_dot: Mapping[str, NDArray]
+        self, names: Iterable[str], moment: "Moment", dot: Mapping[str, NDArray], parameters_dot: Mapping[str, NDArray]
     ) -> Arrays: ...
 
     def adjoint(self, bars: Mapping[str, NDArray], moment: "Moment") -> tuple[Arrays, Arrays]: ...
