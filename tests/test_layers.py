@@ -26,7 +26,7 @@ LAYERS = """
     parameters.tilt parameters.values
     scene scene.fields scene.sentences scene.point_reader scene.points scene.tables
     scene.schedule scene.fluids scene.emitter
-    scene.mixture scene.picture scene.render scene.toml
+    scene.mixture scene.picture scene.sensors scene.render scene.toml
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights
     scene.containers scene.model scene.stability
@@ -55,8 +55,10 @@ LAYERS = """
     evaluation rollout residual
     parameters.scene_parameters parameters.first_positions parameters.restarts parameters.space
     quantities.moment quantities.formulas quantities.evaluator quantities.recorder
+    sensors.sensor sensors.flow_rate sensors.log sensors.pressure_probe sensors.wall_force sensors.wave_gauge
+    sensors.of_scene sensors
     losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
-    losses.positions losses.recorded losses losses.checked image_losses
+    losses.positions losses.recorded losses.series losses losses.checked image_losses
     gradients.estimator gradients.points gradients.ensemble_members gradients.exact
     gradients.filter_kernels gradients.adjoint_filters gradients.filters gradients.left_out gradients.ensemble
     gradients.guided gradients
@@ -70,11 +72,11 @@ LAYERS = """
     shading.painter shading.page shading.labels shading.scale shading.film shading.scene_view
     outcome
     recorded
-    stepper stepping measuring
+    stepper stepping measuring watching
     simulation
     forward_pass
     problem
-    figures.curves figures
+    figures.curves figures.readings figures
     certificate.growth certificate.alignment certificate.perturbations certificate.twin certificate.loss_history
     certificate.horizon
     certificate.consistency certificate.text certificate.certificate certificate certificate.figure

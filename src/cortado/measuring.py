@@ -1,6 +1,6 @@
 """What can be read of a simulation's states: quantities of its particles."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -14,7 +14,6 @@ from cortado.parameters.values import OVER_TIME
 from cortado.quantities.evaluator import Evaluator
 from cortado.quantities.known import check_quantity, sizes
 from cortado.quantities.moment import Moment
-from cortado.quantities.recorder import Recorder
 from cortado.restart import RestartState
 from cortado.rollout import Rollout
 from cortado.scene.scene import Scene
@@ -56,16 +55,6 @@ class Measuring:
             factor = circulation_factor(own.smoothing, spacing, lattice.support, dimension)
             made = self.__dict__["_evaluator"] = Evaluator(own.solver, dimension, factor)
         return made
-
-    def recorder(self, rollout: Rollout, names: Iterable[str]) -> Recorder:
-        """What computes quantities of a rollout's states while it runs, in arrays of its own."""
-        own = cast(Measured, self)
-
-        def of_another() -> Evaluator:
-            other = own.in_precision(own.precision.name) if own.batch is None else own.batch_of(own.batch)
-            return other.evaluator()
-
-        return Recorder(rollout, names, of_another)
 
     def quantity(
         self,

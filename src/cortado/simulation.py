@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from hashlib import sha256
 from importlib import import_module
 from inspect import signature
@@ -44,6 +45,7 @@ from cortado.rollout import Rollout
 from cortado.scene.model import SOLVERS
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene, as_scene
+from cortado.sensors.sensor import Sensor
 from cortado.shading.painter import colours_of, painter
 from cortado.shading.scale import Scale
 from cortado.solvers.build import first_capacity
@@ -52,6 +54,7 @@ from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy
 from cortado.sph.makers import ForceMaker, check_own, checked_makers, known_of
 from cortado.sph.substeps import stable_substeps
 from cortado.stepping import Stepping
+from cortado.watching import Watch
 from cortado.words import counted
 
 WORTH = {"cpu": 16_000, "cuda": 1_000_000}
@@ -181,6 +184,7 @@ class Simulation(Stepping, Measuring):
         record_every: int = 1,
         state: RestartState | Sequence[RestartState] | None = None,
         record: Sequence[str] = (),
+        sensors: Mapping[str, Sensor] | None = None,
     ) -> Trajectory:
         """Run from the scene's first state and return the frames, the first and the last state included; of a batch a
         `TrajectoryBatch`.
@@ -190,33 +194,43 @@ class Simulation(Stepping, Measuring):
         scene, the run goes on from there, with the same bits as if it had not stopped; a parameter over time is then
         one of the steps to come, and a rest density that the earlier run was given is given again. A batch goes on from
         one state for each scene. ``record=["density"]`` keeps quantities of the particles with every frame: see
-        `quantity`. Warns when the pressure did not converge; raises `DivergedError` when a particle is
+        `quantity`. ``sensors`` by name are read in every step, besides those of the scene: see `cortado.sensors`. Warns
+        when the pressure did not converge; raises `DivergedError` when a particle is
         lost, where a batch warns, and goes on without the scene.
         """
-        return self.collect(self.rollout(steps, controls, state), record_every, record)
+        return self.collect(self.rollout(steps, controls, state), record_every, record, sensors)
 
     @in_turn
-    def collect(self, rollout: Rollout, record_every: int = 1, record: Sequence[str] = ()) -> Trajectory:
+    def collect(
+        self,
+        rollout: Rollout,
+        record_every: int = 1,
+        record: Sequence[str] = (),
+        sensors: Mapping[str, Sensor] | None = None,
+    ) -> Trajectory:
         """Run a rollout forward and return its frames; warnings and errors as of `run`."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
         parts = frame_parts(2 + rollout.steps // record_every, numbers, self.precision.bytes)
         require(parts, "take a larger record_every or fewer steps")
-        look = self.recorder(rollout, record)
-        steps, frames, looks = [0], [self.frame(rollout.initial)], [look(0, rollout.initial)]
+        watch = Watch(self, rollout, record, sensors)
+        steps, frames, looks = [0], [self.frame(rollout.initial)], [watch.frame(0, rollout.initial)]
+        watch.step(0, rollout.initial)
 
         def keep(step: int, state: State) -> None:
             if step % record_every == 0 or step == rollout.steps:
                 steps.append(step)
                 frames.append(self.frame(state))
-                looks.append(look(step, state))
+                looks.append(watch.frame(step, state))
+            watch.step(step, state)
 
         rollout.forward(keep, keep=False)
         for sentence in trouble(rollout, self.scene):
             warnings.warn(sentence, CortadoWarning, stacklevel=5)
         fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
-        own = {name: np.array([one[name] for one in looks]) for name in look.names}
-        return recorded(rollout, np.array(steps), fields, self.constants(rollout), own)  # type: ignore[return-value]  # of a batch
+        own = {name: np.array([one[name] for one in looks]) for name in watch.names}
+        found = recorded(rollout, np.array(steps), fields, self.constants(rollout), own)
+        return replace(found, sensors=watch.readings()) if isinstance(found, Trajectory) else found  # type: ignore[return-value]  # of a batch
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
         """What a trajectory records of a state: the fields that steps change."""

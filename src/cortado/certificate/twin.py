@@ -11,6 +11,7 @@ from cortado.losses import (
     FinalPositions,
     Frames,
     Image,
+    SensorMatch,
     Snapshot,
     SnapshotAdjoint,
 )
@@ -20,7 +21,7 @@ from cortado.problem import Problem
 from cortado.render.renderer import Renderer
 from cortado.simulation import Simulation
 
-ANY_PRECISION = (FinalPositions, CentreOfMass, CentreOfMassAlong)
+ANY_PRECISION = (FinalPositions, CentreOfMass, CentreOfMassAlong, SensorMatch)
 """Losses that take states of either precision."""
 
 

@@ -18,6 +18,7 @@ from cortado.io.notebook import as_text, with_view
 from cortado.io.particle_view import Cloud, particle_view, thinned
 from cortado.quantities.known import QUANTITIES, check_quantity
 from cortado.restart import Clock, Origin, RestartState
+from cortado.sensors.log import Readings
 from cortado.words import counted
 
 IN_A_NOTEBOOK = 1_000_000
@@ -90,6 +91,8 @@ class Trajectory:
     """of which particles it is; None where nothing is known of it"""
     quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """(frames, n) or (frames, n, k) by name: those that were recorded, such as ``density``"""
+    sensors: Mapping[str, Readings] = field(default_factory=dict)
+    """what sensors have read in every step, by their names; it is not in files"""
 
     def __post_init__(self) -> None:
         frames = {len(self.times), len(self.steps), len(self.positions), len(self.velocities)}

@@ -11,6 +11,7 @@ from cortado.arrays import is_whole
 from cortado.device.launching import add
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.device.state import State
+from cortado.discretise.discrete_scene import Lattice
 from cortado.errors import InputError, shown
 from cortado.fixed import FixedDict, fixed
 from cortado.quantities.known import check_quantity
@@ -69,6 +70,11 @@ class Snapshot:
             return _read_only(self.state.numpy(self.dimension, only=[name])[name])
         check_quantity(name, "a field of a state", self.state.names)
         return self._quantity(name)
+
+    @property
+    def lattice(self) -> Lattice:
+        """Constants of the particles at rest, such as their volume."""
+        return moment_of(self).lattice
 
     def _quantity(self, name: str) -> np.ndarray:
         return moment_of(self).value(name)

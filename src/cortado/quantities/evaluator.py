@@ -36,6 +36,8 @@ class Evaluator:
         if not isinstance(solver, ParticleSolver):
             raise InputError("The solver of this scene does not say what lies around its particles: no quantities.")
         self._solver, self._dimension = solver, dimension
+        self.lattice = solver.lattice
+        """Constants of the lattice of particles at rest."""
         self._formulas = formulas(solver, dimension, circulation_factor)
         self._counts: Counts = ()
         """Of the step that was solved last."""

@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.device.state import State
+from cortado.discretise.discrete_scene import Lattice
 from cortado.parameters.values import Arrays
 from cortado.rollout import Rollout
 
 
 class Evaluates(Protocol):
     """What computes quantities: see `cortado.quantities.evaluator.Evaluator`."""
+
+    lattice: Lattice
 
     def values(self, names: Iterable[str], moment: "Moment") -> Arrays: ...
 
@@ -47,6 +50,11 @@ class Moment:
         those of the last step."""
         row = min(step, max(rollout.steps - 1, 0))
         return cls(state, row_of(rollout, rollout.parameters.written, row), rollout.substeps, row, evaluator)
+
+    @property
+    def lattice(self) -> Lattice:
+        """Constants of the lattice of particles at rest."""
+        return self.evaluator().lattice
 
     def value(self, name: str) -> NDArray:
         """A quantity of the state, float64, read-only, of a batch with a first axis for the scenes."""

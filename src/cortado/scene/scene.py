@@ -52,8 +52,8 @@ class Scene(SceneTables):
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
-        """The same without [picture]: what results depend on."""
-        return json.dumps(self.model_dump(mode="json", exclude={"picture"}), indent=2)
+        """The same without [picture] and [[sensor]]: what results depend on."""
+        return json.dumps(self.model_dump(mode="json", exclude={"picture", "sensor"}), indent=2)
 
     @classmethod
     def from_json(cls, text: str | bytes, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":
