@@ -30,6 +30,7 @@ class PressureProbeTable(SensorTable):
     """The mean pressure of the particles around a point."""
 
     kind: Literal["pressure_probe"]
+    """Which sensor it is."""
     position: Vector[Length]
     """(d,) the point [m]."""
     radius: Reach = None
@@ -40,6 +41,7 @@ class WaveGaugeTable(SensorTable):
     """How high the fluid stands at a place: its volume in a column over the column's cross-section."""
 
     kind: Literal["wave_gauge"]
+    """Which sensor it is."""
     position: Vector[Length]
     """(d,) a point of the middle of the column [m]; its height does not matter."""
     floor: Length = 0.0
@@ -52,6 +54,7 @@ class FlowRateTable(SensorTable):
     """Volume of fluid that goes through a plane in a second."""
 
     kind: Literal["flow_rate"]
+    """Which sensor it is."""
     position: Vector[Length]
     """(d,) a point of the plane [m]."""
     normal: Vector[Annotated[float, quantity()]]
@@ -64,6 +67,7 @@ class WallForceTable(SensorTable):
     """The force, and its torque, with which the pressure of the fluid in a region pushes the walls."""
 
     kind: Literal["wall_force"]
+    """Which sensor it is."""
     lower: Corner = None
     """(d,) lower corner of the region [m]; without an end there if left out."""
     upper: Corner = None
