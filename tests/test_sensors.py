@@ -193,3 +193,23 @@ MISTAKES = [
 def test_a_mistake_is_a_sentence(make, words):
     with pytest.raises((InputError, cortado.SceneError), match=words):
         make()
+
+
+def test_a_run_that_diverges_says_where_also_with_sensors(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(TINY_SCENE + TABLES)
+    wild = ["--set", "solver.time_step=0.08", "--set", "forces.gravity=[3000.0, -9000.0]"]
+    told = []
+    for name, more in (("plain", []), ("looked", ["--record", "pressure"])):
+        with pytest.raises(SystemExit) as end:
+            main(["run", "scene.toml", "--steps", "40", "--no-pictures", "--out", name, *wild, *more])
+        assert end.value.code == 1
+        told.append(capsys.readouterr().err.replace(name, "").splitlines()[-1])
+    assert told[0] == told[1]
+    bare = TINY_SCENE
+    (tmp_path / "scene.toml").write_text(bare)
+    with pytest.raises(SystemExit):
+        main(["run", "scene.toml", "--steps", "40", "--no-pictures", "--out", "bare", *wild])
+    assert capsys.readouterr().err.replace("bare", "").splitlines()[-1] == told[0]
+    rows = list(csv.reader((tmp_path / "looked" / "sensors.csv").open()))
+    assert rows[-1][1] == "nan"

@@ -41,7 +41,7 @@ class Watch:
             return (own.in_precision(own.precision.name) if batch is None else own.batch_of(batch)).evaluator()
 
         of_scene = sensors_of(simulation.scene) if simulation.batch is None else {}
-        self._recorder = Recorder(rollout, record, evaluator)
+        self._recorder = Recorder(rollout, record, evaluator, simulation.dimension)
         self._log = SensorLog(of_scene | dict(sensors or {}), simulation.dimension)
         self._rollout, self._dimension, self._evaluator = rollout, simulation.dimension, evaluator
         self._colours = np.array([phase.colour for phase in simulation.scene.phase])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.errors import InputError, shown
+from cortado.errors import DivergedError, InputError, shown
 from cortado.sensors.sensor import Reading, Sensor
 
 
@@ -51,7 +51,14 @@ class SensorLog:
     def read(self, at: Reading) -> None:
         """Have every sensor read a state."""
         for name, sensor in self.sensors.items():
-            self._rows[name].append(np.asarray(sensor.value(at), dtype=np.float64))
+            self._rows[name].append(self._value(name, sensor, at))
+
+    def _value(self, name: str, sensor: Sensor, at: Reading) -> NDArray[Any]:
+        """NaN where the step after the state loses a particle: the run says so where it takes it."""
+        try:
+            return np.asarray(sensor.value(at), dtype=np.float64)
+        except DivergedError:
+            return np.full(len(self._units[name]), np.nan)
 
     def readings(self, times: NDArray[Any]) -> dict[str, Readings]:
         """What was read, at the first of these times [s]."""
