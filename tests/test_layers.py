@@ -17,6 +17,7 @@ LAYERS = """
     fixed
     words
     arrays
+    quantities quantities.known
     restart
     io io.file_lock io.files io.folder_lock io.input_files io.interruption io.terminal io.progress
     io.run_environment io.shipped io.srgb io.particle_view io.notebook io.usage io.video io.vtkhdf_layout io.vtkhdf
@@ -25,7 +26,7 @@ LAYERS = """
     parameters.tilt parameters.values
     scene scene.fields scene.sentences scene.point_reader scene.points scene.tables
     scene.schedule scene.fluids scene.emitter
-    scene.mixture scene.picture scene.render scene.toml
+    scene.mixture scene.picture scene.sensors scene.render scene.toml
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights
     scene.containers scene.entry_points scene.package_tables scene.solvers scene.model scene.stability
@@ -39,7 +40,7 @@ LAYERS = """
     discretise.bodies discretise.packing discretise.sampling discretise.discrete_scene
     discretise.distance
     sph sph.density sph.free_energy sph.substeps sph.integration sph.begin_adjoint sph.order sph.materials
-    sph.emitter_kernels sph.pair_forces
+    sph.emitter_kernels sph.pair_forces sph.vorticity sph.wall_slope
     sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
     sph.gravity sph.makers sph.mixture sph.surface_tension sph.viscosity
     sph.function_text sph.formula sph.packed sph.formula_kernels sph.own_force sph.body sph.pair forces
@@ -53,8 +54,11 @@ LAYERS = """
     executors.executor executors.calls executors.distributed executors.worker_process executors.local executors
     checkpoints evaluation rollout residual
     parameters.scene_parameters parameters.first_positions parameters.restarts parameters.space
+    quantities.moment quantities.formulas quantities.evaluator quantities.recorder
+    sensors.sensor sensors.flow_rate sensors.log sensors.pressure_probe sensors.wall_force sensors.wave_gauge
+    sensors.of_scene sensors
     losses.image_losses losses.loss losses.batch losses.centre_of_mass losses.image losses.matching
-    losses.positions losses.recorded losses losses.checked image_losses
+    losses.positions losses.recorded losses.series losses losses.checked image_losses
     gradients.estimator gradients.points gradients.ensemble_members gradients.exact
     gradients.filter_kernels gradients.adjoint_filters gradients.filters gradients.left_out gradients.ensemble
     gradients.guided gradients
@@ -65,14 +69,14 @@ LAYERS = """
     io.trajectory io.trajectory_batch
     shading shading.surface shading.stage shading.shadow shading.surroundings shading.glass shading.meeting
     shading.scenery shading.trace shading.space shading.plane
-    shading.painter shading.page shading.labels shading.film shading.scene_view
+    shading.painter shading.page shading.labels shading.scale shading.film shading.scene_view
     outcome
     recorded
-    host_states device_states stepper stepping
+    host_states device_states stepper stepping measuring watching
     simulation
     forward_pass
     problem
-    figures.curves figures
+    figures.curves figures.readings figures
     certificate.growth certificate.alignment certificate.perturbations certificate.twin certificate.loss_history
     certificate.horizon
     certificate.consistency certificate.text certificate.certificate certificate certificate.figure

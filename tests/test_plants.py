@@ -44,6 +44,7 @@ ELSEWHERE = {
     "sph.body": "made from functions of users, which scenes do not have: tests/test_own_functions.py",
     "sph.pair": "the same",
     "sph.begin_adjoint": "for solvers from outside, as PCISPH has a kernel of its own: tests/test_solver.py",
+    "sph.vorticity": "of a quantity, which no loss of these scenes sees: tests/test_quantities.py",
     "solvers.pcisph.frozen_pressure": "an estimator that is not exact: tests/test_estimators.py",
 }
 """Modules with functions of adjoints that no plant is in, and why."""

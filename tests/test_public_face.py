@@ -9,7 +9,7 @@ import pytest
 
 import cortado
 
-MODULES = ("executors", "gradients", "image_losses", "losses", "optimisers", "pictures", "render")
+MODULES = ("executors", "gradients", "image_losses", "losses", "optimisers", "pictures", "render", "sensors")
 ROOT = Path(__file__).parents[1]
 NAMED = {
     name

@@ -51,6 +51,7 @@ LINKS = {
     "force": ("[tables](#forces-of-packages-force)", "Forces of installed packages, which act besides."),
     "schedule": ("[table](#changes-over-time-schedule)", "What changes while the scene runs."),
     "solver": ("[table](#time-steps-solver)", "How a step is solved."),
+    "sensor": ("[tables](#sensors-sensor)", "What is read of the fluid in every step."),
     "render": ("[table](#pictures-render)", "How pictures are taken."),
     "picture": ("[table](#shaded-pictures-picture)", "How shaded pictures and films are made."),
 }
@@ -227,6 +228,33 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "",
                 "[solver]\ntime_step = 0.002\nminimum_iterations = 3\nmaximum_iterations = 100\n"
                 "density_tolerance = 0.001",
+            ),
+        ),
+    ),
+    (
+        "## Sensors: `[[sensor]]`",
+        "What `cortado run` reads of the fluid in every step and writes to `sensors.csv` ([sensors](sensors.md)). "
+        "`kind` decides which other keys a sensor has.",
+        (
+            (
+                "PressureProbeTable",
+                "### A pressure probe",
+                '[[sensor]]\nkind = "pressure_probe"\nname = "probe"\nposition = [0.2, 0.1, 0.25]',
+            ),
+            (
+                "WaveGaugeTable",
+                "### A wave gauge",
+                '[[sensor]]\nkind = "wave_gauge"\nname = "gauge"\nposition = [0.25, 0.0, 0.25]\nradius = 0.2',
+            ),
+            (
+                "FlowRateTable",
+                "### A flow through a plane",
+                '[[sensor]]\nkind = "flow_rate"\nname = "flow"\nposition = [0.6, 0.0, 0.0]\nnormal = [1.0, 0.0, 0.0]',
+            ),
+            (
+                "WallForceTable",
+                "### The force on walls",
+                '[[sensor]]\nkind = "wall_force"\nname = "left wall"\nupper = [0.5, 1.0, 0.5]',
             ),
         ),
     ),

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from cortado import optimisers as optimisers
     from cortado import pictures as pictures
     from cortado import render as render
+    from cortado import sensors as sensors
     from cortado.certificate import certify as certify
     from cortado.errors import ComputationError as ComputationError
     from cortado.errors import CortadoError as CortadoError
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_MODULES = ("executors", "forces", "gradients", "image_losses", "losses", "optimisers", "pictures", "render")
+_MODULES = ("executors", "forces", "gradients", "image_losses", "losses", "optimisers", "pictures", "render", "sensors")
 _HOMES = {
     "ComputationError": "errors",
     "CortadoError": "errors",

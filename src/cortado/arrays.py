@@ -1,6 +1,6 @@
 """Numbers that a user gives in whatever form, as arrays in float64; and what is no number, in a sentence."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from numbers import Real
 from typing import Any
 
@@ -124,3 +124,10 @@ def _is_masked(value: Any) -> bool:
 
 def _is_real(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def require_names(what: str, names: Any) -> list[Any]:
+    """Several names, as a list; raises `InputError` for one text alone, whose letters would be taken for names."""
+    if isinstance(names, (str, bytes)) or not isinstance(names, Iterable):
+        raise InputError(f"{what} is {shown(names)}, but must be a list of names.")
+    return list(names)

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from cortado.device.memory import require
-from cortado.device.state import State
+from cortado.device.state import Parameters, State
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import InputError
 from cortado.gradients import AdjointEstimator
 from cortado.losses import SnapshotAdjoint
+from cortado.losses.loss import StepBar
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import Arrays
 from cortado.residual import Residual, without_lost
@@ -79,7 +80,19 @@ class ForwardPass:
 
     def _first_adjoint(self, derivative: BackwardStep, observe: Observer | None = None) -> State:
         self._residual.bring_back()
-        return self.rollout.backward(derivative, {step: bar.state for step, bar in self._bars.items()}, observe)
+        first = self.rollout.backward(derivative, {step: bar.state for step, bar in self._bars.items()}, observe)
+        for own in (bar.step for bar in self._bars.values()):
+            if own is not None:
+                self._add(own, derivative.parameters())
+        return first
+
+    def _add(self, own: StepBar, total: Parameters) -> None:
+        """Add adjoints of the parameters of one step to those of all steps."""
+        over_time = self.rollout.solver.layout.known.over_time
+        for name, bar in own.parameters.items():
+            whole = total[name].numpy()
+            (whole[:, own.row : own.row + 1] if name in over_time else whole)[...] += bar
+            total[name].assign(whole)
 
     def _gradient(self, derivative: BackwardStep, first: State) -> Arrays:
         bars, values = self._bars, self._values

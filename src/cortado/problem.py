@@ -18,10 +18,11 @@ from cortado.gradients.estimator import checked_reverse
 from cortado.io.trajectory import noted
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch, batch, fingerprint
 from cortado.losses.checked import as_loss
-from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
+from cortado.losses.loss import Adjoint, by_field, moment_of
 from cortado.parameters.restarts import one_for_each
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import NAMES, UNITS, Arrays, Values, require_points
+from cortado.quantities.moment import Moment, row_of
 from cortado.residual import Residual
 from cortado.restart import RestartState
 from cortado.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
@@ -166,7 +167,8 @@ class Problem:
         values = self._checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself
-        loss, bars = self._judged(ends)
+        loss, found = self._judged(ends)
+        bars = {step: bar.through_quantities(ends[step]) for step, bar in found.items()}
         return ForwardPass(loss, residual, values, bars, self._space, self._derivatives)
 
     @in_turn
@@ -193,6 +195,8 @@ class Problem:
         for step in sorted(dots):
             bar = bars[step].state.numpy(3)
             terms += [product(bar[name], d) for name, d in dots[step].items()]
+            more = self.along(ends[step], bars[step].quantities, dots[step], parameters, directions)
+            terms += [product(bars[step].quantities[name], d) for name, d in more.items()]
         return sum(terms) + 0.0 * loss if leading else float(sum(terms))
 
     @in_turn
@@ -208,6 +212,17 @@ class Problem:
         ends = self._ends(values, self._checked_steps(steps), keep=False, varied=along)
         self._rollout.tangent(*self._space.direction(self._rollout, values, along), observe)
         return ends
+
+    @in_turn
+    def along(self, end: Any, quantities: Iterable[str], dot: Arrays, parameters: Values, directions: Values) -> Arrays:
+        """Tangents of quantities of a state of the last run under these parameters, by name, along ``dot``, the state's
+        own tangent by fields, and ``directions`` of the parameters."""
+        names = list(quantities)
+        if not names:
+            return {}
+        values, along = self._checked(parameters), self._space.checked(directions, "direction")
+        moment, rows = moment_of(end), self._space.direction(self._rollout, values, along)[1].written
+        return moment.tangents(names, dot, row_of(self._rollout, rows, moment.row))
 
     @property
     def lost(self) -> Mapping[int, DivergedError]:
@@ -301,14 +316,19 @@ class Problem:
 
         def observe(step: int, state: State) -> None:
             if step in wanted and state.batch is None:
-                ends[step] = Snapshot(state.copy(), dimension, colours[0])
+                ends[step] = Snapshot(kept := state.copy(), dimension, colours[0], self._moment(step, kept))
             elif step in wanted:
-                ends[step] = SnapshotBatch(state.copy(), dimension, np.array(colours))
+                kept = state.copy()
+                ends[step] = SnapshotBatch(kept, dimension, np.array(colours), self._moment(step, kept))
 
         self._space.begin(self._rollout, values, varied, self._states)
         observe(0, self._rollout.initial)
         self._rollout.forward(observe, keep)
         return ends
+
+    def _moment(self, step: int, state: State) -> Moment:
+        """What quantities of a state after so many steps follow from."""
+        return Moment.of(self._rollout, step, state, self.simulation.evaluator)
 
     @property
     def _going(self) -> list[int]:
@@ -336,6 +356,7 @@ class Problem:
         no_colours = np.zeros_like(end.colours)
         if isinstance(bar, State):
             return SnapshotAdjoint(bar, no_colours)
-        state = self.simulation.solver.new_state()
-        state.set(dict(zip(ADJOINT_FIELDS, bar, strict=False)))
-        return SnapshotAdjoint(state, no_colours)
+        state, arrays = self.simulation.solver.new_state(), by_field(bar, end.dimension)
+        state.set(arrays)
+        of_quantities = {name: array for name, array in arrays.items() if name not in state.names}
+        return SnapshotAdjoint(state, no_colours, of_quantities)

@@ -10,9 +10,11 @@ from cortado.parameters.values import Arrays
 from cortado.rollout import Rollout
 
 
-def recorded(rollout: Rollout, steps: np.ndarray, fields: Arrays, constants: Arrays) -> Trajectory | TrajectoryBatch:
+def recorded(
+    rollout: Rollout, steps: np.ndarray, fields: Arrays, constants: Arrays, quantities: Arrays
+) -> Trajectory | TrajectoryBatch:
     """Of fields (frames, ...) after so many steps (frames,), in a batch (frames, batch, ...), and of the fields of the
-    rollout's states that no step changes."""
+    rollout's states that no step changes, with ``quantities`` (frames, ...) of the same frames."""
 
     def one(number: int, kept: slice, at: tuple[Any, ...]) -> Trajectory:
         own = {name: array[kept][at] for name, array in fields.items()}
@@ -28,6 +30,7 @@ def recorded(rollout: Rollout, steps: np.ndarray, fields: Arrays, constants: Arr
             constants={name: array[at[1:]] for name, array in constants.items()},
             substeps=rollout.substeps,
             origin=rollout.origins[number],
+            quantities={name: array[kept][at] for name, array in quantities.items()},
         )
 
     batch = rollout.solver.layout.batch

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from hashlib import sha256
 from math import isqrt, prod
 from os import PathLike
@@ -26,12 +27,14 @@ from cortado.figures.particle_sets import particles
 from cortado.fixed import fixed
 from cortado.io.notebook import with_picture
 from cortado.io.trajectory import Frame, Trajectory
+from cortado.measuring import Measuring
 from cortado.outcome import trouble
 from cortado.parameters.checks import check_sizes
 from cortado.parameters.restarts import one_for_each
 from cortado.parameters.scene_parameters import SceneParameters
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import scene_values
+from cortado.quantities.known import sizes
 from cortado.recorded import recorded
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer
@@ -40,7 +43,9 @@ from cortado.rollout import Rollout
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.solvers import OWN
+from cortado.sensors.sensor import Sensor
 from cortado.shading.painter import colours_of, painter
+from cortado.shading.scale import Scale
 from cortado.solvers.build import first_capacity
 from cortado.solvers.makers import SolverMaker, SolverSetting, built, called, checked_solver
 from cortado.solvers.named import forces_named, solver_named
@@ -49,6 +54,7 @@ from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy
 from cortado.sph.makers import ForceMaker, check_own, checked_makers, known_of
 from cortado.sph.substeps import stable_substeps
 from cortado.stepping import Stepping
+from cortado.watching import Watch
 from cortado.words import counted
 
 WORTH = {"cpu": 16_000, "cuda": 1_000_000}
@@ -56,7 +62,7 @@ WORTH = {"cpu": 16_000, "cuda": 1_000_000}
 
 
 @fixed
-class Simulation(Stepping):
+class Simulation(Stepping, Measuring):
     """A scene made ready to run: particles sampled, masses calibrated, kernels chosen.
 
     Threads that use it take turns, and other processes can have it, pickled or by a fork: see `docs/processes.md`.
@@ -182,6 +188,8 @@ class Simulation(Stepping):
         controls: Mapping[str, Any] | None = None,
         record_every: int = 1,
         state: RestartState | Sequence[RestartState] | None = None,
+        record: Sequence[str] = (),
+        sensors: Mapping[str, Sensor] | None = None,
     ) -> Trajectory:
         """Run from the scene's first state and return the frames, the first and the last state included; of a batch a
         `TrajectoryBatch`.
@@ -190,30 +198,44 @@ class Simulation(Stepping):
         does any other parameter of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same
         scene, the run goes on from there, with the same bits as if it had not stopped; a parameter over time is then
         one of the steps to come, and a rest density that the earlier run was given is given again. A batch goes on from
-        one state for each scene. Warns when the pressure did not converge; raises `DivergedError` when a particle is
+        one state for each scene. ``record=["density"]`` keeps quantities of the particles with every frame: see
+        `quantity`. ``sensors`` by name are read in every step, besides those of the scene: see `cortado.sensors`. Warns
+        when the pressure did not converge; raises `DivergedError` when a particle is
         lost, where a batch warns, and goes on without the scene.
         """
-        return self.collect(self.rollout(steps, controls, state), record_every)
+        return self.collect(self.rollout(steps, controls, state), record_every, record, sensors)
 
     @in_turn
-    def collect(self, rollout: Rollout, record_every: int = 1) -> Trajectory:
+    def collect(
+        self,
+        rollout: Rollout,
+        record_every: int = 1,
+        record: Sequence[str] = (),
+        sensors: Mapping[str, Sensor] | None = None,
+    ) -> Trajectory:
         """Run a rollout forward and return its frames; warnings and errors as of `run`."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
         parts = frame_parts(2 + rollout.steps // record_every, numbers, self.precision.bytes)
         require(parts, "take a larger record_every or fewer steps")
-        steps, frames = [0], [self.frame(rollout.initial)]
+        watch = Watch(self, rollout, record, sensors)
+        steps, frames, looks = [0], [self.frame(rollout.initial)], [watch.frame(0, rollout.initial)]
+        watch.step(0, rollout.initial)
 
         def keep(step: int, state: State) -> None:
             if step % record_every == 0 or step == rollout.steps:
                 steps.append(step)
                 frames.append(self.frame(state))
+                looks.append(watch.frame(step, state))
+            watch.step(step, state)
 
         rollout.forward(keep, keep=False)
         for sentence in trouble(rollout, self.scene):
             warnings.warn(sentence, CortadoWarning, stacklevel=5)
         fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
-        return recorded(rollout, np.array(steps), fields, self.constants(rollout))  # type: ignore[return-value]  # of a batch
+        own = {name: np.array([one[name] for one in looks]) for name in watch.names}
+        found = recorded(rollout, np.array(steps), fields, self.constants(rollout), own)
+        return replace(found, sensors=watch.readings()) if isinstance(found, Trajectory) else found  # type: ignore[return-value]  # of a batch
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
         """What a trajectory records of a state: the fields that steps change."""
@@ -279,15 +301,20 @@ class Simulation(Stepping):
 
         Raises:
             SceneError: settings that do not fit.
-            InputError: pysplashsurf is missing, for the surface of a liquid in 3-D.
+            InputError: pysplashsurf is missing, for the surface of a liquid in 3-D; or the frame has not recorded what
+                ``colour_by`` names.
         """
         if not isinstance(frame, Frame):
             raise InputError(f"frame is {shown(frame)}, but must be one frame of a trajectory, such as trajectory[-1].")
         given = {} if self.scene.picture is None else self.scene.picture.model_dump()
         table = Picture(**{**given, **settings}).in_dimension(self.dimension, ("picture",))
         scene = self.scene.model_copy(update={"picture": table})
-        colours = colours_of(scene, frame.mass_fractions, self.particles)
-        return painter(scene, frame.positions, self.device).image(frame.positions, colours)
+        draws = painter(scene, frame.positions, self.device)
+        if table.colour_by is None:
+            return draws.image(frame.positions, colours_of(scene, frame.mass_fractions, self.particles))
+        values = sizes(table.colour_by, frame[table.colour_by], self.dimension)
+        scale = Scale.of(table.colour_by, values)
+        return scale.beside(draws.image(frame.positions, scale.colours(values)))
 
     def parameters(self) -> dict[str, np.ndarray]:
         """Every parameter of `Problem` as the scene and forces have it, without what its schedule changes."""

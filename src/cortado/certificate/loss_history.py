@@ -103,16 +103,19 @@ class LossHistory:
     def tangent(self, parameters: Arrays, along: Arrays) -> Tangent:
         """Derivatives along a direction, which names all or some of the parameters."""
         dots: dict[int, Arrays] = {}
+        dimension = self.problem.simulation.dimension
 
         def observe(step: int, dot: State) -> None:
             if step in self._losses:
-                dots[step] = dot.numpy(self.problem.simulation.dimension)
+                dots[step] = dot.numpy(dimension)
 
         ends = self.problem.tangents(parameters, along, observe, self._losses)
         slopes, strain = [], []
         for step, loss in self._losses.items():
             _, bar = loss.value_and_adjoint(ends[step])
-            slopes.append(_product(bar, dots[step]) + _of_colours(bar, along))
+            wanted = [name for name in by_field(bar, dimension) if name not in dots[step]]
+            more = self.problem.along(ends[step], wanted, dots[step], parameters, along)
+            slopes.append(_product(bar, dots[step] | more) + _of_colours(bar, along))
             strain.append(_strain(ends[step].positions, dots[step]["positions"]))
         return Tangent(self._judged(ends), self._total(slopes), np.array(strain))
 
@@ -134,6 +137,8 @@ def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
     old, new = (end.state.numpy(end.dimension) for end in ends)
     distance, colours = {name: new[name] - old[name] for name in new}, {"colours": after.colours - before.colours}
     bars = [loss.value_and_adjoint(end)[1] for end in ends]
+    beyond = {name for bar in bars for name in by_field(bar, before.dimension) if name not in distance}
+    distance |= {name: after[name] - before[name] for name in beyond}
     return 0.5 * sum(_product(bar, distance) + _of_colours(bar, colours) for bar in bars)
 
 

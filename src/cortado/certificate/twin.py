@@ -1,5 +1,6 @@
 """A copy of a problem in float64: in float32 the round-off is far greater than the errors a certificate looks for."""
 
+from dataclasses import replace
 from typing import Any
 
 from cortado.device.precision import FLOAT64
@@ -10,6 +11,7 @@ from cortado.losses import (
     FinalPositions,
     Frames,
     Image,
+    SensorMatch,
     Snapshot,
     SnapshotAdjoint,
 )
@@ -19,7 +21,7 @@ from cortado.problem import Problem
 from cortado.render.renderer import Renderer
 from cortado.simulation import Simulation
 
-ANY_PRECISION = (FinalPositions, CentreOfMass, CentreOfMassAlong)
+ANY_PRECISION = (FinalPositions, CentreOfMass, CentreOfMassAlong, SensorMatch)
 """Losses that take states of either precision."""
 
 
@@ -70,4 +72,7 @@ class Rounded:
     def _rounded(self, end: Snapshot) -> Snapshot:
         state = self._single.solver.new_state()
         state.set(end.state.numpy(end.dimension))
-        return Snapshot(state, end.dimension, end.colours)
+        if end.moment is None:
+            return Snapshot(state, end.dimension, end.colours)
+        single = replace(end.moment, state=state, evaluator=self._single.evaluator, _values={})
+        return Snapshot(state, end.dimension, end.colours, single)

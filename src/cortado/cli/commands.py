@@ -86,6 +86,7 @@ def run(
     record_every: int = 1,
     overwrite: Flag = False,
     pictures: Flag = True,
+    record: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (),
 ) -> Work:
     """Run a scene forward and write its trajectory.
 
@@ -99,12 +100,17 @@ def run(
         record_every: Steps from one frame of the trajectory to the next.
         overwrite: Replace an earlier run in the same folder.
         pictures: Leave out the shaded pictures and the film.
+        record: A quantity of the particles for the trajectory, such as density, pressure or vorticity; may be given
+            again.
     """
     require_at_least(1, record_every, "--record-every")
     from cortado.commands.run import run_scene
 
     words, told = as_text(overrides), command_line()
-    return partial(run_scene, scene, steps, out, words, device, precision, record_every, overwrite, told, pictures)
+    wanted = as_text(record)
+    return partial(
+        run_scene, scene, steps, out, words, device, precision, record_every, overwrite, told, pictures, wanted
+    )
 
 
 @command(app, answers=True)

@@ -6,8 +6,10 @@ from cortado.errors import InputError
 from cortado.io.pictures import write_picture
 from cortado.io.run_folder import RunFolder
 from cortado.io.trajectory import Trajectory
+from cortado.measuring import coloured_by
 from cortado.scene.picture import Picture
 from cortado.shading.film import film, lacking, run_page
+from cortado.simulation import Simulation
 
 
 def draw_run(run: Path, frame: int, as_film: bool, out: Path | None, overrides: list[str], device: str) -> str:
@@ -24,7 +26,7 @@ def draw_run(run: Path, frame: int, as_film: bool, out: Path | None, overrides: 
     missing = lacking(scene)
     if missing:
         raise InputError(missing)
-    page = run_page(scene, trajectory, device)
+    page = run_page(scene, trajectory, device, coloured_by(scene, trajectory, lambda: Simulation(scene, device)))
     if as_film:
         path = out or folder.figures / "film.mp4"
         film(path, page, range(len(trajectory)), (scene.picture or Picture()).film_frames or None)

@@ -1,40 +1,51 @@
 """The report of ``cortado run``, at first without shaded pictures, which take long, then with them."""
 
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from cortado.figures import density_errors, images, particles
+from cortado.figures.readings import readings
 from cortado.io.interruption import keeping
 from cortado.io.report import Figures, Section, write_report
 from cortado.io.run_folder import RunFolder
 from cortado.io.terminal import say
 from cortado.io.trajectory import Trajectory
 from cortado.io.video import MOST_FRAMES, write_video
+from cortado.measuring import coloured_by
 from cortado.outcome import not_converged_sentence
 from cortado.rollout import Rollout
 from cortado.scene.in_words import scene_in_words
 from cortado.scene.scene import Scene
+from cortado.sensors.log import Readings
 from cortado.shading.film import lacking, run_pictures
 from cortado.shading.scene_view import trajectory_view
 from cortado.simulation import Simulation
 
 
 def write_run_report(
-    simulation: Simulation, rollout: Rollout, folder: RunFolder, told: Section, pictures: bool
+    simulation: Simulation,
+    rollout: Rollout,
+    folder: RunFolder,
+    told: Section,
+    pictures: bool,
+    read: Mapping[str, Readings] | None = None,
 ) -> None:
-    """Write the report, and shaded ``pictures`` too if wished; ``told``: what came out."""
+    """Write the report, and shaded ``pictures`` too if wished; ``told``: what came out; ``read``: by sensors."""
     scene, trajectory = simulation.scene, Trajectory.load(folder.trajectory)
     asked = Section("What was asked", _asked(simulation, rollout))
     view = Section("To turn and to play", view=trajectory_view(scene, trajectory))
     figures, solver = _figures(simulation, trajectory, folder.figures), _solver(rollout, trajectory, scene, folder)
 
+    sensors = [_sensors(read, folder)] if read else []
+
     def write(shaded: Figures) -> None:
         films = [(caption, path) for caption, path in shaded if Path(path).suffix == ".mp4"]
         stills = [pair for pair in shaded if pair not in films]
         looks = Section("What it looks like", figures=films)
-        chapters = [asked, looks, view, told, Section("Pictures", figures=[*stills, *figures]), solver]
+        chapters = [asked, looks, view, told, *sensors, Section("Pictures", figures=[*stills, *figures]), solver]
         write_report(folder, scene.name, chapters)
 
     write([])
@@ -45,7 +56,8 @@ def write_run_report(
         with keeping(
             lambda: f"the run has ended, and is in {folder.path}; cortado picture {folder.path} --film draws it"
         ):
-            write(run_pictures(scene, trajectory, folder.figures, simulation.device))
+            values = coloured_by(scene, trajectory, lambda: simulation)
+            write(run_pictures(scene, trajectory, folder.figures, simulation.device, values))
 
 
 def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Figures:
@@ -80,6 +92,13 @@ def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], 
         frames = range(0, len(trajectory.times), -(-len(trajectory.times) // MOST_FRAMES))
         figures.append(("The same, in motion.", write_video(folder / "run.mp4", map(image, frames), 20)))
     return figures
+
+
+def _sensors(read: Mapping[str, Readings], folder: RunFolder) -> Section:
+    """What sensors have read."""
+    path = readings(read, folder.figures / "sensors.png")
+    told = f"The sensors of the scene, read in every step; the numbers are in {folder.sensors.name}."
+    return Section("Sensors", [told], figures=[("What the sensors read.", path)])
 
 
 def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:

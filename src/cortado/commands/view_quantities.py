@@ -18,7 +18,7 @@ from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.pcisph.steps import PcisphSteps
 
-UNITS = {"speed": "m/s", "density": "kg/m³", "pressure": "Pa"}
+UNITS = {"speed": "m/s", "density": "kg/m³", "pressure": "Pa", "vorticity": "1/s", "wall_force": "N"}
 """Of what every state has."""
 HEIGHT_UNITS = {**UNITS, PULL: "m/m"}
 """The same, where the loss is the height of the centre of mass."""
@@ -35,7 +35,14 @@ def quantities_of(
         "speed": lambda: np.linalg.norm(velocities, axis=1),
         "density": lambda: densities(simulation().rollout(1, controls, state)),
         "pressure": lambda: pressures(simulation().rollout(1, controls, state)),
+        "vorticity": lambda: sizes_of(simulation().quantity("vorticity", state, controls)),
+        "wall_force": lambda: sizes_of(simulation().quantity("wall_force", state, controls)),
     }
+
+
+def sizes_of(values: np.ndarray) -> np.ndarray:
+    """(n,) numbers as they are, or the lengths of vectors (n, k)."""
+    return values if values.ndim == 1 else np.linalg.norm(values, axis=-1)
 
 
 def densities(rollout: Rollout) -> np.ndarray:

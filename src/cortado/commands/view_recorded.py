@@ -2,11 +2,12 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from cortado.commands.view_quantities import HEIGHT_UNITS, pull_on_height, quantities_of
+from cortado.commands.view_quantities import HEIGHT_UNITS, pull_on_height, quantities_of, sizes_of
 from cortado.commands.view_window import Shown, Window
 from cortado.io.trajectory import Trajectory
 from cortado.parameters.values import OVER_TIME
@@ -72,6 +73,8 @@ class RecordedView:
         colours = colours_of(self.scene, frame.mass_fractions, self.trajectory.particles)
         state, controls = self.trajectory[: k + 1].last_state, self._controls_at(k)
         quantities = quantities_of(frame.velocities, self._simulation, state, controls)
+        recorded = {name: sizes_of(values) for name, values in frame.quantities.items()}
+        quantities |= {name: partial(np.asarray, values) for name, values in recorded.items()}
         pull = (lambda: self._pulls[k]) if len(self._pulls) else pull_on_height(self._simulation, state, controls)
         self.window.show(Shown(frame.positions, colours, quantities, pull))
 

@@ -20,6 +20,7 @@ from cortado.optimisation.replay_log import FILE_NAME
 from cortado.parameters.values import NAMES
 from cortado.scene.picture import MOST_FRAMES
 from cortado.scene.scene import Scene
+from cortado.sensors.log import Readings, as_csv
 
 _FORMAT = 2
 """Of run folders, in environment.json; of those before it says nothing."""
@@ -27,7 +28,7 @@ _RESUMABLE = "optimise"
 """The command that has --resume."""
 _LARGEST = 2**31
 """Bytes of a file that is read again when a run goes on."""
-_FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "result.json")
+_FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "result.json", "sensors.csv")
 _FOLDERS = ("checkpoint", "figures")
 _PICTURES = ("particles", "rendered", "density_errors", "loss", "images", "progress", *NAMES)
 _SHADED = ("first", "last", "picture", "found", "search")
@@ -159,6 +160,16 @@ class RunFolder:
     def trajectory(self) -> Path:
         """The recorded frames (VTKHDF)."""
         return self.path / "trajectory.vtkhdf"
+
+    @property
+    def sensors(self) -> Path:
+        """sensors.csv: what sensors read in every step; only where the scene has some."""
+        return self.path / "sensors.csv"
+
+    def write_sensors(self, readings: Mapping[str, Readings]) -> None:
+        """Writes sensors.csv, whole or not at all; nothing without sensors."""
+        if readings:
+            write_atomically(self.sensors, as_csv(readings))
 
     @property
     def checkpoint(self) -> Path:
@@ -293,8 +304,9 @@ def _asked_for(scene_json: str) -> str:
 
 
 def _computed(scene: Any) -> Any:
-    """A scene without what changes only how it is shown."""
-    return {name: table for name, table in scene.items() if name != "picture"} if isinstance(scene, dict) else scene
+    """A scene without what changes only how it is shown, and what is read of it."""
+    shown = ("picture", "sensor")
+    return {name: table for name, table in scene.items() if name not in shown} if isinstance(scene, dict) else scene
 
 
 def _finite(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from operator import index
 from pathlib import Path
@@ -16,7 +16,9 @@ from cortado.io import vtkhdf
 from cortado.io.input_files import as_path
 from cortado.io.notebook import as_text, with_view
 from cortado.io.particle_view import Cloud, particle_view, thinned
+from cortado.quantities.known import QUANTITIES, check_quantity
 from cortado.restart import Clock, Origin, RestartState
+from cortado.sensors.log import Readings
 from cortado.words import counted
 
 IN_A_NOTEBOOK = 1_000_000
@@ -37,6 +39,18 @@ class Frame:
     """(n, phases) [-]; None with one phase"""
     time: float
     """[s]"""
+    quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """(n,) or (n, k) by name: those that were recorded, such as ``density``"""
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """A quantity of the particles by its name, one that was recorded or the speed.
+
+        Raises:
+            InputError: it was not recorded, or there is no such quantity.
+        """
+        if name == "speed" and name not in self.quantities:
+            return np.linalg.norm(self.velocities, axis=1)
+        return chosen(self.quantities, name)
 
     def __repr__(self) -> str:
         return f"Frame({counted(len(self.positions), 'particle')}, t = {self.time:.4g} s)"
@@ -75,6 +89,10 @@ class Trajectory:
     """[-] explicit steps of diffusion within each step"""
     origin: Origin | None = None
     """of which particles it is; None where nothing is known of it"""
+    quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """(frames, n) or (frames, n, k) by name: those that were recorded, such as ``density``"""
+    sensors: Mapping[str, Readings] = field(default_factory=dict)
+    """what sensors have read in every step, by their names; it is not in files"""
 
     def __post_init__(self) -> None:
         frames = {len(self.times), len(self.steps), len(self.positions), len(self.velocities)}
@@ -134,7 +152,19 @@ class Trajectory:
         if place not in range(-len(self), len(self)):
             raise IndexError(f"frame {place} is asked for, but there are {len(self)} frames.")
         fractions = None if self.mass_fractions is None else self.mass_fractions[place]
-        return Frame(self.positions[place], self.velocities[place], fractions, float(self.times[place]))
+        own = {name: array[place] for name, array in self.quantities.items()}
+        return Frame(self.positions[place], self.velocities[place], fractions, float(self.times[place]), own)
+
+    def quantity(self, name: str) -> NDArray[Any]:
+        """(frames, n) or (frames, n, k) a quantity of the particles, one that was recorded or the speed; that of any
+        other `Simulation.quantity` computes.
+
+        Raises:
+            InputError: it was not recorded, or there is no such quantity.
+        """
+        if name == "speed" and name not in self.quantities:
+            return np.linalg.norm(self.velocities, axis=2)
+        return chosen(self.quantities, name)
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
@@ -143,8 +173,10 @@ class Trajectory:
         """The trajectory of some frames."""
         names = ("times", "steps", "positions", "velocities", "mass_fractions")
         arrays = {name: getattr(self, name) for name in names}
-        chosen: dict[str, Any] = {name: None if array is None else array[frames] for name, array in arrays.items()}
-        return replace(self, **chosen, others={name: array[frames] for name, array in self.others.items()})
+        kept: dict[str, Any] = {name: None if array is None else array[frames] for name, array in arrays.items()}
+        each = {name: getattr(self, name) for name in ("others", "quantities")}
+        kept |= {key: {name: array[frames] for name, array in own.items()} for key, own in each.items()}
+        return replace(self, **kept)
 
     @property
     def dimension(self) -> int:
@@ -216,10 +248,12 @@ class Trajectory:
         frames = self._fields
         first = {name: array[0] if len(array) else array for name, array in frames.items()}
         steps = len(self.converged)
-        with frame_writer(path, self.times, first, self.constants, steps, self.diagnostics, self.origin) as writer:
+        own = {name: array[:1] for name, array in self.quantities.items()}
+        with frame_writer(path, self.times, first, self.constants, steps, self.diagnostics, self.origin, own) as writer:
             writer.append_steps(**self.diagnostics)
             for k, step in enumerate(self.steps):
-                append_frame(writer, {name: array[k] for name, array in frames.items()}, int(step))
+                recorded = {name: array[k] for name, array in self.quantities.items()}
+                append_frame(writer, {name: array[k] for name, array in frames.items()}, int(step), recorded)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -236,7 +270,13 @@ class Trajectory:
             origin = Origin.from_json(arrays["origin"]) if arrays["origin"] else None
         except (ValueError, TypeError, AttributeError) as problem:
             raise InputError(f"{path} is damaged: of which particles it is cannot be read: {problem}.") from problem
-        return cls(**{name: arrays[name] for name in names}, mass_fractions=fractions, origin=origin)
+        recorded = {name: arrays[name] for name in QUANTITIES if name in arrays}
+        for name, array in recorded.items():
+            _, *row = QUANTITIES[name].shape(1, arrays["positions"].shape[2])
+            recorded[name] = np.ascontiguousarray(array[..., : row[0]]) if row else array
+        return cls(
+            **{name: arrays[name] for name in names}, mass_fractions=fractions, origin=origin, quantities=recorded
+        )
 
 
 def _spacing(positions: NDArray[Any]) -> float:
@@ -246,6 +286,15 @@ def _spacing(positions: NDArray[Any]) -> float:
     if len(positions) < 2:
         return 1.0
     return float(np.median(KDTree(positions).query(positions[:MANY], k=2)[0][:, 1])) or 1.0
+
+
+def chosen(quantities: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
+    """A quantity that was recorded; raises `InputError` for any other name."""
+    if check_quantity(name) not in quantities:
+        found = f"{', '.join(quantities)} and the speed are" if quantities else "only the speed is"
+        advice = f'record it, as in simulation.run(steps, record=["{name}"]), or ask simulation.quantity for it'
+        raise InputError(f"{name} was not recorded, {found} there: {advice}.")
+    return quantities[name]
 
 
 def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
@@ -268,11 +317,15 @@ def frame_writer(
     steps: int,
     diagnostics: Mapping[str, NDArray[Any]],
     origin: Origin | None,
+    quantities: Iterable[str] = (),
 ) -> vtkhdf.TrajectoryWriter:
-    """A file with room for frames at ``times`` (frames,) [s] that hold the same fields as the first, and for what is
-    noted of so many steps, which have the names and types of ``diagnostics``; all of it of particles of an origin."""
+    """A file with room for frames at ``times`` (frames,) [s] that hold the same fields as the first, with
+    ``quantities`` of these names, and for what is noted of so many steps, which have the names and types of
+    ``diagnostics``; all of it of particles of an origin."""
     particles, dimension = first["positions"].shape[-2:]
     single = first["positions"].dtype == np.float32
+    vectors = [name for name in quantities if len(QUANTITIES[name].shape(particles, dimension)) == 2]
+    numbers = [name for name in quantities if name not in vectors]
     return vtkhdf.TrajectoryWriter(
         path,
         times=times,
@@ -280,7 +333,8 @@ def frame_writer(
         dimension=dimension,
         precision="float32" if single else "float64",
         steps=steps,
-        scalars=_fraction_names(first["mass_fractions"].shape[-1] if "mass_fractions" in first else 0),
+        scalars=[*_fraction_names(first["mass_fractions"].shape[-1] if "mass_fractions" in first else 0), *numbers],
+        vectors=vectors,
         others=_others(first),
         constants=constants,
         diagnostics={name: column.dtype for name, column in diagnostics.items()},
@@ -288,10 +342,15 @@ def frame_writer(
     )
 
 
-def append_frame(writer: vtkhdf.TrajectoryWriter, frame: Mapping[str, NDArray[Any]], step: int) -> None:
-    """Write the fields of a frame, after so many steps, to a file of `frame_writer`."""
+def append_frame(
+    writer: vtkhdf.TrajectoryWriter,
+    frame: Mapping[str, NDArray[Any]],
+    step: int,
+    quantities: Mapping[str, NDArray[Any]] | None = None,
+) -> None:
+    """Write the fields of a frame, after so many steps, with its quantities, to a file of `frame_writer`."""
     fractions = frame["mass_fractions"].T if "mass_fractions" in frame else ()
-    scalars = dict(zip(_fraction_names(len(fractions)), fractions, strict=True))
+    scalars = {**dict(zip(_fraction_names(len(fractions)), fractions, strict=True)), **(quantities or {})}
     writer.append(frame["positions"], frame["velocities"], step=step, others=_others(frame), **scalars)
 
 

@@ -40,6 +40,7 @@ class TrajectoryWriter:
         precision: of the stored positions, velocities and scalars.
         steps: the most steps of which `append_steps` will be told.
         scalars: names of further scalar fields of every frame, such as "density" and "pressure", which ParaView shows.
+        vectors: names of further fields of vectors.
         others: further arrays of every frame by name, as they are in the first: their types and shapes are kept.
         constants: arrays by name that hold for the whole run.
         diagnostics: the type of each number that `append_steps` will be told of a step, by name.
@@ -60,6 +61,7 @@ class TrajectoryWriter:
         precision: Literal["float32", "float64"] = "float32",
         steps: int = 0,
         scalars: Sequence[str] = (),
+        vectors: Sequence[str] = (),
         others: Mapping[str, ArrayLike] | None = None,
         constants: Mapping[str, ArrayLike] | None = None,
         diagnostics: Mapping[str, DTypeLike] | None = None,
@@ -80,6 +82,7 @@ class TrajectoryWriter:
             np.dtype(precision),
             steps,
             tuple(scalars),
+            tuple(vectors),
             {name: np.asarray(value) for name, value in (others or {}).items()},
             {name: np.asarray(value) for name, value in (constants or {}).items()},
             {name: np.dtype(dtype) for name, dtype in (diagnostics or {}).items()},
@@ -113,7 +116,7 @@ class TrajectoryWriter:
             velocities: (n, d) [m/s]
             step: number of steps taken so far; the number of this frame when left out.
             others: exactly those given at construction.
-            scalars: (n,) each, exactly those named at construction.
+            scalars: (n,) each, and vectors (n, d), exactly those named at construction.
 
         Raises:
             InputError: shapes or names other than announced, or more frames than announced.
@@ -124,7 +127,7 @@ class TrajectoryWriter:
         if frame >= frames:
             raise InputError(f"{self.path} was laid out for {frames} frames, and one more came.")
         for what, found, wanted in (
-            ("scalar fields", scalars, self._layout.scalars),
+            ("scalar fields", scalars, (*self._layout.scalars, *self._layout.vectors)),
             ("other fields", others or {}, self._layout.others),
         ):
             if set(found) != set(wanted):
@@ -132,7 +135,9 @@ class TrajectoryWriter:
         fields = {"VTKHDF/Points": self._vectors("positions", positions)}
         fields["VTKHDF/PointData/velocity"] = self._vectors("velocities", velocities)
         for name, values in scalars.items():
-            fields[f"VTKHDF/PointData/{name}"] = self._checked(name, values, self._layout.shape[:1])
+            shape = self._layout.shape[:1]
+            array = self._vectors(name, values) if name in self._layout.vectors else self._checked(name, values, shape)
+            fields[f"VTKHDF/PointData/{name}"] = array
         number = np.int64(frame if step is None else step)
         rows = {name: fields[name].tobytes() for name in self._layout.rows}
         for name, first in sorted(self._layout.others.items()):

@@ -45,6 +45,8 @@ class Layout:
     """Of positions, velocities and scalars."""
     steps: int
     scalars: tuple[str, ...]
+    vectors: tuple[str, ...]
+    """Further fields of three components, besides the velocity."""
     others: Mapping[str, NDArray[Any]]
     """Further arrays of every frame, as they are in the first."""
     constants: Mapping[str, NDArray[Any]]
@@ -57,7 +59,10 @@ class Layout:
     @property
     def rows(self) -> dict[str, tuple[int, ...]]:
         """The datasets that have n rows a frame, in the order of their checksum, with the shape of a row."""
-        fields = {"velocity": (3,), **dict.fromkeys(self.scalars, ())}
+        fields: dict[str, tuple[int, ...]] = {
+            **dict.fromkeys(("velocity", *self.vectors), (3,)),
+            **dict.fromkeys(self.scalars, ()),
+        }
         return {"VTKHDF/Points": (3,)} | {f"VTKHDF/PointData/{name}": fields[name] for name in sorted(fields)}
 
     @property
@@ -78,7 +83,9 @@ class Layout:
         """About how many bytes the file takes when it is full."""
         numbers = sum(int(np.prod(row, dtype=int)) for row in self.rows.values())
         others, constants = (sum(a.nbytes for a in arrays.values()) for arrays in (self.others, self.constants))
-        frame = self.shape[0] * numbers * self.dtype.itemsize + others + 8 * (17 + len(self.scalars))
+        frame = (
+            self.shape[0] * numbers * self.dtype.itemsize + others + 8 * (17 + len(self.scalars) + len(self.vectors))
+        )
         return len(self.times) * frame + self.steps * self.records.itemsize + 8 * 2 * self.shape[0] + constants
 
     def create(self) -> tuple[Pages, dict[str, int]]:
@@ -127,7 +134,7 @@ class Layout:
         series["PointOffsets"] = np.arange(frames) * particles
         for name in ("CellOffsets", "ConnectivityIdOffsets"):
             series[name] = np.zeros((frames, len(_TOPOLOGIES)), np.int64)
-        for name in ("velocity", *self.scalars):
+        for name in ("velocity", *self.scalars, *self.vectors):
             series[f"PointDataOffsets/{name}"] = np.arange(frames) * particles
         vtk.create_group("PointData")
         places = {

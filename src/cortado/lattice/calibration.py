@@ -91,6 +91,14 @@ def lattice_laplacian_correction(kernel: SmoothingKernel, spacing: float, suppor
 
 
 @cache
+def circulation_factor(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """mu = -(V / d) sum_j x_j . G_j of the lattice [-]: what a sum of V v_ij x G_ij is there of the curl of v."""
+    offsets = lattice_offsets(spacing, support, dimension)
+    volume = rest_volume(kernel, spacing, support, dimension) / (1.0 - SLACK)
+    return float(-volume * (offsets * kernel.gradient(offsets, support)).sum() / dimension)
+
+
+@cache
 def laplacian_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
     """The greatest eigenvalue [1 / m2] of the Laplacian on the lattice, without its sign."""
     offsets = lattice_offsets(spacing, support, dimension)

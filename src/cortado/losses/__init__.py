@@ -6,6 +6,7 @@ from cortado.losses.image import Image
 from cortado.losses.loss import Frames, Loss, Snapshot, SnapshotAdjoint, fingerprint
 from cortado.losses.positions import FinalPositions
 from cortado.losses.recorded import Recorded
+from cortado.losses.series import SensorMatch, Series
 
 __all__ = [
     "CentreOfMass",
@@ -15,6 +16,8 @@ __all__ = [
     "Image",
     "Loss",
     "Recorded",
+    "SensorMatch",
+    "Series",
     "Snapshot",
     "SnapshotAdjoint",
     "SnapshotBatch",

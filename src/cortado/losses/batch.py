@@ -1,7 +1,7 @@
 """Losses of the scenes of a batch: of all at once where a loss can, else one by one."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, overload, runtime_checkable
 
@@ -9,7 +9,8 @@ import numpy as np
 
 from cortado.device.precision import Precision
 from cortado.device.state import State
-from cortado.losses.loss import ADJOINT_FIELDS, Loss, Snapshot, SnapshotAdjoint, precision_of
+from cortado.losses.loss import Loss, Snapshot, SnapshotAdjoint, by_field, precision_of
+from cortado.quantities.moment import Moment
 from cortado.words import counted
 
 
@@ -22,6 +23,8 @@ class SnapshotBatch(Sequence[Snapshot]):
     dimension: int
     colours: np.ndarray
     """(batch, phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
+    moment: Moment | None = None
+    """As that of `Snapshot`."""
 
     def __repr__(self) -> str:
         scenes = counted(len(self), "scene")
@@ -41,7 +44,8 @@ class SnapshotBatch(Sequence[Snapshot]):
         if isinstance(b, slice):
             return [self[k] for k in range(len(self))[b]]
         number = range(len(self))[b]
-        return _Member(self.state.member(number), self.dimension, self.colours[number], self, number)
+        own = self.state.member(number), self.dimension, self.colours[number], self.moment
+        return _Member(*own, batch=self, number=number)
 
     @property
     def precision(self) -> Precision:
@@ -72,12 +76,15 @@ class SnapshotBatch(Sequence[Snapshot]):
         return found
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class _Member(Snapshot):
     """One scene of a batch, whose arrays come to the host with those of the others."""
 
     batch: SnapshotBatch
     number: int
+
+    def _quantity(self, name: str) -> np.ndarray:
+        return super()._quantity(name)[self.number]
 
     @cached_property
     def positions(self) -> np.ndarray:
@@ -131,11 +138,14 @@ def values_and_adjoints(loss: Loss, end: SnapshotBatch, members: Sequence[int]) 
         found[b], bar = loss.value_and_adjoint(end[b])
         if isinstance(bar, SnapshotAdjoint):
             adjoint.colours[b] = bar.colours
+            for name, array in bar.quantities.items():
+                arrays.setdefault(name, np.zeros((len(end), *array.shape)))[b] = array
             bar = bar.state
         if isinstance(bar, State):
             adjoint.state.member(b).assign(bar)
             continue
-        for name, array in zip(ADJOINT_FIELDS, bar, strict=False):
+        for name, array in by_field(bar, end.dimension).items():
             arrays.setdefault(name, np.zeros((len(end), *array.shape)))[b] = array
     adjoint.state.set(arrays)
-    return found, adjoint
+    of_quantities = {name: array for name, array in arrays.items() if name not in end.state.names}
+    return found, replace(adjoint, quantities=of_quantities)

@@ -1,7 +1,7 @@
 """A user's loss, in whatever form it comes, with a sentence where it cannot be used or gives what cannot be used."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from cortado.errors import InputError, shown
 from cortado.losses import Loss, Recorded, Snapshot, SnapshotAdjoint, SnapshotBatch
 from cortado.losses.batch import Together
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
+from cortado.quantities.known import check_quantity
 
 FORMS = tuple(name.replace("_", " ") for name in ADJOINT_FIELDS)
 """What the arrays of an adjoint are derivatives with respect to, in words."""
@@ -40,7 +41,9 @@ class CheckedLoss:
             return _checked_state(bar, end)
         if isinstance(bar, SnapshotAdjoint):
             colours = _checked_array("adjoint of colours", bar.colours, end.colours.shape)
-            return SnapshotAdjoint(_checked_state(bar.state, end), colours)
+            return SnapshotAdjoint(_checked_state(bar.state, end), colours, _checked_table(bar.quantities, end))
+        if isinstance(bar, Mapping):
+            return _checked_table(bar, end)
         if not isinstance(bar, (tuple, list, np.ndarray)) or len(bar) not in (2, 3):
             count = f" of {len(bar)}" if isinstance(bar, (tuple, list)) else ""
             raise InputError(
@@ -103,6 +106,13 @@ def _checked_state(bar: Any, end: Snapshot | SnapshotBatch) -> State:
             text = _layout(found) if isinstance(found, wp.array) else f"a {type(found).__name__}"
             raise InputError(f"the loss's adjoint of {form} is {text}, but must be {_layout(wanted)}.")
     return bar
+
+
+def _checked_table(bar: Mapping[str, Any], end: Snapshot) -> dict[str, np.ndarray]:
+    """Adjoints by the names of fields of a state and of quantities."""
+    for name in bar:
+        check_quantity(name, "a name in the loss's adjoint", end.state.names)
+    return {name: _checked_array(f"adjoint of {name}", array, end[name].shape) for name, array in bar.items()}
 
 
 def _checked_array(what: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -1,17 +1,21 @@
 """What a loss is, what it is given, and the sum of several at several steps."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 
 from cortado.arrays import is_whole
+from cortado.device.launching import add
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
 from cortado.device.state import State
+from cortado.discretise.discrete_scene import Lattice
 from cortado.errors import InputError, shown
 from cortado.fixed import FixedDict, fixed
+from cortado.quantities.known import check_quantity
+from cortado.quantities.moment import Moment
 from cortado.words import counted
 
 
@@ -30,6 +34,9 @@ class Snapshot:
     dimension: int
     colours: np.ndarray
     """(phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
+    moment: Moment | None = None
+    """The state with the parameters of the step after it, which its quantities follow from; None where they are not
+    known."""
 
     def __repr__(self) -> str:
         return f"Snapshot({counted(len(self.state.positions), 'particle')}, {self.precision.name})"
@@ -54,12 +61,55 @@ class Snapshot:
         """(n, phases) [-], float64, read-only"""
         return _read_only(self.state.mass_fractions.numpy())
 
+    def __getitem__(self, name: str) -> np.ndarray:
+        """A field of the state by its name, such as "velocities", or a quantity of its particles, such as "density" or
+        "pressure" (see `docs/sensors.md`); float64, read-only. Raises `InputError` for any other name."""
+        if name in ADJOINT_FIELDS:
+            return getattr(self, name)
+        if isinstance(name, str) and name in self.state.names:
+            return _read_only(self.state.numpy(self.dimension, only=[name])[name])
+        check_quantity(name, "a field of a state", self.state.names)
+        return self._quantity(name)
+
+    @property
+    def lattice(self) -> Lattice:
+        """Constants of the particles at rest, such as their volume."""
+        return moment_of(self).lattice
+
+    def _quantity(self, name: str) -> np.ndarray:
+        return moment_of(self).value(name)
+
 
 def _read_only(values: np.ndarray) -> np.ndarray:
     """A copy in float64 that a loss cannot change by mistake for what is computed from it next."""
     found = values.astype(np.float64)
     found.flags.writeable = False
     return found
+
+
+class HasMoment(Protocol):
+    """A state of one scene or of a batch, as its quantities see it."""
+
+    @property
+    def moment(self) -> Moment | None:
+        """See `Snapshot`."""
+
+
+def moment_of(end: HasMoment) -> Moment:
+    """What quantities of a state follow from; raises `InputError` where it is not known."""
+    if end.moment is None:
+        raise InputError("a quantity is asked for of a state whose simulation is not known, but must be of a run's.")
+    return end.moment
+
+
+@dataclass(frozen=True, repr=False)
+class StepBar:
+    """Derivatives of a loss with respect to the parameters of one step."""
+
+    row: int
+    """Which of a run's steps it is."""
+    parameters: Mapping[str, np.ndarray]
+    """By name, with a first axis for the scenes of a batch, and one row of those over time."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -70,19 +120,39 @@ class SnapshotAdjoint:
     """With respect to positions, velocities and mass fractions, as Warp arrays."""
     colours: np.ndarray
     """(phases, 3)"""
+    quantities: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """With respect to quantities of the particles, by name."""
+    step: StepBar | None = None
+    """With respect to the parameters of the step after the state, once that of quantities is in it."""
+
+    def through_quantities(self, end: HasMoment) -> "SnapshotAdjoint":
+        """With respect to the state and the parameters alone: quantities follow from these."""
+        if not self.quantities:
+            return self
+        moment = moment_of(end)
+        fields, parameters = moment.adjoint(self.quantities)
+        more = self.state.like()
+        more.set(fields)
+        for own, total in zip(self.state.arrays(), more.arrays(), strict=True):
+            add(own, total)
+        return SnapshotAdjoint(more, self.colours, step=StepBar(moment.row, parameters))
 
 
 ADJOINT_FIELDS = ("positions", "velocities", "mass_fractions")
 """What the arrays of an adjoint are derivatives with respect to, in their order."""
-Adjoint = State | SnapshotAdjoint | tuple[np.ndarray, ...]
+Adjoint = State | SnapshotAdjoint | tuple[np.ndarray, ...] | Mapping[str, np.ndarray]
 """Derivatives of a loss with respect to positions and velocities, (n, d) each, and, if there is a third array, mass
-fractions (n, phases); or as Warp arrays."""
+fractions (n, phases); or by the names of fields of a state and of quantities, what is left out being 0; or as Warp
+arrays."""
 
 
 def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
-    """An adjoint as arrays by the fields of a state that they are derivatives with respect to, vectors (n, d)."""
+    """An adjoint as arrays by the fields of a state, and the quantities, that they are derivatives with respect to,
+    vectors (n, d)."""
+    if isinstance(bar, Mapping):
+        return dict(bar)
     if isinstance(bar, SnapshotAdjoint):
-        return bar.state.numpy(dimension)
+        return {**bar.state.numpy(dimension), **bar.quantities}
     return bar.numpy(dimension) if isinstance(bar, State) else dict(zip(ADJOINT_FIELDS, bar, strict=False))
 
 
@@ -97,8 +167,9 @@ class Loss(Protocol):
         """The loss."""
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """The loss and its derivatives, in one call as they often share work: a tuple of NumPy arrays, or a `State` of
-        Warp arrays, which ``end.state.like()`` makes, all 0, and ``set({"positions": array})`` of it fills."""
+        """The loss and its derivatives, in one call as they often share work: a tuple of NumPy arrays, or a table of
+        them by the names of fields and quantities, ``{"density": array}``, or a `State` of Warp arrays, which
+        ``end.state.like()`` makes, all 0, and ``set({"positions": array})`` of it fills."""
 
 
 @fixed

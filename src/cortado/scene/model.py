@@ -10,13 +10,14 @@ from pydantic import Field, ValidationInfo, create_model, field_validator
 from cortado.parameters.registry import PARAMETERS
 from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import Emitter
-from cortado.scene.fields import Colour, Flag, Several, Text, Vector, count, quantity
+from cortado.scene.fields import Colour, Flag, Several, Text, Vector, count, field_error, quantity
 from cortado.scene.fluids import AnyFluid
 from cortado.scene.mixture import Mixture
 from cortado.scene.package_tables import AnyForces
 from cortado.scene.picture import Picture
 from cortado.scene.render import Render
 from cortado.scene.schedule import Schedule
+from cortado.scene.sensors import AnySensor
 from cortado.scene.solvers import AnySolver
 from cortado.scene.tables import Table
 
@@ -101,6 +102,8 @@ class SceneTables(Table):
     """How a step is solved."""
     schedule: Schedule = Schedule()
     """What changes while the scene runs."""
+    sensor: tuple[AnySensor, ...] = ()
+    """What is read of the fluid in every step; it changes nothing of what is computed."""
     render: Render | None = None
     """How pictures are taken."""
     picture: Picture | None = None
@@ -111,6 +114,14 @@ class SceneTables(Table):
     def _resolve(cls, table: Any, info: ValidationInfo) -> Any:
         given = table is not None and "dimension" in info.data
         return table.in_dimension(info.data["dimension"]) if given else table
+
+    @field_validator("sensor")
+    @classmethod
+    def _resolve_sensors(cls, sensors: Any, info: ValidationInfo) -> Any:
+        for index, sensor in enumerate(sensors):
+            if sensor.name in [one.name for one in sensors[:index]]:
+                raise field_error((index, "name"), sensor.name, "another name than those of the sensors before")
+        return cls._resolve_fluids(sensors, info)
 
     @field_validator("fluid")
     @classmethod

@@ -4,7 +4,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ValidationInfo, field_validator
 
-from cortado.scene.fields import Colour, FieldPath, Flag, Length, components, count, field_error, quantity
+from cortado.quantities.known import NAMES
+from cortado.scene.fields import Colour, FieldPath, Flag, Length, OneOf, components, count, field_error, quantity
 from cortado.scene.tables import Table
 
 MOST_FRAMES = 120
@@ -30,11 +31,14 @@ class Picture(Table):
     """The angle that the width of the picture spans [degrees], in 3-D."""
     transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
     """The part of the light, from 0 to 1, that goes through fluid a tenth as thick as the container is long; if left
-    out 0.9 with one phase and 0 with several."""
+    out 0.9 with one phase, and 0 with several or with colour_by."""
     floor: Flag = True
     """Whether there is a floor, in 3-D."""
     background: Colour = (0.74, 0.77, 0.80)
     """(3,) red, green and blue, linear, each from 0 to 1"""
+    colour_by: Annotated[str, OneOf(NAMES)] | None = None
+    """A quantity of the particles that they are coloured by, on a scale beside the picture: "density", "pressure",
+    "speed", "vorticity" or "wall_force"; the colours of the phases if left out."""
     film_frames: Annotated[int, count(0, 100_000)] | None = None
     """Frames of a film, as far as there are so many; no film if 0. If left out as many as are drawn in about 40 s, at
     most 120."""

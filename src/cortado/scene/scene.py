@@ -52,8 +52,8 @@ class Scene(SceneTables):
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
-        """The same without [picture], and without [[force]] where there is none: what results depend on."""
-        aside = {"picture"} if self.force else {"picture", "force"}
+        """What results depend on: not [picture] and [[sensor]], nor an empty [[force]]."""
+        aside = {"picture", "sensor"} if self.force else {"picture", "sensor", "force"}
         return json.dumps(self.model_dump(mode="json", exclude=aside), indent=2)
 
     @classmethod

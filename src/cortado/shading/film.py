@@ -18,8 +18,9 @@ from cortado.io.video import write_video
 from cortado.lattice.shapes import Points
 from cortado.scene.picture import MOST_FRAMES, Picture
 from cortado.scene.scene import Scene
-from cortado.shading.page import Page
+from cortado.shading.page import Page, alone
 from cortado.shading.painter import colours_of, painter
+from cortado.shading.scale import Scale
 from cortado.shading.scenery import State
 from cortado.words import counted
 
@@ -49,9 +50,12 @@ def lacking(scene: Scene) -> str | None:
     return f"Shaded pictures need {' and '.join(missing)}, {verb} not installed: pip install 'cortado-sph[pictures]'."
 
 
-def run_pictures(scene: Scene, trajectory: Trajectory, folder: Path, device: Any) -> Figures:
-    """Draw the first and the last state of a run, and a film of it, into a folder; (caption, path) of each."""
-    page = run_page(scene, trajectory, device)
+def run_pictures(
+    scene: Scene, trajectory: Trajectory, folder: Path, device: Any, values: Points | None = None
+) -> Figures:
+    """Draw the first and the last state of a run, and a film of it, into a folder; (caption, path) of each. ``values``
+    as those of `run_page`."""
+    page = run_page(scene, trajectory, device, values)
     last, asked = len(trajectory) - 1, (scene.picture or Picture()).film_frames
     stills: Figures = []
     for k, name, words in ((0, "first", "at the start"), (last, "last", "at the end")):
@@ -63,14 +67,23 @@ def run_pictures(scene: Scene, trajectory: Trajectory, folder: Path, device: Any
     return [("The run.", film(folder / "film.mp4", page, range(last + 1), asked)), *stills]
 
 
-def run_page(scene: Scene, trajectory: Trajectory, device: Any) -> Page:
-    """The frames of a run by their number; all are taken from one place."""
+def run_page(scene: Scene, trajectory: Trajectory, device: Any, values: Points | None = None) -> Page:
+    """The frames of a run by their number; all are taken from one place. ``values`` (frames, n): what the scene colours
+    its particles by."""
+    name, draws = (scene.picture or Picture()).colour_by, painter(scene, trajectory.positions, device)
+    if name is not None and values is not None:
+        scale = Scale.of(name, values)
+        return Page(
+            draws,
+            [lambda k: (trajectory.positions[k], scale.colours(values[k]))],
+            lambda images: scale.beside(alone(images)),
+        )
 
     def state(k: int) -> State:
         frame = trajectory[k]
         return frame.positions, colours_of(scene, frame.mass_fractions, trajectory.particles)
 
-    return Page(painter(scene, trajectory.positions, device), [state])
+    return Page(draws, [state])
 
 
 def film(path: Path, page: Page, frames: Sequence[int], asked: int | None = None) -> Path:

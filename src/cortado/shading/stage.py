@@ -74,7 +74,7 @@ class Stage:
             eye = frame @ (picture.camera - origin)
         transparency = picture.transparency
         if transparency is None:
-            transparency = 0.0 if several else 0.9
+            transparency = 0.0 if several or picture.colour_by is not None else 0.9
         spacing = scene.discretisation.spacing
         cuts = ends is not None and not spilled(scene.container, positions, spacing)
         return cls(frame, origin, low, high, eye, look_at, picture, scene.container, spacing, transparency, cuts)

@@ -1,8 +1,12 @@
 """The tangent of a replayed PCISPH step, and its transpose, the adjoint."""
 
-import warp as wp
+from collections.abc import Sequence
 
-from cortado.device.launching import Named
+import warp as wp
+from numpy.typing import NDArray
+
+from cortado.device.arrays import Fields
+from cortado.device.launching import Named, add
 from cortado.device.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
@@ -23,20 +27,45 @@ class PcisphAdjoint(ParticleAdjoint):
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         """Replace the adjoint of the replayed step's result by that of its state; adjoints of the parameters are added
         to ``bar``."""
+        self._finish(counts, state_bar, self._begin(counts, state_bar, parameters), parameters)
+
+    def from_within(
+        self, counts: Counts, fields_bar: Fields, p_bar: wp.array, state_bar: State, parameters: Parameters
+    ) -> None:
+        """Write to ``state_bar`` the adjoint of the replayed step's state, for adjoints of its sorted fields and of the
+        pressure after the last iteration, (n,), with none of its result."""
+        state_bar.clear()
+        free_bar = self._begin(counts, state_bar, parameters)
+        for own, total in zip(fields_bar.arrays(), self.bar.fields.arrays(), strict=True):
+            add(own, total)
+        add(p_bar, self._p_bar)
+        self._finish(counts, state_bar, free_bar, parameters)
+
+    def _begin(self, counts: Counts, state_bar: State, parameters: Parameters) -> State:
+        """From the adjoint of the result to that of the last prediction; returns the adjoint of what no emitter
+        prescribes."""
+        (iterations,) = counts
+        solver = self._solver
+        context = solver.context(parameters)
+        free_bar = self.unsort(context, state_bar)
+        context.launch(
+            solver.kernels.begin_adjoint,
+            *self.bar.named,
+            v_star=solver.iterates.v_star[iterations],
+            x_scene_bar=free_bar.positions,
+            v_scene_bar=free_bar.velocities,
+            scaled_bar=self._scaled_bar,
+            y_bar=self._y_bar,
+            p_bar=self._p_bar,
+        )
+        return free_bar
+
+    def _finish(self, counts: Counts, state_bar: State, free_bar: State, parameters: Parameters) -> None:
+        """From the adjoint of the last prediction to that of the state."""
         (iterations,) = counts
         solver, it, kernels, scaled_bar = self._solver, self._solver.iterates, self._solver.kernels, self._scaled_bar
         context, known = solver.context(parameters), self.bar.named
         pressure_bar = {"y_bar": self._y_bar, "p_bar": self._p_bar}
-        free_bar = self.unsort(context, state_bar)
-        context.launch(
-            kernels.begin_adjoint,
-            *known,
-            v_star=it.v_star[iterations],
-            x_scene_bar=free_bar.positions,
-            v_scene_bar=free_bar.velocities,
-            scaled_bar=scaled_bar,
-            **pressure_bar,
-        )
         for k in reversed(range(iterations)):
             going = {"k": k, "rounds": solver.pressure_loop.rounds}
             context.launch(
@@ -138,6 +167,12 @@ class PcisphTangent(ParticleTangent):
             context.launch(kernels.force.tangent, going, *known, **accelerations, **forces, **predicted)
             p_dot_before = p_dot
         self.unsort(context, self._x_star_dot, self._v_star_dot, state_dot)
+
+    def pressures(self, rounds: Sequence[int]) -> list[NDArray]:
+        """Tangents (n,) of the pressure after the last iteration, of sorted particles, of each scene that went round so
+        often."""
+        own = [p_dot.numpy().reshape(len(rounds), -1) for p_dot in self._p_dot]
+        return [own[(k - 1) % 2][b] for b, k in enumerate(rounds)]
 
     def _relax(self, known: tuple[Named, ...], context: StepContext) -> None:
         """The tangent of the pressure relaxation."""

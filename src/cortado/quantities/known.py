@@ -1,0 +1,61 @@
+"""The quantities of particles by name, with their units and what they are. Without Warp."""
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.errors import InputError, shown
+
+
+class Kind(Enum):
+    """How many numbers a quantity has for each particle."""
+
+    NUMBER = "a number"
+    VECTOR = "a vector"
+    TURNING = "in the plane a number, which is positive counter-clockwise, in space a vector"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a state decides of each particle, together with the parameters of the step after it."""
+
+    name: str
+    unit: str
+    meaning: str
+    """One sentence."""
+    kind: Kind = Kind.NUMBER
+
+    def shape(self, particles: int, dimension: int) -> tuple[int, ...]:
+        """Of its values."""
+        is_vector = self.kind is Kind.VECTOR or (self.kind is Kind.TURNING and dimension == 3)
+        return (particles, dimension) if is_vector else (particles,)
+
+
+QUANTITIES = {
+    quantity.name: quantity
+    for quantity in (
+        Quantity("density", "kg/m3", "The sum of smoothing kernels around a particle, walls included, times its mass."),
+        Quantity("pressure", "Pa", "What the solver finds in the step that begins at the state."),
+        Quantity("speed", "m/s", "The length of the velocity."),
+        Quantity("vorticity", "1/s", "The curl of the velocity, from the fluid around a particle.", Kind.TURNING),
+        Quantity("wall_force", "N", "What a particle's pressure pushes the walls with; in the plane N/m.", Kind.VECTOR),
+    )
+}
+"""Every quantity by its name."""
+NAMES = tuple(QUANTITIES)
+
+
+def sizes(name: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
+    """Numbers (..., n) of a quantity's values, of vectors (..., n, k) their lengths."""
+    is_vector = len(QUANTITIES[name].shape(1, dimension)) == 2
+    return np.linalg.norm(values, axis=-1) if is_vector else values
+
+
+def check_quantity(name: object, what: str = "quantity", others: tuple[str, ...] = ()) -> str:
+    """A name of a quantity, or one of ``others``; raises `InputError` for any other."""
+    if not isinstance(name, str) or name not in (*others, *NAMES):
+        raise InputError(f"{what} is {shown(name)}, but must be one of {', '.join((*others, *NAMES))}.")
+    return name

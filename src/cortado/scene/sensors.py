@@ -1,0 +1,79 @@
+"""Sensors that a scene names: what `cortado run` reads in every step. They change nothing of what is computed."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field
+
+from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
+from cortado.scene.tables import Table
+
+Reach = Annotated[float, quantity("m", gt=0.0)] | None
+Corner = tuple[Length, ...] | None
+
+
+class SensorTable(Table):
+    """Something that reads numbers of the fluid in every step."""
+
+    name: Text
+    """What its columns in sensors.csv begin with."""
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        for name in ("lower", "upper", "about"):
+            value = getattr(self, name, None)
+            if value is not None and len(value) != dimension:
+                wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
+                raise field_error((*path, name), value, wanted)
+        return super().in_dimension(dimension, path)
+
+
+class PressureProbeTable(SensorTable):
+    """The mean pressure of the particles around a point."""
+
+    kind: Literal["pressure_probe"]
+    """Which sensor it is."""
+    position: Vector[Length]
+    """(d,) the point [m]."""
+    radius: Reach = None
+    """How far away particles count [m]; the support radius if left out."""
+
+
+class WaveGaugeTable(SensorTable):
+    """How high the fluid stands at a place: its volume in a column over the column's cross-section."""
+
+    kind: Literal["wave_gauge"]
+    """Which sensor it is."""
+    position: Vector[Length]
+    """(d,) a point of the middle of the column [m]; its height does not matter."""
+    floor: Length = 0.0
+    """Where the fluid stands on [m], against gravity."""
+    radius: Reach = None
+    """Radius of the column [m]; two support radii if left out."""
+
+
+class FlowRateTable(SensorTable):
+    """Volume of fluid that goes through a plane in a second."""
+
+    kind: Literal["flow_rate"]
+    """Which sensor it is."""
+    position: Vector[Length]
+    """(d,) a point of the plane [m]."""
+    normal: Vector[Annotated[float, quantity()]]
+    """(d,) the direction in which the flow is positive."""
+    reach: Reach = None
+    """Half of the thickness of the layer that counts [m]; two support radii if left out."""
+
+
+class WallForceTable(SensorTable):
+    """The force, and its torque, with which the pressure of the fluid in a region pushes the walls."""
+
+    kind: Literal["wall_force"]
+    """Which sensor it is."""
+    lower: Corner = None
+    """(d,) lower corner of the region [m]; without an end there if left out."""
+    upper: Corner = None
+    """(d,) upper corner of the region [m]; without an end there if left out."""
+    about: Corner = None
+    """(d,) the point of the torque [m]; the origin if left out."""
+
+
+AnySensor = Annotated[PressureProbeTable | WaveGaugeTable | FlowRateTable | WallForceTable, Field(discriminator="kind")]

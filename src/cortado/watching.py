@@ -1,0 +1,64 @@
+"""What is looked at of a run's states while it runs: quantities of recorded frames, and sensors in every step."""
+
+from collections.abc import Iterable, Mapping
+from functools import cache
+
+import numpy as np
+
+from cortado.device.state import State
+from cortado.errors import InputError
+from cortado.losses.loss import Snapshot
+from cortado.measuring import Measured
+from cortado.parameters.values import Arrays
+from cortado.quantities.evaluator import Evaluator
+from cortado.quantities.moment import Moment
+from cortado.quantities.recorder import Recorder
+from cortado.rollout import Rollout
+from cortado.sensors.log import Readings, SensorLog
+from cortado.sensors.of_scene import sensors_of
+from cortado.sensors.sensor import Sensor
+
+
+class Watch:
+    """Looks at the states of one rollout, with the arrays of another solver of the same scene, as the rollout's own are
+    at work."""
+
+    def __init__(
+        self,
+        simulation: Measured,
+        rollout: Rollout,
+        record: Iterable[str] = (),
+        sensors: Mapping[str, Sensor] | None = None,
+    ):
+        """``sensors`` are read besides those of the scene, which a batch does not read. Raises `InputError` for names
+        of quantities that there are not, and for sensors of a batch."""
+        if sensors and simulation.batch is not None:
+            raise InputError("sensors is given, but must be left out, as a batch reads none: read one scene's.")
+
+        @cache
+        def evaluator() -> Evaluator:
+            own, batch = simulation, simulation.batch
+            return (own.in_precision(own.precision.name) if batch is None else own.batch_of(batch)).evaluator()
+
+        of_scene = sensors_of(simulation.scene) if simulation.batch is None else {}
+        self._recorder = Recorder(rollout, record, evaluator, simulation.dimension)
+        self._log = SensorLog(of_scene | dict(sensors or {}), simulation.dimension)
+        self._rollout, self._dimension, self._evaluator = rollout, simulation.dimension, evaluator
+        self._colours = np.array([phase.colour for phase in simulation.scene.phase])
+        self.names = self._recorder.names
+        """Of the quantities that are recorded."""
+
+    def frame(self, step: int, state: State) -> Arrays:
+        """The quantities of a state after so many steps, by name."""
+        return self._recorder(step, state)
+
+    def step(self, step: int, state: State) -> None:
+        """Have the sensors read a state after so many steps; every state in its turn."""
+        if self._log.sensors:
+            moment = Moment.of(self._rollout, step, state, self._evaluator)
+            self._log.read(Snapshot(state, self._dimension, self._colours, moment))
+
+    def readings(self) -> dict[str, Readings]:
+        """What the sensors have read, by their names."""
+        clock, steps = self._rollout.clocks[0], np.arange(self._rollout.steps + 1)
+        return self._log.readings(clock.times(steps, float(self._rollout.time_steps[0])))

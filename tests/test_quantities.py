@@ -1,0 +1,274 @@
+"""Quantities of particles that a state decides: their values against twins, and their derivatives."""
+
+import numpy as np
+import pytest
+
+import cortado
+from bad_tasks import TINY_SCENE
+from cortado.cli import main
+from cortado.errors import InputError
+from cortado.quantities.known import NAMES, QUANTITIES
+from finite_differences import distance
+from scenes import jet, plane, scene, two_layers
+
+SCENES = {"plane": plane, "space": scene, "two fluids": two_layers, "jet": jet}
+
+
+class Weighted:
+    """The sum of weights times the squares of a quantity's values."""
+
+    def __init__(self, name, weights):
+        self.name, self.weights = name, weights
+
+    def value(self, end):
+        return float((self.weights * end[self.name] ** 2).sum())
+
+    def adjoint(self, end):
+        return {self.name: 2.0 * self.weights * end[self.name]}
+
+
+def problem_of(make, name, steps=6, precision="float64", seed=0):
+    """A problem whose loss weighs a quantity, a point of it, and a direction there."""
+    random = np.random.default_rng(seed)
+    simulation = cortado.Simulation(make(), precision=precision)
+    weights = random.uniform(size=simulation.quantity(name).shape)
+    gravity, n = np.array(simulation.scene.forces.gravity), simulation.particles
+    density = [phase.rest_density for phase in simulation.scene.phase]
+    point = {
+        "gravity": gravity + random.normal(size=(steps, len(gravity))),
+        "initial_velocities": simulation.velocities + 0.3 * random.normal(size=(n, len(gravity))),
+        "initial_positions": simulation.positions + 0.001 * random.normal(size=(n, len(gravity))),
+        "rest_density": np.array(density if len(density) > 1 else density[0]),
+        "time_step": np.array(0.0021),
+    }
+    if simulation.scene.emitter is not None:
+        del point["initial_positions"], point["initial_velocities"]
+    sizes = {"gravity": 1.0, "initial_velocities": 0.1, "initial_positions": 1e-3, "rest_density": 3.0}
+    along = {name: sizes.get(name, 1e-5) * random.normal(size=value.shape) for name, value in point.items()}
+    return cortado.Problem(simulation, steps, Weighted(name, weights)), point, along
+
+
+def paired(gradient, along):
+    return float(sum((gradient[name] * along[name]).sum() for name in along))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("make", SCENES.values(), ids=SCENES)
+def test_the_gradient_of_a_quantity_is_that_of_forward_mode_and_of_differences(make, name):
+    problem, point, along = problem_of(make, name)
+    derivative = problem.tangent(point, along)
+    gradient = problem.value_and_gradient(point)[1]
+    assert paired(gradient, along) == pytest.approx(derivative, rel=1e-11)
+    assert distance(problem.value, point, along, derivative, [1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7], enough=1e-6) < 1e-6
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_in_float32_the_gradient_is_near_that_of_float64(name):
+    problem, point, _ = problem_of(plane, name)
+    single, _, _ = problem_of(plane, name, precision="float32")
+    wanted, found = (one.value_and_gradient(point)[1]["gravity"] for one in (problem, single))
+    assert np.linalg.norm(found - wanted) < 2e-3 * np.linalg.norm(wanted)
+
+
+@pytest.mark.parametrize("name", ["vorticity", "pressure"])
+def test_the_certificate_finds_the_gradient_of_a_quantity_right(name):
+    problem, _, _ = problem_of(plane, name)
+    assert cortado.certify(problem, ["gravity"]).right
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_same_bits_come_twice_and_a_look_changes_none_of_a_run(name):
+    problem, point, _ = problem_of(plane, name)
+    first, again = (problem.value_and_gradient(point)[1] for _ in range(2))
+    assert all(np.array_equal(first[key], again[key]) for key in first)
+    simulation = problem.simulation
+    before = simulation.run(20).positions
+    simulation.quantity(name)
+    assert np.array_equal(simulation.run(20).positions, before)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_scene_of_a_batch_has_its_own(name):
+    problem, point, _ = problem_of(plane, name)
+    batch = cortado.Problem(problem.simulation.batch_of(2), problem.steps, problem.loss)
+    other = {**point, "gravity": 0.7 * point["gravity"]}
+    both = {key: np.stack([point[key], other[key]]) for key in point}
+    values, gradient = batch.value_and_gradient(both)
+    along = {key: np.ones_like(value) for key, value in both.items()}
+    tangents = batch.tangent(both, along)
+    for b, own in enumerate((point, other)):
+        value, alone = problem.value_and_gradient(own)
+        assert values[b] == value
+        for key in alone:
+            np.testing.assert_allclose(gradient[key][b], alone[key], rtol=1e-12, atol=1e-12 * np.abs(alone[key]).max())
+        wanted = problem.tangent(own, {key: np.ones_like(value) for key, value in own.items()})
+        assert tangents[b] == pytest.approx(wanted, rel=1e-11)
+
+
+def cubic_spline(simulation, positions):
+    """Of all pairs of positions (n, d) and of them and the walls: separations, W and the gradient of W."""
+    lattice, kernel, d = simulation.lattice, simulation.smoothing, simulation.dimension
+    found = []
+    walls = simulation.solver.search.wall_positions.numpy()[:, :d]
+    for others in (positions, walls):
+        apart = positions[:, None] - others[None]
+        weight = kernel.weight(np.linalg.norm(apart, axis=-1), d, lattice.support)
+        slope = kernel.gradient(apart.reshape(-1, d), lattice.support).reshape(apart.shape)
+        found.append((weight, slope))
+    return found
+
+
+@pytest.mark.parametrize("make", [plane, scene])
+def test_values_are_those_of_sums_over_all_pairs(make):
+    simulation = cortado.Simulation(make(), precision="float64")
+    state = simulation.run(5, {"initial_velocities": np.random.default_rng(1).normal(size=simulation.velocities.shape)})
+    state, volume = state.last_state, simulation.lattice.volume
+    x, v, weights = state["positions"], state["velocities"], simulation.solver.search.wall_weights.numpy()
+    (w, slope), (wall_w, wall_slope) = cubic_spline(simulation, x)
+    n = volume * (w.sum(axis=1) + wall_w @ weights)
+    density = simulation.quantity("density", state)
+    np.testing.assert_allclose(density, n * state["reference_density"], rtol=1e-12)
+    np.testing.assert_allclose(simulation.quantity("speed", state), np.linalg.norm(v, axis=1), rtol=1e-14)
+
+    pressure = simulation.quantity("pressure", state)
+    push = volume**2 * (pressure / n**2)[:, None] * np.einsum("b,nbd->nd", weights, wall_slope)
+    np.testing.assert_allclose(simulation.quantity("wall_force", state), push, atol=1e-12 * np.abs(push).max())
+
+    in_space = ((0, 0), (0, 0), (0, 3 - v.shape[1]))
+    crossed = np.cross(np.pad(v[:, None] - v[None], in_space), np.pad(slope, in_space))
+    curl = volume * crossed.sum(axis=1) / n[:, None]
+    found = simulation.quantity("vorticity", state)
+    shown = curl if simulation.dimension == 3 else curl[:, 2]
+    factor = (shown * found).sum() / (found**2).sum()
+    np.testing.assert_allclose(shown / factor, found, atol=1e-12 * np.abs(found).max())
+    assert 0.8 < factor < 1.2
+
+
+def test_fluid_that_turns_as_a_whole_has_twice_its_rate():
+    simulation = cortado.Simulation(plane(container={"shape": "none"}), precision="float64")
+    turning = 3.0 * np.stack([-simulation.positions[:, 1], simulation.positions[:, 0]], axis=1)
+    state = simulation.state({"initial_velocities": turning})
+    inner = np.all(np.abs(simulation.positions - 0.2) < 0.09, axis=1)
+    assert inner.any()
+    np.testing.assert_allclose(simulation.quantity("vorticity", state)[inner], 6.0, rtol=1e-12)
+
+
+def test_a_wrong_name_is_told_those_that_there_are():
+    simulation = cortado.Simulation(plane())
+    with pytest.raises(InputError, match="quantity is 'presure', but must be one of density, pressure, speed"):
+        simulation.quantity("presure")
+    end = cortado.Problem(simulation, 1, Weighted("density", 1.0)).end({})
+    with pytest.raises(InputError, match="a field of a state is 'rho', but must be one of positions, velocities"):
+        end["rho"]
+    assert np.array_equal(end["velocities"], end.velocities)
+    assert end["reference_density"].shape == (simulation.particles,)
+
+
+@pytest.mark.parametrize("bar", [{"rho": np.zeros(64)}, {"density": np.zeros(3)}])
+def test_a_wrong_adjoint_is_told_what_it_must_be(bar):
+    class Wrong(Weighted):
+        def adjoint(self, end):
+            return bar
+
+    problem = cortado.Problem(cortado.Simulation(plane()), 1, Wrong("density", 1.0))
+    with pytest.raises(InputError, match="the loss's adjoint"):
+        problem.value_and_gradient({"gravity": np.array([0.0, -9.81])})
+
+
+def test_a_fluid_without_pressure_has_none_to_see():
+    simulation = cortado.Simulation(plane(forces={"pressure": False}))
+    with pytest.raises(InputError, match="without a pressure"):
+        simulation.quantity("pressure")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_trajectory_is_looked_at_frame_by_frame(name):
+    simulation = cortado.Simulation(plane(), precision="float64")
+    gravity = np.linspace(-9.0, -1.0, 7)[:, None] * [0.0, 1.0]
+    trajectory = simulation.run(7, {"gravity": gravity}, record_every=3)
+    found = simulation.quantity(name, trajectory, {"gravity": gravity})
+    assert found.shape == (4, *QUANTITIES[name].shape(simulation.particles, 2))
+    ends = cortado.Problem(simulation, 7, Weighted(name, 1.0)).states({"gravity": gravity}, [0, 3, 6, 7])
+    for own, end in zip(found, ends.values(), strict=True):
+        np.testing.assert_array_equal(own, end[name])
+
+
+@pytest.mark.parametrize("make", [plane, scene, two_layers])
+def test_recorded_quantities_are_those_of_the_states_and_change_no_other_bit(make, tmp_path):
+    simulation = cortado.Simulation(make(), precision="float64")
+    bare, found = simulation.run(6, record_every=2), simulation.run(6, record_every=2, record=NAMES)
+    assert np.array_equal(bare.positions, found.positions) and not bare.quantities
+    for name in NAMES:
+        np.testing.assert_array_equal(found.quantity(name), simulation.quantity(name, found))
+        np.testing.assert_array_equal(found[2][name], found[1:].quantity(name)[1])
+    found.save(tmp_path / "run.vtkhdf")
+    read = cortado.Trajectory.load(tmp_path / "run.vtkhdf")
+    assert read.quantities.keys() == set(NAMES)
+    for name in NAMES:
+        np.testing.assert_array_equal(read.quantity(name), found.quantity(name))
+    bare.save(tmp_path / "bare.vtkhdf")
+    assert not cortado.Trajectory.load(tmp_path / "bare.vtkhdf").quantities
+    np.testing.assert_array_equal(simulation.run(1, state=read.last_state).positions[0], found.positions[-1])
+
+
+def test_recorded_quantities_of_a_batch_are_those_of_its_scenes():
+    simulation = cortado.Simulation(plane())
+    found = simulation.batch_of(2).run(4, {"gravity": [[[0.0, -9.81]], [[1.0, -5.0]]]}, record=["pressure"])
+    for own, gravity in zip(found, ([0.0, -9.81], [1.0, -5.0]), strict=True):
+        alone = simulation.run(4, {"gravity": gravity}, record=["pressure"])
+        np.testing.assert_array_equal(own.quantity("pressure"), alone.quantity("pressure"))
+
+
+def test_what_was_not_recorded_is_told_how():
+    simulation = cortado.Simulation(plane())
+    trajectory = simulation.run(1)
+    np.testing.assert_allclose(trajectory[1]["speed"], np.linalg.norm(trajectory.velocities[1], axis=1))
+    with pytest.raises(InputError, match=r'density was not recorded.*record=\["density"\]'):
+        trajectory[0]["density"]
+    with pytest.raises(InputError, match="quantity is 'rho', but must be one of density"):
+        trajectory.quantity("rho")
+    with pytest.raises(InputError, match="record is 'rho', but must be one of density"):
+        simulation.run(1, record=["rho"])
+    with pytest.raises(InputError, match="record is 'density', but must be a list of names"):
+        simulation.run(1, record="density")
+
+
+def test_the_command_records_what_is_asked_for(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(TINY_SCENE)
+    wished = ["--record", "density", "--record", "vorticity"]
+    plain = ["run", "scene.toml", "--steps", "3", "--no-pictures"]
+    main([*plain, "--out", "looked", *wished])
+    main([*plain, "--out", "plain"])
+    looked, bare = (cortado.Trajectory.load(tmp_path / name / "trajectory.vtkhdf") for name in ("looked", "plain"))
+    assert set(looked.quantities) == {"density", "vorticity"} and not bare.quantities
+    assert np.array_equal(looked.positions, bare.positions)
+    with pytest.raises(SystemExit) as end:
+        main([*plain, "--out", "wrong", "--record", "rho"])
+    assert end.value.code == 2
+    assert "record is 'rho', but must be one of density, pressure" in capsys.readouterr().err
+
+
+def test_pictures_are_coloured_by_a_quantity_on_a_scale():
+    simulation = cortado.Simulation(plane(picture={"width": 160, "height": 120, "colour_by": "vorticity"}))
+    frame = simulation.run(5, record=["vorticity"])[-1]
+    found, plain = simulation.picture(frame), simulation.picture(frame, colour_by=None)
+    assert found.shape == plain.shape == (120, 160, 3)
+    assert np.abs(found - plain).max() > 0.1
+    bar = found[-6, 4:-4]
+    assert np.linalg.norm(bar[0] - bar[-1]) > 0.5
+    with pytest.raises(InputError, match="density was not recorded"):
+        simulation.picture(frame, colour_by="density")
+    with pytest.raises(cortado.SceneError, match="colour_by"):
+        simulation.picture(frame, colour_by="rho")
+
+
+def test_the_pictures_of_a_run_are_coloured_by_what_was_not_recorded_too(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(TINY_SCENE)
+    main(["run", "scene.toml", "--steps", "2", "--no-pictures", "--out", "run"])
+    main(["picture", "run", "--out", "plain.png", "--set", "picture.width=160", "--set", "picture.height=120"])
+    for name in ("speed", "pressure"):
+        sizes = ["--set", "picture.width=160", "--set", "picture.height=120", "--set", f"picture.colour_by={name}"]
+        main(["picture", "run", "--out", f"{name}.png", *sizes])
+        assert (tmp_path / f"{name}.png").read_bytes() != (tmp_path / "plain.png").read_bytes()

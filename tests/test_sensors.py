@@ -1,0 +1,215 @@
+"""Sensors against what is known, and their derivatives."""
+
+import csv
+
+import numpy as np
+import pytest
+
+import cortado
+from bad_tasks import TINY_SCENE
+from cortado.cli import main
+from cortado.errors import InputError
+from cortado.losses import Series
+from cortado.losses.series import SensorMatch
+from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
+from finite_differences import distance
+from scenes import jet, plane, scene
+
+IN_THE_PLANE = {
+    "probe": PressureProbe([0.21, 0.13], 0.12),
+    "gauge": WaveGauge([0.19, 0.0], radius=0.15),
+    "flow": FlowRate([0.33, 0.0], [1.0, 0.2]),
+    "force": WallForce(upper=[0.35, 2.0], about=[0.1, 0.05]),
+}
+IN_SPACE = {
+    "probe": PressureProbe([0.12, 0.1, 0.11]),
+    "gauge": WaveGauge([0.11, 0.0, 0.13]),
+    "flow": FlowRate([0.2, 0.0, 0.0], [1.0, 0.1, 0.2]),
+    "force": WallForce(about=[0.1, 0.0, 0.2]),
+}
+CASES = [(make, name, own) for make, each in ((plane, IN_THE_PLANE), (scene, IN_SPACE)) for name, own in each.items()]
+NAMED = [f"{make.__name__}-{name}" for make, name, _ in CASES]
+
+
+def problem_of(make, sensor, precision="float64", steps=8):
+    """One whose loss holds a sensor against a series, a point, and a direction there."""
+    random = np.random.default_rng(3)
+    simulation = cortado.Simulation(make(), precision=precision)
+    d, dt = simulation.dimension, simulation.scene.solver.time_step
+    wanted = random.normal(size=(4, len(sensor.columns(d))))
+    loss = Series(sensor, np.linspace(0.0, steps * dt, 4), wanted, dt)
+    gravity = np.array(simulation.scene.forces.gravity) + random.normal(size=(steps, d))
+    velocities = 0.5 * random.normal(size=simulation.velocities.shape)
+    point = {"gravity": gravity, "initial_velocities": velocities, "rest_density": np.array(1000.0)}
+    along = {"gravity": random.normal(size=gravity.shape), "initial_velocities": random.normal(size=velocities.shape)}
+    return cortado.Problem(simulation, steps, loss), point, {**along, "rest_density": np.array(20.0)}
+
+
+@pytest.mark.parametrize(("make", "name", "sensor"), CASES, ids=NAMED)
+def test_the_gradient_of_a_sensor_is_that_of_forward_mode_and_of_differences(make, name, sensor):
+    problem, point, along = problem_of(make, sensor)
+    derivative, gradient = problem.tangent(point, along), problem.value_and_gradient(point)[1]
+    assert sum((gradient[key] * along[key]).sum() for key in along) == pytest.approx(derivative, rel=1e-11)
+    steps = [1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7, 1e-7]
+    assert distance(problem.value, point, along, derivative, steps, enough=1e-6) < 1e-6
+
+
+@pytest.mark.parametrize(("name", "sensor"), IN_THE_PLANE.items(), ids=IN_THE_PLANE)
+def test_the_certificate_finds_the_gradient_of_a_sensor_right(name, sensor):
+    problem, point, _ = problem_of(plane, sensor)
+    assert cortado.certify(problem, {"gravity": point["gravity"]}).right
+    single, _, _ = problem_of(plane, sensor, "float32")
+    assert cortado.certify(single, {"gravity": point["gravity"]}).right
+
+
+@pytest.mark.parametrize(("make", "name", "sensor"), CASES, ids=NAMED)
+def test_what_a_sensor_makes_of_its_adjoint_is_its_derivative(make, name, sensor):
+    """With respect to the fields and quantities that it reads, taken as free."""
+
+    class Fields(dict):
+        dimension, lattice = make().dimension, cortado.Simulation(make()).lattice
+
+    end = cortado.Problem(cortado.Simulation(make(), precision="float64"), 5, SensorMatch(sensor, 0.0)).end({})
+    names = ("positions", "velocities", "pressure", "wall_force")
+    random, at = np.random.default_rng(2), Fields({key: end[key] for key in names})
+    bar = random.normal(size=len(sensor.value(at)))
+    bars = sensor.adjoint(at, bar)
+    along = {key: random.normal(size=value.shape) * np.abs(value).max() * 1e-3 for key, value in at.items()}
+    derivative = sum((bars[key] * along[key]).sum() for key in bars)
+
+    def value(point):
+        return float(bar @ sensor.value(Fields(point)))
+
+    assert distance(value, dict(at), along, derivative, [1e-2, 1e-3, 1e-4, 1e-5], enough=1e-5) < 1e-5
+
+
+def still_water(precision="float64", **changes):
+    """A column of water, 0.5 m wide and 0.5 m high, in the plane."""
+    tables = {
+        "fluid": [{"shape": "box", "lower": [0.0, 0.0], "upper": [0.5, 0.5], "phase": "water"}],
+        "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.5, 0.8]},
+        "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 5.0}],
+        "discretisation": {"spacing": 0.025, "support": 3.0, "kernel": "wendland_c2"},
+        "solver": {"time_step": 0.001, "maximum_iterations": 100, "density_tolerance": 0.001},
+    }
+    return cortado.Simulation(plane(**{**tables, **changes}), precision=precision)
+
+
+def test_still_water_pushes_walls_and_probes_as_it_must():
+    simulation = still_water("float32")
+    weight, side = 1000.0 * 9.81 * 0.5 * 0.5, 1000.0 * 9.81 * 0.5**2 / 2.0
+    sensors = {
+        "left": WallForce(upper=[0.25, 1.0]),
+        "right": WallForce(lower=[0.25, -1.0]),
+        "floor": WallForce(upper=[1.0, 0.25]),
+        "probe": PressureProbe([0.25, 0.2]),
+        "gauge": WaveGauge([0.25, 0.0], radius=0.2),
+        "flow": FlowRate([0.25, 0.0], [1.0, 0.0]),
+    }
+    read = simulation.run(700, record_every=700, sensors=sensors).sensors
+
+    def mean(name, column):
+        assert len(read[name].times) == 701
+        return read[name][column][300:].mean()
+
+    print({n: {c: mean(n, c) for c in own.units} for n, own in read.items()}, weight, side)
+    assert mean("floor", "force_y") == pytest.approx(-weight, rel=0.03)
+    assert mean("left", "force_x") == pytest.approx(-side, rel=0.03)
+    assert mean("right", "force_x") == pytest.approx(side, rel=0.03)
+    assert mean("probe", "pressure") == pytest.approx(1000.0 * 9.81 * 0.3, rel=0.03)
+    assert mean("gauge", "height") == pytest.approx(0.5, rel=0.02)
+    assert abs(mean("flow", "flow_rate")) < 1e-3
+
+
+def test_the_force_on_walls_is_what_the_fluid_lacks_of_its_momentum():
+    """Without friction, to round-off, in every step: M (v' - v) / dt = M g - F."""
+    simulation = still_water(forces={"viscosity": "none", "gravity": [1.0, -9.81]})
+    gravity, dt = np.array([1.0, -9.81]), simulation.scene.solver.time_step
+    trajectory = simulation.run(30, sensors={"walls": WallForce()})
+    masses = trajectory.constants["reference_density"] * simulation.lattice.volume
+    momentum = np.einsum("n,fnd->fd", masses, trajectory.velocities)
+    force = trajectory.sensors["walls"].values[:-1, :2]
+    lack = masses.sum() * gravity - np.diff(momentum, axis=0) / dt
+    assert np.abs(force).max() > 1000.0
+    np.testing.assert_allclose(force, lack, atol=1e-9 * np.abs(force).max())
+
+
+def test_the_flow_of_an_emitter_is_its_flow_rate():
+    """Where the jet goes through a plane in free fall."""
+    outlet = {"phase": "water", "outlet": [0.3, 0.9], "radius": 0.075, "length": 0.5, "flow_rate": 0.3}
+    room = {"shape": "box", "lower": [0.0, -3.0], "upper": [0.6, 1.6]}
+    simulation = cortado.Simulation(
+        jet(emitter=outlet, fluid=[], container=room, forces={"gravity": [0.0, 0.0]}, solver={"time_step": 0.001})
+    )
+    read = simulation.run(200, record_every=200, sensors={"jet": FlowRate([0.0, 0.7], [0.0, -1.0], 0.1)}).sensors["jet"]
+    assert read["flow_rate"][-20:].mean() == pytest.approx(0.3, rel=0.01)
+
+
+TABLES = """
+[[sensor]]
+kind = "pressure_probe"
+name = "bottom"
+position = [0.1, 0.05]
+
+[[sensor]]
+kind = "wall_force"
+name = "walls"
+"""
+
+
+def test_the_command_reads_the_sensors_of_a_scene(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(TINY_SCENE + TABLES)
+    main(["run", "scene.toml", "--steps", "4", "--record-every", "2", "--no-pictures", "--out", "run"])
+    rows = list(csv.reader((tmp_path / "run" / "sensors.csv").open()))
+    heads = ["time [s]", "bottom.pressure [Pa]", "walls.force_x [N/m]", "walls.force_y [N/m]", "walls.torque [N]"]
+    assert rows[0] == heads and len(rows) == 6
+    alone = cortado.Simulation(tmp_path / "scene.toml").run(4)
+    np.testing.assert_array_equal([float(row[1]) for row in rows[1:]], alone.sensors["bottom"]["pressure"])
+    assert "sensors.png" in "".join(path.name for path in (tmp_path / "run" / "figures").iterdir())
+    assert "What the sensors read" in (tmp_path / "run" / "report.html").read_text()
+    (tmp_path / "plain.toml").write_text(TINY_SCENE)
+    plain = cortado.Simulation(tmp_path / "plain.toml").run(4)
+    assert np.array_equal(plain.positions, alone.positions) and not plain.sensors
+
+
+MISTAKES = [
+    (lambda: PressureProbe([0.0]), "position has shape"),
+    (lambda: PressureProbe([0.0, 0.0], -1.0), "radius is -1, but must be greater than 0"),
+    (lambda: FlowRate([0.0, 0.0], [0.0, 0.0]), "normal is .* but must not be 0"),
+    (lambda: WallForce([1.0, 0.0], [0.0, 1.0]), "upper is .* but must be greater than lower"),
+    (lambda: Series(PressureProbe([0.0, 0.0]), [0.0, 1.0], [1.0], 0.1), "values has shape"),
+    (lambda: Series(PressureProbe([0.0, 0.0]), [1.0, 0.0], [1.0, 1.0], 0.1), "times must be"),
+    (lambda: cortado.Simulation(plane()).run(1, sensors={"p": PressureProbe}), "sensors has"),
+    (lambda: cortado.Simulation(plane()).run(1, sensors={"p": PressureProbe([0.0] * 3)}), "position has 3 components"),
+    (lambda: cortado.Simulation(plane(), batch=2).run(1, sensors=IN_THE_PLANE), "sensors is given, but must be left"),
+    (lambda: plane(sensor=[{"kind": "probe", "name": "a"}]), "kind"),
+    (lambda: plane(sensor=2 * [{"kind": "wall_force", "name": "a"}]), "another name"),
+    (lambda: plane(sensor=[{"kind": "wall_force", "name": "a", "lower": [0.0]}]), "2 components"),
+]
+
+
+@pytest.mark.parametrize(("make", "words"), MISTAKES)
+def test_a_mistake_is_a_sentence(make, words):
+    with pytest.raises((InputError, cortado.SceneError), match=words):
+        make()
+
+
+def test_a_run_that_diverges_says_where_also_with_sensors(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(TINY_SCENE + TABLES)
+    wild = ["--set", "solver.time_step=0.08", "--set", "forces.gravity=[3000.0, -9000.0]"]
+    told = []
+    for name, more in (("plain", []), ("looked", ["--record", "pressure"])):
+        with pytest.raises(SystemExit) as end:
+            main(["run", "scene.toml", "--steps", "40", "--no-pictures", "--out", name, *wild, *more])
+        assert end.value.code == 1
+        told.append(capsys.readouterr().err.replace(name, "").splitlines()[-1])
+    assert told[0] == told[1]
+    bare = TINY_SCENE
+    (tmp_path / "scene.toml").write_text(bare)
+    with pytest.raises(SystemExit):
+        main(["run", "scene.toml", "--steps", "40", "--no-pictures", "--out", "bare", *wild])
+    assert capsys.readouterr().err.replace("bare", "").splitlines()[-1] == told[0]
+    rows = list(csv.reader((tmp_path / "looked" / "sensors.csv").open()))
+    assert rows[-1][1] == "nan"
