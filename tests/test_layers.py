@@ -66,13 +66,13 @@ LAYERS = """
     render.absorption render.views render.marching render.renderer render.scene_renderer render
     io.pictures pictures
     figures.canvas figures.panels figures.particle_sets figures.side_by_side
-    io.trajectory io.trajectory_batch
+    io.frame_file io.trajectory io.trajectory_batch
     shading shading.surface shading.stage shading.shadow shading.surroundings shading.glass shading.meeting
     shading.scenery shading.trace shading.space shading.plane
     shading.painter shading.page shading.labels shading.scale shading.film shading.scene_view
     outcome
     recorded
-    host_states device_states stepper stepping measuring watching
+    host_states device_states stepper stepping measuring picturing watching
     simulation
     forward_pass
     problem

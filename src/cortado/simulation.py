@@ -26,7 +26,7 @@ from cortado.errors import CortadoWarning, InputError, shown
 from cortado.figures.particle_sets import particles
 from cortado.fixed import fixed
 from cortado.io.notebook import with_picture
-from cortado.io.trajectory import Frame, Trajectory
+from cortado.io.trajectory import Trajectory
 from cortado.measuring import Measuring
 from cortado.outcome import trouble
 from cortado.parameters.checks import check_sizes
@@ -34,18 +34,13 @@ from cortado.parameters.restarts import one_for_each
 from cortado.parameters.scene_parameters import SceneParameters
 from cortado.parameters.space import ParameterSpace
 from cortado.parameters.values import scene_values
-from cortado.quantities.known import sizes
+from cortado.picturing import Picturing
 from cortado.recorded import recorded
-from cortado.render.renderer import Renderer
-from cortado.render.scene_renderer import scene_renderer
 from cortado.restart import RestartState
 from cortado.rollout import Rollout
-from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.solvers import OWN
 from cortado.sensors.sensor import Sensor
-from cortado.shading.painter import colours_of, painter
-from cortado.shading.scale import Scale
 from cortado.solvers.build import first_capacity
 from cortado.solvers.makers import SolverMaker, SolverSetting, built, called, checked_solver
 from cortado.solvers.named import forces_named, solver_named
@@ -62,7 +57,7 @@ WORTH = {"cpu": 16_000, "cuda": 1_000_000}
 
 
 @fixed
-class Simulation(Stepping, Measuring):
+class Simulation(Stepping, Measuring, Picturing):
     """A scene made ready to run: particles sampled, masses calibrated, kernels chosen.
 
     Threads that use it take turns, and other processes can have it, pickled or by a fork: see `docs/processes.md`.
@@ -165,11 +160,6 @@ class Simulation(Stepping, Measuring):
         """With a picture of its first particles."""
         shown, extent = self.positions[: self.free_particles or None], self.scene.container.extent()
         return with_picture(self, lambda path: particles([shown], ["t = 0 s"], path, container=extent))
-
-    @property
-    def dimension(self) -> int:
-        """2 or 3."""
-        return self.scene.dimension
 
     @property
     def _points(self) -> str:
@@ -285,36 +275,6 @@ class Simulation(Stepping, Measuring):
         fitting = within(np.inf, self.device) // own
         kept = checkpoints // states if checkpoints else fitting
         return int(max(min(WORTH["cpu" if self.device.is_cpu else "cuda"] // self.particles, fitting, kept), 1))
-
-    def renderer(self, **settings: Any) -> Renderer:
-        """What takes pictures of the simulation, ``renderer.render(trajectory[k])``, and differentiates them: as the
-        table ``[render]`` of its scene says, or from above, in 2-D as the plane is.
-
-        ``settings`` replace keys of that table: ``resolution=(320, 240)``, or ``view="volume", position=(1, 1, 2),
-        look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for settings that do not fit.
-        """
-        return scene_renderer(self, **settings)
-
-    def picture(self, frame: Frame, **settings: Any) -> np.ndarray:
-        """A shaded picture of a frame, (rows, columns, 3), linear from 0 to 1, as the table ``[picture]`` of the scene
-        says; ``settings`` replace keys of it: ``width=640, height=360``.
-
-        Raises:
-            SceneError: settings that do not fit.
-            InputError: pysplashsurf is missing, for the surface of a liquid in 3-D; or the frame has not recorded what
-                ``colour_by`` names.
-        """
-        if not isinstance(frame, Frame):
-            raise InputError(f"frame is {shown(frame)}, but must be one frame of a trajectory, such as trajectory[-1].")
-        given = {} if self.scene.picture is None else self.scene.picture.model_dump()
-        table = Picture(**{**given, **settings}).in_dimension(self.dimension, ("picture",))
-        scene = self.scene.model_copy(update={"picture": table})
-        draws = painter(scene, frame.positions, self.device)
-        if table.colour_by is None:
-            return draws.image(frame.positions, colours_of(scene, frame.mass_fractions, self.particles))
-        values = sizes(table.colour_by, frame[table.colour_by], self.dimension)
-        scale = Scale.of(table.colour_by, values)
-        return scale.beside(draws.image(frame.positions, scale.colours(values)))
 
     def parameters(self) -> dict[str, np.ndarray]:
         """Every parameter of `Problem` as the scene and forces have it, without what its schedule changes."""

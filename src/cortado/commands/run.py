@@ -16,11 +16,11 @@ from cortado.device.memory import frame_parts, require
 from cortado.device.state import State
 from cortado.errors import CortadoWarning, DivergedError
 from cortado.io.folder_lock import locked
+from cortado.io.frame_file import append_frame, frame_writer
 from cortado.io.interruption import keeping
 from cortado.io.progress import announce, track
 from cortado.io.report import Section
 from cortado.io.run_folder import RunFolder
-from cortado.io.trajectory import append_frame, frame_writer
 from cortado.outcome import not_converged_sentence
 from cortado.rollout import Rollout
 from cortado.scene.scene import load_scene

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from operator import index
 from pathlib import Path
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cortado.errors import InputError, shown
 from cortado.io import vtkhdf
+from cortado.io.frame_file import FRACTION, append_frame, fraction_names, frame_writer
 from cortado.io.input_files import as_path
 from cortado.io.notebook import as_text, with_view
 from cortado.io.particle_view import Cloud, particle_view, thinned
@@ -25,6 +26,8 @@ IN_A_NOTEBOOK = 1_000_000
 """Bytes of what a notebook shows in motion."""
 MANY = 2000
 """Particles of which the nearest others are looked for."""
+SUFFIXES = (".vtkhdf", ".hdf")
+"""By which ParaView knows a trajectory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +268,7 @@ class Trajectory:
         arrays = vtkhdf.read(as_path("path", path))
         names = ("times", "steps", "positions", "velocities", "diagnostics", "others", "constants")
         phases = sum(name.startswith(FRACTION) for name in arrays)
-        fractions = np.stack([arrays[name] for name in _fraction_names(phases)], axis=-1) if phases else None
+        fractions = np.stack([arrays[name] for name in fraction_names(phases)], axis=-1) if phases else None
         try:
             origin = Origin.from_json(arrays["origin"]) if arrays["origin"] else None
         except (ValueError, TypeError, AttributeError) as problem:
@@ -302,62 +305,3 @@ def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
     if name not in diagnostics:
         raise InputError(f"{name} is no diagnostic of this solver, whose diagnostics are {', '.join(diagnostics)}.")
     return diagnostics[name]
-
-
-FRACTION = "mass_fraction_"
-SUFFIXES = (".vtkhdf", ".hdf")
-"""By which ParaView knows a trajectory."""
-
-
-def frame_writer(
-    path: str | Path,
-    times: NDArray[Any],
-    first: Mapping[str, NDArray[Any]],
-    constants: Mapping[str, NDArray[Any]],
-    steps: int,
-    diagnostics: Mapping[str, NDArray[Any]],
-    origin: Origin | None,
-    quantities: Iterable[str] = (),
-) -> vtkhdf.TrajectoryWriter:
-    """A file with room for frames at ``times`` (frames,) [s] that hold the same fields as the first, with
-    ``quantities`` of these names, and for what is noted of so many steps, which have the names and types of
-    ``diagnostics``; all of it of particles of an origin."""
-    particles, dimension = first["positions"].shape[-2:]
-    single = first["positions"].dtype == np.float32
-    vectors = [name for name in quantities if len(QUANTITIES[name].shape(particles, dimension)) == 2]
-    numbers = [name for name in quantities if name not in vectors]
-    return vtkhdf.TrajectoryWriter(
-        path,
-        times=times,
-        particles=particles,
-        dimension=dimension,
-        precision="float32" if single else "float64",
-        steps=steps,
-        scalars=[*_fraction_names(first["mass_fractions"].shape[-1] if "mass_fractions" in first else 0), *numbers],
-        vectors=vectors,
-        others=_others(first),
-        constants=constants,
-        diagnostics={name: column.dtype for name, column in diagnostics.items()},
-        origin="" if origin is None else origin.to_json(),
-    )
-
-
-def append_frame(
-    writer: vtkhdf.TrajectoryWriter,
-    frame: Mapping[str, NDArray[Any]],
-    step: int,
-    quantities: Mapping[str, NDArray[Any]] | None = None,
-) -> None:
-    """Write the fields of a frame, after so many steps, with its quantities, to a file of `frame_writer`."""
-    fractions = frame["mass_fractions"].T if "mass_fractions" in frame else ()
-    scalars = {**dict(zip(_fraction_names(len(fractions)), fractions, strict=True)), **(quantities or {})}
-    writer.append(frame["positions"], frame["velocities"], step=step, others=_others(frame), **scalars)
-
-
-def _others(frame: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    return {name: frame[name] for name in frame if name not in ("positions", "velocities", "mass_fractions")}
-
-
-def _fraction_names(phases: int) -> list[str]:
-    """Names of the scalar fields that hold the mass fractions of several phases; none for one phase."""
-    return [f"{FRACTION}{k}" for k in range(phases)]
