@@ -135,8 +135,8 @@ def number(name, value=1.0):
     [
         (Breeze(), "forces is <.*>, but must be a list of forces, such as"),
         ("drag", "forces is 'drag', but must be a list of forces"),
-        ([Breeze], "forces has <class .*> at place 0, but must be"),
-        ([Breeze(), 3.0], "forces has 3.0 at place 1, but must be"),
+        ([Breeze], r"forces has <class .*> at place 0, but each must be an object with a method force\(setting\)"),
+        ([Breeze(), 3.0], "forces has 3.0 at place 1, but each must be"),
         ([Named("k")], r"has parameters \['k'\], but must have a list of"),
         ([Breeze(), Breeze()], "parameter breeze.k of a force has the name of another one, breeze.k, but must have"),
         ([Named(number("gravity"))], "parameter gravity of a force has the name of another one"),

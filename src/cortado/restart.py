@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.errors import InputError, shown
 from cortado.fixed import FixedDict
 from cortado.words import Brief
 
@@ -74,6 +75,9 @@ class RestartState(Brief):
     """Of which particles it is; None of one that was made by hand, or that an earlier version wrote."""
 
     def __getitem__(self, name: str) -> NDArray:
+        """A field by name; raises `InputError` for one that the state does not have."""
+        if name not in self.fields:
+            raise InputError(f"state has no {shown(name)}, but has {', '.join(self.fields)}.")
         return self.fields[name]
 
     def fixed(self) -> "RestartState":

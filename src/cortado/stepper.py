@@ -22,6 +22,7 @@ from cortado.parameters.values import Arrays, Values
 from cortado.residual import Residual, without_lost
 from cortado.rollout import BackwardStep, Rollout
 from cortado.solvers.solver import Solver
+from cortado.words import counted, sized
 
 
 class Steppable(Simulated, Protocol):
@@ -39,6 +40,11 @@ class StepResidual:
     """The parameters that were given."""
     place: HostStates
     """Where its states are, and the derivatives with respect to them."""
+
+    def __repr__(self) -> str:
+        return (
+            f"StepResidual({counted(self.evaluation.rollout.steps, 'step')}, parameters {sized(self.values) or 'none'})"
+        )
 
 
 class Stepper:

@@ -22,6 +22,7 @@ def estimated_bytes(simulation: Simulation, rollout: Rollout) -> tuple[float, fl
     particles, walls, real = simulation.particles, len(simulation.walls), simulation.precision.bytes
     capacity = search_of(simulation).capacity
     forward = sum(simulation_parts(particles, walls, capacity, real).values())
-    iterations = int(rollout.diagnostics["iterations"].max(initial=0))
+    counts = rollout.diagnostics.get("iterations")  # a solver of one's own may have none
+    iterations = 0 if counts is None else int(counts.max(initial=0))
     checkpoints = rollout.steps * sum(array.capacity for array in rollout.initial.arrays())
     return forward, forward + checkpoints + sum(gradient_parts(particles, iterations, real).values())

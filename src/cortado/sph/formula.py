@@ -14,7 +14,7 @@ import warp as wp
 
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
-from cortado.sph.function_text import REAL, VECTOR, Differentiable, InPrecision
+from cortado.sph.function_text import REAL, VECTOR, Differentiable, InPrecision, check_names, check_returns
 
 _SENT: WeakKeyDictionary[FunctionType, str] = WeakKeyDictionary()
 """Texts of functions that came from other processes."""
@@ -80,14 +80,18 @@ def formula(
     its own for what is not. Raises `InputError`."""
     name, what = function.__name__, f"{kind} function {function.__name__}"
     inputs, values = _arguments(what, function, parameters)
-    tree, scope = _definition(what, source), _scope(function)
+    definition, scope = _definition(what, source), _scope(function)
+    tree = ast.Module([definition], [])
     helpers = _called(scope)
     for one in (tree, *(helper.adj.tree for helper in helpers)):
         Differentiable(what).visit(one)
     scopes = scope, *(_scope(helper.func) for helper in helpers)
     outside = (*(helper.adj.source for helper in helpers), *map(_values, scopes))
     local = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
-    rewritten = InPrecision(scope, {*inputs, *values, *local}).visit(tree)
+    own = {*inputs, *values, *local}
+    check_returns(what, definition)
+    check_names(what, definition, own, scope)
+    rewritten = InPrecision(scope, own).visit(tree)
     text = ast.unparse(ast.fix_missing_locations(rewritten)) + "\n"
     return Formula(name, text, inputs, tuple(values), outside, MappingProxyType(scope)), values
 
@@ -104,13 +108,16 @@ def _arguments(what: str, function: FunctionType, given: Mapping[str, Any]) -> t
             raise InputError(f"{what} is given a value of {name}, but must have {name} among its arguments {found}.")
     values = {n: given.get(n, a.default) for n, a in signature.items() if n in given or a.default is not a.empty}
     inputs = tuple(name for name in signature if name not in values)
+    if lacking := [name for name in tuple(signature)[3:] if name in inputs]:
+        found = f"{what} is given no value of {', '.join(lacking)}"
+        raise InputError(f"{found}, but must have one of each parameter, as in {lacking[0]}=1.0.")
     if len(inputs) not in (2, 3) or tuple(signature)[: len(inputs)] != inputs:
         wanted = "two vectors first, then time or nothing, and then parameters that all have values"
         raise InputError(f"{what} has {', '.join(inputs) or 'nothing'} without a value, but must have {wanted}.")
     return inputs, values
 
 
-def _definition(what: str, source: str) -> ast.Module:
+def _definition(what: str, source: str) -> ast.FunctionDef:
     """The definition alone, without annotations, defaults and decorators."""
     try:
         found: ast.AST = ast.parse(source).body[0]
@@ -121,7 +128,7 @@ def _definition(what: str, source: str) -> ast.Module:
     found.decorator_list, found.returns, found.args.defaults = [], None, []
     for argument in found.args.args:
         argument.annotation = None
-    return ast.Module([found], [])
+    return found
 
 
 def _scope(function: FunctionType) -> dict[str, Any]:
@@ -149,6 +156,6 @@ def compiled(what: str, module: Any, device: Any) -> None:
     try:
         wp.load_module(module, device)
     except Exception as error:  # Warp raises any kind for a text that it does not understand
-        reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
-        wanted = "it must use numbers, vectors and functions of Warp alone, and return a vector"
+        reason = str(error).replace("\\n", "\n").strip().splitlines()[-1:] or [type(error).__name__]
+        wanted = "it must use numbers, vectors of three components and functions of Warp alone, and return a vector"
         raise InputError(f"{what} cannot be compiled: {reason[0].lstrip('; ').rstrip('.')}; {wanted}.") from error

@@ -1,9 +1,11 @@
 """The text of a user's function: what Warp can differentiate, and its numbers in a precision."""
 
 import ast
+import builtins
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from cortado.errors import InputError
@@ -27,12 +29,14 @@ class Differentiable(ast.NodeVisitor):
             self._refuse(node)
         self.generic_visit(node)
 
-    def visit_Subscript(self, node: ast.Subscript) -> None:
+    def _refuse_part(self, node: ast.Subscript | ast.Attribute) -> None:
         if isinstance(node.ctx, ast.Store):
             part = ast.unparse(node)
             found = f"{self._what} changes {part} alone, which Warp cannot differentiate"
             raise InputError(f"{found}, but must make vectors whole, as in wp.vec3(a, b, c).")
         self.generic_visit(node)
+
+    visit_Subscript = visit_Attribute = _refuse_part
 
     def _refuse(self, node: ast.AST) -> None:
         line = ast.unparse(node).splitlines()[0].rstrip(":")
@@ -44,9 +48,34 @@ class Differentiable(ast.NodeVisitor):
     visit_While = visit_Break = visit_Continue = _refuse
 
 
+def check_returns(what: str, function: ast.FunctionDef) -> None:
+    """Raises `InputError` for a function that may end without returning anything."""
+    if not _returns(function.body):
+        raise InputError(f"{what} may end without return, but must return a vector, whatever its arguments are.")
+
+
+def _returns(body: list[ast.stmt]) -> bool:
+    last = body[-1]
+    if isinstance(last, ast.If):
+        return _returns(last.body) and bool(last.orelse) and _returns(last.orelse)
+    return isinstance(last, ast.Return) and last.value is not None
+
+
+def check_names(what: str, function: ast.FunctionDef, own: set[str], scope: Mapping[str, Any]) -> None:
+    """Raises `InputError` for a name that stands for nothing, or for arrays and lists, of which Warp takes none."""
+    for node in ast.walk(function):
+        if not isinstance(node, ast.Name) or node.id in own:
+            continue
+        if node.id not in scope and not hasattr(builtins, node.id):
+            raise InputError(f"{what} has the name {node.id}, which stands for nothing, but must name what is there.")
+        if isinstance(scope.get(node.id), (list, tuple, dict, str, np.ndarray)):
+            found = f"{what} has the name {node.id}, which is a {type(scope[node.id]).__name__} outside of it"
+            raise InputError(f"{found}, but must take a number or a vector: make it a parameter of the function.")
+
+
 class InPrecision(ast.NodeTransformer):
-    """Numbers, and types of numbers and vectors, become those of the precision; numbers from outside are written out,
-    so that the text says all that the function does. Indices and what counts them stay whole."""
+    """Numbers, and types of numbers and vectors, become those of the precision; what numbers and vectors from outside
+    are is written out, so that the text says all that the function does. Indices and what counts them stay whole."""
 
     def __init__(self, scope: Mapping[str, Any], local: set[str]):
         self._scope, self._local, self._whole = scope, local, set[str]()
@@ -106,7 +135,9 @@ class InPrecision(ast.NodeTransformer):
 
     @staticmethod
     def _number(node: ast.expr, value: Any) -> ast.AST:
-        """A call that makes a number of the precision, where a value is one."""
+        """A call that makes a number or a vector of the precision, where a value is one."""
+        if type(value) in (wp.vec3f, wp.vec3d):
+            return ast.Call(ast.Name(VECTOR, ast.Load()), [ast.Constant(float(part)) for part in value], [])
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return node
         return ast.Call(ast.Name(REAL, ast.Load()), [ast.Constant(float(value))], [])

@@ -37,7 +37,8 @@ def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
         raise InputError(f"forces is {shown(forces)}, but must be {WANTED}.")
     for k, maker in enumerate(forces):
         if isinstance(maker, type) or not callable(getattr(maker, "force", None)):
-            raise InputError(f"forces has {shown(maker)} at place {k}, but must be {WANTED}.")
+            wanted = "but each must be an object with a method force(setting), such as cortado.forces.Body(f, k=2.0)"
+            raise InputError(f"forces has {shown(maker)} at place {k}, {wanted}.")
         checked_parameters("force", maker, getattr(maker, "parameters", None))
     return tuple(forces)
 
