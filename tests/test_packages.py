@@ -267,6 +267,19 @@ def test_the_package_of_the_page_is_one(tmp_path, monkeypatch):
     assert Simulation(tmp_path / "scene.toml").parameters()["drag.k"] == 3.0
 
 
+def test_a_solver_without_iterations_is_described(tmp_path, monkeypatch, cortado_command):
+    """That of the page, which has no diagnostics of PCISPH."""
+    page = (Path(__file__).parents[1] / "docs" / "own_parts.md").read_text()
+    block = next(
+        one for one in re.findall(r"^```py[a-z0-9]*\n(.*?)^```$", page, re.DOTALL | re.MULTILINE) if "class Dust(" in one
+    )
+    on_path(tmp_path, monkeypatch, entries={"cortado.solvers": {"dust": "my_dust:MakeDust"}})
+    (tmp_path / "my_dust.py").write_text(block.partition("dusty = ")[0])
+    (tmp_path / "scene.toml").write_text(SCENE + '[solver]\nkind = "dust"\ntime_step = 0.002\n')
+    code, words, told = cortado_command("describe", tmp_path / "scene.toml")
+    assert code == 0 and "memory" in words, told
+
+
 def test_the_reference_engine_has_none(file):
     with pytest.raises(InputError, match=r"scene has \[\[force\]\], but must leave it out for the reference engine"):
         reference.Simulation(file(DRAG))
