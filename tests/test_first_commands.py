@@ -212,7 +212,11 @@ def test_it_refuses_what_cortado_refuses(old, new):
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
 @pytest.mark.parametrize(
     ("typed", "found"),
-    [("cortado optim", "optimise"), ("cortado run --rec", "--record-every"), ("cortado gradients f", "figure")],
+    [
+        ("cortado optim", "optimise"),
+        ("cortado run --rec", "--record-every --record"),
+        ("cortado gradients f", "figure"),
+    ],
 )
 def test_bash_completes(cortado_command, typed, found):
     code, script, err = cortado_command("completion", "bash")
@@ -221,6 +225,18 @@ def test_bash_completes(cortado_command, typed, found):
     ask = f"COMP_WORDS=({typed}); COMP_CWORD={len(words) - 1}; _tyro_cortado; echo ${{COMPREPLY[@]}}"
     done = subprocess.run(["bash", "-c", f"{script}\n{ask}"], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == found, done.stderr
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+@pytest.mark.parametrize("command", ["run", "optimise", "picture", "sweep", "view", "bench", "gradients check"])
+def test_bash_completes_nothing_but_options(cortado_command, command):
+    """A description of several lines, of which all but the first would be taken for words, is not written."""
+    script = cortado_command("completion", "bash")[1]
+    ask = f"COMP_WORDS=(cortado {command} --); COMP_CWORD={len(command.split()) + 1}; _tyro_cortado"
+    line = f'{script}\n{ask}; printf "%s\\n" "${{COMPREPLY[@]}}"'
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, timeout=60)
+    options = done.stdout.split()
+    assert "--help" in options and all(option.startswith("--") for option in options), options
 
 
 def test_zsh_has_a_script(cortado_command):

@@ -271,7 +271,9 @@ def test_a_solver_without_iterations_is_described(tmp_path, monkeypatch, cortado
     """That of the page, which has no diagnostics of PCISPH."""
     page = (Path(__file__).parents[1] / "docs" / "own_parts.md").read_text()
     block = next(
-        one for one in re.findall(r"^```py[a-z0-9]*\n(.*?)^```$", page, re.DOTALL | re.MULTILINE) if "class Dust(" in one
+        one
+        for one in re.findall(r"^```py[a-z0-9]*\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+        if "class Dust(" in one
     )
     on_path(tmp_path, monkeypatch, entries={"cortado.solvers": {"dust": "my_dust:MakeDust"}})
     (tmp_path / "my_dust.py").write_text(block.partition("dusty = ")[0])

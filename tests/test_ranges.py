@@ -73,6 +73,20 @@ class Weighed:
         return tuple(self.weights)
 
 
+class Seen(Weighed):
+    """A linear loss of quantities that are sums over neighbours too."""
+
+    def __init__(self, simulation, names=("vorticity", "wall_force")):
+        random, first = np.random.default_rng(9), {name: simulation.quantity(name) for name in names}
+        self.weights = {name: random.standard_normal(array.shape) for name, array in first.items()}
+
+    def value(self, end):
+        return sum(float((w * end[name]).sum()) for name, w in self.weights.items())
+
+    def adjoint(self, end):
+        return self.weights
+
+
 def results(name) -> dict[str, bytes]:
     """Bits of a short run of a disturbed start, of tangents, and of gradients by every estimator."""
     simulation = Simulation(CASES[name](), precision="float64", forces=FORCES.get(name, []))
@@ -88,6 +102,10 @@ def results(name) -> dict[str, bytes]:
     for label, estimator in ESTIMATORS.items():
         _, gradient = problem.value_and_gradient(point, estimator)
         found |= {f"{label}, {name}": array for name, array in gradient.items()}
+    seen = Problem(simulation, STEPS, Seen(simulation))
+    for _ in range(2):  # a kernel is compiled whole
+        found |= {"seen": seen.value(point), "seen, tangent": seen.tangent(point, directions)}
+        found |= {f"seen, {name}": array for name, array in seen.value_and_gradient(point)[1].items()}
     return {name: np.asarray(array).tobytes() for name, array in found.items()}
 
 

@@ -100,8 +100,7 @@ def run(
         record_every: Steps from one frame of the trajectory to the next.
         overwrite: Replace an earlier run in the same folder.
         pictures: Leave out the shaded pictures and the film.
-        record: A quantity of the particles for the trajectory, such as density, pressure or vorticity; may be given
-            again.
+        record: A quantity of the particles for the trajectory, such as pressure or vorticity; may be given again.
     """
     require_at_least(1, record_every, "--record-every")
     from cortado.commands.run import run_scene
@@ -232,8 +231,7 @@ def sweep(
     Args:
         file: The scene file, or the task file.
         sets: What changes, such as solver.time_step=0.001,0.002; may be given again, for every combination.
-        steps: Number of time steps of a scene, 200 if left out, with the smallest time step of the sweep; with longer
-            ones as many fewer as reach the same time. A task says its own.
+        steps: Time steps of a scene with the smallest one of the sweep, 200 if left out; longer ones end at its time.
         time: Seconds that a scene is simulated, in the place of steps.
         out: Folder of the sweep, with a folder for each combination and a table of them all.
         device: "cpu", or "cuda:0" for the first GPU, of each worker.
