@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from cortado.device.binding import bound
+from cortado.device.bundles import Bundles, bundles_of
 from cortado.device.cells import Grid
 from cortado.device.launching import TreeReduction, add, sum_and_maximum, sum_of
 from cortado.device.neighbourhood import Discretisation, neighbourhood_type
@@ -61,8 +63,10 @@ class Kernels:
     integration = integration_kernels(FLOAT64, False)
     begin_adjoint = begin_adjoint_kernel(DISCRETISATION)
     gravity = gravity_kernels(FLOAT64, False)
-    pairwise = viscosity_kernels(DISCRETISATION, pairwise)
-    laminar = viscosity_kernels(DISCRETISATION, laminar)
+    pairwise_no_slip = viscosity_kernels(DISCRETISATION, pairwise, True)
+    pairwise = viscosity_kernels(DISCRETISATION, pairwise, False)
+    laminar_no_slip = viscosity_kernels(DISCRETISATION, laminar, True)
+    laminar = viscosity_kernels(DISCRETISATION, laminar, False)
     mixture = mixture_kernels(FLOAT64, 3, False)
     diffusion = MappingProxyType(
         {
@@ -94,16 +98,20 @@ def launch(kernel: Any, threads: int = N, **given: Any) -> Values:
     """Run a kernel on arguments by name and return every array argument after it. An array with an axis for the scenes
     of a batch has none here."""
     given = {"particles": N, "k": 0, **SINGLE, **given}
-    arguments = []
-    for a in kernel.adj.args:
-        value = given[a.label]
+    types, bundles = {a.label: a.type for a in kernel.adj.args}, bundles_of(kernel)
+    for label, fields in bundles.items():
+        own = types.pop(label).vars
+        types |= {name: own[field].type for field, name in fields.items()}
+    values = {}
+    for name, kind in types.items():
+        value = given[name]
         if isinstance(value, np.ndarray):
-            value = array(value[None] if a.type.ndim == 2 else value, a.type.dtype)
-        arguments.append(value)
-    wp.launch(kernel, threads, inputs=arguments, device=CPU)
+            value = array(value[None] if kind.ndim == 2 else value, kind.dtype)
+        values[name] = value
+    wp.launch(kernel, threads, inputs=bound(kernel, (values,), {}, Bundles()), device=CPU)
     return {
-        a.label: value.numpy()[0] if a.type.ndim == 2 else value.numpy()
-        for a, value in zip(kernel.adj.args, arguments, strict=True)
+        name: value.numpy()[0] if types[name].ndim == 2 else value.numpy()
+        for name, value in values.items()
         if isinstance(value, wp.array)
     }
 
@@ -302,8 +310,8 @@ class Pairwise(Viscosity):
     kernels = Kernels.pairwise
 
 
-class PairwiseWithFriction(Pairwise):
-    friction = 0.7
+class PairwiseWithFriction(Viscosity):
+    kernels, friction = Kernels.pairwise_no_slip, 0.7
 
 
 class WithoutViscosity(Pairwise):
@@ -323,8 +331,8 @@ class Laminar(Viscosity):
     kernels = Kernels.laminar
 
 
-class LaminarWithFriction(Laminar):
-    friction = 0.7
+class LaminarWithFriction(Viscosity):
+    kernels, friction = Kernels.laminar_no_slip, 0.7
 
 
 class GravityTable(Operation):

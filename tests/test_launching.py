@@ -4,7 +4,9 @@ import pytest
 import warp as wp
 
 from cortado import Simulation
-from cortado.device.launching import KernelLauncher, bound, launch, launch_together, watched
+from cortado.device.binding import bound
+from cortado.device.bundles import Bundles
+from cortado.device.launching import KernelLauncher, launch, launch_together, watched
 from cortado.device.neighbourhood import neighbourhood_type
 from cortado.device.precision import FLOAT64
 from cortado.sph.integration import integration_kernels
@@ -17,12 +19,12 @@ NAMES = ("particles", "time_step", "x", "v", "acceleration", "x_star", "v_star")
 
 def test_arguments_come_in_the_order_of_the_kernel():
     given = {name: name.upper() for name in reversed(NAMES)}
-    assert bound(PREDICT, (), given) == [name.upper() for name in NAMES]
+    assert bound(PREDICT, (), given, Bundles()) == [name.upper() for name in NAMES]
 
 
 def test_what_is_given_comes_before_groups_and_groups_in_their_order():
     first, second = {"x": 1, "v": 2, "other": 0}, {"x": 10, "v": 20, "time_step": 30, "x_star": 40, "v_star": 50}
-    found = bound(PREDICT, (first, second), {"v": 3, "acceleration": 4, "particles": 60})
+    found = bound(PREDICT, (first, second), {"v": 3, "acceleration": 4, "particles": 60}, Bundles())
     assert found == [60, 30, 1, 3, 4, 40, 50]
 
 
@@ -32,7 +34,7 @@ def test_a_missing_argument_is_named(missing):
     with pytest.raises(
         TypeError, match=f"argument '{missing}' of kernel .*predict.* is missing; it has particles, time"
     ):
-        bound(PREDICT, (), given)
+        bound(PREDICT, (), given, Bundles())
 
 
 def test_what_is_known_is_said_where_an_argument_is_missing():
@@ -40,12 +42,12 @@ def test_what_is_known_is_said_where_an_argument_is_missing():
     with pytest.raises(
         TypeError, match=r"'x_star' of .* is missing; .*; known are v_star, particles, time_step, x, v, xstar, acc"
     ):
-        bound(PREDICT, groups, {"v_star": 0})
+        bound(PREDICT, groups, {"v_star": 0}, Bundles())
 
 
 def test_a_misspelt_argument_is_named():
     with pytest.raises(TypeError, match="has no argument 'xstar'; it has particles, time_step, x, v, acc"):
-        bound(PREDICT, (), {**dict.fromkeys(NAMES, 0), "xstar": 0})
+        bound(PREDICT, (), {**dict.fromkeys(NAMES, 0), "xstar": 0}, Bundles())
 
 
 @pytest.mark.parametrize("by", ["launch", "launcher"])

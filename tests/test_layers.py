@@ -30,10 +30,11 @@ LAYERS = """
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights
     scene.containers scene.entry_points scene.package_tables scene.solvers scene.model scene.stability
-    device device.cores device.driver device.kernels device.memory device.precision device.arithmetic device.loads
+    device device.cores device.driver device.bundles device.binding device.kernels device.memory device.precision device.arithmetic device.loads
     device.lanes device.reduction device.host device.silence device.threads device.compiling device.kernel_cache
     device.smoothing
-    device.neighbourhood device.arrays device.fields device.launching device.state device.cells
+    device.neighbourhood device.terms device.pair_loops device.pair_sums device.made_derivatives device.by_hand
+    device.arrays device.fields device.launching device.state device.cells
     device.candidates device.neighbours
     scene.overlaps scene.checks scene.scene scene.in_words
     discretise.crowding parameters.checks
@@ -46,8 +47,8 @@ LAYERS = """
     sph.function_text sph.formula sph.packed sph.formula_kernels sph.own_force sph.body sph.pair forces
     solvers solvers.containment_kernels solvers.containment solvers.solver solvers.makers solvers.named
     solvers.convergence solvers.loop solvers.particles solvers.particle_derivatives solvers.build solvers.pcisph
-    solvers.pcisph.begin_adjoint solvers.pcisph.density_ratio_relaxation solvers.pcisph.frozen_pressure
-    solvers.pcisph.pressure solvers.pcisph.pressure_force
+    solvers.pcisph.begin_adjoint solvers.pcisph.density_ratio_relaxation
+    solvers.pcisph.pressure solvers.pcisph.pressure_force solvers.pcisph.frozen_pressure
     solvers.pcisph.wall_relaxation solvers.pcisph.parts solvers.pcisph.steps solvers.pcisph.derivatives
     solvers.pcisph.solver solvers.pcisph.build
     reference.digits reference.engine reference.histories reference.losses reference.simulation reference

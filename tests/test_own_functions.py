@@ -92,12 +92,13 @@ def test_reverse_forward_tape_and_differences_agree(force, make):
 
 @pytest.mark.parametrize("force", FORCES)
 def test_float32_is_near_float64(force):
+    """Over 12 random starts the gradient by the rest density, which nearly cancels, is off by up to 3.3e-3."""
     found = []
     for precision in ("float32", "float64"):
         judged = problem(FORCES[force](3), precision=precision)
         found.append(judged.value_and_gradient(point_of(judged))[1])
     for name, bar in found[1].items():
-        assert np.linalg.norm(found[0][name] - bar) < 2e-3 * np.linalg.norm(bar), name
+        assert np.linalg.norm(found[0][name] - bar) < 5e-3 * np.linalg.norm(bar), name
 
 
 @pytest.mark.parametrize("force", FORCES)

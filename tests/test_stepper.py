@@ -225,7 +225,8 @@ def test_segments_chained_by_vjp_have_the_bits_of_one_run(name, precision):
             assert found.tobytes() == gradient[parameter].tobytes(), parameter
         else:
             found = sum(part[parameter] for part in parts)
-            np.testing.assert_allclose(found, gradient[parameter], rtol=ROUND_OFF[precision], atol=0.0)
+            size = sum(np.abs(part[parameter]) for part in parts)  # parts of the sum may cancel
+            assert (np.abs(found - gradient[parameter]) <= ROUND_OFF[precision] * size).all(), parameter
 
 
 def test_segments_of_a_batch_chained_by_vjp_have_the_bits_of_one_run():

@@ -19,6 +19,7 @@ import numpy as np
 import warp as wp
 
 from cortado.bench.timing import median_seconds
+from cortado.device.bundles import unbundled
 from cortado.device.cores import usable_cores
 
 COPIED = 128 * 2**20
@@ -28,7 +29,7 @@ COPIED = 128 * 2**20
 def least_bytes(arguments: Sequence[Any], threads: int, particles: int, listed: int) -> int:
     """[bytes] that a launch must read and write at least, with so many neighbours in all lists together."""
     entries = max(threads, particles) if threads > 1 else 1
-    arrays = {a.ptr: a for a in arguments if isinstance(a, wp.array)}
+    arrays = {a.ptr: a for a in unbundled(arguments) if isinstance(a, wp.array)}
     total = sum(min(len(a), entries) * wp.types.type_size_in_bytes(a.dtype) for a in arrays.values())
     return total + (4 * listed + 8 * particles if sums_over_neighbours(arguments) else 0)
 

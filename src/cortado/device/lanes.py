@@ -63,22 +63,27 @@ def lane_functions(precision: Precision, lanes: int) -> LaneFunctions:
 
 
 @cache
-def fraction_sum(precision: Precision, phases: int, lanes: int) -> Any:
-    """A Warp function: the sum over the lanes of a vector of one number for each phase."""
-    fractions, add_up = precision.fractions(phases), lane_functions(precision, lanes).add_up
+def sum_over_lanes(kind: Any, precision: Precision, lanes: int) -> Any:
+    """A Warp function: the sum over the lanes of a number or of a vector of any length, as ``kind`` says."""
+    functions = lane_functions(precision, lanes)
+    if kind is precision.real:
+        return functions.add_up
+    if kind is precision.vector:
+        return functions.add_up_vectors
+    add_up, length = functions.add_up, len(kind())
 
     @wp.func
-    def same(x: fractions) -> fractions:
+    def same(x: kind) -> kind:
         return x
 
     @wp.func
-    def add_up_fractions(x: fractions) -> fractions:
-        result = fractions()
-        for k in range(wp.static(phases)):
+    def add_up_components(x: kind) -> kind:
+        result = kind()
+        for k in range(wp.static(length)):
             result[k] = add_up(x[k])
         return result
 
-    return same if lanes == 1 else add_up_fractions
+    return same if lanes == 1 else add_up_components
 
 
 def _of_one(precision: Precision) -> LaneFunctions:

@@ -1,6 +1,6 @@
 """Launches of kernels with arguments by name, and sums over particles in a fixed order."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import wait
 from contextlib import contextmanager, nullcontext
 from functools import cache, partial
@@ -8,6 +8,8 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.binding import Named, bound
+from cortado.device.bundles import Bundles
 from cortado.device.cores import usable_cores
 from cortado.device.lanes import lanes_of
 from cortado.device.precision import Precision
@@ -22,37 +24,6 @@ PARTS_A_CORE = 4
 """Ranges for each core at most: one that is busy elsewhere leaves some of its own to the others."""
 LEAST_SHARED_PART = 10_000
 """Particles at least in a range where there is more than one for each core."""
-
-
-Named = Mapping[str, Any]
-"""Arguments of kernels by name, of which a launch takes those that its kernel has."""
-
-
-def bound(kernel: wp.Kernel, groups: Sequence[Named], given: Named) -> list[Any]:
-    """The arguments of a kernel in its order: out of ``given``, all of which it must have, and out of the first of the
-    ``groups`` that has them, which may hold more.
-
-    Kernels take many arrays of one type, and nothing else would notice a mistake: raises `TypeError` for an argument
-    that is missing or that the kernel does not have.
-    """
-    names = [argument.label for argument in kernel.adj.args]
-    surplus = [name for name in given if name not in names]
-    if surplus:
-        raise TypeError(f"kernel {kernel.key} has no argument {surplus[0]!r}; it has {', '.join(names)}.")
-    sources = (given, *groups)
-    arguments = []
-    for name in names:
-        for source in sources:
-            if name in source:
-                arguments.append(source[name])
-                break
-        else:
-            known = ", ".join(dict.fromkeys(known for source in sources for known in source))
-            raise TypeError(
-                f"argument {name!r} of kernel {kernel.key} is missing; it has {', '.join(names)}; known are {known}."
-            )
-    return arguments
-
 
 Watcher = Callable[[str, Any, Sequence[Any], Callable[[], None]], None]
 """Is given every launch: the name of what is launched, its threads, its arguments, and what launches it, which it must
@@ -89,7 +60,7 @@ def launch(
 ) -> None:
     """Launch a kernel, off any tape, with arguments by name; ``threads``: their number, or a shape; ``block``: how many
     threads of a GPU share memory, if it matters."""
-    inputs, sizes = bound(kernel, groups, arguments), {} if block is None else {"block_dim": block}
+    inputs, sizes = bound(kernel, groups, arguments, Bundles()), {} if block is None else {"block_dim": block}
     work = partial(wp.launch, kernel, threads, inputs=inputs, device=device, record_tape=False, **sizes)
     _perform(kernel.key, threads, inputs, work)
 
@@ -130,6 +101,7 @@ class KernelLauncher:
         self._side = wp.Stream(device) if device.is_cuda and not record_tape else None
         self._went_aside = False
         self._compiled: set[Any] = set()
+        self._bundles = Bundles()
         self._whole: Any = None
         self._parts: list[Any] = []
 
@@ -139,7 +111,7 @@ class KernelLauncher:
         return self.parts == 1
 
     def __call__(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
-        inputs = bound(kernel, groups, arguments)
+        inputs = bound(kernel, groups, arguments, self._bundles)
         sums = hasattr(inputs[0], "neighbours")
         if sums and threads is not None:
             raise TypeError(f"kernel {kernel.key} sums over neighbours, and has one thread for each particle.")

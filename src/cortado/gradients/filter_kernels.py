@@ -22,7 +22,8 @@ from typing import Any
 import warp as wp
 
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.device.pair_sums import fluid_sum
 
 STRONGEST = 0.6
 """Strength s of the viscosity at most: waves of two spacings are damped by a factor, and do not change their sign."""
@@ -49,13 +50,34 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
-    separation, weight, per_size = pair.separation, pair.weight, pair.per_size
-    vectors, numbers = pair.vectors, pair.numbers
+    weight, per_size = pair.weight, pair.per_size
     LANES = discretisation.lanes
-    lanes = lane_functions(discretisation.precision, LANES)
-    lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
+    lane = lane_functions(discretisation.precision, LANES).lane
     module = discretisation.module(False, "adjoint_filters")
     strongest = wp.constant(real(STRONGEST))
+
+    @fluid_sum(discretisation)
+    def weights(x_ij: vector, s: neighbourhood) -> real:
+        return weight(x_ij, s)
+
+    @fluid_sum(discretisation)
+    def strain(x_ij: vector, v_ij: vector, most_i: real, most_j: real, s: neighbourhood) -> real:
+        """gamma_i^2"""
+        return weight(x_ij, s) / wp.max(most_i, most_j) * wp.dot(v_ij, v_ij) * per_size(x_ij, s)
+
+    @fluid_sum(discretisation)
+    def exchange(
+        x_ij: vector,
+        most_i: real,
+        most_j: real,
+        strengths_i: real,
+        strengths_j: real,
+        a_ij: vector,
+        b_ij: vector,
+        s: neighbourhood,
+    ) -> tuple[vector, vector]:
+        share = wp.max(strengths_i, strengths_j) * (weight(x_ij, s) / wp.max(most_i, most_j))
+        return share * a_ij, share * b_ij
 
     @wp.kernel(module=module, enable_backward=False)
     def crowd(
@@ -66,15 +88,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
     ):
         """max(S_i, W(h / 2))"""
         i = s.first + wp.tid() // LANES
-        x_i = x[i]
-        total = real(0.0)
-        if lane() == 0:
-            total = -real(s.filling[i]) * s.self_weight
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            for u in range(UNROLL):
-                total += weight(separation(x_i, x_j[u], s), s)
-        total = add_up(total)
+        total = weights(i, x, s) - real(s.filling[i]) * s.self_weight
         if lane() > 0:
             return
         most[i] = wp.max(total, weight(vector(real(0.5) * s.support, real(0.0), real(0.0)), s))
@@ -92,19 +106,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
     ):
         """s_i, of sorted particles as all arguments"""
         i = s.first + wp.tid() // LANES
-        x_i = x[i]
-        v_i = v[i]
-        most_i = most[i]
-        total = real(0.0)
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            v_j = vectors(v, k, i, s)
-            most_j = numbers(most, k, i, s)
-            for u in range(UNROLL):
-                x_ij = separation(x_i, x_j[u], s)
-                v_ij = v_i - v_j[u]
-                total += weight(x_ij, s) / wp.max(most_i, most_j[u]) * wp.dot(v_ij, v_ij) * per_size(x_ij, s)
-        total = add_up(total)
+        total = strain(i, x, v, most, s)
         if lane() > 0:
             return
         strengths[i] = wp.min(coefficient * time_step[i // s.particles] * wp.sqrt(total), strongest)
@@ -137,30 +139,11 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> FilterKernels:
     ):
         """Two fields of an adjoint at once, which are written in the scene's order."""
         i = s.first + wp.tid() // LANES
-        x_i = x[i]
-        most_i = most[i]
-        strength_i = strengths[i]
-        a_i = a_sorted[i]
-        b_i = b_sorted[i]
-        a_total = vector()
-        b_total = vector()
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            most_j = numbers(most, k, i, s)
-            strength_j = numbers(strengths, k, i, s)
-            a_j = vectors(a_sorted, k, i, s)
-            b_j = vectors(b_sorted, k, i, s)
-            for u in range(UNROLL):
-                w_ij = weight(separation(x_i, x_j[u], s), s) / wp.max(most_i, most_j[u])
-                share = wp.max(strength_i, strength_j[u]) * w_ij
-                a_total += share * (a_j[u] - a_i)
-                b_total += share * (b_j[u] - b_i)
-        a_total = add_up_vectors(a_total)
-        b_total = add_up_vectors(b_total)
+        a_total, b_total = exchange(i, x, most, strengths, a_sorted, b_sorted, s)
         if lane() > 0:
             return
-        a[order[i]] = a_i + a_total
-        b[order[i]] = b_i + b_total
+        a[order[i]] = a_sorted[i] - a_total
+        b[order[i]] = b_sorted[i] - b_total
 
     @wp.kernel(module=module, enable_backward=False)
     def drag(

@@ -13,7 +13,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.arrays import Fields, padded
-from cortado.device.launching import Named
+from cortado.device.binding import Named
 from cortado.solvers.particles import ParticleSolver
 from cortado.sph.parts import StepContext
 from cortado.sph.vorticity import circulation_kernels

@@ -17,23 +17,21 @@ from cortado.sph.packed import theta_of
 
 
 @cache
-def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int, ...]) -> Kernels:
-    """Of a function whose parameters are numbers (rank 0) and vectors (rank 1). ``plane`` is 0 along an axis that a
-    scene in 2-D does not have."""
+def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int) -> Kernels:
+    """Of a function whose parameters are numbers (rank 0) and vectors (rank 1), in a scene of 2 or 3 dimensions."""
     vector = discretisation.precision.vector
     theta_type = theta_of(discretisation.precision, ranks)
     neighbourhood = neighbourhood_type(discretisation.precision)
-    name = topic("body", text, ranks)
+    name = topic("body", text, ranks, dimension)
     module = discretisation.module(True, name)
     tangent_module, adjoint_module = discretisation.tangent_module(name), discretisation.module(False, name)
-    force = applied(text, discretisation.precision, ranks, module)
-    change_of = change_along(text, discretisation.precision, ranks, tangent_module)
-    work = work_of(text, discretisation.precision, ranks, adjoint_module)
+    force = applied(text, discretisation.precision, ranks, dimension, module)
+    change_of = change_along(text, discretisation.precision, ranks, dimension, tangent_module)
+    work = work_of(text, discretisation.precision, ranks, dimension, adjoint_module)
 
     @wp.kernel(module=module)
     def body(
         s: neighbourhood,
-        plane: vector,
         theta: wp.array(dtype=theta_type),
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
@@ -42,12 +40,11 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
         acceleration: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid()
-        acceleration[i] = acceleration_in[i] + wp.cw_mul(plane, force(x[i], v[i], theta[i // s.particles]))
+        acceleration[i] = acceleration_in[i] + force(x[i], v[i], theta[i // s.particles])
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def body_tangent(
         s: neighbourhood,
-        plane: vector,
         theta: wp.array(dtype=theta_type),
         theta_dot: wp.array(dtype=theta_type),
         x: wp.array(dtype=vector),
@@ -61,12 +58,11 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
         i = s.first + wp.tid()
         member = i // s.particles
         change = change_of(x[i], v[i], theta[member], x_dot[i], v_dot[i], theta_dot[member])
-        acceleration_dot[i] = acceleration_in_dot[i] + wp.cw_mul(plane, change)
+        acceleration_dot[i] = acceleration_in_dot[i] + change
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def body_adjoint(
         s: neighbourhood,
-        plane: vector,
         theta: wp.array(dtype=theta_type),
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
@@ -78,8 +74,9 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
         theta_bar: wp.array(dtype=theta_type),
     ):
         i = s.first + wp.tid()
-        bar = wp.cw_mul(plane, acceleration_bar[i])
-        own_x_bar, own_v_bar, own_theta_bar, _bar_bar = wp.grad(work)(x[i], v[i], theta[i // s.particles], bar)
+        own_x_bar, own_v_bar, own_theta_bar, _bar_bar = wp.grad(work)(
+            x[i], v[i], theta[i // s.particles], acceleration_bar[i]
+        )
         x_bar[i] = x_bar[i] + own_x_bar
         v_bar[i] = v_bar[i] + own_v_bar
         theta_bar[i] = own_theta_bar
@@ -93,5 +90,5 @@ class Body(OwnForce):
 
     kind = "Body"
 
-    def kernels(self, discretisation: Discretisation) -> Kernels:
-        return body_kernels(discretisation, self._formula, tuple(p.rank for p in self.parameters))
+    def kernels(self, discretisation: Discretisation, dimension: int) -> Kernels:
+        return body_kernels(discretisation, self._formula, tuple(p.rank for p in self.parameters), dimension)

@@ -12,9 +12,11 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.by_hand import adjoint_of, tangent_of
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.device.pair_sums import pair_sum
 
 
 @dataclass(frozen=True)
@@ -34,56 +36,21 @@ def density_sums(discretisation: Discretisation) -> DensitySums:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
-    neighbour, wall_position, wall_weight = pair.neighbour, pair.wall_position, pair.wall_weight
-    separation, weight, slope, gradient = pair.separation, pair.weight, pair.slope, pair.gradient
-    vectors, numbers = pair.vectors, pair.numbers
-    LANES = discretisation.lanes
-    lanes = lane_functions(discretisation.precision, LANES)
-    lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
+    weight, slope, gradient = pair.weight, pair.slope, pair.gradient
 
-    @wp.func
-    def weights(i: int, x: wp.array(dtype=vector), s: neighbourhood) -> real:
-        x_i = x[i]
-        total = real(0.0)
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            for u in range(UNROLL):
-                total += weight(separation(x_i, x_j[u], s), s)
-        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = neighbour(k, i, s)
-            total += wall_weight(b, s) * weight(separation(x_i, wall_position(b, s), s), s)
-        return add_up(total)
+    @pair_sum(discretisation)
+    def weights(x_ij: vector, s: neighbourhood) -> real:
+        return weight(x_ij, s)
 
-    @wp.func
-    def weights_tangent(i: int, x: wp.array(dtype=vector), x_dot: wp.array(dtype=vector), s: neighbourhood) -> real:
-        x_i = x[i]
-        x_dot_i = x_dot[i]
-        total = real(0.0)
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            for u in range(UNROLL):
-                j = neighbour(k + u, i, s)
-                total += wp.dot(gradient(separation(x_i, x[j], s), s), x_dot_i - x_dot[j])
-        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = neighbour(k, i, s)
-            g_ib = gradient(separation(x_i, wall_position(b, s), s), s)
-            total += wall_weight(b, s) * wp.dot(g_ib, x_dot_i)
-        return add_up(total)
+    @tangent_of(weights)
+    @pair_sum(discretisation, ahead=False)
+    def weights_tangent(x_ij: vector, x_dot_ij: vector, s: neighbourhood) -> real:
+        return wp.dot(gradient(x_ij, s), x_dot_ij)
 
-    @wp.func
-    def weights_adjoint(i: int, x: wp.array(dtype=vector), r: wp.array(dtype=real), s: neighbourhood) -> vector:
-        x_i = x[i]
-        r_i = r[i]
-        total = vector()
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            r_j = numbers(r, k, i, s)
-            for u in range(UNROLL):
-                x_ij = separation(x_i, x_j[u], s)
-                total += ((r_i + r_j[u]) * slope(x_ij, s)) * x_ij
-        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = neighbour(k, i, s)
-            total += (wall_weight(b, s) * r_i) * gradient(separation(x_i, wall_position(b, s), s), s)
-        return add_up_vectors(total)
+    @adjoint_of(weights)
+    @pair_sum(discretisation)
+    def weights_adjoint(x_ij: vector, r_i: real, r_j: real, s: neighbourhood) -> vector:
+        return ((r_i + r_j) * slope(x_ij, s)) * x_ij
 
     return DensitySums(weights=weights, weights_tangent=weights_tangent, weights_adjoint=weights_adjoint)
 

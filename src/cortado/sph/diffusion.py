@@ -18,6 +18,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import Discretisation, neighbourhood_type
@@ -70,6 +71,10 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
     energy, form = diffusion.energy.functions(precision, phases), diffusion.mobility.functions(precision, phases)
     energy_gradient, energy_hessian_product = energy.gradient, energy.hessian_product
     mobile, mobile_gradient = form.value, form.gradient
+
+    potential_changes = bundle(x=vector, n=real, m=real, c=fractions)
+    flux_changes = bundle(x=vector, n=real, m=real, w=real, chi=fractions)
+    flux_adjoints = bundle(x=vector, n=real, m=real, c=fractions, time_step=real, mobility=real)
 
     @wp.func
     def project(u: fractions) -> fractions:
@@ -136,13 +141,10 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         mobility: wp.array(dtype=real),
         mobility_dot: wp.array(dtype=real),
         x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
         n: wp.array(dtype=real),
-        n_dot: wp.array(dtype=real),
         m: wp.array(dtype=real),
-        m_dot: wp.array(dtype=real),
         c: wp.array(dtype=fractions),
-        c_dot: wp.array(dtype=fractions),
+        dot: potential_changes,
         # out
         chi_dot: wp.array(dtype=fractions),
         w_dot: wp.array(dtype=real),
@@ -150,19 +152,19 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         total = spread(i, x, n, m, c, s)
-        total_dot = spread_tangent(i, x, x_dot, n, n_dot, m, m_dot, c, c_dot, s)
+        total_dot = spread_tangent(i, x, dot.x, n, dot.n, m, dot.m, c, dot.c, s)
         if lane() > 0:
             return
         width = interface_width[member]
         scale = s.volume / m[i]
         stiffness = width * width * scale
-        stiffness_dot = real(2.0) * width * interface_width_dot[member] * scale - stiffness * m_dot[i] / m[i]
+        stiffness_dot = real(2.0) * width * interface_width_dot[member] * scale - stiffness * dot.m[i] / m[i]
         chi_dot[i] = (
-            strength * project(energy_hessian_product(c[i], c_dot[i])) - stiffness * total_dot - stiffness_dot * total
+            strength * project(energy_hessian_product(c[i], dot.c[i])) - stiffness * total_dot - stiffness_dot * total
         )
         m_0 = mobility[member]
-        w_dot[i] = (m_dot[i] * m_0 + m[i] * mobility_dot[member]) * mobile(c[i]) + m[i] * m_0 * wp.dot(
-            mobile_gradient(c[i]), c_dot[i]
+        w_dot[i] = (dot.m[i] * m_0 + m[i] * mobility_dot[member]) * mobile(c[i]) + m[i] * m_0 * wp.dot(
+            mobile_gradient(c[i]), dot.c[i]
         )
 
     @wp.kernel(module=diffusion.tangent_module(), enable_backward=False)
@@ -172,15 +174,11 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
         x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
         n: wp.array(dtype=real),
-        n_dot: wp.array(dtype=real),
         m: wp.array(dtype=real),
-        m_dot: wp.array(dtype=real),
         w: wp.array(dtype=real),
-        w_dot: wp.array(dtype=real),
         chi: wp.array(dtype=fractions),
-        chi_dot: wp.array(dtype=fractions),
+        dot: flux_changes,
         c_dot: wp.array(dtype=fractions),
         # out
         c_new_dot: wp.array(dtype=fractions),
@@ -188,11 +186,11 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         total = spread(i, x, n, w, chi, s)
-        total_dot = spread_tangent(i, x, x_dot, n, n_dot, w, w_dot, chi, chi_dot, s)
+        total_dot = spread_tangent(i, x, dot.x, n, dot.n, w, dot.w, chi, dot.chi, s)
         if lane() > 0:
             return
         scale = time_step[member] / real(substeps) * s.volume / m[i]
-        change = time_step_dot[member] / time_step[member] - m_dot[i] / m[i]
+        change = time_step_dot[member] / time_step[member] - dot.m[i] / m[i]
         c_new_dot[i] = c_dot[i] + scale * (total_dot + change * total)
 
     @wp.kernel(module=diffusion.module(False), enable_backward=False)
@@ -225,12 +223,7 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         c: wp.array(dtype=fractions),
         y: wp.array(dtype=fractions),
         # in and out
-        x_bar: wp.array(dtype=vector),
-        n_bar: wp.array(dtype=real),
-        m_bar: wp.array(dtype=real),
-        c_bar: wp.array(dtype=fractions),
-        time_step_bar: wp.array(dtype=real),
-        mobility_bar: wp.array(dtype=real),
+        bar: flux_adjoints,
         # out
         z: wp.array(dtype=fractions),
     ):
@@ -243,15 +236,15 @@ def diffusion_kernels(diffusion: Diffusion) -> DiffusionKernels:
         m_i = m[i]
         m_0 = mobility[member]
         mobile_i = mobile(c[i])
-        x_bar[i] = x_bar[i] + x_sum
-        n_bar[i] = n_bar[i] + n_sum
-        m_bar[i] = m_bar[i] + w_bar * m_0 * mobile_i - own / m_i
+        bar.x[i] = bar.x[i] + x_sum
+        bar.n[i] = bar.n[i] + n_sum
+        bar.m[i] = bar.m[i] + w_bar * m_0 * mobile_i - own / m_i
         straight = project(chi_bar)
-        c_bar[i] = (
-            c_bar[i] + (w_bar * m_i * m_0) * mobile_gradient(c[i]) + strength * energy_hessian_product(c[i], straight)
+        bar.c[i] = (
+            bar.c[i] + (w_bar * m_i * m_0) * mobile_gradient(c[i]) + strength * energy_hessian_product(c[i], straight)
         )
-        time_step_bar[i] = time_step_bar[i] + own / time_step[member]
-        mobility_bar[i] = mobility_bar[i] + w_bar * m_i * mobile_i
+        bar.time_step[i] = bar.time_step[i] + own / time_step[member]
+        bar.mobility[i] = bar.mobility[i] + w_bar * m_i * mobile_i
         z[i] = (-interface_width[member] * interface_width[member] * s.volume / m_i) * chi_bar
 
     @wp.kernel(module=diffusion.module(False), enable_backward=False)

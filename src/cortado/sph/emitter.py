@@ -9,7 +9,7 @@ from cortado.device.arrays import to_device
 from cortado.device.fields import POSITIONS, VELOCITIES, Entry, StateField
 from cortado.device.state import Layout, Parameters, State
 from cortado.parameters.registry import Axis
-from cortado.sph.emitter_kernels import emitter_kernels
+from cortado.sph.emitter_kernels import emitter_kernels, nozzle_type
 from cortado.sph.parts import StepContext
 
 OUTLET = StateField("outlet", "m", Entry.VECTOR, Axis.SCALAR, first="nozzle_path")
@@ -46,14 +46,12 @@ class Emitter:
         """Room for the end of a step if no particle were prescribed."""
         precision, device = layout.precision, layout.device
         self.kernels = emitter_kernels(precision, requires_grad)
-        self.constants = {
-            "first": nozzle.first,
-            "upstream": wp.array(nozzle.upstream, dtype=precision.real, device=device),
-            "offsets": to_device(nozzle.offsets, precision, device),
-            "direction": precision.vector(*np.pad(nozzle.direction, (0, 3 - len(nozzle.direction)))),
-            "area": nozzle.area,
-            **layout.state(self.fields, requires_grad).named(),
-        }
+        constants = nozzle_type(precision)()
+        constants.first, constants.area = nozzle.first, nozzle.area
+        constants.upstream = wp.array(nozzle.upstream, dtype=precision.real, device=device)
+        constants.offsets = to_device(nozzle.offsets, precision, device)
+        constants.direction = precision.vector(*np.pad(nozzle.direction, (0, 3 - len(nozzle.direction))))
+        self.constants = {"nozzle": constants, **layout.state(self.fields, requires_grad).named()}
         """Of the nozzle, and of a step once it has begun, for kernels."""
         self._dot = layout.state(self.fields).named("_dot")
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.precision import Precision
 from cortado.sph.integration import integration_module
@@ -32,10 +33,33 @@ class EmitterKernels(Kernels):
 
 
 @cache
+def nozzle_type(precision: Precision) -> Any:
+    """The Warp struct of what does not change of an emitter; its arrays are of the particles of one scene from
+    ``first`` on."""
+    real, vector = precision.real, precision.vector
+
+    class Nozzle:
+        first: wp.int32
+        """Number of its first particle."""
+        upstream: wp.array(dtype=real)
+        """u [m]"""
+        offsets: wp.array(dtype=vector)
+        """o [m]"""
+        direction: vector
+        """e"""
+        area: real
+        """A [m^(d - 1)]"""
+
+    Nozzle.__name__ = Nozzle.__qualname__ = f"Nozzle_{precision.name}"
+    return wp.struct(Nozzle)
+
+
+@cache
 def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
     """The kernels for a precision. Of each scene b, ``outlet`` (members,) is q_(n-1) [m], ``emitted`` (members,) l at
-    the end of the step [m]; ``first`` and ``upstream`` count the particles p of one scene."""
-    real, vector = precision.real, precision.vector
+    the end of the step [m]."""
+    real, vector, nozzle_of = precision.real, precision.vector, nozzle_type(precision)
+    changes = bundle(outlet=vector, emitted=wp.float64, flow_rate=real, time_step=real)
 
     @wp.func
     def advance(flow_rate: real, area: real, time_step: real) -> wp.float64:
@@ -43,15 +67,15 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         return wp.float64(flow_rate) / wp.float64(area) * wp.float64(time_step)
 
     @wp.func
-    def remaining(p: int, first: int, upstream: wp.array(dtype=real), emitted: wp.float64) -> real:
+    def remaining(p: int, nozzle: nozzle_of, emitted: wp.float64) -> real:
         """s of a particle; 0 for one that is no part of the emitter."""
-        if p < first:
+        if p < nozzle.first:
             return real(0.0)
-        return real(wp.float64(upstream[p - first]) - emitted)
+        return real(wp.float64(nozzle.upstream[p - nozzle.first]) - emitted)
 
     @wp.kernel(module=integration_module(precision, True, taped))
     def begin(
-        area: real,
+        nozzle: nozzle_of,
         flow_rate: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
         outlet_in: wp.array(dtype=vector),
@@ -62,16 +86,12 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
     ):
         b = wp.tid()
         outlet[b] = outlet_in[b]
-        emitted[b] = emitted_in[b] + advance(flow_rate[b], area, time_step[b])
+        emitted[b] = emitted_in[b] + advance(flow_rate[b], nozzle.area, time_step[b])
 
     @wp.kernel(module=integration_module(precision, True, taped))
     def prescribe(
         particles: int,
-        first: int,
-        upstream: wp.array(dtype=real),
-        offsets: wp.array(dtype=vector),
-        direction: vector,
-        area: real,
+        nozzle: nozzle_of,
         nozzle_path: wp.array2d(dtype=vector),
         flow_rate: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
@@ -89,11 +109,11 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         i = wp.tid()
         b = i // particles
         p = i - b * particles
-        s = remaining(p, first, upstream, emitted[b])
+        s = remaining(p, nozzle, emitted[b])
         q = nozzle_path[b, step[b]]
         if s > real(0.0):
-            x[i] = q + offsets[p - first] - s * direction
-            v[i] = (q - outlet[b]) / time_step[b] + (flow_rate[b] / area) * direction
+            x[i] = q + nozzle.offsets[p - nozzle.first] - s * nozzle.direction
+            v[i] = (q - outlet[b]) / time_step[b] + (flow_rate[b] / nozzle.area) * nozzle.direction
         else:
             x[i] = x_free[i]
             v[i] = v_free[i]
@@ -103,7 +123,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def begin_tangent(
-        area: real,
+        nozzle: nozzle_of,
         flow_rate: wp.array(dtype=real),
         flow_rate_dot: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
@@ -116,27 +136,21 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
     ):
         b = wp.tid()
         outlet_dot[b] = outlet_in_dot[b]
-        faster = advance(flow_rate_dot[b], area, time_step[b])
-        longer = advance(flow_rate[b], area, time_step_dot[b])
+        faster = advance(flow_rate_dot[b], nozzle.area, time_step[b])
+        longer = advance(flow_rate[b], nozzle.area, time_step_dot[b])
         emitted_dot[b] = emitted_in_dot[b] + faster + longer
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def prescribe_tangent(
         particles: int,
-        first: int,
-        upstream: wp.array(dtype=real),
-        direction: vector,
-        area: real,
+        nozzle: nozzle_of,
         nozzle_path: wp.array2d(dtype=vector),
         nozzle_path_dot: wp.array2d(dtype=vector),
-        flow_rate_dot: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
         step: wp.array(dtype=wp.int32),
         outlet: wp.array(dtype=vector),
-        outlet_dot: wp.array(dtype=vector),
         emitted: wp.array(dtype=wp.float64),
-        emitted_dot: wp.array(dtype=wp.float64),
+        dot: changes,
         # in and out
         x_dot: wp.array(dtype=vector),
         v_dot: wp.array(dtype=vector),
@@ -149,20 +163,19 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         p = i - b * particles
         q = nozzle_path[b, step[b]]
         q_dot = nozzle_path_dot[b, step[b]]
-        if remaining(p, first, upstream, emitted[b]) > real(0.0):
+        if remaining(p, nozzle, emitted[b]) > real(0.0):
             dt = time_step[b]
-            turn_dot = q_dot - outlet_dot[b] - (q - outlet[b]) * (time_step_dot[b] / dt)
-            x_dot[i] = q_dot + real(emitted_dot[b]) * direction
-            v_dot[i] = turn_dot / dt + (flow_rate_dot[b] / area) * direction
+            turn_dot = q_dot - dot.outlet[b] - (q - outlet[b]) * (dot.time_step[b] / dt)
+            x_dot[i] = q_dot + real(dot.emitted[b]) * nozzle.direction
+            v_dot[i] = turn_dot / dt + (dot.flow_rate[b] / nozzle.area) * nozzle.direction
         if p == 0:
             outlet_out_dot[b] = q_dot
-            emitted_out_dot[b] = emitted_dot[b]
+            emitted_out_dot[b] = dot.emitted[b]
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def prescribe_adjoint(
         particles: int,
-        first: int,
-        upstream: wp.array(dtype=real),
+        nozzle: nozzle_of,
         emitted: wp.array(dtype=wp.float64),
         x_bar: wp.array(dtype=vector),
         v_bar: wp.array(dtype=vector),
@@ -175,7 +188,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         """What reaches free particles, and what reaches prescribed ones."""
         i = wp.tid()
         b = i // particles
-        prescribed = remaining(i - b * particles, first, upstream, emitted[b]) > real(0.0)
+        prescribed = remaining(i - b * particles, nozzle, emitted[b]) > real(0.0)
         x_free_bar[i] = wp.where(prescribed, vector(), x_bar[i])
         v_free_bar[i] = wp.where(prescribed, vector(), v_bar[i])
         x_prescribed_bar[i] = wp.where(prescribed, x_bar[i], vector())
@@ -183,8 +196,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
 
     @wp.kernel(module=integration_module(precision, False), enable_backward=False)
     def collect(
-        direction: vector,
-        area: real,
+        nozzle: nozzle_of,
         nozzle_path: wp.array2d(dtype=vector),
         flow_rate: wp.array(dtype=real),
         time_step: wp.array(dtype=real),
@@ -206,9 +218,9 @@ def emitter_kernels(precision: Precision, taped: bool) -> EmitterKernels:
         v_bar = v_total[b]
         nozzle_path_bar[b, n] = nozzle_path_bar[b, n] + outlet_bar[b] + x_bar + v_bar / dt
         outlet_bar[b] = -v_bar / dt
-        emitted_bar[b] = emitted_bar[b] + wp.float64(wp.dot(direction, x_bar))
-        along = real(emitted_bar[b]) / area
-        flow_rate_bar[b] = flow_rate_bar[b] + along * dt + wp.dot(direction, v_bar) / area
+        emitted_bar[b] = emitted_bar[b] + wp.float64(wp.dot(nozzle.direction, x_bar))
+        along = real(emitted_bar[b]) / nozzle.area
+        flow_rate_bar[b] = flow_rate_bar[b] + along * dt + wp.dot(nozzle.direction, v_bar) / nozzle.area
         turn = wp.dot(v_bar, nozzle_path[b, n] - outlet[b]) / (dt * dt)
         time_step_bar[b] = time_step_bar[b] + along * flow_rate[b] - turn
 

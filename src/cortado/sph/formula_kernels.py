@@ -9,8 +9,8 @@ from cortado.sph.formula import Formula
 from cortado.sph.packed import theta_of
 
 
-def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], module: Any) -> Any:
-    """The Warp function of two vectors and theta that a user's function is."""
+def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
+    """The Warp function of two vectors and theta that a user's function is; in 2-D without what it has along z."""
     timed = len(text.inputs) == 3
     types = tuple(precision.vector if rank else precision.real for rank in ranks[timed:])
     terms, first = [], 0
@@ -18,9 +18,14 @@ def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], module:
         at = ", ".join(f"theta[{first + k}]" for k in range(3 if rank else 1))
         terms.append(f"vector({at})" if rank else at)
         first += 3 if rank else 1
-    source = f"def applied(x: vector, v: vector, theta: numbers):\n    return own({', '.join(['x', 'v', *terms])})\n"
+    called = f"own({', '.join(['x', 'v', *terms])})"
+    result = called if dimension == 3 else f"wp.cw_mul(vector(one, one, zero), {called})"
+    source = f"def applied(x: vector, v: vector, theta: numbers):\n    return {result}\n"
     scope = {
         "vector": precision.vector,
+        "one": wp.constant(precision.real(1.0)),
+        "zero": wp.constant(precision.real(0.0)),
+        "wp": wp,
         "numbers": theta_of(precision, ranks),
         "own": text.function(precision, types, module),
     }
@@ -29,10 +34,10 @@ def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], module:
     return wp.Function(func=made, key="applied", namespace="", module=module, source=source)
 
 
-def work_of(text: Formula, precision: Precision, ranks: tuple[int, ...], module: Any) -> Any:
+def work_of(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
     """The Warp function f . bar, whose gradient a user's function f is differentiated by."""
     vector, theta_type = precision.vector, theta_of(precision, ranks)
-    force = applied(text, precision, ranks, module)
+    force = applied(text, precision, ranks, dimension, module)
 
     @wp.func(module=module)
     def work(x: vector, v: vector, theta: theta_type, bar: vector):
@@ -41,11 +46,11 @@ def work_of(text: Formula, precision: Precision, ranks: tuple[int, ...], module:
     return work
 
 
-def change_along(text: Formula, precision: Precision, ranks: tuple[int, ...], module: Any) -> Any:
+def change_along(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
     """The Warp function that is the derivative of a user's function along a direction, put together of the gradients of
     its components."""
     real, vector, theta_type = precision.real, precision.vector, theta_of(precision, ranks)
-    work = work_of(text, precision, ranks, module)
+    work = work_of(text, precision, ranks, dimension, module)
 
     @wp.func(module=module)
     def change_of(

@@ -116,12 +116,12 @@ class OwnForce(ABC):
         )
 
     @abstractmethod
-    def kernels(self, discretisation: Discretisation) -> Kernels:
-        """Of the force, in a precision."""
+    def kernels(self, discretisation: Discretisation, dimension: int) -> Kernels:
+        """Of the force, in a precision, in a scene of 2 or 3 dimensions."""
 
     def force(self, setting: Setting) -> "FunctionForce":
         """The force in a solver; raises `InputError` for a function that Warp cannot compile."""
-        kernels = self.kernels(setting.discretisation)
+        kernels = self.kernels(setting.discretisation, setting.scene.dimension)
         made = FunctionForce(f"{self.kind} function {self._formula.name}", kernels, self.parameters, setting)
         made.compile(kernels.forward)
         return made
@@ -136,8 +136,6 @@ class FunctionForce:
     def __init__(self, what: str, kernels: Kernels, parameters: tuple[Parameter, ...], setting: Setting):
         self._what, self._kernels, self._device = what, kernels, setting.layout.device
         self._packed = Packed(parameters, setting.layout, setting.discretisation.taped)
-        flat = setting.scene.dimension == 2
-        self._constants = {"plane": setting.layout.precision.vector(1.0, 1.0, 0.0 if flat else 1.0)}
 
     def compile(self, kernel: Any) -> Any:
         """A kernel, which can be launched then; raises `InputError`."""
@@ -154,22 +152,22 @@ class FunctionForce:
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         now = {"theta": self._packed.theta(step), "acceleration_in": before, "acceleration": after}
-        step.launch(self._kernels.forward, **self._constants, **now)
+        step.launch(self._kernels.forward, **now)
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
         theta = {"theta": self._packed.theta(step), "theta_dot": self._packed.theta_dot(step, dot.parameters)}
         now = {"acceleration_in_dot": before, "acceleration_dot": after}
-        step.launch(self._tangent, *dot.named, **self._constants, **theta, **now)
+        step.launch(self._tangent, *dot.named, **theta, **now)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
         now = {"theta": self._packed.theta(step), "acceleration_bar": acceleration_bar}
-        step.launch(self._adjoint, *bar.named, **self._constants, **now, theta_bar=self._packed.shares)
+        step.launch(self._adjoint, *bar.named, **now, theta_bar=self._packed.shares)
         self._packed.collect(step, bar)
 
 
-def topic(kind: str, text: Formula, ranks: tuple[int, ...]) -> str:
+def topic(kind: str, text: Formula, ranks: tuple[int, ...], dimension: int) -> str:
     """The part of a Warp module's name that tells one function from another."""
-    words = "\n".join((text.text, *text.outside, str(ranks)))
+    words = "\n".join((text.text, *text.outside, str(ranks), str(dimension)))
     return f"{kind}_{text.name}_{sha256(words.encode()).hexdigest()[:12]}"
 
 

@@ -12,7 +12,8 @@ from typing import Any, Protocol
 import warp as wp
 
 from cortado.device.arrays import Arrays, Fields, zeros
-from cortado.device.launching import KernelLauncher, Named, add
+from cortado.device.binding import Named
+from cortado.device.launching import KernelLauncher, add
 from cortado.device.neighbourhood import Discretisation
 from cortado.device.state import Layout, Parameters
 from cortado.discretise.discrete_scene import Lattice

@@ -4,9 +4,11 @@ from functools import cache
 
 import warp as wp
 
+from cortado.device.by_hand import adjoint_of, tangent_of
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type
+from cortado.device.pair_sums import fluid_sum
 
 
 @cache
@@ -14,49 +16,25 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
     """The kernels of n; ``inverse`` is 1 / N."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
-    pair = pair_functions(discretisation)
-    separation, vectors = pair.separation, pair.vectors
     one = wp.constant(real(1.0))
     LANES = discretisation.lanes
-    lanes = lane_functions(discretisation.precision, LANES)
-    lane, add_up_vectors = lanes.lane, lanes.add_up_vectors
+    lane = lane_functions(discretisation.precision, LANES).lane
 
-    @wp.func
-    def arrow(x: vector, h2: real) -> vector:
-        """(1 - s)^2 x, where h2 is h^2."""
-        d = wp.max(one - wp.dot(x, x) / h2, real(0.0))
-        return (d * d) * x
+    @fluid_sum(discretisation)
+    def arrows(x_ij: vector, s: neighbourhood) -> vector:
+        """(1 - s)^2 x"""
+        d = wp.max(one - wp.dot(x_ij, x_ij) / (s.support * s.support), real(0.0))
+        return (d * d) * x_ij
 
-    @wp.func
-    def arrow_change(x: vector, v: vector, h2: real) -> vector:
-        """Its derivative along a vector, which is symmetric."""
-        d = wp.max(one - wp.dot(x, x) / h2, real(0.0))
-        return (d * d) * v - (real(4.0) * d * wp.dot(x, v) / h2) * x
-
-    @wp.func
-    def arrows(i: int, x: wp.array(dtype=vector), s: neighbourhood) -> vector:
-        x_i = x[i]
+    @adjoint_of(arrows)
+    @tangent_of(arrows)
+    @fluid_sum(discretisation)
+    def change(x_ij: vector, v_ij: vector, s: neighbourhood) -> vector:
+        """Its tangent along v, and likewise what the adjoint of positions is for an adjoint v of every n, as the
+        derivative of a pair is symmetric."""
         h2 = s.support * s.support
-        total = vector()
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            for u in range(UNROLL):
-                total += arrow(separation(x_i, x_j[u], s), h2)
-        return add_up_vectors(total)
-
-    @wp.func
-    def change(i: int, x: wp.array(dtype=vector), v: wp.array(dtype=vector), s: neighbourhood) -> vector:
-        """Its tangent along v, and likewise what the adjoint of positions is for an adjoint v of every n."""
-        x_i = x[i]
-        v_i = v[i]
-        h2 = s.support * s.support
-        total = vector()
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            v_j = vectors(v, k, i, s)
-            for u in range(UNROLL):
-                total += arrow_change(separation(x_i, x_j[u], s), v_i - v_j[u], h2)
-        return add_up_vectors(total)
+        d = wp.max(one - wp.dot(x_ij, x_ij) / h2, real(0.0))
+        return (d * d) * v_ij - (real(4.0) * d * wp.dot(x_ij, v_ij) / h2) * x_ij
 
     @wp.kernel(module=discretisation.module(True, "surface_tension"))
     def normal(

@@ -18,9 +18,11 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.by_hand import adjoint_of, tangent_of
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type
+from cortado.device.pair_sums import fluid_sum
 
 PART = 2.0 / 3.0
 """How much less of the stress acts across the surface than along it; see above."""
@@ -84,51 +86,68 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
     """The kernels of the acceleration; ``scale`` is 1 / (Gamma V)."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
-    pair, functions = pair_functions(discretisation), tension_functions(discretisation)
-    separation, vectors, numbers = pair.separation, pair.vectors, pair.numbers
+    functions = tension_functions(discretisation)
     pull, pull_derivative = functions.pull, functions.pull_derivative
     stress, stress_change, stress_derivative = functions.stress, functions.stress_change, functions.stress_derivative
     LANES = discretisation.lanes
-    lanes = lane_functions(discretisation.precision, LANES)
-    lane, add_up_vectors = lanes.lane, lanes.add_up_vectors
+    lane = lane_functions(discretisation.precision, LANES).lane
 
-    @wp.func
-    def pulls(i: int, x: wp.array(dtype=vector), normals: wp.array(dtype=vector), s: neighbourhood) -> vector:
-        x_i = x[i]
-        n_i = normals[i]
-        h2 = s.support * s.support
-        total = vector()
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            n_j = vectors(normals, k, i, s)
-            for u in range(UNROLL):
-                x_ij = separation(x_i, x_j[u], s)
-                total += pull(x_ij, h2) * (stress(n_i, x_ij) + stress(n_j[u], x_ij))
-        return add_up_vectors(total)
+    @fluid_sum(discretisation)
+    def tension(
+        x_ij: vector, normals_i: vector, normals_j: vector, m_i: real, sigma: real, scale: real, s: neighbourhood
+    ) -> vector:
+        both = stress(normals_i, x_ij) + stress(normals_j, x_ij)
+        return (-sigma * scale / m_i * pull(x_ij, s.support * s.support)) * both
 
-    @wp.func
-    def pulls_change(
-        i: int,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        normals: wp.array(dtype=vector),
-        normals_dot: wp.array(dtype=vector),
+    @tangent_of(tension)
+    @fluid_sum(discretisation, ahead=False)
+    def tension_tangent(
+        x_ij: vector,
+        x_dot_ij: vector,
+        normals_i: vector,
+        normals_j: vector,
+        normals_dot_i: vector,
+        normals_dot_j: vector,
+        m_i: real,
+        m_dot_i: real,
+        sigma: real,
+        sigma_dot: real,
+        scale: real,
         s: neighbourhood,
     ) -> vector:
-        x_i = x[i]
-        n_i = normals[i]
         h2 = s.support * s.support
-        total = vector()
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
-                x_ij = separation(x_i, x[j], s)
-                x_dot_ij = x_dot[i] - x_dot[j]
-                pull_dot = pull_derivative(x_ij, h2) * wp.dot(x_ij, x_dot_ij) / h2
-                total += pull_dot * (stress(n_i, x_ij) + stress(normals[j], x_ij))
-                turn = stress_change(n_i, normals_dot[i], x_ij) + stress_change(normals[j], normals_dot[j], x_ij)
-                total += pull(x_ij, h2) * (turn + stress(n_i, x_dot_ij) + stress(normals[j], x_dot_ij))
-        return add_up_vectors(total)
+        g = pull(x_ij, h2)
+        both = stress(normals_i, x_ij) + stress(normals_j, x_ij)
+        turn = stress_change(normals_i, normals_dot_i, x_ij) + stress_change(normals_j, normals_dot_j, x_ij)
+        moved = turn + stress(normals_i, x_dot_ij) + stress(normals_j, x_dot_ij)
+        g_dot = pull_derivative(x_ij, h2) * wp.dot(x_ij, x_dot_ij) / h2
+        total = (sigma_dot - sigma * m_dot_i / m_i) * g * both + sigma * (g_dot * both + g * moved)
+        return (-scale / m_i) * total
+
+    @adjoint_of(tension)
+    @fluid_sum(discretisation)
+    def tension_adjoint(
+        x_ij: vector,
+        normals_i: vector,
+        normals_j: vector,
+        m_i: real,
+        m_j: real,
+        bar_i: vector,
+        bar_j: vector,
+        sigma: real,
+        scale: real,
+        s: neighbourhood,
+    ) -> tuple[vector, vector, real, real]:
+        """What the pair gives to x, the normals, m and sigma of i; w is the adjoint of a force."""
+        h2 = s.support * s.support
+        w_i = (-scale / m_i) * bar_i
+        w_ij = w_i + (scale / m_j) * bar_j
+        g = pull(x_ij, h2)
+        both = stress(normals_i, x_ij) + stress(normals_j, x_ij)
+        turn = stress(normals_i, w_ij) + stress(normals_j, w_ij)
+        x_part = g * turn + (pull_derivative(x_ij, h2) * wp.dot(both, w_ij) / h2) * x_ij
+        work = g * wp.dot(both, w_i)
+        return sigma * x_part, (sigma * g) * stress_derivative(normals_i, w_ij, x_ij), -sigma * work / m_i, work
 
     @wp.kernel(module=discretisation.module(True, "surface_tension"))
     def accelerate(
@@ -143,11 +162,10 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         acceleration: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        member = i // s.particles
-        total = pulls(i, x, normals, s)
+        total = tension(i, x, normals, m, surface_tension[i // s.particles], scale, s)
         if lane() > 0:
             return
-        acceleration[i] = acceleration_in[i] - (scale * surface_tension[member] / m[i]) * total
+        acceleration[i] = acceleration_in[i] + total
 
     @wp.kernel(module=discretisation.tangent_module("surface_tension"), enable_backward=False)
     def accelerate_tangent(
@@ -166,13 +184,12 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         acceleration_dot: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        member = i // s.particles
-        sigma = surface_tension[member]
-        rate = surface_tension_dot[member] - sigma * m_dot[i] / m[i]
-        total = rate * pulls(i, x, normals, s) + sigma * pulls_change(i, x, x_dot, normals, normals_dot, s)
+        b = i // s.particles
+        sigma, sigma_dot = surface_tension[b], surface_tension_dot[b]
+        total = tension_tangent(i, x, x_dot, normals, normals_dot, m, m_dot, sigma, sigma_dot, scale, s)
         if lane() > 0:
             return
-        acceleration_dot[i] = acceleration_in_dot[i] - (scale / m[i]) * total
+        acceleration_dot[i] = acceleration_in_dot[i] + total
 
     @wp.kernel(module=discretisation.module(False, "surface_tension"), enable_backward=False)
     def accelerate_adjoint(
@@ -190,40 +207,14 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
         # out
         normals_bar: wp.array(dtype=vector),
     ):
-        """w is the adjoint of a force."""
         i = s.first + wp.tid() // LANES
-        member = i // s.particles
-        x_i = x[i]
-        n_i = normals[i]
-        w_i = acceleration_bar[i] / m[i]
-        h2 = s.support * s.support
-        total = vector()
-        x_sum = vector()
-        n_sum = vector()
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            n_j = vectors(normals, k, i, s)
-            m_j = numbers(m, k, i, s)
-            bar_j = vectors(acceleration_bar, k, i, s)
-            for u in range(UNROLL):
-                x_ij = separation(x_i, x_j[u], s)
-                w_ij = w_i - bar_j[u] / m_j[u]
-                force = stress(n_i, x_ij) + stress(n_j[u], x_ij)
-                g = pull(x_ij, h2)
-                total += g * force
-                x_sum += g * (stress(n_i, w_ij) + stress(n_j[u], w_ij))
-                x_sum += (pull_derivative(x_ij, h2) * wp.dot(force, w_ij) / h2) * x_ij
-                n_sum += g * stress_derivative(n_i, w_ij, x_ij)
-        total = add_up_vectors(total)
-        x_sum = add_up_vectors(x_sum)
-        n_sum = add_up_vectors(n_sum)
+        sigma = surface_tension[i // s.particles]
+        x_sum, n_sum, m_sum, sigma_sum = tension_adjoint(i, x, normals, m, acceleration_bar, sigma, scale, s)
         if lane() > 0:
             return
-        sigma = surface_tension[member]
-        work = scale * wp.dot(total, w_i)
-        x_bar[i] = x_bar[i] - (scale * sigma) * x_sum
-        m_bar[i] = m_bar[i] + sigma * work / m[i]
-        surface_tension_bar[i] = surface_tension_bar[i] - work
-        normals_bar[i] = -(scale * sigma) * n_sum
+        x_bar[i] = x_bar[i] + x_sum
+        m_bar[i] = m_bar[i] + m_sum
+        surface_tension_bar[i] = surface_tension_bar[i] + sigma_sum
+        normals_bar[i] = n_sum
 
     return Kernels(accelerate, accelerate_tangent, accelerate_adjoint)

@@ -17,29 +17,34 @@ from typing import Any
 import warp as wp
 
 from cortado.device.arithmetic import arithmetic
+from cortado.device.bundles import bundle
+from cortado.device.by_hand import adjoint_of, tangent_of
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type
+from cortado.device.pair_sums import fluid_sum, pair_sum
 from cortado.sph.pair_forces import PairForm, laminar, pairwise
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 
 
 @cache
-def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels:
-    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the viscous acceleration with a given pair force phi."""
+def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bool) -> Kernels:
+    """Kernels ``forward``, ``tangent`` and ``adjoint`` of the viscous acceleration with a given pair force phi, and
+    with walls that have a ``friction`` or slip freely."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
-    pair = pair_functions(discretisation)
-    neighbour, wall_position, wall_weight = pair.neighbour, pair.wall_position, pair.wall_weight
-    separation, vectors, numbers = pair.separation, pair.vectors, pair.numbers
     phi = form(discretisation)
     phi_force, phi_tangent, phi_adjoint_x, phi_adjoint_v = phi.force, phi.tangent, phi.adjoint_x, phi.adjoint_v
     LANES = discretisation.lanes
-    lanes = lane_functions(discretisation.precision, LANES)
-    lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
+    lane = lane_functions(discretisation.precision, LANES).lane
+    changes = bundle(x=vector, v=vector, n=real, m=real, mu=real)
     reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
     tiny = wp.constant(real(discretisation.precision.tiny))
-    name = form.__name__  # a module for each form: their functions have the same names
+    name = form.__name__ + "_no_slip" * sticks  # a module for each: their functions have the same names
+
+    def summed(wall_term: Any, ahead: bool = True) -> Any:
+        """The decorator of a sum over what the fluid rubs against."""
+        return pair_sum(discretisation, wall_term, ahead) if sticks else fluid_sum(discretisation, ahead)
 
     @wp.func
     def part(a: real, b: real) -> real:
@@ -61,75 +66,120 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         wp.adjoint[a] += pair_viscosity_derivative(a, b) * bar
         wp.adjoint[b] += pair_viscosity_derivative(b, a) * bar
 
-    @wp.func
-    def force_sum(
-        i: int,
-        friction: real,
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        mu: wp.array(dtype=real),
-        s: neighbourhood,
+    def wall_force(
+        x_ij: vector, v_ij: vector, n_i: real, m_i: real, mu_i: real, kappa: real, friction: real, s: neighbourhood
     ) -> vector:
-        x_i = x[i]
-        v_i = v[i]
-        mu_i = mu[i]
-        total = vector()
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            v_j = vectors(v, k, i, s)
-            n_j = numbers(n, k, i, s)
-            mu_j = numbers(mu, k, i, s)
-            for u in range(UNROLL):
-                weight = pair_viscosity(mu_i, mu_j[u]) * s.volume * reciprocal(n_j[u])
-                total += weight * phi_force(separation(x_i, x_j[u], s), v_i - v_j[u], s)
-        if friction != real(0.0):
-            for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-                b = neighbour(k, i, s)
-                x_ib = separation(x_i, wall_position(b, s), s)
-                total += (mu_i * friction * s.volume * wall_weight(b, s)) * phi_force(x_ib, v_i, s)
-        return add_up_vectors(total)
+        return (kappa * friction * s.volume / (m_i * n_i) * mu_i) * phi_force(x_ij, v_ij, s)
 
-    @wp.func
-    def force_sum_tangent(
-        i: int,
+    @summed(wall_force)
+    def force(
+        x_ij: vector,
+        v_ij: vector,
+        n_i: real,
+        n_j: real,
+        m_i: real,
+        mu_i: real,
+        mu_j: real,
+        kappa: real,
         friction: real,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        v_dot: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        n_dot: wp.array(dtype=real),
-        mu: wp.array(dtype=real),
-        mu_dot: wp.array(dtype=real),
         s: neighbourhood,
     ) -> vector:
-        x_i = x[i]
-        v_i = v[i]
-        mu_i = mu[i]
-        x_dot_i = x_dot[i]
-        v_dot_i = v_dot[i]
-        mu_dot_i = mu_dot[i]
-        total = vector()
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            for u in range(UNROLL):
-                j = neighbour(k + u, i, s)
-                x_ij = separation(x_i, x[j], s)
-                v_ij = v_i - v[j]
-                volume_j = s.volume / n[j]
-                mu_ij = pair_viscosity(mu_i, mu[j])
-                own = pair_viscosity_derivative(mu_i, mu[j]) * mu_dot_i
-                mu_dot_ij = own + pair_viscosity_derivative(mu[j], mu_i) * mu_dot[j]
-                total += volume_j * (mu_dot_ij - mu_ij * n_dot[j] / n[j]) * phi_force(x_ij, v_ij, s)
-                total += (volume_j * mu_ij) * phi_tangent(x_ij, v_ij, x_dot_i - x_dot[j], v_dot_i - v_dot[j], s)
-        if friction != real(0.0):
-            for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-                b = neighbour(k, i, s)
-                x_ib = separation(x_i, wall_position(b, s), s)
-                wall_volume = friction * s.volume * wall_weight(b, s)
-                total += (wall_volume * mu_dot_i) * phi_force(x_ib, v_i, s)
-                total += (wall_volume * mu_i) * phi_tangent(x_ib, v_i, x_dot_i, v_dot_i, s)
-        return add_up_vectors(total)
+        weight = pair_viscosity(mu_i, mu_j) * reciprocal(n_j)
+        return (kappa * s.volume / (m_i * n_i) * weight) * phi_force(x_ij, v_ij, s)
+
+    def wall_tangent(
+        x_ij: vector,
+        x_dot_ij: vector,
+        v_ij: vector,
+        v_dot_ij: vector,
+        n_i: real,
+        n_dot_i: real,
+        m_i: real,
+        m_dot_i: real,
+        mu_i: real,
+        mu_dot_i: real,
+        kappa: real,
+        friction: real,
+        s: neighbourhood,
+    ) -> vector:
+        change = mu_dot_i - mu_i * (m_dot_i / m_i + n_dot_i / n_i)
+        total = change * phi_force(x_ij, v_ij, s) + mu_i * phi_tangent(x_ij, v_ij, x_dot_ij, v_dot_ij, s)
+        return (kappa * friction * s.volume / (m_i * n_i)) * total
+
+    @tangent_of(force)
+    @summed(wall_tangent, ahead=False)
+    def force_tangent(
+        x_ij: vector,
+        x_dot_ij: vector,
+        v_ij: vector,
+        v_dot_ij: vector,
+        n_i: real,
+        n_j: real,
+        n_dot_i: real,
+        n_dot_j: real,
+        m_i: real,
+        m_dot_i: real,
+        mu_i: real,
+        mu_j: real,
+        mu_dot_i: real,
+        mu_dot_j: real,
+        kappa: real,
+        friction: real,
+        s: neighbourhood,
+    ) -> vector:
+        mu_ij = pair_viscosity(mu_i, mu_j)
+        own = pair_viscosity_derivative(mu_i, mu_j) * mu_dot_i
+        mu_dot_ij = own + pair_viscosity_derivative(mu_j, mu_i) * mu_dot_j
+        change = mu_dot_ij - mu_ij * (m_dot_i / m_i + n_dot_i / n_i + n_dot_j / n_j)
+        total = change * phi_force(x_ij, v_ij, s) + mu_ij * phi_tangent(x_ij, v_ij, x_dot_ij, v_dot_ij, s)
+        return (kappa * s.volume / (m_i * n_i * n_j)) * total
+
+    def wall_adjoint(
+        x_ij: vector,
+        v_ij: vector,
+        n_i: real,
+        m_i: real,
+        mu_i: real,
+        bar_i: vector,
+        kappa: real,
+        friction: real,
+        s: neighbourhood,
+    ) -> tuple[vector, vector, real, real, real]:
+        w_i = (kappa * friction * s.volume / (m_i * n_i)) * bar_i
+        work = wp.dot(phi_force(x_ij, v_ij, s), w_i)
+        x_part = phi_adjoint_x(x_ij, v_ij, mu_i * w_i, s)
+        v_part = phi_adjoint_v(x_ij, v_ij, mu_i * w_i, s)
+        return x_part, v_part, -mu_i * work * reciprocal(n_i), -mu_i * work * reciprocal(m_i), work
+
+    @adjoint_of(force)
+    @summed(wall_adjoint)
+    def force_adjoint(
+        x_ij: vector,
+        v_ij: vector,
+        n_i: real,
+        n_j: real,
+        m_i: real,
+        m_j: real,
+        mu_i: real,
+        mu_j: real,
+        bar_i: vector,
+        bar_j: vector,
+        kappa: real,
+        friction: real,
+        s: neighbourhood,
+    ) -> tuple[vector, vector, real, real, real]:
+        """What the pair adds to i is what it adds to j, seen from i: to x, v, n, m and mu."""
+        w_i = bar_i * reciprocal(m_i)
+        w_ij = w_i - bar_j * reciprocal(m_j)
+        per_volume = kappa * s.volume * reciprocal(n_i) * reciprocal(n_j)
+        weight = per_volume * pair_viscosity(mu_i, mu_j)
+        pushed = phi_force(x_ij, v_ij, s)
+        work = wp.dot(pushed, w_ij)
+        x_part = phi_adjoint_x(x_ij, v_ij, weight * w_ij, s)
+        v_part = phi_adjoint_v(x_ij, v_ij, weight * w_ij, s)
+        m_part = -weight * wp.dot(pushed, w_i) * reciprocal(m_i)
+        mu_part = per_volume * pair_viscosity_derivative(mu_i, mu_j) * work
+        return x_part, v_part, -weight * work * reciprocal(n_i), m_part, mu_part
 
     @wp.kernel(module=discretisation.module(True, name))
     def viscosity(
@@ -146,10 +196,10 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         acceleration: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        total = force_sum(i, friction, x, v, n, mu, s)
+        total = force(i, x, v, n, m, mu, kappa, friction, s)
         if lane() > 0:
             return
-        acceleration[i] = acceleration_in[i] + (kappa / (m[i] * n[i])) * total
+        acceleration[i] = acceleration_in[i] + total
 
     @wp.kernel(module=discretisation.tangent_module(name), enable_backward=False)
     def viscosity_tangent(
@@ -157,27 +207,20 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         kappa: real,
         friction: real,
         x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
-        v_dot: wp.array(dtype=vector),
         n: wp.array(dtype=real),
-        n_dot: wp.array(dtype=real),
         m: wp.array(dtype=real),
-        m_dot: wp.array(dtype=real),
         mu: wp.array(dtype=real),
-        mu_dot: wp.array(dtype=real),
+        dot: changes,
         acceleration_in_dot: wp.array(dtype=vector),
         # out
         acceleration_dot: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        total = force_sum(i, friction, x, v, n, mu, s)
-        total_dot = force_sum_tangent(i, friction, x, x_dot, v, v_dot, n, n_dot, mu, mu_dot, s)
+        total = force_tangent(i, x, dot.x, v, dot.v, n, dot.n, m, dot.m, mu, dot.mu, kappa, friction, s)
         if lane() > 0:
             return
-        factor = kappa / (m[i] * n[i])
-        change = m_dot[i] / m[i] + n_dot[i] / n[i]
-        acceleration_dot[i] = acceleration_in_dot[i] + factor * (total_dot - change * total)
+        acceleration_dot[i] = acceleration_in_dot[i] + total
 
     @wp.kernel(module=discretisation.module(False, name), enable_backward=False)
     def viscosity_adjoint(
@@ -197,61 +240,15 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm) -> Kernels
         m_bar: wp.array(dtype=real),
         mu_bar: wp.array(dtype=real),
     ):
-        """Gathers alone: the pair (i, j) adds to i what it adds to j, seen from i."""
         i = s.first + wp.tid() // LANES
-        x_i = x[i]
-        v_i = v[i]
-        mu_i = mu[i]
-        w_i = acceleration_bar[i] / m[i]
-        x_sum = vector()
-        v_sum = vector()
-        work = real(0.0)
-        own_work = real(0.0)
-        mu_work = real(0.0)
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            v_j = vectors(v, k, i, s)
-            n_j = numbers(n, k, i, s)
-            m_j = numbers(m, k, i, s)
-            mu_j = numbers(mu, k, i, s)
-            w_j = vectors(acceleration_bar, k, i, s)
-            for u in range(UNROLL):
-                x_ij = separation(x_i, x_j[u], s)
-                v_ij = v_i - v_j[u]
-                w_ij = w_i - reciprocal(m_j[u]) * w_j[u]
-                volume_j = s.volume * reciprocal(n_j[u])
-                weight = volume_j * pair_viscosity(mu_i, mu_j[u])
-                force = phi_force(x_ij, v_ij, s)
-                force_work = wp.dot(force, w_ij)
-                x_sum += phi_adjoint_x(x_ij, v_ij, weight * w_ij, s)
-                v_sum += phi_adjoint_v(x_ij, v_ij, weight * w_ij, s)
-                work += weight * force_work
-                own_work += weight * wp.dot(force, w_i)
-                mu_work += volume_j * pair_viscosity_derivative(mu_i, mu_j[u]) * force_work
-        if friction != real(0.0):
-            for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-                b = neighbour(k, i, s)
-                x_ib = separation(x_i, wall_position(b, s), s)
-                wall_volume = friction * s.volume * wall_weight(b, s)
-                x_sum += (mu_i * wall_volume) * phi_adjoint_x(x_ib, v_i, w_i, s)
-                v_sum += (mu_i * wall_volume) * phi_adjoint_v(x_ib, v_i, w_i, s)
-                wall_work = wall_volume * wp.dot(phi_force(x_ib, v_i, s), w_i)
-                work += mu_i * wall_work
-                own_work += mu_i * wall_work
-                mu_work += wall_work
-        x_sum = add_up_vectors(x_sum)
-        v_sum = add_up_vectors(v_sum)
-        work = add_up(work)
-        own_work = add_up(own_work)
-        mu_work = add_up(mu_work)
+        x_sum, v_sum, n_sum, m_sum, mu_sum = force_adjoint(i, x, v, n, m, mu, acceleration_bar, kappa, friction, s)
         if lane() > 0:
             return
-        factor = kappa / n[i]
-        x_bar[i] = x_bar[i] + factor * x_sum
-        v_bar[i] = v_bar[i] + factor * v_sum
-        n_bar[i] = n_bar[i] - factor / n[i] * work
-        m_bar[i] = m_bar[i] - factor / m[i] * own_work
-        mu_bar[i] = mu_bar[i] + factor * mu_work
+        x_bar[i] = x_bar[i] + x_sum
+        v_bar[i] = v_bar[i] + v_sum
+        n_bar[i] = n_bar[i] + n_sum
+        m_bar[i] = m_bar[i] + m_sum
+        mu_bar[i] = mu_bar[i] + mu_sum
 
     return Kernels(viscosity, viscosity_tangent, viscosity_adjoint)
 
@@ -264,7 +261,7 @@ class Viscosity:
 
     def __init__(self, discretisation: Discretisation, form: PairForm, kappa: float, friction: float):
         """``friction`` 0 lets walls slip freely."""
-        self._kernels, self.friction = viscosity_kernels(discretisation, form), friction
+        self._kernels, self.friction = viscosity_kernels(discretisation, form, friction > 0.0), friction
         self._constants: dict[str, Any] = {"kappa": kappa, "friction": friction}
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:

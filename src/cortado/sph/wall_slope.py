@@ -14,11 +14,12 @@ import warp as wp
 
 from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.device.pair_sums import wall_sum
 
 
 @dataclass(frozen=True)
 class WallSlope:
-    """Kernels of the sums over the walls around a particle."""
+    """Sums over the walls around a particle, as Warp functions or kernels."""
 
     slope: Any
     """g."""
@@ -27,18 +28,36 @@ class WallSlope:
 
 
 @cache
+def wall_slope_sums(discretisation: Discretisation) -> WallSlope:
+    """The Warp functions ``slope(i, x, s)`` and ``change(i, x, along, s)``, with one vector ``along``."""
+    vector = discretisation.precision.vector
+    neighbourhood = neighbourhood_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    gradient, hessian_product = pair.gradient, pair.hessian_product
+
+    @wall_sum(discretisation)
+    def slope(x_ij: vector, s: neighbourhood) -> vector:
+        return gradient(x_ij, s)
+
+    @wall_sum(discretisation)
+    def change(x_ij: vector, along: vector, s: neighbourhood) -> vector:
+        return hessian_product(x_ij, along, s)
+
+    return WallSlope(slope, change)
+
+
+@cache
 def wall_slope_kernels(discretisation: Discretisation) -> WallSlope:
     """The kernels of a smoothing kernel in a precision."""
     vector = discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
-    pair = pair_functions(discretisation)
-    neighbour, wall_position, wall_weight = pair.neighbour, pair.wall_position, pair.wall_weight
-    separation, gradient, hessian_product = pair.separation, pair.gradient, pair.hessian_product
+    sums = wall_slope_sums(discretisation)
+    gradients, hessian_products = sums.slope, sums.change
     LANES = discretisation.lanes
-    lanes = lane_functions(discretisation.precision, LANES)
-    lane, add_up_vectors = lanes.lane, lanes.add_up_vectors
+    lane = lane_functions(discretisation.precision, LANES).lane
+    module = discretisation.module(False, "wall_slope")
 
-    @wp.kernel(module=discretisation.module(False, "wall_slope"), enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False)
     def slope(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -46,15 +65,11 @@ def wall_slope_kernels(discretisation: Discretisation) -> WallSlope:
         wall_slope: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        total = vector()
-        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = neighbour(k, i, s)
-            total += wall_weight(b, s) * gradient(separation(x[i], wall_position(b, s), s), s)
-        total = add_up_vectors(total)
+        total = gradients(i, x, s)
         if lane() == 0:
             wall_slope[i] = total
 
-    @wp.kernel(module=discretisation.module(False, "wall_slope"), enable_backward=False)
+    @wp.kernel(module=module, enable_backward=False)
     def change(
         s: neighbourhood,
         x: wp.array(dtype=vector),
@@ -63,12 +78,7 @@ def wall_slope_kernels(discretisation: Discretisation) -> WallSlope:
         wall_slope_change: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        total = vector()
-        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = neighbour(k, i, s)
-            x_ib = separation(x[i], wall_position(b, s), s)
-            total += wall_weight(b, s) * hessian_product(x_ib, along[i], s)
-        total = add_up_vectors(total)
+        total = hessian_products(i, x, along[i], s)
         if lane() == 0:
             wall_slope_change[i] = total
 

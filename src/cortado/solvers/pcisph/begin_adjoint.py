@@ -5,6 +5,7 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.bundles import bundle
 from cortado.device.neighbourhood import Discretisation
 from cortado.sph.integration import new_state_adjoint
 
@@ -13,6 +14,7 @@ from cortado.sph.integration import new_state_adjoint
 def begin_adjoint_kernel(discretisation: Discretisation) -> Any:
     """Does in one launch what that of `cortado.sph.begin_adjoint` does, and begins the adjoints of PCISPH's own."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
+    from_zero = bundle(n=real, m=real, rho_0=real, mu=real, y=real, p=real)
     adjoin_new_state = new_state_adjoint(discretisation.precision)
 
     @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
@@ -30,13 +32,8 @@ def begin_adjoint_kernel(discretisation: Discretisation) -> Any:
         # out
         x_bar: wp.array(dtype=vector),
         v_bar: wp.array(dtype=vector),
-        n_bar: wp.array(dtype=real),
-        m_bar: wp.array(dtype=real),
-        rho_0_bar: wp.array(dtype=real),
-        mu_bar: wp.array(dtype=real),
         scaled_bar: wp.array(dtype=vector),
-        y_bar: wp.array(dtype=real),
-        p_bar: wp.array(dtype=real),
+        bar: from_zero,
     ):
         i = wp.tid()
         dt = time_step[i // particles]
@@ -46,12 +43,12 @@ def begin_adjoint_kernel(discretisation: Discretisation) -> Any:
         x_bar[i] = x_i_bar
         v_bar[i] = v_i_bar
         scaled_bar[i] = (dt / m[i]) * v_i_bar
-        n_bar[i] = real(0.0)
-        m_bar[i] = real(0.0)
-        rho_0_bar[i] = real(0.0)
-        mu_bar[i] = real(0.0)
-        y_bar[i] = real(0.0)
-        p_bar[i] = real(0.0)
+        bar.n[i] = real(0.0)
+        bar.m[i] = real(0.0)
+        bar.rho_0[i] = real(0.0)
+        bar.mu[i] = real(0.0)
+        bar.y[i] = real(0.0)
+        bar.p[i] = real(0.0)
         time_step_bar[i] = dt_bar
 
     return begin_adjoint

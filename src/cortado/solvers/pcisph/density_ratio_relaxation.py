@@ -16,9 +16,11 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.by_hand import adjoint_of, tangent_of
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.device.pair_sums import fluid_sum
 
 SOFTNESS = 0.2
 """a [-]"""
@@ -38,25 +40,33 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
-    separation, weight, gradient = pair.separation, pair.weight, pair.gradient
-    vectors, numbers = pair.vectors, pair.numbers
+    weight, gradient = pair.weight, pair.gradient
     LANES = discretisation.lanes
-    lanes = lane_functions(discretisation.precision, LANES)
-    lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
+    lane = lane_functions(discretisation.precision, LANES).lane
     a = wp.constant(real(SOFTNESS))
 
-    @wp.func
-    def density_ratio_sum(i: int, x: wp.array(dtype=vector), m: wp.array(dtype=real), s: neighbourhood) -> real:
+    @fluid_sum(discretisation)
+    def density_ratio_sum(x_ij: vector, m_i: real, m_j: real, s: neighbourhood) -> real:
         """t_i / V"""
-        x_i = x[i]
-        m_i = m[i]
-        total = real(0.0)
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            m_j = numbers(m, k, i, s)
-            for u in range(UNROLL):
-                total += weight(separation(x_i, x_j[u], s), s) * (m_i / m_j[u] - real(1.0))
-        return add_up(total)
+        return weight(x_ij, s) * (m_i / m_j - real(1.0))
+
+    @tangent_of(density_ratio_sum)
+    @fluid_sum(discretisation, ahead=False)
+    def density_ratio_sum_tangent(
+        x_ij: vector, x_dot_ij: vector, m_i: real, m_j: real, m_dot_i: real, m_dot_j: real, s: neighbourhood
+    ) -> real:
+        ratio = m_i / m_j
+        change = wp.dot(gradient(x_ij, s), x_dot_ij) * (ratio - real(1.0))
+        return change + weight(x_ij, s) * ratio * (m_dot_i / m_i - m_dot_j / m_j)
+
+    @adjoint_of(density_ratio_sum)
+    @fluid_sum(discretisation)
+    def density_ratio_sum_adjoint(
+        x_ij: vector, m_i: real, m_j: real, t_bar_i: real, t_bar_j: real, s: neighbourhood
+    ) -> tuple[vector, real]:
+        own = t_bar_i * m_i / m_j
+        other = t_bar_j * m_j / m_i
+        return (own - t_bar_i + other - t_bar_j) * gradient(x_ij, s), weight(x_ij, s) * (own - other) / m_i
 
     @wp.func
     def excess(t: real) -> real:
@@ -103,16 +113,7 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
         y_dot: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        m_i = m[i]
-        t_dot = real(0.0)
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            for u in range(UNROLL):
-                j = s.neighbours[k + u, i]
-                x_ij = separation(x[i], x[j], s)
-                ratio = m_i / m[j]
-                t_dot += wp.dot(gradient(x_ij, s), x_dot[i] - x_dot[j]) * (ratio - real(1.0))
-                t_dot += weight(x_ij, s) * ratio * (m_dot[i] / m_i - m_dot[j] / m[j])
-        t_dot = add_up(t_dot)
+        t_dot = density_ratio_sum_tangent(i, x, x_dot, m, m_dot, s)
         if lane() > 0:
             return
         part = real(1.0) / (real(1.0) + excess(t[i]))
@@ -145,26 +146,10 @@ def density_ratio_kernels(discretisation: Discretisation) -> DensityRatioKernels
         m_bar: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        x_i = x[i]
-        m_i = m[i]
-        t_bar_i = t_bar[i]
-        x_sum = vector()
-        m_sum = real(0.0)
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            m_j = numbers(m, k, i, s)
-            t_bar_j = numbers(t_bar, k, i, s)
-            for u in range(UNROLL):
-                x_ij = separation(x_i, x_j[u], s)
-                own = t_bar_i * m_i / m_j[u]
-                other = t_bar_j[u] * m_j[u] / m_i
-                x_sum += (own - t_bar_i + other - t_bar_j[u]) * gradient(x_ij, s)
-                m_sum += weight(x_ij, s) * (own - other)
-        x_sum = add_up_vectors(x_sum)
-        m_sum = add_up(m_sum)
+        x_sum, m_sum = density_ratio_sum_adjoint(i, x, m, t_bar, s)
         if lane() > 0:
             return
         x_bar[i] = x_bar[i] + s.volume * x_sum
-        m_bar[i] = m_bar[i] + s.volume * m_sum / m_i
+        m_bar[i] = m_bar[i] + s.volume * m_sum
 
     return DensityRatioKernels(density_ratio, density_ratio_tangent, density_ratio_adjoint, factor_adjoint)

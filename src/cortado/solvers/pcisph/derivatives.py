@@ -6,7 +6,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.arrays import Fields
-from cortado.device.launching import Named, add
+from cortado.device.binding import Named
+from cortado.device.launching import add
 from cortado.device.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint

@@ -16,6 +16,7 @@ from functools import cache
 
 import warp as wp
 
+from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.device.neighbourhood import Discretisation, neighbourhood_type
@@ -34,6 +35,8 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     neighbourhood = neighbourhood_type(discretisation.precision)
     sums = density_sums(discretisation)
     weights, weights_tangent, weights_adjoint = sums.weights, sums.weights_tangent, sums.weights_adjoint
+    values = bundle(n=real, m=real, rho_0=real, y=real, p_in=real, p_out=real)
+    changes = bundle(n=real, m=real, rho_0=real, y=real, p_in=real)
     adjoin_prediction = prediction_share(discretisation.precision)
     LANES = discretisation.lanes
     lane = lane_functions(discretisation.precision, LANES).lane
@@ -87,19 +90,10 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         stiffness: real,
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
-        n: wp.array(dtype=real),
-        n_dot: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        m_dot: wp.array(dtype=real),
-        rho_0: wp.array(dtype=real),
-        rho_0_dot: wp.array(dtype=real),
-        y: wp.array(dtype=real),
-        y_dot: wp.array(dtype=real),
+        at: values,
         x_star: wp.array(dtype=vector),
         x_star_dot: wp.array(dtype=vector),
-        p_in: wp.array(dtype=real),
-        p_in_dot: wp.array(dtype=real),
-        p_out: wp.array(dtype=real),
+        dot: changes,
         # out
         p_out_dot: wp.array(dtype=real),
         c_dot: wp.array(dtype=real),
@@ -111,17 +105,17 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         total = weights_tangent(i, x_star, x_star_dot, s)
         if lane() > 0:
             return
-        p_i = p_out[i]
+        p_i = at.p_out[i]
         p_dot_i = real(0.0)
         if p_i > real(0.0):
-            delta = y[i] * stiffness / (time_step[member] * time_step[member])
-            excess = (p_i - p_in[i]) / delta
-            excess_dot = m[i] * s.volume * total + (excess + rho_0[i]) * m_dot[i] / m[i] - rho_0_dot[i]
-            delta_dot = delta * (y_dot[i] / y[i] - real(2.0) * time_step_dot[member] / time_step[member])
-            p_dot_i = p_in_dot[i] + delta * excess_dot + delta_dot * excess
-        n_i = n[i]
+            delta = at.y[i] * stiffness / (time_step[member] * time_step[member])
+            excess = (p_i - at.p_in[i]) / delta
+            excess_dot = at.m[i] * s.volume * total + (excess + at.rho_0[i]) * dot.m[i] / at.m[i] - dot.rho_0[i]
+            delta_dot = delta * (dot.y[i] / at.y[i] - real(2.0) * time_step_dot[member] / time_step[member])
+            p_dot_i = dot.p_in[i] + delta * excess_dot + delta_dot * excess
+        n_i = at.n[i]
         p_out_dot[i] = p_dot_i
-        c_dot[i] = (p_dot_i - real(2.0) * p_i / n_i * n_dot[i]) / (n_i * n_i)
+        c_dot[i] = (p_dot_i - real(2.0) * p_i / n_i * dot.n[i]) / (n_i * n_i)
 
     @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
     def pressure_adjoint(

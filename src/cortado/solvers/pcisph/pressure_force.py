@@ -1,12 +1,61 @@
 """The pressure force of an iteration, and the prediction that follows it: see `cortado.solvers.pcisph.pressure`."""
 
+from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import warp as wp
 
+from cortado.device.bundles import bundle
+from cortado.device.by_hand import adjoint_of, tangent_of
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.device.pair_sums import pair_sum
+from cortado.device.precision import Precision
+
+
+@dataclass(frozen=True)
+class PressureShare:
+    """What the adjoints of the pressure force have in common."""
+
+    values: Any
+    """The bundle of what the pressure of an iteration is computed from."""
+    adjoints: Any
+    """The bundle of their adjoints."""
+    adjoint: Any
+    """The Warp function ``adjoint(i, stiffness, dt, volume, divergence, work, at, bar)``: adds to the adjoints, and
+    returns r, the adjoint of n*."""
+
+
+@cache
+def pressure_share(precision: Precision) -> PressureShare:
+    """For a precision."""
+    real = precision.real
+    values = bundle(n=real, m=real, rho_0=real, y=real, p_in=real, p_out=real)
+    adjoints = bundle(m=real, rho_0=real, y=real, p=real, time_step=real)
+
+    @wp.func
+    def adjoint(
+        i: int, stiffness: real, dt: real, volume: real, divergence: real, work: real, at: values, bar: adjoints
+    ) -> real:
+        n_i = at.n[i]
+        m_i = at.m[i]
+        p_i = at.p_out[i]
+        delta = at.y[i] * stiffness / (dt * dt)
+        p_bar_i = real(0.0)
+        if p_i > real(0.0):
+            p_bar_i = bar.p[i] - volume * divergence / (n_i * n_i)
+        excess_bar = delta * p_bar_i
+        excess = (p_i - at.p_in[i]) / delta
+        bar.m[i] = bar.m[i] + (volume * work + excess_bar * (excess + at.rho_0[i])) / m_i
+        bar.rho_0[i] = bar.rho_0[i] - excess_bar
+        bar.y[i] = bar.y[i] + excess_bar * excess / at.y[i]
+        bar.p[i] = p_bar_i
+        bar.time_step[i] = bar.time_step[i] - real(2.0) * excess_bar * excess / dt
+        return m_i * excess_bar
+
+    return PressureShare(values, adjoints, adjoint)
 
 
 @cache
@@ -15,56 +64,35 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     pair = pair_functions(discretisation)
-    neighbour, wall_position, wall_weight = pair.neighbour, pair.wall_position, pair.wall_weight
-    separation, slope, slope_change = pair.separation, pair.slope, pair.slope_change
+    slope, slope_change = pair.slope, pair.slope_change
     gradient, hessian_product = pair.gradient, pair.hessian_product
-    vectors, numbers = pair.vectors, pair.numbers
     LANES = discretisation.lanes
-    lanes = lane_functions(discretisation.precision, LANES)
-    lane, add_up, add_up_vectors = lanes.lane, lanes.add_up, lanes.add_up_vectors
+    lane = lane_functions(discretisation.precision, LANES).lane
+    moved = bundle(m=real, x=vector, v=vector, acceleration=vector, c=real)
+    share = pressure_share(discretisation.precision)
+    values, adjoints, adjoin_pressure = share.values, share.adjoints, share.adjoint
 
-    @wp.func
-    def force_sum(i: int, x: wp.array(dtype=vector), c: wp.array(dtype=real), s: neighbourhood) -> vector:
-        x_i = x[i]
-        c_i = c[i]
-        total = vector()
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            c_j = numbers(c, k, i, s)
-            for u in range(UNROLL):
-                x_ij = separation(x_i, x_j[u], s)
-                total += ((c_i + c_j[u]) * slope(x_ij, s)) * x_ij
-        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = neighbour(k, i, s)
-            total += (wall_weight(b, s) * c_i) * gradient(separation(x_i, wall_position(b, s), s), s)
-        return add_up_vectors(total)
+    @pair_sum(discretisation)
+    def force(x_ij: vector, c_i: real, c_j: real, s: neighbourhood) -> vector:
+        return ((c_i + c_j) * slope(x_ij, s)) * x_ij
 
-    @wp.func
-    def force_sum_tangent(
-        i: int,
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        c: wp.array(dtype=real),
-        c_dot: wp.array(dtype=real),
-        s: neighbourhood,
+    @tangent_of(force)
+    @pair_sum(discretisation, ahead=False)
+    def force_tangent(
+        x_ij: vector, x_dot_ij: vector, c_i: real, c_j: real, c_dot_i: real, c_dot_j: real, s: neighbourhood
     ) -> vector:
-        x_i = x[i]
-        x_dot_i = x_dot[i]
-        c_i = c[i]
-        c_dot_i = c_dot[i]
-        total = vector()
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            for u in range(UNROLL):
-                j = neighbour(k + u, i, s)
-                x_ij = separation(x_i, x[j], s)
-                total += (c_dot_i + c_dot[j]) * gradient(x_ij, s)
-                total += (c_i + c[j]) * hessian_product(x_ij, x_dot_i - x_dot[j], s)
-        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = neighbour(k, i, s)
-            x_ib = separation(x_i, wall_position(b, s), s)
-            total += (wall_weight(b, s) * c_dot_i) * gradient(x_ib, s)
-            total += (wall_weight(b, s) * c_i) * hessian_product(x_ib, x_dot_i, s)
-        return add_up_vectors(total)
+        return (c_dot_i + c_dot_j) * gradient(x_ij, s) + (c_i + c_j) * hessian_product(x_ij, x_dot_ij, s)
+
+    @adjoint_of(force)
+    @pair_sum(discretisation)
+    def force_adjoint(
+        x_ij: vector, c_i: real, c_j: real, scaled_bar_i: vector, scaled_bar_ij: vector, s: neighbourhood
+    ) -> tuple[vector, real, real]:
+        """Hessian products, divergence, and the work of the own share."""
+        a = slope(x_ij, s)
+        c_ij = c_i + c_j
+        change = (c_ij * a) * scaled_bar_ij + (c_ij * slope_change(x_ij, scaled_bar_ij, s)) * x_ij
+        return change, a * wp.dot(x_ij, scaled_bar_ij), (c_ij * a) * wp.dot(x_ij, scaled_bar_i)
 
     @wp.kernel(module=discretisation.module(True, "pcisph"))
     def pressure_force(
@@ -95,7 +123,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         v_i = v[i]
         a_i = acceleration[i]
         scale = -s.volume / m[i]
-        total = force_sum(i, x, c, s)
+        total = force(i, x, c, s)
         if lane() > 0:
             return
         velocity = v_i + dt * (a_i + scale * total)
@@ -109,16 +137,8 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         rounds: wp.array(dtype=wp.int32),
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        m_dot: wp.array(dtype=real),
-        x: wp.array(dtype=vector),
-        x_dot: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        v_dot: wp.array(dtype=vector),
-        acceleration: wp.array(dtype=vector),
-        acceleration_dot: wp.array(dtype=vector),
-        c: wp.array(dtype=real),
-        c_dot: wp.array(dtype=real),
+        at: moved,
+        dot: moved,
         v_star: wp.array(dtype=vector),
         # out
         x_star_dot: wp.array(dtype=vector),
@@ -128,16 +148,16 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         member = i // s.particles
         if k >= rounds[member]:
             return
-        total_dot = force_sum_tangent(i, x, x_dot, c, c_dot, s)
+        total_dot = force_tangent(i, at.x, dot.x, at.c, dot.c, s)
         if lane() > 0:
             return
         dt = time_step[member]
-        accelerated = (v_star[i] - v[i]) / dt
-        push = accelerated - acceleration[i]
-        push_dot = (-s.volume / m[i]) * total_dot - (m_dot[i] / m[i]) * push
-        velocity_dot = v_dot[i] + dt * (acceleration_dot[i] + push_dot) + time_step_dot[member] * accelerated
+        accelerated = (v_star[i] - at.v[i]) / dt
+        push = accelerated - at.acceleration[i]
+        push_dot = (-s.volume / at.m[i]) * total_dot - (dot.m[i] / at.m[i]) * push
+        velocity_dot = dot.v[i] + dt * (dot.acceleration[i] + push_dot) + time_step_dot[member] * accelerated
         v_star_dot[i] = velocity_dot
-        x_star_dot[i] = x_dot[i] + dt * velocity_dot + time_step_dot[member] * v_star[i]
+        x_star_dot[i] = dot.x[i] + dt * velocity_dot + time_step_dot[member] * v_star[i]
 
     @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
     def pressure_force_adjoint(
@@ -147,22 +167,13 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         stiffness: real,
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),
-        n: wp.array(dtype=real),
-        m: wp.array(dtype=real),
-        rho_0: wp.array(dtype=real),
-        y: wp.array(dtype=real),
-        p_in: wp.array(dtype=real),
-        p_out: wp.array(dtype=real),
+        at: values,
         c: wp.array(dtype=real),
         scaled_bar: wp.array(dtype=vector),
         # in and out
         x_bar: wp.array(dtype=vector),
         n_bar: wp.array(dtype=real),
-        m_bar: wp.array(dtype=real),
-        rho_0_bar: wp.array(dtype=real),
-        y_bar: wp.array(dtype=real),
-        p_bar: wp.array(dtype=real),
-        time_step_bar: wp.array(dtype=real),
+        bar: adjoints,
         # out
         r: wp.array(dtype=real),
     ):
@@ -172,54 +183,12 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         member = i // s.particles
         if k >= rounds[member]:
             return
-        x_i = x[i]
-        c_i = c[i]
-        scaled_bar_i = scaled_bar[i]
-        divergence = real(0.0)
-        hessian_products = vector()
-        work = real(0.0)
-        for k in range(lane() * UNROLL, s.fluid_count[i], UNROLL * LANES):
-            x_j = vectors(x, k, i, s)
-            c_j = numbers(c, k, i, s)
-            scaled_bar_j = vectors(scaled_bar, k, i, s)
-            for u in range(UNROLL):
-                x_ij = separation(x_i, x_j[u], s)
-                u_ij = scaled_bar_i - scaled_bar_j[u]
-                a = slope(x_ij, s)
-                c_ij = c_i + c_j[u]
-                divergence += a * wp.dot(x_ij, u_ij)
-                hessian_products += (c_ij * a) * u_ij + (c_ij * slope_change(x_ij, u_ij, s)) * x_ij
-                work += (c_ij * a) * wp.dot(x_ij, scaled_bar_i)
-        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = neighbour(k, i, s)
-            x_ib = separation(x_i, wall_position(b, s), s)
-            weight = wall_weight(b, s)
-            wall_divergence = weight * wp.dot(gradient(x_ib, s), scaled_bar_i)
-            divergence += wall_divergence
-            hessian_products += (weight * c_i) * hessian_product(x_ib, scaled_bar_i, s)
-            work += c_i * wall_divergence
-        divergence = add_up(divergence)
-        hessian_products = add_up_vectors(hessian_products)
-        work = add_up(work)
+        hessian_products, divergence, work = force_adjoint(i, x, c, scaled_bar, s)
         if lane() > 0:
             return
-        n_i = n[i]
-        m_i = m[i]
-        p_i = p_out[i]
-        delta = y[i] * stiffness / (time_step[member] * time_step[member])
-        c_bar = -s.volume * divergence
-        p_bar_i = real(0.0)
-        if p_i > real(0.0):
-            p_bar_i = p_bar[i] + c_bar / (n_i * n_i)
-        excess_bar = delta * p_bar_i
-        excess = (p_i - p_in[i]) / delta
+        n_i = at.n[i]
         x_bar[i] = x_bar[i] - s.volume * hessian_products
-        n_bar[i] = n_bar[i] - real(2.0) * c_i / n_i * c_bar
-        m_bar[i] = m_bar[i] + (s.volume * work + excess_bar * (excess + rho_0[i])) / m_i
-        rho_0_bar[i] = rho_0_bar[i] - excess_bar
-        y_bar[i] = y_bar[i] + excess_bar * excess / y[i]
-        p_bar[i] = p_bar_i
-        r[i] = m_i * excess_bar
-        time_step_bar[i] = time_step_bar[i] - real(2.0) * excess_bar * excess / time_step[member]
+        n_bar[i] = n_bar[i] + real(2.0) * c[i] / n_i * s.volume * divergence
+        r[i] = adjoin_pressure(i, stiffness, time_step[member], s.volume, divergence, work, at, bar)
 
     return Kernels(pressure_force, pressure_force_tangent, pressure_force_adjoint)

@@ -18,7 +18,8 @@ import warp as wp
 
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type
+from cortado.sph.wall_slope import wall_slope_sums
 
 
 @cache
@@ -26,31 +27,10 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
     """Kernels ``forward``, ``tangent`` and ``adjoint`` of the pressure relaxation beside walls."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
-    pair = pair_functions(discretisation)
-    neighbour, wall_position, wall_weight = pair.neighbour, pair.wall_position, pair.wall_weight
-    separation, gradient, hessian_product = pair.separation, pair.gradient, pair.hessian_product
-
+    sums = wall_slope_sums(discretisation)
+    slope, change = sums.slope, sums.change
     LANES = discretisation.lanes
-    lanes = lane_functions(discretisation.precision, LANES)
-    lane, add_up_vectors = lanes.lane, lanes.add_up_vectors
-
-    @wp.func
-    def wall_gradient(i: int, x: wp.array(dtype=vector), s: neighbourhood) -> vector:
-        total = vector()
-        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = neighbour(k, i, s)
-            total += (s.response_scale * wall_weight(b, s)) * gradient(separation(x[i], wall_position(b, s), s), s)
-        return add_up_vectors(total)
-
-    @wp.func
-    def wall_hessian_product(i: int, x: wp.array(dtype=vector), u: vector, s: neighbourhood) -> vector:
-        total = vector()
-        for k in range(s.fluid_count[i] + lane(), s.count[i], LANES):
-            b = neighbour(k, i, s)
-            total += (s.response_scale * wall_weight(b, s)) * hessian_product(
-                separation(x[i], wall_position(b, s), s), u, s
-            )
-        return add_up_vectors(total)
+    lane = lane_functions(discretisation.precision, LANES).lane
 
     @wp.kernel(module=discretisation.module(True, "pcisph"))
     def wall_relaxation(
@@ -60,7 +40,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
         y: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        total = wall_gradient(i, x, s)
+        total = s.response_scale * slope(i, x, s)
         if lane() > 0:
             return
         y[i] = real(1.0) / (real(1.0) + wp.dot(total, total))
@@ -75,8 +55,8 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
         y_dot: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        total = wall_gradient(i, x, s)
-        total_dot = wall_hessian_product(i, x, x_dot[i], s)
+        total = s.response_scale * slope(i, x, s)
+        total_dot = change(i, x, s.response_scale * x_dot[i], s)
         if lane() > 0:
             return
         y_dot[i] = real(-2.0) * y[i] * y[i] * wp.dot(total, total_dot)
@@ -91,10 +71,10 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
         x_bar: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        total_bar = (real(-2.0) * y_bar[i] * y[i] * y[i]) * wall_gradient(i, x, s)
-        change = wall_hessian_product(i, x, total_bar, s)
+        total = s.response_scale * slope(i, x, s)
+        x_sum = change(i, x, (real(-2.0) * y_bar[i] * y[i] * y[i] * s.response_scale) * total, s)
         if lane() > 0:
             return
-        x_bar[i] = x_bar[i] + change
+        x_bar[i] = x_bar[i] + x_sum
 
     return Kernels(wall_relaxation, wall_relaxation_tangent, wall_relaxation_adjoint)

@@ -1,0 +1,71 @@
+"""Bundles: several arrays that a kernel takes as one argument, so that its arguments can be read.
+
+A launch finds the arrays of a bundle by their names, as it finds arguments (`cortado.device.binding`). In a bundle
+called ``dot`` or ``bar``, x is the array ``x_dot`` or ``x_bar``. Kernels with few arrays take them one by one: with a
+bundle, that of the density is 6 % slower on an H200.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+MOST = 4_096
+"""Filled bundles that are kept; then all are let go, and filled anew."""
+_FIELDS: dict[Any, tuple[str, ...]] = {}
+"""Names of the arrays of each bundle."""
+
+
+def bundle(**entries: Any) -> Any:
+    """The Warp struct of arrays of these names, with entries of these types."""
+    return _bundle(tuple(entries.items()))
+
+
+@cache
+def _bundle(entries: tuple[tuple[str, Any], ...]) -> Any:
+    words = (f"{name}_{wp.types.type_size_in_bytes(kind)}" for name, kind in entries)
+    arrays = {name: wp.array(dtype=kind) for name, kind in entries}
+    made = wp.struct(type("_".join(("Bundle", *words)), (), {"__annotations__": arrays, "__module__": __name__}))
+    _FIELDS[made] = tuple(arrays)
+    return made
+
+
+@cache
+def bundles_of(kernel: wp.Kernel) -> dict[str, dict[str, str]]:
+    """The arguments of a kernel that are bundles: the names of the arrays that their fields are."""
+    found = {a.label: _FIELDS[a.type] for a in kernel.adj.args if a.type.__hash__ and a.type in _FIELDS}
+    return {label: {name: _array(name, label) for name in fields} for label, fields in found.items()}
+
+
+def _array(field: str, label: str) -> str:
+    return f"{field}_{label}" if label in ("dot", "bar") else field
+
+
+def unbundled(arguments: Iterable[Any]) -> Iterator[Any]:
+    """The arguments of a launch, with its arrays in the place of the bundles that they are in."""
+    for argument in arguments:
+        struct = getattr(argument, "_cls", None)
+        if struct in _FIELDS:
+            yield from (getattr(argument, name) for name in _FIELDS[struct])
+        else:
+            yield argument
+
+
+class Bundles:
+    """Bundles filled with arrays. Filling one takes longer than a launch, so that they are kept."""
+
+    def __init__(self) -> None:
+        self._filled: dict[tuple[Any, ...], Any] = {}
+
+    def filled(self, struct: Any, arrays: Mapping[str, wp.array]) -> Any:
+        """The bundle of a type with these arrays."""
+        key = (struct, *map(id, arrays.values()))  # a bundle holds its arrays, so that their ids stay theirs
+        if key not in self._filled:
+            if len(self._filled) >= MOST:
+                self._filled.clear()
+            made = struct()
+            for name, array in arrays.items():
+                setattr(made, name, array)
+            self._filled[key] = made
+        return self._filled[key]
