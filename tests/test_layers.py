@@ -30,8 +30,9 @@ LAYERS = """
     discretise discretise.walls discretise.walls.layers discretise.walls.points discretise.walls.places
     discretise.walls.weights
     scene.containers scene.entry_points scene.package_tables scene.solvers scene.model scene.stability
-    device device.cores device.driver device.bundles device.binding device.kernels device.memory device.precision device.arithmetic device.loads
-    device.lanes device.reduction device.host device.silence device.threads device.compiling device.kernel_cache
+    device device.cores device.driver device.bundles device.binding device.kernels device.memory device.precision
+    device.arithmetic device.loads device.lanes device.reduction device.host device.silence device.threads
+    device.compiling device.kernel_cache
     device.smoothing
     device.neighbourhood device.terms device.pair_loops device.pair_sums device.made_derivatives device.by_hand
     device.arrays device.fields device.launching device.state device.cells

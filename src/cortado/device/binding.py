@@ -19,31 +19,35 @@ def bound(kernel: wp.Kernel, groups: Sequence[Named], given: Named, bundles: Bun
     Kernels take many arrays of one type, and nothing else would notice a mistake: raises `TypeError` for an argument
     that is missing or that the kernel does not have.
     """
-    names = _names(kernel)
-    surplus = [name for name in given if name not in names]
-    if surplus:
-        raise TypeError(f"kernel {kernel.key} has no argument {surplus[0]!r}; it has {', '.join(names)}.")
-    sources, bundled = (given, *groups), bundles_of(kernel)
+    names, arguments = _signature(kernel)
+    for name in given:
+        if name not in names:
+            raise TypeError(f"kernel {kernel.key} has no argument {name!r}; it has {', '.join(names)}.")
+    sources, found = (given, *groups), []
+    for name, struct, arrays in arguments:
+        if struct is None:
+            found.append(_found(name, sources, kernel))
+        else:
+            found.append(bundles.filled(struct, [_found(array, sources, kernel) for array in arrays]))
+    return found
 
-    def found(name: str) -> Any:
-        for source in sources:
-            if name in source:
-                return source[name]
-        known = ", ".join(dict.fromkeys(known for source in sources for known in source))
-        raise TypeError(
-            f"argument {name!r} of kernel {kernel.key} is missing; it has {', '.join(names)}; known are {known}."
-        )
 
-    def argument(one: Any) -> Any:
-        if one.label not in bundled:
-            return found(one.label)
-        return bundles.filled(one.type, {field: found(name) for field, name in bundled[one.label].items()})
-
-    return [argument(one) for one in kernel.adj.args]
+def _found(name: str, sources: Sequence[Named], kernel: wp.Kernel) -> Any:
+    for source in sources:
+        if name in source:
+            return source[name]
+    names, known = _signature(kernel)[0], ", ".join(dict.fromkeys(known for source in sources for known in source))
+    raise TypeError(
+        f"argument {name!r} of kernel {kernel.key} is missing; it has {', '.join(names)}; known are {known}."
+    )
 
 
 @cache
-def _names(kernel: wp.Kernel) -> tuple[str, ...]:
-    """Of all arguments, with the arrays of bundles in their place."""
+def _signature(kernel: wp.Kernel) -> tuple[dict[str, None], tuple[tuple[str, Any, tuple[str, ...]], ...]]:
+    """All names, with the arrays of bundles in their place; and each argument with its bundle's type and arrays."""
     bundled = bundles_of(kernel)
-    return tuple(name for a in kernel.adj.args for name in bundled.get(a.label, {a.label: a.label}).values())
+    arguments = tuple(
+        (a.label, a.type if a.label in bundled else None, tuple(bundled.get(a.label, {}).values()))
+        for a in kernel.adj.args
+    )
+    return dict.fromkeys(name for label, _, arrays in arguments for name in (arrays or (label,))), arguments

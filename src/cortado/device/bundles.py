@@ -5,7 +5,7 @@ called ``dot`` or ``bar``, x is the array ``x_dot`` or ``x_bar``. Kernels with f
 bundle, that of the density is 6 % slower on an H200.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from typing import Any
 
@@ -58,14 +58,14 @@ class Bundles:
     def __init__(self) -> None:
         self._filled: dict[tuple[Any, ...], Any] = {}
 
-    def filled(self, struct: Any, arrays: Mapping[str, wp.array]) -> Any:
-        """The bundle of a type with these arrays."""
-        key = (struct, *map(id, arrays.values()))  # a bundle holds its arrays, so that their ids stay theirs
-        if key not in self._filled:
+    def filled(self, struct: Any, arrays: Sequence[wp.array]) -> Any:
+        """The bundle of a type with these arrays, in the order of its fields."""
+        key = (struct, *map(id, arrays))  # a bundle holds its arrays, so that their ids stay theirs
+        found = self._filled.get(key)
+        if found is None:
             if len(self._filled) >= MOST:
                 self._filled.clear()
-            made = struct()
-            for name, array in arrays.items():
-                setattr(made, name, array)
-            self._filled[key] = made
-        return self._filled[key]
+            found = self._filled[key] = struct()
+            for name, array in zip(_FIELDS[struct], arrays, strict=True):
+                setattr(found, name, array)
+        return found
