@@ -116,7 +116,7 @@ def _tangent(term: Term, d: Discretisation) -> Body:
     """Of each component of each result the gradient times the tangents of the parameters."""
     kinds = {**term.parameters, **_bars(term)}
 
-    def tangent_of(name: str, of_j: Mapping[str, str]) -> str:
+    def change_of(name: str, of_j: Mapping[str, str]) -> str:
         array = array_of(name)
         if not array:
             return f"{name}_dot"
@@ -133,7 +133,7 @@ def _tangent(term: Term, d: Discretisation) -> Body:
             for k in range(components):
                 bars = [_unit(each, d, k) if m == n else zero(each, d) for m, each in enumerate(term.results)]
                 yield _gradient(f"by_{n}_{k}", term, term.seen_from_i(of_j), bars)
-                terms = (product(f"by_{n}_{k}_{name}", name, tangent_of(name, of_j)) for name in moved)
+                terms = (product(f"by_{n}_{k}_{name}", name, change_of(name, of_j)) for name in moved)
                 yield f"total_{n} += ({' + '.join(terms)}) * {_unit(kind, d, k)}"
 
     return body
