@@ -251,6 +251,21 @@ def test_there_is_a_launch_to_speak_of():
     assert "launch" in warp_names(MODULES["device.launching"])
 
 
+MOST_ARGUMENTS = 14
+"""Of a kernel: more can hardly be read."""
+LOOPS = {"device.pair_loops", "device.neighbours", "study.one_kernel_loops"}
+"""Modules that may count neighbours: the one that writes loops, the one that lists them, and wrong kernels on purpose."""
+
+
+@pytest.mark.parametrize("module", sorted(MODULES))
+def test_kernels_can_be_read(module):
+    text = MODULES[module].read_text()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef) and any("wp.kernel" in ast.unparse(one) for one in node.decorator_list):
+            assert len(node.args.args) <= MOST_ARGUMENTS, f"{node.name} takes too many arguments: bundle some"
+    assert module in LOOPS or "s.fluid_count" not in text, "sums over neighbours are made: cortado.device.pair_sums"
+
+
 def test_import_is_light():
     program = "import sys, cortado; print(*(n for n in ('warp', 'matplotlib', 'scipy') if n in sys.modules))"
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
