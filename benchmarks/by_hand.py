@@ -29,9 +29,9 @@ from cortado.device.neighbourhood import Discretisation, neighbourhood_type
 from cortado.sph.pair_forces import laminar, pairwise
 
 ROOT = Path(cortado.__file__).parent
-ASKED = {"phases": [3], "form": [pairwise, laminar], "sticks": [False]}
+ASKED: dict[str, list[Any]] = {"phases": [3], "form": [pairwise, laminar], "sticks": [False]}
 """What the factories of sums ask for beside a discretisation."""
-KINDS = {"tangent": made_tangent, "adjoint": made_adjoint}
+KINDS: dict[str, Callable[..., Any]] = {"tangent": made_tangent, "adjoint": made_adjoint}
 
 
 def noting_factories() -> Iterator[tuple[Callable[..., Any], int]]:
@@ -102,7 +102,7 @@ class Pair:
     def __init__(self, one: ByHand, differentiable: ByHand):
         """``differentiable``: the same of a discretisation that is taped."""
         term, own, d = differentiable.of.term, one.function.term, one.of.discretisation
-        self.name, self._d = f"{inspect.getmodule(own.function).__name__}.{one.function.key}", d
+        self.name, self._d = f"{own.function.__module__}.{one.function.key}", d
         arrays, others = dict(term.arrays), dict(term.others)
         if one.kind == "tangent":
             arrays, others = ({n: k for m, k in t.items() for n in (m, f"{m}_dot")} for t in (arrays, others))
@@ -167,7 +167,7 @@ def main() -> None:
     simulation = Simulation(dam_break(options.particles), options.device, options.precision)
     rollout = simulation.rollout(3)
     rollout.forward()
-    solver = rollout.solver
+    solver: Any = rollout.solver
     s, x = without_walls(solver.context(rollout.parameters).neighbourhood), solver.fields["x"]
     for pair in pairs(solver.discretisation):
         values = pair.values(x, 1)

@@ -254,7 +254,7 @@ def test_there_is_a_launch_to_speak_of():
 MOST_ARGUMENTS = 14
 """Of a kernel: more can hardly be read."""
 LOOPS = {"device.pair_loops", "device.neighbours", "study.one_kernel_loops"}
-"""Modules that may count neighbours: the one that writes loops, the one that lists them, and wrong kernels on purpose."""
+"""Modules that may count neighbours: one writes loops, one lists neighbours, and one is wrong on purpose."""
 
 
 @pytest.mark.parametrize("module", sorted(MODULES))
