@@ -9,6 +9,7 @@ import pytest
 from cortado import CortadoWarning, InputError, Problem, Scene, Simulation, gradients, losses
 from finite_differences import decades, distance
 from scenes import jet, plane, pour, scene
+from twins import nozzle_of
 
 STEPS = 30
 
@@ -69,7 +70,7 @@ def direction_of(name, value, seed=4):
 
 def released(problem, point, frames):
     """(m,) distance before the opening [m] after a number of steps; negative once let go."""
-    nozzle = problem.simulation.solver.emitter.nozzle
+    nozzle = nozzle_of(problem.simulation)
     return nozzle.upstream - float(point["flow_rate"]) / nozzle.area * frames * float(point["time_step"])
 
 
@@ -141,7 +142,7 @@ def test_led_particles_follow_the_formula(name):
     problem = problem_of(name)
     point, simulation = point_of(problem), problem.simulation
     trajectory = problem.run(point)
-    nozzle, dt = simulation.solver.emitter.nozzle, float(point["time_step"])
+    nozzle, dt = nozzle_of(simulation), float(point["time_step"])
     speed, path = float(point["flow_rate"]) / nozzle.area, point["nozzle_path"]
     assert speed == pytest.approx(simulation.scene.emitter.speed(simulation.scene.discretisation.spacing))
     for n in range(1, STEPS + 1):
@@ -164,7 +165,7 @@ def test_particles_are_let_go_without_a_jump(name):
     problem = Problem(simulation, STEPS, Motion(simulation))
     point = {key: value for key, value in simulation.parameters().items() if key in SIZES}
     trajectory = problem.run(point)
-    first, dt = problem.simulation.solver.emitter.nozzle.first, float(point["time_step"])
+    first, dt = nozzle_of(problem.simulation).first, float(point["time_step"])
     seen = 0
     for n in range(1, STEPS + 1):
         free = (released(problem, point, n - 1) > 0.0) & (released(problem, point, n) <= 0.0)
@@ -186,7 +187,7 @@ def test_without_forces_the_column_goes_straight_on(direction):
         forces={"gravity": [0.0, 0.0, 0.0], "viscosity": "none", "pressure": False},
     )
     simulation = Simulation(made, precision="float64")
-    sample, emitter = made.emitter.sample(0.05), simulation.solver.emitter.nozzle
+    sample, emitter = made.emitter.sample(0.05), nozzle_of(simulation)
     trajectory = simulation.run(40)
     unit = np.array(direction) / np.linalg.norm(direction)
     travelled = sample.speed * trajectory.times[:, None, None] * unit

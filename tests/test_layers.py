@@ -43,8 +43,8 @@ LAYERS = """
     discretise.distance
     sph sph.density sph.free_energy sph.substeps sph.integration sph.begin_adjoint sph.order sph.materials
     sph.emitter_kernels sph.pair_forces sph.vorticity sph.wall_slope
-    sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.emitter
-    sph.gravity sph.makers sph.mixture sph.surface_tension sph.viscosity
+    sph.pairwise_laplacian sph.surface_normals sph.surface_stress sph.diffusion sph.parts sph.carried sph.part
+    sph.emitter sph.gravity sph.makers sph.mixture sph.surface_tension sph.viscosity
     sph.function_text sph.formula sph.packed sph.formula_kernels sph.own_force sph.body sph.pair forces
     solvers solvers.containment_kernels solvers.containment solvers.solver solvers.makers solvers.named
     solvers.convergence solvers.loop solvers.particles solvers.particle_derivatives solvers.build solvers.pcisph

@@ -11,7 +11,7 @@ from cortado.lattice.smoothing import KERNELS
 from cortado.losses.loss import ADJOINT_FIELDS
 from cortado.parameters.space import ParameterSpace
 from scenes import jet, plane, plane_of_three, pour, scene, two_layers
-from twins import emitter_twin, tension_twin, twin
+from twins import emitter_twin, nozzle_of, tension_twin, twin
 
 GRAVITY, STEPS, ITERATIONS = np.array([0.3, -9.81, 0.1]), 3, 5
 ONE = {"rest_density": 1000.0, "viscosity": 5.0, "time_step": 0.0021}
@@ -56,7 +56,7 @@ def point_of(simulation, seed=0):
         point = {name: value for name, value in point.items() if name != "viscosity"}
     if simulation.scene.forces.surface_tension:
         point["surface_tension"] = simulation.scene.forces.surface_tension
-    if nozzle := simulation.solver.emitter and simulation.solver.emitter.nozzle:
+    if nozzle := nozzle_of(simulation):
         outlet = simulation.parameters()["nozzle_path"]
         point["nozzle_path"] = outlet + 0.01 * random.standard_normal((STEPS, len(outlet)))
         point["flow_rate"] = 0.6 * nozzle.area * simulation.scene.discretisation.spacing / point["time_step"]
@@ -139,7 +139,7 @@ def test_steps_equal_those_of_the_twin(make, kernel, viscosity, slip, precision)
     rollout = simulation.rollout(STEPS, point)
     last = rollout.forward().numpy(d)
     found = np.concatenate([last[name] for name in ADJOINT_FIELDS], axis=1)
-    wanted = twins_steps(simulation, rollout.solver.mixture.substeps)(**point)
+    wanted = twins_steps(simulation, rollout.solver.substeps)(**point)
     tolerance = 1e-13 if precision == "float64" else 2e-5
     assert np.abs(wanted[:, :d] - point["initial_positions"]).max() > 1e-3
     if "mass_fractions" in point:
@@ -159,7 +159,7 @@ def test_tangents_and_adjoints_equal_complex_steps_of_the_twin(make, kernel, vis
     rollout.forward()
     states = {}
     rollout.tangent(*controls.direction(rollout, values, along), lambda step, dot: states.update({step: dot.numpy(d)}))
-    slow = twins_steps(simulation, rollout.solver.mixture.substeps)
+    slow = twins_steps(simulation, rollout.solver.substeps)
     exact = reference.complex_step(
         lambda *given: slow(**dict(zip(values, given, strict=True))), list(values.values()), list(along.values())
     )

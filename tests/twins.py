@@ -3,6 +3,7 @@
 import numpy as np
 
 import reference
+from cortado.sph.emitter import Nozzle
 from cortado.sph.surface_tension import SurfaceTension, tension_constants
 from cortado.sph.viscosity import Viscosity
 
@@ -39,8 +40,10 @@ def tension_twin(simulation):
 
 def emitter_twin(simulation, path):
     """The slow twin of its emitter, whose opening goes along a path (steps, d); None without."""
-    emitter = simulation.solver.emitter
-    if emitter is None:
-        return None
-    nozzle = emitter.nozzle
-    return reference.Emitter(nozzle.upstream, nozzle.offsets, nozzle.direction, nozzle.area, path)
+    nozzle = nozzle_of(simulation)
+    return nozzle and reference.Emitter(nozzle.upstream, nozzle.offsets, nozzle.direction, nozzle.area, path)
+
+
+def nozzle_of(simulation):
+    """Of its emitter; None without."""
+    return next((part for part in simulation.solver.system.parts if isinstance(part, Nozzle)), None)

@@ -26,6 +26,7 @@ from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy
 from cortado.sph.makers import ForceMaker
 from cortado.sph.mixture import Phases
+from cortado.sph.part import PartMaker
 from cortado.sph.parts import Force, Setting
 
 
@@ -51,8 +52,8 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
             search,
             _forces(scene, discrete, discretisation, layout, setting.forces),
             [*discrete.periods, *[0.0] * (3 - scene.dimension)],
-            _phases(scene, discretisation, setting.free_energy),
-            _nozzle(scene, discrete),
+            _parts(scene, discrete, discretisation, setting.free_energy),
+            discrete.fluid.emitted.start,
             _walled(scene, discrete),
             of_one_lane=lambda: system(replace(discretisation, lanes=1, taped=True)),
         )
@@ -90,6 +91,14 @@ def _forces(
                 "`batches = True`, which says that its kernels read the parameters of a particle's own scene."
             )
     return forces
+
+
+def _parts(
+    scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, free_energy: FreeEnergy
+) -> list[PartMaker]:
+    """The parts that are no forces, in the order in which they end a step."""
+    nozzle = _nozzle(scene, discrete)
+    return [_phases(scene, discretisation, free_energy), *([nozzle] if nozzle else [])]
 
 
 def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnergy) -> Phases:

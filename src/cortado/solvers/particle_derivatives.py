@@ -1,7 +1,5 @@
 """Tangent and adjoint of what solvers of particles have in common; a solver adds those of its own loops."""
 
-from contextlib import nullcontext
-
 import warp as wp
 
 from cortado.device.arrays import Fields
@@ -9,8 +7,6 @@ from cortado.device.state import Parameters, State
 from cortado.solvers.particles import ParticleSolver
 from cortado.sph.begin_adjoint import begin_adjoint_kernel
 from cortado.sph.carried import Carried
-from cortado.sph.emitter import EmitterAdjoint
-from cortado.sph.mixture import MixtureAdjoint, MixtureTangent
 from cortado.sph.parts import Adjoints, Shares, StepContext, Tangents
 
 
@@ -24,7 +20,7 @@ class ParticleTangent:
         """Of the sorted particles, once `sort` has been called, and of the parameters."""
         self.carried_dot = Carried(solver.carried_fields, solver.layout)
         self._accelerations_dot = [solver.vectors() for _ in range(len(solver.forces) + 1)]
-        self._mixture = MixtureTangent(solver.mixture)
+        self._parts = [part.new_tangent() for part in solver.parts]
 
     def sort(self, context: StepContext, state_dot: State) -> None:
         """Of `ParticleSolver.sort`."""
@@ -40,7 +36,8 @@ class ParticleTangent:
         )
         self.carried_dot.sort(context, state_dot)
         context.launch(solver.density.tangent, *self.dot.named)
-        self._mixture.step(context, self.dot, state_dot.mass_fractions)
+        for part in self._parts:
+            part.sort(context, self.dot, state_dot)
 
     def accelerate(self, context: StepContext) -> wp.array:
         """Of `ParticleSolver.accelerate`."""
@@ -62,9 +59,8 @@ class ParticleTangent:
         scene = {"x_scene": state_dot.positions, "v_scene": state_dot.velocities}
         context.launch(solver.integration.unsort, x=x_dot, v=v_dot, **scene)
         self.carried_dot.unsort(context, carried_dot, state_dot)
-        self._mixture.result(context, state_dot.mass_fractions)
-        if solver.emitter:
-            solver.emitter.tangent(context, self.dot.parameters, state_dot)
+        for part in self._parts:
+            part.end(context, self.dot, state_dot)
 
 
 class ParticleAdjoint:
@@ -72,9 +68,10 @@ class ParticleAdjoint:
     atomics are needed."""
 
     def __init__(self, solver: ParticleSolver, steps: int):
-        layout, mixture = solver.layout, solver.mixture
+        layout = solver.layout
+        of_parts = (name for part in solver.parts for name in part.shares)
         of_forces = (name for force in solver.forces for name in force.shares)
-        names = ["time_step", *mixture.shares, *solver.shares, *of_forces]
+        names = ["time_step", *of_parts, *solver.shares, *of_forces]
         self._solver = solver
         self.bar = Adjoints(
             Fields.zeros(layout.all_particles, layout.precision, layout.device),
@@ -85,8 +82,7 @@ class ParticleAdjoint:
         self.carried_bar = Carried(solver.carried_fields, solver.layout)
         """Of what the step carries on, once `unsort` has been called."""
         self._acceleration_bar = solver.vectors()
-        self._mixture = MixtureAdjoint(mixture)
-        self._emitter = EmitterAdjoint(solver.emitter) if solver.emitter else None
+        self._parts = [part.new_adjoint() for part in reversed(solver.parts)]
 
     def begin(self) -> None:
         """Forget the adjoints of the parameters of an earlier way back."""
@@ -99,13 +95,13 @@ class ParticleAdjoint:
         return self.bar.parameters
 
     def unsort(self, context: StepContext, state_bar: State) -> State:
-        """Of `ParticleSolver.unsort`: the adjoints of positions and velocities without what the emitter prescribes, in
-        the scene's order."""
+        """Of `ParticleSolver.unsort`: the adjoints of positions and velocities without what parts prescribe, in the
+        scene's order."""
         self.carried_bar.sort(context, state_bar)
-        if self._emitter is None:
-            return state_bar
-        self._emitter.step(context, state_bar, self.bar.parameters)
-        return self._emitter.free
+        free_bar = state_bar
+        for part in self._parts:
+            free_bar = part.end(context, self.bar.parameters, state_bar, free_bar)
+        return free_bar
 
     def begin_step(self, context: StepContext, free_bar: State, v_star: wp.array) -> None:
         """Of a step that ends with x' = x + dt v', where v' is the ``v_star`` of an explicit prediction, given what
@@ -125,10 +121,11 @@ class ParticleAdjoint:
             force.adjoint(context, acceleration_bar, self.bar)
 
     def mix(self, context: StepContext, state_bar: State) -> None:
-        """Of the mixture, and of the particles' masses, in `ParticleSolver.sort`."""
-        m_scene_bar = state_bar["reference_density"]
-        with context.aside() if not self._solver.mixture.substeps else nullcontext():
-            self._mixture.step(context, self.bar, state_bar.mass_fractions)
+        """Of the parts, and of the particles' masses, in `ParticleSolver.sort`."""
+        for part in self._parts:
+            part.sort(context, self.bar, state_bar)
+        with context.aside():
+            m_scene_bar = state_bar["reference_density"]
             context.launch(self._solver.integration.collect_masses, *self.bar.named, m_scene_bar=m_scene_bar)
 
     def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:

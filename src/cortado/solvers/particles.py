@@ -29,9 +29,8 @@ from cortado.solvers.loop import IterationLog, Loop
 from cortado.solvers.solver import Counts, StepAdjoint, StepTangent
 from cortado.sph.carried import Carried
 from cortado.sph.density import density_kernels
-from cortado.sph.emitter import Emitter, Nozzle
 from cortado.sph.integration import integration_kernels
-from cortado.sph.mixture import Mixture, Phases
+from cortado.sph.part import Part, PartMaker
 from cortado.sph.parts import Force, StepContext
 
 
@@ -48,8 +47,10 @@ class ParticleSystem:
     forces: Sequence[Force]
     periods: Sequence[float]
     """(3,) [m], 0 along an axis that is not periodic."""
-    phases: Phases
-    nozzle: Nozzle | None
+    parts: Sequence[PartMaker]
+    """Of its parts that are no forces."""
+    waiting: int
+    """Number of the first particle of a scene that may wait in a nozzle."""
     walled: Walled
     of_one_lane: Callable[[], "ParticleSystem"]
     """The same over the same search for neighbours, with kernels that Warp's tape can differentiate."""
@@ -70,7 +71,7 @@ class ParticleSolver:
     """Parameters of its own to whose adjoints every particle adds a share, as those of a `Force`."""
 
     def __init__(self, system: ParticleSystem, requires_grad: bool = False):
-        discretisation, search, layout, nozzle = system.discretisation, system.search, system.layout, system.nozzle
+        discretisation, search, layout = system.discretisation, system.search, system.layout
         precision, particles, device = layout.precision, layout.all_particles, layout.device
         if requires_grad and not discretisation.taped:
             raise TypeError("a tape needs the kernels of system.of_one_lane(): make the solver of that system.")
@@ -83,11 +84,15 @@ class ParticleSolver:
             density_kernels(discretisation, self.topic),
             integration_kernels(precision, requires_grad),
         )
-        self.mixture = Mixture(system.phases, layout, requires_grad)
-        self.emitter = Emitter(nozzle, layout, requires_grad) if nozzle else None
+        self.parts = (
+            *(maker.part(layout, requires_grad) for maker in system.parts),
+            *(force for force in self.forces if isinstance(force, Part)),
+        )
+        self.substeps = 0
+        """Of diffusion, in each step."""
         self.carried = Carried(self.carried_fields, layout, requires_grad)
         """Sorted, as they were at the start of the step."""
-        of_parts = (*self.mixture.fields, *(self.emitter.fields if self.emitter else ()))
+        of_parts = (field for part in self.parts for field in part.fields)
         self.state_fields = (POSITIONS, VELOCITIES, *of_parts, *self.carried_fields)
         """What a state consists of."""
         self.fields = Fields.zeros(particles, precision, device, requires_grad)
@@ -97,8 +102,7 @@ class ParticleSolver:
         self.loops: tuple[Loop, ...] = ()
         """Those of a step, in the order in which they run."""
         self.step_number = wp.zeros(layout.members, dtype=wp.int32, device=device)
-        first_waiting = nozzle.first if nozzle else layout.particles
-        self.containment = Containment(system.walled, layout, self.launch, first_waiting)
+        self.containment = Containment(system.walled, layout, self.launch, system.waiting)
         self._neighbourhood: Any = None
         self._context: StepContext | None = None
         self.generation = 0
@@ -133,8 +137,10 @@ class ParticleSolver:
         return IterationLog(steps, self.loops, self.layout)
 
     def set_substeps(self, substeps: int) -> None:
-        if substeps != self.mixture.substeps:
-            self.mixture.reserve(substeps)
+        if substeps != self.substeps:
+            for part in self.parts:
+                part.set_substeps(substeps)
+            self.substeps = substeps
             self.generation += 1
 
     def make_room(self) -> bool:
@@ -147,7 +153,7 @@ class ParticleSolver:
 
     def match(self, other: Self) -> None:
         self.resize(other.search.capacity)
-        self.set_substeps(other.mixture.substeps)
+        self.set_substeps(other.substeps)
 
     def follow(self, other: Self) -> None:
         wp.copy(self.step_number, other.step_number)
@@ -173,20 +179,21 @@ class ParticleSolver:
         return self._context
 
     def sort(self, state: State, parameters: Parameters) -> StepContext:
-        """Neighbours, density and mixture: how a step begins. It reads all of the state."""
+        """Neighbours, density and parts: how a step begins. It reads all of the state."""
         context = self.context(parameters)
-        if self.emitter:
-            self.emitter.begin(context, state)
+        for part in self.parts:
+            part.begin(context, state)
         self.search.sort(state.positions)
         scene = {"x_scene": state.positions, "v_scene": state.velocities, "m_scene": state["reference_density"]}
         context.launch(self.integration.sort, **scene)
         self.carried.sort(context, state)
-        with context.aside():
-            self.mixture.sort(context, state.mass_fractions)
+        for part in self.parts:
+            part.sort(context, state)
         self.search.fill(self._neighbourhood, self.fields["x"], self.containment.bad_step)
         context.launch(self.density.forward)
         context.join()
-        self.mixture.diffuse(context)
+        for part in self.parts:
+            part.settle(context)
         return context
 
     def accelerate(self, context: StepContext) -> wp.array:
@@ -196,14 +203,16 @@ class ParticleSolver:
         return self.accelerations[-1]
 
     def unsort(self, context: StepContext, x: wp.array, v: wp.array, new_state: State, **carried: wp.array) -> None:
-        """Write the new state from sorted positions and velocities, but for particles that the emitter prescribes, and
-        from what is ``carried`` to the next step, one array for each of `carried_fields`."""
-        free = self.emitter.free if self.emitter else new_state
+        """Write the new state from sorted positions and velocities, but for what parts prescribe, and from what is
+        ``carried`` to the next step, one array for each of `carried_fields`."""
+        free, ends = new_state, []
+        for part in reversed(self.parts):
+            ends.append((part, free))
+            free = part.target(free)
         context.launch(self.integration.unsort, x=x, v=v, x_scene=free.positions, v_scene=free.velocities)
         self.carried.unsort(context, carried, new_state)
-        self.mixture.result(context, new_state.mass_fractions)
-        if self.emitter:
-            self.emitter.prescribe(context, new_state)
+        for part, moved in reversed(ends):
+            part.end(context, new_state, moved)
 
     def end_step(self, x: wp.array, v: wp.array, new_state: State, log: IterationLog) -> None:
         """Look for lost particles, given sorted positions and velocities after the step without what a nozzle leads;

@@ -10,7 +10,8 @@ from cortado.device.fields import POSITIONS, VELOCITIES, Entry, StateField
 from cortado.device.state import Layout, Parameters, State
 from cortado.parameters.registry import Axis
 from cortado.sph.emitter_kernels import emitter_kernels, nozzle_type
-from cortado.sph.parts import StepContext
+from cortado.sph.part import Part, PartAdjoint, PartTangent
+from cortado.sph.parts import StepContext, Tangents
 
 OUTLET = StateField("outlet", "m", Entry.VECTOR, Axis.SCALAR, first="nozzle_path")
 """Where the opening of the nozzle is."""
@@ -33,8 +34,11 @@ class Nozzle:
     area: float
     """Of the opening [m2], in 2-D [m]."""
 
+    def part(self, layout: Layout, requires_grad: bool) -> "Emitter":
+        return Emitter(self, layout, requires_grad)
 
-class Emitter:
+
+class Emitter(Part):
     """The emitter of one solver."""
 
     fields = (OUTLET, EMITTED)
@@ -53,49 +57,64 @@ class Emitter:
         constants.direction = precision.vector(*np.pad(nozzle.direction, (0, 3 - len(nozzle.direction))))
         self.constants = {"nozzle": constants, **layout.state(self.fields, requires_grad).named()}
         """Of the nozzle, and of a step once it has begun, for kernels."""
-        self._dot = layout.state(self.fields).named("_dot")
 
     def begin(self, step: StepContext, state: State) -> None:
         """Keep what the end of a step needs of the state before it."""
         before = {"outlet_in": state["outlet"], "emitted_in": state["emitted"]}
         step.launch(self.kernels.begin, self.constants, **before, threads=self.layout.members)
 
-    def prescribe(self, step: StepContext, state: State) -> None:
-        """Write the state at the end of a step; ``free`` holds positions and velocities without the nozzle."""
+    def target(self, moved: State) -> State:
+        return self.free
+
+    def end(self, step: StepContext, state: State, moved: State) -> None:
         free = {"x_free": self.free.positions, "v_free": self.free.velocities}
         new = {"outlet_out": state["outlet"], "emitted_out": state["emitted"]}
-        step.launch(self.kernels.forward, self.constants, **free, x=state.positions, v=state.velocities, **new)
+        step.launch(self.kernels.forward, self.constants, **free, x=moved.positions, v=moved.velocities, **new)
 
-    def tangent(self, step: StepContext, dot: Parameters, state_dot: State) -> None:
-        """From the tangent of the state before to that of the state after, of prescribed particles and the nozzle."""
-        rates, outlet, emitted = dot.named("_dot"), state_dot["outlet"], state_dot["emitted"]
-        before = {"outlet_in_dot": outlet, "emitted_in_dot": emitted}
-        step.launch(self.kernels.begin_tangent, self.constants, self._dot, rates, **before, threads=self.layout.members)
-        new = {"outlet_out_dot": outlet, "emitted_out_dot": emitted}
-        moved = {"x_dot": state_dot.positions, "v_dot": state_dot.velocities}
-        step.launch(self.kernels.tangent, self.constants, self._dot, rates, **moved, **new)
+    def new_tangent(self) -> "EmitterTangent":
+        return EmitterTangent(self)
+
+    def new_adjoint(self) -> "EmitterAdjoint":
+        return EmitterAdjoint(self)
 
 
-class EmitterAdjoint:
-    """Reverse mode of `Emitter.prescribe`."""
+class EmitterTangent(PartTangent):
+    """Forward mode of prescribed particles and of the nozzle."""
 
     def __init__(self, emitter: Emitter):
         self._emitter = emitter
-        self.free = emitter.free.like()
+        self._dot = emitter.layout.state(emitter.fields).named("_dot")
+
+    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        kernels, known = self._emitter.kernels, (self._emitter.constants, self._dot, dot.parameters.named("_dot"))
+        outlet, emitted = state_dot["outlet"], state_dot["emitted"]
+        before = {"outlet_in_dot": outlet, "emitted_in_dot": emitted}
+        step.launch(kernels.begin_tangent, *known, **before, threads=self._emitter.layout.members)
+        new = {"outlet_out_dot": outlet, "emitted_out_dot": emitted}
+        moved = {"x_dot": state_dot.positions, "v_dot": state_dot.velocities}
+        step.launch(kernels.tangent, *known, **moved, **new)
+
+
+class EmitterAdjoint(PartAdjoint):
+    """Reverse mode of prescribed particles and of the nozzle."""
+
+    def __init__(self, emitter: Emitter):
+        self._emitter = emitter
+        self._free = emitter.free.like()
         """Adjoint of the end of a step if no particle were prescribed."""
         self._prescribed = emitter.free.like()
         layout = emitter.layout
         self._sums = [layout.sum_of(layout.precision.vector) for _ in range(2)]
 
-    def step(self, step: StepContext, state_bar: State, bar: Parameters) -> None:
-        """Write what reaches ``free``, and add what reaches prescribed particles to ``bar`` and to the adjoint of the
-        nozzle, which becomes that before the step."""
-        emitter, free, prescribed = self._emitter, self.free, self._prescribed
+    def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
+        """What reaches free particles; adds what reaches prescribed ones to ``bar`` and to the adjoint of the nozzle,
+        which becomes that before the step."""
+        emitter, free, prescribed = self._emitter, self._free, self._prescribed
         step.launch(
             emitter.kernels.adjoint,
             emitter.constants,
-            x_bar=state_bar.positions,
-            v_bar=state_bar.velocities,
+            x_bar=moved_bar.positions,
+            v_bar=moved_bar.velocities,
             x_free_bar=free.positions,
             v_free_bar=free.velocities,
             x_prescribed_bar=prescribed.positions,
@@ -106,3 +125,4 @@ class EmitterAdjoint:
         totals = {"x_total": x_total, "v_total": v_total}
         collected = {**own, **totals, "threads": emitter.layout.members}
         step.launch(emitter.kernels.collect, emitter.constants, bar.named("_bar"), **collected)
+        return free

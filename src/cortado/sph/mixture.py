@@ -3,14 +3,16 @@
 It comes first in a step, on the particles at rest at x(t); what it makes of a particle holds for the rest of the step.
 """
 
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 import warp as wp
 
 from cortado.device.fields import Entry, StateField
-from cortado.device.state import Layout
+from cortado.device.state import Layout, State
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.materials import mixture_kernels
+from cortado.sph.part import Part, PartAdjoint, PartTangent
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 MASS_FRACTIONS = StateField("mass_fractions", "", Entry.FRACTIONS, first="mass_fractions")
@@ -28,8 +30,11 @@ class Phases:
     strength: float
     """alpha of the free energy [-]."""
 
+    def part(self, layout: Layout, requires_grad: bool) -> "Mixture":
+        return Mixture(self, layout, requires_grad)
 
-class Mixture:
+
+class Mixture(Part):
     """The composition of the particles of one solver; its arrays are reused by every step."""
 
     def __init__(self, phases: Phases, layout: Layout, requires_grad: bool = False):
@@ -62,23 +67,23 @@ class Mixture:
         """(n,) numbers, all 0."""
         return wp.zeros(self._layout.all_particles, dtype=self._layout.precision.real, **self._options)
 
-    def reserve(self, substeps: int) -> None:
-        """Take so many substeps from now on, and make room for them."""
+    def set_substeps(self, substeps: int) -> None:
         self.substeps = substeps
         while len(self.chi) < substeps:
             self.c.append(self.fractions())
             self.chi.append(self.fractions())
             self.w.append(self.numbers())
 
-    def sort(self, step: StepContext, mass_fractions: wp.array) -> None:
-        """From ``mass_fractions`` in the scene's order; without diffusion that is all."""
-        if self.phases.count > 1:
-            step.launch(self.kernels.order.sort, a_scene=mass_fractions, a=self.c[0])
-        if not self.substeps:
-            self._blend(step)
+    def sort(self, step: StepContext, state: State) -> None:
+        """Without diffusion that is all."""
+        with step.aside():
+            if self.phases.count > 1:
+                step.launch(self.kernels.order.sort, a_scene=state.mass_fractions, a=self.c[0])
+            if not self.substeps:
+                self._blend(step)
 
-    def diffuse(self, step: StepContext) -> None:
-        """Take the substeps of diffusion, once there are densities."""
+    def settle(self, step: StepContext) -> None:
+        """Take the substeps of diffusion."""
         for k in range(self.substeps):
             assert self.diffusion is not None
             now = {"c": self.c[k], "chi": self.chi[k], "w": self.w[k]}
@@ -91,21 +96,31 @@ class Mixture:
         """Rest densities and viscosities."""
         step.launch(self.kernels.blend.forward, c=self.c[self.substeps])
 
-    def result(self, step: StepContext, mass_fractions: wp.array) -> None:
-        """Write the fractions after the last substep, in the scene's order."""
+    def end(self, step: StepContext, state: State, moved: State) -> None:
+        """Write the fractions after the last substep."""
         if self.phases.count > 1:
-            step.launch(self.kernels.order.unsort, a=self.c[self.substeps], a_scene=mass_fractions)
+            step.launch(self.kernels.order.unsort, a=self.c[self.substeps], a_scene=state.mass_fractions)
+
+    def new_tangent(self) -> "MixtureTangent":
+        return MixtureTangent(self)
+
+    def new_adjoint(self) -> "MixtureAdjoint":
+        return MixtureAdjoint(self)
 
 
-class MixtureAdjoint:
+class MixtureAdjoint(PartAdjoint):
     """Reverse mode of a mixture step, by gathers."""
 
     def __init__(self, mixture: Mixture):
         self._mixture = mixture
         self._c_bar, self._y, self._z = (mixture.fractions() for _ in range(3))
 
-    def step(self, step: StepContext, bar: Adjoints, fractions_bar: wp.array) -> None:
+    def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
         """Replace the adjoint of the new fractions, in scene order, by that of the old ones, to which materials add."""
+        with step.aside() if not self._mixture.substeps else nullcontext():
+            self._unmix(step, bar, state_bar.mass_fractions)
+
+    def _unmix(self, step: StepContext, bar: Adjoints, fractions_bar: wp.array) -> None:
         mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, bar.named
         substeps, strength, c_bar, y, z = mixture.substeps, mixture.phases.strength, self._c_bar, self._y, self._z
         step.launch(kernels.blend.adjoint, *known, c=mixture.c[substeps], c_scene_bar=fractions_bar, c_bar=c_bar)
@@ -119,7 +134,7 @@ class MixtureAdjoint:
             step.launch(kernels.order.unsort, a=c_bar, a_scene=fractions_bar)
 
 
-class MixtureTangent:
+class MixtureTangent(PartTangent):
     """Forward mode of a mixture step."""
 
     def __init__(self, mixture: Mixture):
@@ -128,12 +143,12 @@ class MixtureTangent:
         self._chi_dot = mixture.fractions()
         self._w_dot = mixture.numbers()
 
-    def step(self, step: StepContext, dot: Tangents, fractions_dot: wp.array) -> None:
-        """From the tangent of the old fractions, in scene order, to those of the materials; `result` writes the new."""
+    def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        """From the tangent of the old fractions, in scene order, to those of the materials."""
         mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, dot.named
         substeps, now = mixture.substeps, {"chi_dot": self._chi_dot, "w_dot": self._w_dot}
         if mixture.phases.count > 1:
-            step.launch(kernels.order.sort, a_scene=fractions_dot, a=self._c_dot[0])
+            step.launch(kernels.order.sort, a_scene=state_dot.mass_fractions, a=self._c_dot[0])
         for k in range(substeps):
             assert diffusion is not None
             c_dot, c_new_dot = self._c_dot[k % 2], self._c_dot[(k + 1) % 2]
@@ -149,8 +164,8 @@ class MixtureTangent:
             step.launch(diffusion.flux.tangent, *known, substeps=substeps, **flux, **now)
         step.launch(kernels.blend.tangent, *known, c=mixture.c[substeps], c_dot=self._c_dot[substeps % 2])
 
-    def result(self, step: StepContext, new_fractions_dot: wp.array) -> None:
-        """Write the tangent of the new fractions, in the scene's order."""
+    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        """Write the tangent of the new fractions."""
         if self._mixture.phases.count > 1:
             last = self._c_dot[self._mixture.substeps % 2]
-            step.launch(self._mixture.kernels.order.unsort, a=last, a_scene=new_fractions_dot)
+            step.launch(self._mixture.kernels.order.unsort, a=last, a_scene=state_dot.mass_fractions)

@@ -22,9 +22,9 @@ class PcisphSteps(ParticleSolver):
     def __init__(self, system: ParticleSystem, limits: LoopLimits | None, requires_grad: bool = False):
         """``limits`` None leaves the pressure out."""
         super().__init__(system, requires_grad)
-        self.limits, self.kernels = limits, PcisphKernels.of(self.discretisation, self.mixture.phases.count)
+        self.limits, self.kernels = limits, PcisphKernels.of(self.discretisation, self.layout.phases)
         self.wall_relaxation, self.density_ratio = self.numbers(), self.numbers()
-        self.pressure_relaxation = self.numbers() if self.mixture.phases.count > 1 else self.wall_relaxation
+        self.pressure_relaxation = self.numbers() if self.layout.phases > 1 else self.wall_relaxation
         """(n,) what delta is multiplied with [-]: beside walls, and with several phases among lighter neighbours."""
         self.iterates = Iterates(self.numbers, self.vectors)
         self.pressure_loop = Loop(limits, self.layout, self.launch)

@@ -1,0 +1,82 @@
+"""What a part of a step may do besides accelerating particles: keep fields from step to step, and work at the beginning
+and at the end of a step. The mixture, the emitter, and forces that remember are parts; a solver knows only their list.
+
+A step goes through its parts in their order at each of the times below, forward and in forward mode, and in the reverse
+order in reverse mode. Every method does nothing unless a part has its own.
+"""
+
+from typing import Protocol
+
+from cortado.device.fields import StateField
+from cortado.device.state import Layout, Parameters, State
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+
+
+class PartTangent:
+    """Forward mode of a part."""
+
+    def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        """Of `Part.sort` and `Part.settle`: from the tangent of the state before the step; ``dot`` has those of the
+        sorted particles."""
+
+    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        """Of `Part.end`: ``state_dot`` has the tangents of positions and velocities at the end of the step, and becomes
+        that of the state there."""
+
+
+class PartAdjoint:
+    """Reverse mode of a part."""
+
+    def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
+        """Of a part that has a `Part.target`: from the adjoint of the positions and velocities that it left to that of
+        those that it found, which is returned. It adds to ``bar``; sorted particles have no adjoints yet."""
+        return moved_bar
+
+    def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
+        """Of `Part.settle` and `Part.sort`, and of what `Part.end` wrote of sorted particles: ``state_bar`` has the
+        adjoint of the part's fields after the step, and becomes that of those before it."""
+
+
+class Part:
+    """A part of a step, in one solver. A `Force` may be one too."""
+
+    fields: tuple[StateField, ...] = ()
+    """What it keeps from step to step, as arrays of the state."""
+    shares: tuple[str, ...] = ()
+    """Parameters to whose adjoints every particle adds a share, as those of a `Force`."""
+
+    def set_substeps(self, substeps: int) -> None:
+        """Take so many explicit substeps of diffusion in each step from now on."""
+
+    def begin(self, step: StepContext, state: State) -> None:
+        """Before anything else, with the state that the step begins from, over which it may write."""
+
+    def sort(self, step: StepContext, state: State) -> None:
+        """Once the order of the sorted particles is known."""
+
+    def settle(self, step: StepContext) -> None:
+        """Once neighbours and densities are known."""
+
+    def target(self, moved: State) -> State:
+        """Where the part finds positions and velocities at its `end`, given where it leaves them: a part that changes
+        some has room of its own for them, as nothing is changed in place."""
+        return moved
+
+    def end(self, step: StepContext, state: State, moved: State) -> None:
+        """Write the part's fields of ``state``, that at the end of the step, and, if it has a `target` of its own, all
+        positions and velocities of ``moved``."""
+
+    def new_tangent(self) -> PartTangent:
+        """Forward mode of it, with arrays of its own."""
+        return PartTangent()
+
+    def new_adjoint(self) -> PartAdjoint:
+        """Reverse mode of it, with arrays of its own."""
+        return PartAdjoint()
+
+
+class PartMaker(Protocol):
+    """Makes a part for a solver."""
+
+    def part(self, layout: Layout, requires_grad: bool) -> Part:
+        """The part; with ``requires_grad`` its arrays have gradients, for Warp's tape."""

@@ -1,0 +1,74 @@
+"""A force that keeps a field from step to step is a part like all others, though nothing in Cortado knows of it."""
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado import Problem, Simulation, gradients
+from remembering_force import TAU, Memory, U
+from scenes import jet, plane, two_layers
+
+STEPS = 6
+SCENES = {"plane": plane, "two layers": two_layers, "jet": jet}
+
+
+def problem(make, **options):
+    simulation = Simulation(make(), **{"precision": "float64", **options}, forces=[Memory()])
+    target = simulation.positions + 0.02 * np.sin(7.0 * simulation.positions)
+    return Problem(simulation, STEPS, cortado.losses.FinalPositions(target))
+
+
+def point_of(simulation):
+    velocities = 0.3 * np.random.default_rng(4).standard_normal(simulation.positions.shape)
+    return {"memory.k": 40.0, "time_step": 0.002, "initial_velocities": velocities}
+
+
+def test_what_it_does_is_what_it_says():
+    """Without pressure and viscosity a step is exact."""
+    free = plane(forces={"gravity": [0.0, -9.81], "viscosity": "none", "pressure": False})
+    simulation = Simulation(free, precision="float64", forces=[Memory()])
+    dt, gravity = free.solver.time_step, np.array([0.0, -9.81])
+    v = u = np.zeros(2)
+    for _ in range(STEPS):
+        v, u = v + dt * (gravity + 30.0 * (u - v)), u + dt * (v - u) / TAU
+    run = simulation.run(STEPS)
+    np.testing.assert_allclose(run.velocities[-1], np.tile(v, (simulation.particles, 1)), rtol=1e-12)
+    np.testing.assert_allclose(run.last_state[U.name], np.tile(u, (simulation.particles, 1)), rtol=1e-12)
+    assert np.abs(u).max() > 0.0
+
+
+@pytest.mark.parametrize("make", SCENES)
+def test_reverse_forward_tape_and_differences_agree(make):
+    judged = problem(SCENES[make])
+    point, random = point_of(judged.simulation), np.random.default_rng(5)
+    exact, taped = (judged.value_and_gradient(point, estimator)[1] for estimator in (None, gradients.Tape()))
+    for name, value in point.items():
+        direction = random.standard_normal(np.shape(value)) * np.abs(value).max()
+        along = float(np.sum(exact[name] * direction))
+        assert along != 0.0
+        np.testing.assert_allclose(judged.tangent(point, {name: direction}), along, rtol=1e-9)
+        np.testing.assert_allclose(taped[name], exact[name], rtol=1e-8, atol=1e-12 * np.abs(exact[name]).max())
+        moved = [judged.value({**point, name: value + s * 1e-6 * direction}) for s in (1.0, -1.0)]
+        np.testing.assert_allclose((moved[0] - moved[1]) / 2e-6, along, rtol=1e-4)
+
+
+def test_a_run_that_is_cut_has_the_same_bits():
+    simulation = Simulation(two_layers(), forces=[Memory()])
+    state = simulation.state({"initial_velocities": simulation.velocities + 0.1})
+    whole, halves = (
+        simulation.step(state, steps=STEPS),
+        simulation.step(simulation.step(state, steps=2), steps=STEPS - 2),
+    )
+    for name in (U.name, "positions", "velocities"):
+        np.testing.assert_array_equal(halves[name], whole[name])
+    assert np.abs(np.asarray(whole[U.name]) - whole["velocities"]).max() > 0.0
+
+
+def test_it_is_certified_and_runs_in_a_batch():
+    judged = problem(plane)
+    point = point_of(judged.simulation)
+    assert cortado.certify(judged, point).right
+    many = problem(plane, batch=2)
+    values, found = many.value_and_gradient({**point, "memory.k": [40.0, 10.0]})
+    value, gradient = judged.value_and_gradient({**point, "memory.k": 10.0})
+    assert values[1] == value and found["memory.k"][1] == gradient["memory.k"]
