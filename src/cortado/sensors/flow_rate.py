@@ -14,9 +14,9 @@ from cortado.sensors.sensor import ACROSS, Reading, Weights, direction, in_dimen
 class FlowRate:
     """Volume of fluid that goes through a plane in a second, along its normal; the mean over a layer around it:
 
-    Q = sum_i V (v_i . normal) w_i,   w_i = w(|(x_i - x) . normal| / reach) with the integral 1,
+    Q = sum_i V (v_i . normal) w_i,   w_i = w(r_i / reach) with the integral 1,
 
-    where V is the volume of a particle at rest.
+    where r_i is a particle's distance from the plane and V its volume at rest.
     """
 
     def __init__(self, position: Any, normal: Any, reach: float | None = None):

@@ -13,9 +13,9 @@ from cortado.sensors.sensor import Reading, Weights, in_dimension, point, positi
 class PressureProbe:
     """The mean pressure of the particles around a point, those nearby weighing most:
 
-    p = sum_i p_i w_i / sum_i w_i,   w_i = w(|x_i - x| / radius).
+    p = sum_i p_i w_i / sum_i w_i,   w_i = w(r_i / radius),
 
-    Without fluid within the radius it is 0.
+    where r_i is a particle's distance from the point. Without fluid within the radius it is 0.
     """
 
     def __init__(self, position: Any, radius: float | None = None):
