@@ -48,16 +48,18 @@ def _is_note(function: ast.expr) -> bool:
     return isinstance(function, ast.Name) and function.id in ("tangent_of", "adjoint_of")
 
 
-def by_hand(d: Discretisation) -> list[ByHand]:
-    """All derivatives by hand, made for a discretisation."""
-    found = []
+def by_hand(d: Discretisation) -> dict[str, ByHand]:
+    """All derivatives by hand, made for a discretisation, by what tells them apart."""
+    found = {}
     for factory, notes in noting_factories():
         asked = [name for name in inspect.signature(factory).parameters if name in ASKED]
         for values in product(*(ASKED[name] for name in asked)):
             before = len(BY_HAND)
             inspect.unwrap(factory)(d, *values)
             assert len(BY_HAND) == before + notes
-            found += BY_HAND[before:]
+            for one in BY_HAND[before:]:
+                form = "".join(f" {getattr(value, '__name__', value)}" for value in values)
+                found[f"{factory.__module__}.{one.function.key}{form}: {one.kind}"] = one
     return found
 
 
@@ -99,10 +101,10 @@ class Caller:
 class Pair:
     """A derivative by hand and the made one, of the same values."""
 
-    def __init__(self, one: ByHand, differentiable: ByHand):
+    def __init__(self, name: str, one: ByHand, differentiable: ByHand):
         """``differentiable``: the same of a discretisation that is taped."""
         term, own, d = differentiable.of.term, one.function.term, one.of.discretisation
-        self.name, self._d = f"{own.function.__module__}.{one.function.key}", d
+        self.name, self._d = name, d
         arrays, others = dict(term.arrays), dict(term.others)
         if one.kind == "tangent":
             arrays, others = ({n: k for m, k in t.items() for n in (m, f"{m}_dot")} for t in (arrays, others))
@@ -119,7 +121,7 @@ class Pair:
         self.compared = min(len(results), len(own.results))
         """Results that both have."""
         assert self.compared >= (len(results) if one.kind == "tangent" else len(term.arrays))
-        self.made = Caller(KINDS[one.kind](d)(term.function), [*arrays, *others], results, d)
+        self.made = Caller(KINDS[one.kind](d, lambda _: term.function), [*arrays, *others], results, d)
         self.by_hand = Caller(one.function, [*own_arrays, *own.others], own.results, d)
 
     def values(self, x: wp.array, seed: int) -> dict[str, Any]:
@@ -138,7 +140,8 @@ class Pair:
 
 def pairs(d: Discretisation) -> list[Pair]:
     """All derivatives by hand with the made ones."""
-    return [Pair(*both) for both in zip(by_hand(d), by_hand(replace(d, taped=True)), strict=True)]
+    taped = by_hand(replace(d, taped=True))
+    return [Pair(name, one, taped[name]) for name, one in by_hand(d).items()]
 
 
 def without_walls(neighbourhood: Any) -> Any:

@@ -1,16 +1,20 @@
 """Arguments of kernels are bound by their names, and a mistake is an error where the launch is written."""
 
+import gc
+
 import pytest
 import warp as wp
 
-from cortado import Simulation
+from cortado import Problem, Simulation, losses
 from cortado.device.binding import bound
 from cortado.device.bundles import Bundles
 from cortado.device.launching import KernelLauncher, launch, launch_together, watched
-from cortado.device.neighbourhood import neighbourhood_type
+from cortado.device.neighbourhood import Discretisation, neighbourhood_type
+from cortado.device.pair_sums import fluid_sum
 from cortado.device.precision import FLOAT64
+from cortado.lattice.smoothing import CUBIC_SPLINE
 from cortado.sph.integration import integration_kernels
-from scenes import plane
+from scenes import plane, two_layers
 
 CPU = wp.get_device("cpu")
 PREDICT = integration_kernels(FLOAT64, False).predict
@@ -84,6 +88,43 @@ def test_a_sum_over_neighbours_begins_where_its_range_begins():
     )
     with pytest.raises(TypeError, match=r"count_neighbours takes the neighbourhood s, .* i = s\.first \+ wp\.tid\(\)"):
         context.launch(count_neighbours, found=found)
+
+
+NEIGHBOURHOOD = Discretisation(CUBIC_SPLINE, FLOAT64)
+
+
+@fluid_sum(NEIGHBOURHOOD)
+def times(c_i: wp.float64, c_j: wp.float64) -> wp.float64:
+    return c_i * c_j
+
+
+@wp.func
+def twice(i: int, c: wp.array(dtype=wp.float64), s: neighbourhood_type(FLOAT64)) -> wp.float64:
+    return wp.float64(2.0) * times(i, c, s)
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def of_one_thread(s: neighbourhood_type(FLOAT64), m: wp.array(dtype=wp.float64), found: wp.array(dtype=wp.float64)):
+    i = s.first + wp.tid()
+    found[i] = twice(i, m, s)
+
+
+def test_a_sum_that_lanes_share_is_of_a_kernel_that_is_made_for_them():
+    """Else each of several threads would have a part of the sum of another particle, on a GPU, without a word."""
+    solver = Simulation(plane(), precision="float64").solver
+    with pytest.raises(TypeError, match=r"calls the sum times, which lanes share, .* i = s\.first \+ wp\.tid\(\) // L"):
+        solver.context(solver.new_parameters(1)).launch(of_one_thread, found=solver.numbers())
+
+
+def test_arrays_of_derivatives_that_are_gone_are_let_go():
+    simulation = Simulation(two_layers())
+    problem = Problem(simulation, 2, losses.FinalPositions(simulation.positions))
+    kept = simulation.solver.launch._bundles._filled
+    problem.value_and_gradient({"viscosity": [0.1, 0.2]})
+    assert kept
+    del problem
+    gc.collect()
+    assert not kept
 
 
 def test_launches_together_are_one_to_a_watcher():

@@ -5,7 +5,12 @@ import pytest
 
 import cortado
 from cortado import Problem, Simulation, gradients
-from remembering_force import TAU, Memory, U
+from cortado.device.fields import Entry, StateField
+from cortado.errors import InputError, MissingDerivativeError
+from cortado.parameters.registry import Axis
+from cortado.sph.carried import Carried
+from cortado.sph.part import Part
+from remembering_force import TAU, Memory, MemoryForce, U
 from scenes import jet, plane, two_layers
 
 STEPS = 6
@@ -72,3 +77,72 @@ def test_it_is_certified_and_runs_in_a_batch():
     values, found = many.value_and_gradient({**point, "memory.k": [40.0, 10.0]})
     value, gradient = judged.value_and_gradient({**point, "memory.k": 10.0})
     assert values[1] == value and found["memory.k"][1] == gradient["memory.k"]
+
+
+class Made:
+    """Makes a force that is a class."""
+
+    parameters = Memory.parameters
+
+    def __init__(self, kind):
+        self.force = kind
+
+
+def test_a_part_without_derivatives_says_so():
+    class Forward(MemoryForce):
+        new_tangent, new_adjoint = Part.new_tangent, Part.new_adjoint
+
+    simulation = Simulation(plane(), forces=[Made(Forward)])
+    simulation.run(2)
+    judged = Problem(simulation, 2, cortado.losses.FinalPositions(simulation.positions))
+    with pytest.raises(MissingDerivativeError, match="Forward has no reverse mode: let it have a method new_adjoint"):
+        judged.value_and_gradient({"memory.k": 1.0})
+    with pytest.raises(MissingDerivativeError, match="Forward has no forward mode: let it have a method new_tangent"):
+        judged.tangent({"memory.k": 1.0}, {"memory.k": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ((U, U), "several fields called 'remembered_velocities'"),
+        ((StateField("positions", "m", Entry.VECTOR),), "several fields called 'positions'"),
+        (
+            (StateField("u", "", Entry.NUMBER, first="weight"),),
+            "field 'u' begins as 'weight', but must begin as one of",
+        ),
+        (
+            (StateField("u", "", Entry.NUMBER, first="initial_velocities"),),
+            "begins as 'initial_velocities', which is not a number of each particle",
+        ),
+        (
+            (StateField("u", "", Entry.VECTOR, Axis.SCALAR, first="viscosity"),),
+            "begins as 'viscosity', which is not a vector of the scene",
+        ),
+    ],
+)
+def test_fields_that_cannot_be_are_refused(fields, message):
+    with pytest.raises(TypeError, match=message):
+        Simulation(plane(), forces=[Made(type("Odd", (MemoryForce,), {"fields": fields}))])
+
+
+def test_fields_of_a_scene_are_not_sorted():
+    layout = Simulation(plane()).solver.layout
+    with pytest.raises(TypeError, match="field 'u' has one entry, but must have one for each particle to be sorted"):
+        Carried([StateField("u", "", Entry.NUMBER, Axis.SCALAR)], layout)
+
+
+def test_what_works_as_a_part_must_be_one():
+    class Duck:
+        def __init__(self, setting):
+            self.shares = ()
+
+        def settle(self, step):
+            """Never called."""
+
+    with pytest.raises(InputError, match="the force Duck has the methods settle of a part, but is none"):
+        Simulation(plane(), forces=[Made(Duck)])
+
+
+def test_a_part_writes_its_fields():
+    with pytest.raises(InputError, match="the force Idle has fields, but no method `end` that writes them"):
+        Simulation(plane(), forces=[Made(type("Idle", (MemoryForce,), {"end": Part.end}))])

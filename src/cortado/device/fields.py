@@ -7,7 +7,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.parameters.registry import Axis
+from cortado.parameters.registry import Axis, Parameter
 
 
 class Entry(Enum):
@@ -39,6 +39,31 @@ class StateField:
         """Of its values as NumPy has them."""
         own = {Entry.VECTOR: (dimension,), Entry.FRACTIONS: (phases,)}.get(self.entry, ())
         return (particles if self.axis is Axis.PARTICLE else 1, *own)
+
+
+def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -> None:
+    """Raises `TypeError` for fields of one name, and for one that begins as a parameter which is not known, or which
+    has not one value for each of its entries."""
+    names: set[str] = set()
+    for field in fields:
+        if field.name in names:
+            raise TypeError(f"a state has several fields called {field.name!r}, but each must have a name of its own.")
+        names.add(field.name)
+        if field.first is None:
+            continue
+        if field.first not in known:
+            raise TypeError(
+                f"field {field.name!r} begins as {field.first!r}, but must begin as one of {', '.join(known)}, or at 0."
+            )
+        particles, dimension, phases = 7, 2, 5  # any that differ
+        (shape, *_) = known[field.first].shapes(0, phases, (particles, dimension))
+        given = shape if field.axis is Axis.PARTICLE else (1, *shape)
+        wanted = field.shape(particles, dimension, phases)
+        if given != wanted:
+            raise TypeError(
+                f"field {field.name!r} begins as {field.first!r}, which is not {field.entry.value} "
+                f"{'of each particle' if field.axis is Axis.PARTICLE else 'of the scene'}, but must be."
+            )
 
 
 def first_values(fields: Iterable[StateField], parameters: Mapping[str, NDArray]) -> dict[str, NDArray]:

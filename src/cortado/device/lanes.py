@@ -6,6 +6,8 @@ time, and then those LANES times further down the list. What lanes have summed u
 of which every lane gets the same bits, and the first one writes. On a CPU, and for Warp's tape, there is one lane.
 """
 
+import inspect
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -29,6 +31,30 @@ def set_lanes(module: Any, lanes: int) -> None:
 def lanes_of(kernel: wp.Kernel) -> int:
     """Threads that a kernel has for each particle: one, unless it divides them by LANES."""
     return _OF_MODULES.get(kernel.module.name, 1) if "wp.tid() // LANES" in kernel.adj.source else 1
+
+
+@cache
+def check_lanes(kernel: wp.Kernel) -> None:
+    """Raises `TypeError` for a kernel that calls a sum which lanes share, but is not made for lanes: on a GPU each of
+    its threads would have a part of the sum, of a particle that is not its own."""
+    source = kernel.adj.source
+    if "wp.tid() // LANES" in source and "lane()" in source:
+        return
+    for function in _called(kernel.func):
+        if getattr(function, "shares_lanes", False):
+            raise TypeError(
+                f"kernel {kernel.key} calls the sum {function.key}, which lanes share, but is not made for lanes: let "
+                "it begin with i = s.first + wp.tid() // LANES, and write nothing but where lane() is 0."
+            )
+
+
+def _called(function: Any) -> Iterator[Any]:
+    """The Warp functions that a Python function names, and those that they name."""
+    known = inspect.getclosurevars(function)
+    for value in (*known.nonlocals.values(), *known.globals.values()):
+        if isinstance(value, wp.Function):
+            yield value
+            yield from _called(value.func)
 
 
 def lanes_for(particles: int, device: Any) -> int:

@@ -11,7 +11,7 @@ import warp as wp
 from cortado.device.binding import Named, bound
 from cortado.device.bundles import Bundles
 from cortado.device.cores import usable_cores
-from cortado.device.lanes import lanes_of
+from cortado.device.lanes import check_lanes, lanes_of
 from cortado.device.precision import Precision
 from cortado.device.reduction import ReductionKernel, add_kernel, sum_and_maximum_kernel, sum_kernel
 from cortado.device.threads import MOST_CORES, WARP, helpers
@@ -121,12 +121,18 @@ class KernelLauncher:
                 f"kernel {kernel.key} takes the neighbourhood s, but does not look where its range of particles "
                 "begins, and every range would write to the first: let it begin with i = s.first + wp.tid()."
             )
+        if sums:
+            check_lanes(kernel)
         if sums and not self.capturable and kernel in self._compiled:
             _perform(kernel.key, entries, inputs, partial(self._launch_parts, kernel, inputs))
             return
         options = {"inputs": inputs, "device": self.device, "record_tape": self._record_tape}
         _perform(kernel.key, entries, inputs, partial(wp.launch, kernel, entries * lanes_of(kernel), **options))
         self._compiled.add(kernel)  # only now: an interrupted launch has compiled nothing
+
+    def forget(self) -> None:
+        """Let go of the arrays of earlier launches, which bundles hold."""
+        self._bundles.clear()
 
     @contextmanager
     def aside(self) -> Iterator[None]:

@@ -32,6 +32,7 @@ def pair_sum(d: Discretisation, walls: Function | None = None, ahead: bool = Tru
 
     def make(function: Function) -> Any:
         term, wall = Term.of(function), Term.of(walls or function)
+        _check_walls(wall, term)
         return _made(term, d, _over_fluid(term, d, ahead) + _over_walls(wall, d), wall)
 
     return make
@@ -57,26 +58,35 @@ def wall_sum(d: Discretisation) -> Decorator:
     return make
 
 
+def _check_walls(wall: Term, term: Term) -> None:
+    """Raises `TypeError` for a term of walls that does not fit that of the fluid."""
+    more = [name for name, kind in (wall.arrays | wall.others).items() if (term.arrays | term.others).get(name) != kind]
+    if wall.results != term.results or more:
+        found = f"has {', '.join(more)}" if more else f"returns {wall.results}"
+        raise TypeError(f"term {wall.name} of walls {found}, but must have results and parameters of {term.name}.")
+
+
 def _over_fluid(term: Term, d: Discretisation, ahead: bool) -> str:
     def body(of_j: Mapping[str, str]) -> list[str]:
-        return [f"{_terms(term)} = term({term.seen_from_i(of_j)})", *(f"total_{n} += term_{n}" for n in _numbers(term))]
+        called = f"{_terms(term)} = _term({term.seen_from_i(of_j)})"
+        return [called, *(f"_total_{n} += _term_{n}" for n in _numbers(term))]
 
-    return over_fluid(d, term.of_neighbours, body, ahead, numbered="j" in term.parameters)
+    knows = ("j" in term.parameters, "x_ij" in term.parameters)
+    return over_fluid(d, term.of_neighbours, body, ahead, *knows)
 
 
 def _over_walls(wall: Term, d: Discretisation) -> str:
     def body(of_b: Mapping[str, str]) -> list[str]:
-        called = f"{_terms(wall)} = wall_term({wall.seen_from_i(of_b)})"
-        return ["j = -1"] * ("j" in wall.parameters) + [
-            called,
-            *(f"total_{n} += w_b * term_{n}" for n in _numbers(wall)),
-        ]
+        called = f"{_terms(wall)} = _wall_term({wall.seen_from_i(of_b, '-1')})"
+        return [called, *(f"_total_{n} += _w_b * _term_{n}" for n in _numbers(wall))]
 
+    if "x_ij" not in wall.parameters:
+        raise TypeError(f"term {wall.name} has no x_ij, but must have it where it is summed over walls.")
     return over_walls(d, wall.of_neighbours, body)
 
 
 def _terms(term: Term) -> str:
-    return ", ".join(f"term_{n}" for n in _numbers(term))
+    return ", ".join(f"_term_{n}" for n in _numbers(term))
 
 
 def _numbers(term: Term) -> range:
@@ -85,7 +95,7 @@ def _numbers(term: Term) -> range:
 
 def _made(term: Term, d: Discretisation, loops: str, wall: Term, module: Any = None) -> Any:
     module = module or wp.get_module(term.function.__module__)
-    terms = {"term": wp.func(term.function, module=module), "wall_term": wp.func(wall.function, module=module)}
+    terms = {"_term": wp.func(term.function, module=module), "_wall_term": wp.func(wall.function, module=module)}
     made = summed(term.name, d, term.arrays, term.others, term.results, loops, terms, module)
     made.term, made.discretisation = term, d
     return made

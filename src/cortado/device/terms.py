@@ -12,6 +12,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
 
+NUMBERS = ("i", "j")
+INDICES = ("i", "j", "ij")
+
 
 @dataclass(frozen=True)
 class Term:
@@ -25,8 +28,15 @@ class Term:
 
     @classmethod
     def of(cls, function: Callable[..., Any]) -> "Term":
-        """Of a function that has an annotation at each parameter, and ``tuple[...]`` if it returns several things."""
-        types = inspect.get_annotations(function)
+        """Of a function that has an annotation at each parameter, and ``tuple[...]`` if it returns several things.
+        Raises `TypeError` for one that has not, or for names that begin with an underscore."""
+        types, names = inspect.get_annotations(function), (*inspect.signature(function).parameters, "return")
+        for name in names:
+            if name not in types or isinstance(types[name], str):
+                found = "a text" if name in types else "no type"
+                raise TypeError(f"term {function.__name__} has {found} at {name!r}, but must have a type at each.")
+            if name.startswith("_"):
+                raise TypeError(f"term {function.__name__} has {name!r}, but names must not begin with an underscore.")
         result = types.pop("return")
         return cls(function, types, get_args(result) or (result,))
 
@@ -40,38 +50,34 @@ class Term:
         return {array: self.parameters[name] for name in self.parameters if (array := array_of(name))}
 
     @property
-    def others(self) -> dict[str, Any]:
-        """Types of what is the same for all neighbours, by name."""
-        return {name: kind for name, kind in self.parameters.items() if not array_of(name) and name not in "ijs"}
-
-    def reads(self, array: str, *indices: str) -> bool:
-        """Whether it takes an array's entry with one of these indices."""
-        return any(f"{array}_{index}" in self.parameters for index in indices)
+    def of_neighbours(self) -> dict[str, Any]:
+        """Those arrays of which it takes a neighbour's entry."""
+        read = {array_of(name) for name in self.parameters if name.endswith(("_j", "_ij"))}
+        return {array: kind for array, kind in self.arrays.items() if array in read}
 
     @property
-    def of_neighbours(self) -> dict[str, Any]:
-        """The arrays of which it takes a neighbour's entry."""
-        return {array: kind for array, kind in self.arrays.items() if self.reads(array, "j", "ij")}
+    def others(self) -> dict[str, Any]:
+        """Types of what is the same for all neighbours, by name."""
+        known = (*NUMBERS, "s")
+        return {name: kind for name, kind in self.parameters.items() if not array_of(name) and name not in known}
 
-    def seen_from_i(self, of_j: Mapping[str, str]) -> str:
-        """The text of its arguments, given those of a neighbour's entries."""
-        return self._arguments("x_ij", lambda array: f"{array}_i", of_j.__getitem__, ("i", "j"))
+    def seen_from_i(self, of_j: Mapping[str, str], j: str = "_j") -> str:
+        """The text of its arguments, given those of a neighbour's entries and of its number."""
+        return self._arguments("_x_ij", own_entry, of_j.__getitem__, {"i": "i", "j": j})
 
     def seen_from_j(self, of_j: Mapping[str, str]) -> str:
         """The same with the particles exchanged."""
-        return self._arguments("-x_ij", of_j.__getitem__, lambda array: f"{array}_i", ("j", "i"))
+        return self._arguments("-_x_ij", of_j.__getitem__, own_entry, {"i": "_j", "j": "i"})
 
     def _arguments(
-        self, separation: str, own: Callable[[str], str], other: Callable[[str], str], numbers: tuple[str, str]
+        self, separation: str, own: Callable[[str], str], other: Callable[[str], str], numbers: Mapping[str, str]
     ) -> str:
         def argument(name: str) -> str:
             array = array_of(name)
             if name == "x_ij":
                 return separation
-            if name in "ij":
-                return numbers["ij".index(name)]
             if not array:
-                return name
+                return numbers.get(name, name)
             if name.endswith("_ij"):
                 return f"{own(array)} - {other(array)}"
             return own(array) if name.endswith("_i") else other(array)
@@ -82,4 +88,9 @@ class Term:
 def array_of(parameter: str) -> str:
     """The array that a parameter is of; nothing for others."""
     array, _, index = parameter.rpartition("_")
-    return array if index in ("i", "j", "ij") else ""
+    return array if index in INDICES else ""
+
+
+def own_entry(array: str) -> str:
+    """The text of a particle's own entry of an array."""
+    return f"_{array}_i"

@@ -26,8 +26,11 @@ from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy
 from cortado.sph.makers import ForceMaker
 from cortado.sph.mixture import Phases
-from cortado.sph.part import PartMaker
+from cortado.sph.part import Part, PartMaker
 from cortado.sph.parts import Force, Setting
+
+PART_METHODS = ("begin", "sort", "settle", "target", "end", "new_tangent", "new_adjoint")
+"""Of a `Part`, which no `Force` has."""
 
 
 def first_capacity(support: float, dimension: int) -> int:
@@ -85,12 +88,28 @@ def _forces(
     found = [maker.force(setting) for maker in (*map(import_module, modules), *makers)]
     forces = [force for force in found if force is not None]
     for force in forces:
+        _check_part(force)
         if layout.batch is not None and not getattr(force, "batches", False):
             raise InputError(
                 f"batch is {layout.batch}, but must be left out, as the force {type(force).__name__} has no "
                 "`batches = True`, which says that its kernels read the parameters of a particle's own scene."
             )
     return forces
+
+
+def _check_part(force: Force) -> None:
+    """Raises `InputError` for a force that has methods of a part and is none, as no step would call them, and for a
+    part that would leave its fields unwritten."""
+    name = type(force).__name__
+    if not isinstance(force, Part):
+        found = [method for method in PART_METHODS if hasattr(force, method)]
+        if found:
+            raise InputError(
+                f"the force {name} has the methods {', '.join(found)} of a part, but is none: let its class be a "
+                "cortado.sph.part.Part too."
+            )
+    elif type(force).end is Part.end and not all(field.is_constant for field in force.fields):
+        raise InputError(f"the force {name} has fields, but no method `end` that writes them after a step.")
 
 
 def _parts(

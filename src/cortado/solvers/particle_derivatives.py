@@ -1,5 +1,7 @@
 """Tangent and adjoint of what solvers of particles have in common; a solver adds those of its own loops."""
 
+from weakref import finalize
+
 import warp as wp
 
 from cortado.device.arrays import Fields
@@ -21,6 +23,7 @@ class ParticleTangent:
         self.carried_dot = Carried(solver.carried_fields, solver.layout)
         self._accelerations_dot = [solver.vectors() for _ in range(len(solver.forces) + 1)]
         self._parts = [part.new_tangent() for part in solver.parts]
+        finalize(self, solver.launch.forget)
 
     def sort(self, context: StepContext, state_dot: State) -> None:
         """Of `ParticleSolver.sort`."""
@@ -83,6 +86,7 @@ class ParticleAdjoint:
         """Of what the step carries on, once `unsort` has been called."""
         self._acceleration_bar = solver.vectors()
         self._parts = [part.new_adjoint() for part in reversed(solver.parts)]
+        finalize(self, solver.launch.forget)
 
     def begin(self) -> None:
         """Forget the adjoints of the parameters of an earlier way back."""

@@ -13,7 +13,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.arrays import Fields
-from cortado.device.fields import POSITIONS, VELOCITIES, StateField
+from cortado.device.fields import POSITIONS, VELOCITIES, StateField, check_fields
 from cortado.device.launching import KernelLauncher
 from cortado.device.memory import gradient_parts
 from cortado.device.neighbourhood import Discretisation, neighbourhood_type
@@ -95,6 +95,7 @@ class ParticleSolver:
         of_parts = (field for part in self.parts for field in part.fields)
         self.state_fields = (POSITIONS, VELOCITIES, *of_parts, *self.carried_fields)
         """What a state consists of."""
+        check_fields(self.state_fields, layout.known)
         self.fields = Fields.zeros(particles, precision, device, requires_grad)
         self._requires_grad = requires_grad
         self.accelerations = [self.vectors() for _ in range(len(self.forces) + 1)]

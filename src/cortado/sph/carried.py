@@ -11,6 +11,7 @@ from cortado.device.fields import StateField
 from cortado.device.kernels import kind_of
 from cortado.device.reduction import type_name
 from cortado.device.state import Layout, State
+from cortado.parameters.registry import Axis
 from cortado.sph.order import OrderKernels, order_kernels
 from cortado.sph.parts import StepContext
 
@@ -19,7 +20,14 @@ class Carried:
     """Sorted fields of a step, or their tangents or adjoints."""
 
     def __init__(self, fields: Iterable[StateField], layout: Layout, requires_grad: bool = False):
-        self._arrays = layout.state(tuple(fields), requires_grad)
+        """Raises `TypeError` for a field that has not an entry for each particle."""
+        fields = tuple(fields)
+        for field in fields:
+            if field.axis is not Axis.PARTICLE:
+                raise TypeError(
+                    f"field {field.name!r} has one entry, but must have one for each particle to be sorted."
+                )
+        self._arrays = layout.state(fields, requires_grad)
 
     def __getitem__(self, name: str) -> wp.array:
         """(n,) sorted, as they were at the start of the step."""

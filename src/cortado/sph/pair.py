@@ -8,7 +8,6 @@ along x too. A particle exerts none on itself, and walls have no part in it.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -53,10 +52,9 @@ def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
     name, own = topic("pair", text, ranks, dimension), (text, ranks, dimension)
     module = discretisation.module(True, name)
     tangent_module, adjoint_module = discretisation.tangent_module(name), discretisation.module(False, name)
-    taped = replace(discretisation, taped=True)
     accelerations = fluid_sum(discretisation, module=module)(term(discretisation, *own, module))
-    tangents = made_tangent(discretisation, tangent_module)(term(taped, *own, tangent_module))
-    adjoints = made_adjoint(discretisation, adjoint_module)(term(taped, *own, adjoint_module))
+    tangents = made_tangent(discretisation, lambda taped: term(taped, *own, tangent_module), tangent_module)
+    adjoints = made_adjoint(discretisation, lambda taped: term(taped, *own, adjoint_module), adjoint_module)
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
 

@@ -2,13 +2,19 @@
 and at the end of a step. The mixture, the emitter, and forces that remember are parts; a solver knows only their list.
 
 A step goes through its parts in their order at each of the times below, forward and in forward mode, and in the reverse
-order in reverse mode. Every method does nothing unless a part has its own.
+order in reverse mode. A method that a part has not does nothing. Of what a step knows, kernels find at the `begin` of a
+part the parameters and the number of the step; at `sort` also the order of particles and x, v and m; from `settle` on
+neighbours and n as well, and at `end` everything.
+
+A derivative takes a step again from its state, but not its end. So what a tangent or an adjoint needs of a step has to
+stand in arrays that `begin`, `sort` or `settle` write.
 """
 
 from typing import Protocol
 
 from cortado.device.fields import StateField
 from cortado.device.state import Layout, Parameters, State
+from cortado.errors import MissingDerivativeError
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 
@@ -49,7 +55,8 @@ class Part:
         """Take so many explicit substeps of diffusion in each step from now on."""
 
     def begin(self, step: StepContext, state: State) -> None:
-        """Before anything else, with the state that the step begins from, over which it may write."""
+        """Before anything else, with the state that the step begins from, which stays as it is. What `end` needs of it
+        is kept here, as the state at the end of the step may have the same arrays."""
 
     def sort(self, step: StepContext, state: State) -> None:
         """Once the order of the sorted particles is known."""
@@ -64,15 +71,15 @@ class Part:
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
         """Write the part's fields of ``state``, that at the end of the step, and, if it has a `target` of its own, all
-        positions and velocities of ``moved``."""
+        positions and velocities of ``moved``, from those that it finds in its target."""
 
     def new_tangent(self) -> PartTangent:
-        """Forward mode of it, with arrays of its own."""
-        return PartTangent()
+        """Forward mode of it, with arrays of its own. Raises `MissingDerivativeError` for a part that has none."""
+        raise MissingDerivativeError(f"{type(self).__name__} has no forward mode: let it have a method new_tangent.")
 
     def new_adjoint(self) -> PartAdjoint:
-        """Reverse mode of it, with arrays of its own."""
-        return PartAdjoint()
+        """Reverse mode of it, with arrays of its own. Raises `MissingDerivativeError` for a part that has none."""
+        raise MissingDerivativeError(f"{type(self).__name__} has no reverse mode: let it have a method new_adjoint.")
 
 
 class PartMaker(Protocol):

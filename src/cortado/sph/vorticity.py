@@ -7,7 +7,6 @@ turning. Walls have no part in it.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -38,10 +37,9 @@ def circulation_kernels(discretisation: Discretisation) -> Kernels:
     neighbourhood = neighbourhood_type(discretisation.precision)
     LANES = discretisation.lanes
     lane = lane_functions(discretisation.precision, LANES).lane
-    differentiable = turns(replace(discretisation, taped=True))
     turning = fluid_sum(discretisation)(turns(discretisation))
-    turning_tangent = made_tangent(discretisation)(differentiable)
-    turning_adjoint = made_adjoint(discretisation)(differentiable)
+    turning_tangent = made_tangent(discretisation, turns)
+    turning_adjoint = made_adjoint(discretisation, turns)
 
     @wp.kernel(module=discretisation.module(False, "vorticity"), enable_backward=False)
     def circulation(
