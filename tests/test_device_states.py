@@ -11,7 +11,13 @@ from cortado.device.state import State
 from scenes import jet, plane, pour, scene, two_layers
 from test_stepper import assert_same_state, last_adjoint, scheduled
 
+CUDA = pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no CUDA device")
 SCENES = {"one fluid": plane, "in space": scene, "mixture": two_layers, "schedule": scheduled, "jet": jet, "pour": pour}
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=CUDA)])
+def device(request):
+    return request.param
 
 
 class Foreign:
@@ -31,7 +37,17 @@ def vectors(simulation, values):
     """On the device's side: three components, in its precision."""
     found = np.zeros((*values.shape[:-1], 3), dtype=simulation.precision.name)
     found[..., : values.shape[-1]] = values
-    return Foreign(found)
+    return Foreign(given(simulation, found))
+
+
+def given(simulation, values):
+    """On the device of a simulation."""
+    return wp.array(values, device=simulation.device)
+
+
+def taken(array):
+    """What another program takes by DLPack, as NumPy has it."""
+    return wp.from_dlpack(Foreign(array)).numpy()
 
 
 def on_host(simulation, values):
@@ -39,7 +55,7 @@ def on_host(simulation, values):
     fields = {field.name: field for field in simulation.initial.fields}
     found = {}
     for name, value in values.items():
-        array = np.array(np.from_dlpack(value) if isinstance(value, wp.array) else value, dtype=np.float64)
+        array = np.array(taken(value) if isinstance(value, wp.array) else value, dtype=np.float64)
         is_vector = name in fields and fields[name].entry.name == "VECTOR"
         found[name] = array[..., : simulation.dimension] if is_vector else array
     return found
@@ -47,13 +63,13 @@ def on_host(simulation, values):
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("name", SCENES)
-def test_steps_and_derivatives_have_the_bits_of_those_on_the_host(name, precision):
-    simulation = Simulation(SCENES[name](), precision=precision)
+def test_steps_and_derivatives_have_the_bits_of_those_on_the_host(name, precision, device):
+    simulation = Simulation(SCENES[name](), device, precision)
     parameters = {"viscosity": 1.1 * np.asarray(simulation.parameters()["viscosity"]), "time_step": 0.0018}
     first, stepper = simulation.step(simulation.state(), steps=3), simulation.stepper(5)
     wanted, residual = stepper.step(first, parameters)
     found, same_residual = stepper.step(simulation.on_device(first), parameters)
-    host = {n: np.from_dlpack(found[n]) for n in wanted.fields}
+    host = {n: taken(found[n]) for n in wanted.fields}
     assert on_host(simulation, host).keys() == wanted.fields.keys()
     for field, array in on_host(simulation, host).items():
         assert array.tobytes() == np.float64(wanted[field]).tobytes(), field
@@ -75,13 +91,13 @@ def test_steps_and_derivatives_have_the_bits_of_those_on_the_host(name, precisio
     }
 
 
-def test_nothing_of_a_state_passes_through_the_host(monkeypatch):
-    simulation = Simulation(two_layers())
+def test_nothing_of_a_state_passes_through_the_host(monkeypatch, device):
+    simulation = Simulation(two_layers(), device)
     state, stepper = simulation.on_device(), simulation.stepper(3)
     x = simulation.on_device()["positions"]
     for _ in range(2):
         end, residual = stepper.step(state)
-        wanted = np.array(np.from_dlpack(end["positions"]))
+        wanted = taken(end["positions"])
         stepper.vjp(residual, {"positions": x})
         stepper.jvp(residual, {"positions": x})
     fail = lambda some: pytest.fail("through the host") if some else {}  # noqa: E731
@@ -90,48 +106,48 @@ def test_nothing_of_a_state_passes_through_the_host(monkeypatch):
     end, residual = stepper.step(state)
     bar = stepper.vjp(residual, {"positions": x})[0]
     dot = stepper.jvp(residual, {"positions": x})
-    assert np.from_dlpack(end["positions"]).tobytes() == wanted.tobytes()
+    assert taken(end["positions"]).tobytes() == wanted.tobytes()
     assert bar["velocities"].dtype is wp.float32 and dot["velocities"].shape == x.shape
 
 
-def test_a_batch_on_the_device_has_the_bits_of_one_on_the_host():
-    simulation = Simulation(scheduled(), batch=3)
+def test_a_batch_on_the_device_has_the_bits_of_one_on_the_host(device):
+    simulation = Simulation(scheduled(), device, batch=3)
     parameters = {"viscosity": [0.05, 0.1, 0.3]}
     states, on_device = simulation.state(), simulation.on_device()
     for _ in range(3):
         states, on_device = (simulation.step(one, parameters, steps=4) for one in (states, on_device))
-    found = np.from_dlpack(on_device["velocities"])
+    found = taken(on_device["velocities"])
     assert found.shape == (3, simulation.particles, 3)
     assert found[..., :2].tobytes() == np.stack([state["velocities"] for state in states]).tobytes()
     assert [scene.clock for scene in on_device.scenes] == [state.clock for state in states]
 
 
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
-def test_a_scene_of_a_batch_that_is_lost_has_no_numbers_on_the_device():
-    simulation = Simulation(plane(), batch=2)
+def test_a_scene_of_a_batch_that_is_lost_has_no_numbers_on_the_device(device):
+    simulation = Simulation(plane(), device, batch=2)
     fast = np.zeros((2, simulation.particles, 2))
     fast[1, 0] = [400.0, 0.0]
     state = simulation.step(simulation.on_device(parameters={"initial_velocities": fast}), steps=3)
-    one, lost = np.from_dlpack(state["positions"])
-    assert one[:, :2].tobytes() == Simulation(plane()).run(3).positions[-1].tobytes() and np.isnan(lost).all()
+    one, lost = taken(state["positions"])
+    assert one[:, :2].tobytes() == Simulation(plane(), device).run(3).positions[-1].tobytes() and np.isnan(lost).all()
     with pytest.raises(InputError):
         simulation.step(state)
 
 
-def test_fields_of_other_programs_replace_those_of_a_state():
-    simulation = Simulation(plane(), precision="float64")
+def test_fields_of_other_programs_replace_those_of_a_state(device):
+    simulation = Simulation(plane(), device, precision="float64")
     state = simulation.step(simulation.state(), steps=4)
     faster = 1.5 * state["velocities"]
     found = simulation.step(simulation.on_device(state, {"velocities": vectors(simulation, faster)}), steps=2)
     wanted = simulation.run(
         2, state=type(state)({**state.fields, "velocities": faster}, state.clock, state.origin)
     ).last_state
-    assert np.from_dlpack(found["positions"])[:, :2].tobytes() == wanted["positions"].tobytes()
+    assert taken(found["positions"])[:, :2].tobytes() == wanted["positions"].tobytes()
     assert_same_state(simulation.step(state, steps=2), simulation.run(2, state=state).last_state)
 
 
-def test_what_does_not_fit_is_a_sentence():
-    simulation = Simulation(plane())
+def test_what_does_not_fit_is_a_sentence(device):
+    simulation = Simulation(plane(), device)
     state, n = simulation.on_device(), simulation.particles
     crowded = np.zeros((n, 3), dtype=np.float32)
     single = np.zeros((n, 3), dtype=np.float32)
@@ -145,9 +161,9 @@ def test_what_does_not_fit_is_a_sentence():
         ),
         ({"velocities": [[0.0, 0.0]]}, "must be an array that speaks DLPack"),
         ({"velocities": np.array([["fast"]])}, "velocities cannot be taken: Unsupported"),
-        ({"velocities": single}, "not finite"),
-        ({"positions": crowded}, "at one place"),
-        ({"pressure": crowded}, "'pressure', but must have only positions"),
+        ({"velocities": given(simulation, single)}, "not finite"),
+        ({"positions": given(simulation, crowded)}, "at one place"),
+        ({"pressure": given(simulation, crowded)}, "'pressure', but must have only positions"),
     ]:
         with pytest.raises(InputError, match=words):
             simulation.on_device(state, fields)
