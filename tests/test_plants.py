@@ -42,6 +42,7 @@ SHARED = {
 ELSEWHERE = {
     "device.by_hand": "it notes adjoints and has none",
     "device.compiling": "it compiles adjoints and has none",
+    "device.made_derivatives": "it makes them of terms, in texts: tests/test_by_hand.py",
     "sph.body": "made from functions of users, which scenes do not have: tests/test_own_functions.py",
     "sph.pair": "the same",
     "sph.begin_adjoint": "for solvers from outside, as PCISPH has a kernel of its own: tests/test_solver.py",
