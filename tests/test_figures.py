@@ -6,6 +6,7 @@ from PIL import Image
 
 from cortado import figures
 from cortado.errors import InputError
+from cortado.io.run_figures import density_errors
 from cortado.io.srgb import to_srgb
 from cortado.io.trajectory import Trajectory
 
@@ -95,10 +96,10 @@ def test_parameters_are_drawn_against_the_hidden_ones(tmp_path, shape):
 
 def test_steps_that_did_not_converge_are_marked(tmp_path):
     mark = (0xA8, 0x50, 0x4F)
-    image = pixels(figures.density_errors(trajectory_of(50), tmp_path / "a.png", tolerance=0.01))
+    image = pixels(density_errors(trajectory_of(50), tmp_path / "a.png", tolerance=0.01))
     assert share_of(mark, image) > 1e-4
-    assert share_of(mark, pixels(figures.density_errors(trajectory_of(3), tmp_path / "b.png"))) == 0.0
-    pixels(figures.density_errors(trajectory_of(0), tmp_path / "c.png"))
+    assert share_of(mark, pixels(density_errors(trajectory_of(3), tmp_path / "b.png"))) == 0.0
+    pixels(density_errors(trajectory_of(0), tmp_path / "c.png"))
 
 
 def test_what_is_hidden_is_seen_where_it_was_found(tmp_path):

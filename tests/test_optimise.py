@@ -13,10 +13,10 @@ import pytest
 
 import cortado
 from cortado.errors import ComputationError, DivergedError, InputError
+from cortado.io.run_folder import REPLAY_LOG
 from cortado.optimisation.named_optimisers import BY_NAME
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch
-from cortado.optimisation.replay_log import FILE_NAME
 from rosenbrock_valley import Interrupted, Rosenbrock, rosenbrock
 
 OPTIMISERS = [Adam(learning_rate=0.05), GradientDescent(learning_rate=1e-3, momentum=0.5), LBFGS(), LineSearch()]
@@ -352,7 +352,7 @@ def test_killed_process_resumes_bit_for_bit(tmp_path):
 def test_torn_last_record_is_computed_again(tmp_path):
     optimiser = Adam(learning_rate=0.05)
     whole = bits(rosenbrock(optimiser, 3, checkpoint=tmp_path))
-    log = tmp_path / FILE_NAME
+    log = tmp_path / REPLAY_LOG
     content = log.read_bytes()
     record_size = 8 + 8 * 5 + 4
     torn = [content[:-cut] for cut in range(1, record_size + 1, 3)]
@@ -369,7 +369,7 @@ def test_torn_last_record_is_computed_again(tmp_path):
 def test_damage_before_the_last_record_is_refused(tmp_path):
     optimiser = Adam(learning_rate=0.05)
     rosenbrock(optimiser, 5, checkpoint=tmp_path)
-    log = tmp_path / FILE_NAME
+    log = tmp_path / REPLAY_LOG
     content = bytearray(log.read_bytes())
     content[-100] ^= 1
     log.write_bytes(content)
@@ -380,14 +380,14 @@ def test_damage_before_the_last_record_is_refused(tmp_path):
 
 @pytest.mark.parametrize("content", [b"something else\n", b"[" * 100_000, b"\n", b'{"format": 1}\n'])
 def test_a_foreign_file_is_refused(tmp_path, content):
-    (tmp_path / FILE_NAME).write_bytes(content)
+    (tmp_path / REPLAY_LOG).write_bytes(content)
     with pytest.raises(InputError, match="no replay log"):
         rosenbrock(Adam(0.05), 5, checkpoint=tmp_path, resume=True)
 
 
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_log_that_is_no_file_is_refused(tmp_path, resume):
-    os.mkfifo(tmp_path / FILE_NAME)
+    os.mkfifo(tmp_path / REPLAY_LOG)
     with pytest.raises(InputError, match="no regular file"):
         rosenbrock(Adam(0.05), 5, checkpoint=tmp_path, resume=resume)
 
@@ -395,7 +395,7 @@ def test_a_log_that_is_no_file_is_refused(tmp_path, resume):
 def test_other_settings_are_refused_and_leave_the_log(tmp_path):
     optimiser = Adam(learning_rate=0.05)
     rosenbrock(optimiser, 5, checkpoint=tmp_path)
-    before = (tmp_path / FILE_NAME).read_bytes()
+    before = (tmp_path / REPLAY_LOG).read_bytes()
     with pytest.raises(InputError, match=r"learning_rate=0.05.* now given optimiser = .*learning_rate=0.06"):
         rosenbrock(replace(optimiser, learning_rate=0.06), 5, checkpoint=tmp_path, resume=True)
     with pytest.raises(InputError, match="gradient = None and is now given gradient = 'exact'"):
@@ -409,7 +409,7 @@ def test_other_settings_are_refused_and_leave_the_log(tmp_path):
         rosenbrock(optimiser, 5, checkpoint=tmp_path, resume=True, bounds={"a": (-2.0, -1.12)})
     with pytest.raises(InputError, match="already holds the evaluations"):
         rosenbrock(optimiser, 5, checkpoint=tmp_path)
-    assert (tmp_path / FILE_NAME).read_bytes() == before
+    assert (tmp_path / REPLAY_LOG).read_bytes() == before
 
 
 def test_another_problem_is_refused_by_its_fingerprint(tmp_path):

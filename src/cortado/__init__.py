@@ -4,6 +4,7 @@ Names are imported when they are first used, so that ``import cortado`` is quick
 """
 
 from cortado.lazy import getter
+from cortado.version import __version__ as __version__
 
 TYPE_CHECKING = False  # that of typing, which takes as long to import as all else here
 if TYPE_CHECKING:
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from cortado.scene.scene import load_scene as load_scene
     from cortado.simulation import Simulation as Simulation
 
-__version__ = "0.1.0"
 
 _MODULES = ("executors", "forces", "gradients", "image_losses", "losses", "optimisers", "pictures", "render", "sensors")
 _HOMES = {

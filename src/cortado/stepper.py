@@ -8,12 +8,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from cortado.adjoint_step import AdjointStep
 from cortado.device.memory import require
 from cortado.device.state import Parameters, State
 from cortado.device.threads import Turn, in_turn
 from cortado.device_states import DeviceState, DeviceStates
 from cortado.errors import CortadoWarning, InputError, shown
-from cortado.gradients import Exact
 from cortado.host_states import Given, HostStates, States
 from cortado.outcome import trouble
 from cortado.parameters.scene_parameters import Simulated
@@ -174,7 +174,7 @@ class Stepper:
     def _adjoint(self) -> BackwardStep:
         solver = self._rollout.solver
         require(solver.gradient_memory(self._rollout.log), "take a larger spacing", solver.device)
-        return Exact().derivative(self._rollout)
+        return AdjointStep(self._rollout, solver.adjoint(self._rollout.steps))
 
     def _begin(self, state: Given | DeviceState, values: Arrays, varied: Iterable[str] = ()) -> HostStates:
         """Give the rollout a first state and parameters; returns where the state is."""

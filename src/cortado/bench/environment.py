@@ -10,8 +10,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from cortado import __version__
 from cortado.device.cores import usable_cores
+from cortado.version import __version__
 
 
 def environment() -> dict[str, Any]:

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from contextlib import redirect_stderr
 from signal import SIGINT
 
-from cortado import __version__
 from cortado.cli.command import Work
 from cortado.cli.commands import app
 from cortado.cli.parsing import parsed
@@ -19,6 +18,7 @@ from cortado.errors import ComputationError, CortadoError, CortadoWarning, Input
 from cortado.io.interruption import Interrupted
 from cortado.io.terminal import say, tell, to_stdout
 from cortado.io.usage import usage_sentence
+from cortado.version import __version__
 
 BROKEN_PIPE = 141
 """Exit code where nobody reads the result: that of a process which the signal SIGPIPE ended."""

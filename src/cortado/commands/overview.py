@@ -1,6 +1,6 @@
 """``cortado`` alone: what one can do, each with an example."""
 
-from cortado import __version__
+from cortado.version import __version__
 
 _GROUPS = {
     "Begin": (

@@ -5,10 +5,11 @@ from pathlib import Path
 from cortado.errors import InputError
 from cortado.io.pictures import write_picture
 from cortado.io.run_folder import RunFolder
+from cortado.io.run_pictures import run_page
 from cortado.io.trajectory import Trajectory
 from cortado.measuring import coloured_by
 from cortado.scene.picture import Picture
-from cortado.shading.film import film, lacking, run_page
+from cortado.shading.film import film, lacking
 from cortado.simulation import Simulation
 
 

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from cortado.figures import density_errors, images, particles
-from cortado.figures.readings import readings
+from cortado.figures import images, particles
 from cortado.io.interruption import keeping
 from cortado.io.report import Figures, Section, write_report
+from cortado.io.run_figures import density_errors, readings
 from cortado.io.run_folder import RunFolder
+from cortado.io.run_pictures import run_pictures, trajectory_view
 from cortado.io.terminal import say
 from cortado.io.trajectory import Trajectory
 from cortado.io.video import MOST_FRAMES, write_video
@@ -20,8 +21,7 @@ from cortado.rollout import Rollout
 from cortado.scene.in_words import scene_in_words
 from cortado.scene.scene import Scene
 from cortado.sensors.log import Readings
-from cortado.shading.film import lacking, run_pictures
-from cortado.shading.scene_view import trajectory_view
+from cortado.shading.film import lacking
 from cortado.simulation import Simulation
 
 

@@ -16,8 +16,8 @@ from hashlib import sha256
 from importlib import metadata
 from typing import Any
 
-from cortado import __version__
 from cortado.errors import ComputationError, CortadoError, InputError
+from cortado.version import __version__
 
 KEPT = 2
 """Functions that a worker process keeps, the last ones used. Each may hold a problem with all its memory."""

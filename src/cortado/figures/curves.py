@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from cortado.errors import InputError
 from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE, drawing, whole_numbers
-from cortado.io.trajectory import Trajectory
 
 
 def loss_curve(losses: ArrayLike, path: str | Path, *, title: str = "Loss", label: str = "loss") -> Path:
@@ -105,40 +104,6 @@ def parameters(
             axes.plot([], [], **DASHED, color=FAINT, label="true")
         if count <= len(PALETTE):
             axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
-    return Path(path)
-
-
-def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float | None = None) -> Path:
-    """Density error [%] and iterations, of each loop of the solver, of every step; steps that did not converge are
-    marked.
-
-    Args:
-        tolerance: the solver's, drawn as a line [-].
-    """
-    steps = np.arange(1, len(trajectory.converged) + 1)
-    loops = {name: column for name, column in trajectory.diagnostics.items() if column.dtype.kind == "i"}
-    errors = 100.0 * trajectory.density_errors
-    failed = ~trajectory.converged
-    with drawing(path, height=6.0) as figure:
-        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
-        upper.plot(steps, errors, color=PALETTE[0], linewidth=1.4, label="density error")
-        if failed.any():
-            label = f"not converged ({failed.sum()} of {len(steps)} steps)"
-            upper.plot(steps[failed], errors[failed], "o", color=PALETTE[6], markersize=3.5, label=label)
-        if tolerance is not None:
-            upper.axhline(100.0 * tolerance, **DASHED, color=FAINT, label="tolerance")
-        upper.set_title("Density error and pressure iterations", pad=32)
-        upper.set_ylabel("average density\nerror [%]")
-        upper.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2)
-        for number, (name, iterations) in enumerate(loops.items(), 1):
-            style = {"color": PALETTE[number % len(PALETTE)], "label": name.replace("_", " ")}
-            lower.step(steps, iterations, where="mid", linewidth=1.2, **style)
-        if len(loops) > 1:
-            lower.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
-        lower.set(xlabel="step", ylabel="pressure\niterations", ylim=(0, None))
-        whole_numbers(lower.xaxis)
-        whole_numbers(lower.yaxis)
-        figure.align_ylabels()
     return Path(path)
 
 

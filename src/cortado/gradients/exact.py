@@ -5,10 +5,11 @@ from typing import Any
 
 import warp as wp
 
+from cortado.adjoint_step import AdjointStep
 from cortado.device.state import Parameters, State
 from cortado.gradients.estimator import AdjointEstimator
 from cortado.rollout import BackwardStep, Rollout
-from cortado.solvers.solver import Counts, StepAdjoint
+from cortado.solvers.solver import Counts
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Exact(AdjointEstimator):
     batches = True
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
-        return _AdjointStep(rollout, rollout.solver.adjoint(rollout.steps))
+        return AdjointStep(rollout, rollout.solver.adjoint(rollout.steps))
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class FrozenGeometry(AdjointEstimator):
     batches = True
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
-        return _AdjointStep(rollout, rollout.solver.frozen_adjoint(rollout.steps))
+        return AdjointStep(rollout, rollout.solver.frozen_adjoint(rollout.steps))
 
 
 @dataclass(frozen=True)
@@ -60,24 +61,6 @@ class Tape(AdjointEstimator):
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
         return _TapeStep(rollout)
-
-
-class _AdjointStep:
-    capturable = True
-
-    def __init__(self, rollout: Rollout, adjoint: StepAdjoint):
-        self.rollout, self.solver, self._parameters = rollout, rollout.solver, rollout.parameters
-        self._adjoint = adjoint
-
-    def begin(self) -> None:
-        self._adjoint.begin()
-
-    def step(self, state: State, counts: Counts, bar: State) -> None:
-        self.solver.replay(state, self._parameters, counts)
-        self._adjoint.step(counts, bar, self._parameters)
-
-    def parameters(self) -> Parameters:
-        return self._adjoint.collect()
 
 
 class _TapeStep:

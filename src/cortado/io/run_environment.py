@@ -11,8 +11,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from cortado import __version__
 from cortado.errors import LONGEST, InputError, shown
+from cortado.version import __version__
 
 _PACKAGES = ("warp-lang", "numpy", "scipy", "pydantic", "h5py", "matplotlib")
 

@@ -16,7 +16,6 @@ from cortado.errors import CortadoWarning, InputError, SceneError
 from cortado.io.files import UNFINISHED, parsed_json, sentences, write_atomically
 from cortado.io.input_files import content, reason
 from cortado.io.run_environment import as_json, plain, require_same, session
-from cortado.optimisation.replay_log import FILE_NAME
 from cortado.parameters.values import NAMES
 from cortado.scene.picture import MOST_FRAMES
 from cortado.scene.scene import Scene
@@ -29,6 +28,8 @@ _RESUMABLE = "optimise"
 _LARGEST = 2**31
 """Bytes of a file that is read again when a run goes on."""
 _FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "result.json", "sensors.csv")
+REPLAY_LOG = "replay.log"
+"""In which a search notes its evaluations."""
 _FOLDERS = ("checkpoint", "figures")
 _PICTURES = ("particles", "rendered", "density_errors", "loss", "images", "progress", *NAMES)
 _SHADED = ("first", "last", "picture", "found", "search")
@@ -274,7 +275,7 @@ class RunFolder:
     def _remove_run(self) -> None:
         """Removes what a run wrote, its mark last, and leaves what others put beside it."""
         written = (*map(self.figures.joinpath, FIGURES), *map(self.path.joinpath, _FILES))
-        for path in (*(folder / FILE_NAME for folder in self._checkpoints()), *written):
+        for path in (*(folder / REPLAY_LOG for folder in self._checkpoints()), *written):
             path.unlink(missing_ok=True)
         for folder in (*self._checkpoints(), self.figures):
             with suppress(OSError):  # it is not there, or something of the user's is in it

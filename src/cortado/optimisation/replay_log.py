@@ -19,13 +19,13 @@ import numpy.typing as npt
 
 from cortado.errors import ComputationError, InputError
 from cortado.io.files import parsed_json, sentences, write_atomically, write_fully
+from cortado.io.run_folder import REPLAY_LOG
 
 Vector = npt.NDArray[np.float64]
 
 FORMAT = "cortado replay log 1"
 LONGEST_HEADER = 2**20
 """Bytes of the first line of a log."""
-FILE_NAME = "replay.log"
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class ReplayLog:
         settings, or if the file is damaged elsewhere than at its end.
         """
         self._layout = layout
-        self._path = Path(folder) / FILE_NAME
+        self._path = Path(folder) / REPLAY_LOG
         self._record_size = 8 + 8 * (1 + 2 * layout.size) + 4
         shapes = [list(shape) for shape in layout.shapes]
         header = {"format": FORMAT, "names": list(layout.names), "shapes": shapes, **settings}

@@ -1,27 +1,21 @@
-"""Shaded pictures and a film of one run."""
+"""Films of shaded pictures."""
 
 import time
 import warnings
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from cortado.errors import CortadoWarning
-from cortado.io.pictures import write_picture
 from cortado.io.progress import track
 from cortado.io.terminal import note
-from cortado.io.trajectory import Trajectory
 from cortado.io.video import write_video
 from cortado.lattice.shapes import Points
 from cortado.scene.picture import MOST_FRAMES, Picture
 from cortado.scene.scene import Scene
-from cortado.shading.page import Page, alone
-from cortado.shading.painter import colours_of, painter
-from cortado.shading.scale import Scale
-from cortado.shading.scenery import State
+from cortado.shading.page import Page
 from cortado.words import counted
 
 SECONDS = 40.0
@@ -32,8 +26,6 @@ ALONE = 0.25
 """The part of the time of a picture of a large fluid that is not shared by processes, about."""
 SHORTEST, SLOWEST, QUICKEST = 4.0, 6.0, 25.0
 """[s] that a film lasts if it can, and its frames per second at least and at most."""
-Figures = list[tuple[str, str | Path]]
-"""(caption, path) of each picture or film"""
 
 
 def lacking(scene: Scene) -> str | None:
@@ -48,42 +40,6 @@ def lacking(scene: Scene) -> str | None:
         return None
     verb = "which is" if len(missing) == 1 else "which are"
     return f"Shaded pictures need {' and '.join(missing)}, {verb} not installed: pip install 'cortado-sph[pictures]'."
-
-
-def run_pictures(
-    scene: Scene, trajectory: Trajectory, folder: Path, device: Any, values: Points | None = None
-) -> Figures:
-    """Draw the first and the last state of a run, and a film of it, into a folder; (caption, path) of each. ``values``
-    as those of `run_page`."""
-    page = run_page(scene, trajectory, device, values)
-    last, asked = len(trajectory) - 1, (scene.picture or Picture()).film_frames
-    stills: Figures = []
-    for k, name, words in ((0, "first", "at the start"), (last, "last", "at the end")):
-        path = folder / f"{name}.png"
-        write_picture(path, page.image(k))
-        stills.append((f"The fluid {words}, t = {trajectory.times[k]:.4g} s.", path))
-    if asked == 0 or not last:
-        return stills
-    return [("The run.", film(folder / "film.mp4", page, range(last + 1), asked)), *stills]
-
-
-def run_page(scene: Scene, trajectory: Trajectory, device: Any, values: Points | None = None) -> Page:
-    """The frames of a run by their number; all are taken from one place. ``values`` (frames, n): what the scene colours
-    its particles by."""
-    name, draws = (scene.picture or Picture()).colour_by, painter(scene, trajectory.positions, device)
-    if name is not None and values is not None:
-        scale = Scale.of(name, values)
-        return Page(
-            draws,
-            [lambda k: (trajectory.positions[k], scale.colours(values[k]))],
-            lambda images: scale.beside(alone(images)),
-        )
-
-    def state(k: int) -> State:
-        frame = trajectory[k]
-        return frame.positions, colours_of(scene, frame.mass_fractions, trajectory.particles)
-
-    return Page(draws, [state])
 
 
 def film(path: Path, page: Page, frames: Sequence[int], asked: int | None = None) -> Path:

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cortado.io.particle_view import Cloud, particle_view, thinned
-from cortado.io.trajectory import Trajectory
 from cortado.lattice.shapes import Points, corners
 from cortado.scene.containers import CylinderContainer
 from cortado.scene.fluids import INDEX_OF_AXIS
@@ -33,11 +32,6 @@ class MovingState(Protocol):
     @property
     def mass_fractions(self) -> Points | None:
         """(n, phases) [-]; None with one phase"""
-
-
-def trajectory_view(scene: Scene, trajectory: Trajectory) -> str:
-    """HTML that shows a run; see `scene_view`."""
-    return scene_view(scene, {scene.name: list(trajectory)}, trajectory.times)
 
 
 def scene_view(scene: Scene, runs: Mapping[str, Iterable[MovingState]], times: ArrayLike) -> str:
