@@ -22,10 +22,10 @@ import cortado
 from cortado import Simulation
 from cortado.bench.scene import dam_break
 from cortado.bench.timing import median_seconds
-from cortado.device.by_hand import BY_HAND, ByHand
 from cortado.device.lanes import lane_functions
-from cortado.device.made_derivatives import made_adjoint, made_tangent
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.by_hand import BY_HAND, ByHand
+from cortado.particles.made_derivatives import made_adjoint, made_tangent
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.sph.pair_forces import laminar, pairwise
 
 ROOT = Path(cortado.__file__).parent

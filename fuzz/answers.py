@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cortado.errors import CortadoError, CortadoWarning
-from cortado.io.trajectory import Trajectory
+from cortado.runs.trajectory import Trajectory
 from cortado.scene.scene import Scene
 
 TOLERANCE = 0.5

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cortado.io.trajectory import Trajectory
+from cortado.runs.trajectory import Trajectory
 from cortado.study.experiment_files import load_experiment
 from fuzz import bases
 from fuzz.answers import run_complaints, same_frames, search_complaints

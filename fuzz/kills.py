@@ -6,7 +6,7 @@ import signal
 from collections.abc import Sequence
 from pathlib import Path
 
-from cortado.io.trajectory import Trajectory
+from cortado.runs.trajectory import Trajectory
 from fuzz import bases
 from fuzz.answers import leftovers, run_complaints, same_frames, search_complaints
 from fuzz.cases import Case

@@ -12,8 +12,8 @@ MODULES = (
     "scipy.spatial",
     "cortado.__main__",
     "cortado.cli",
-    "cortado.commands.optimise",
-    "cortado.commands.run",
+    "cortado.cli.commands.optimise",
+    "cortado.cli.commands.run",
     "cortado.study.experiment_files",
 )
 

@@ -5,8 +5,8 @@ from functools import cache
 import warp as wp
 
 from cortado.device.kernels import Kernels
-from cortado.parameters.known import TIME
-from cortado.parameters.registry import Axis, Parameter
+from cortado.scene.parameters.known import TIME
+from cortado.scene.parameters.registry import Axis, Parameter
 
 
 @cache

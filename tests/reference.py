@@ -5,7 +5,7 @@ They take complex numbers too, so that `complex_step` gives derivatives that sha
 
 import numpy as np
 
-from cortado.lattice.smoothing import SmoothingKernel
+from cortado.discretise.smoothing import SmoothingKernel
 
 STEP = 1e-30
 

@@ -5,7 +5,7 @@ It takes complex numbers too, as `reference` does.
 
 import numpy as np
 
-from cortado.lattice.smoothing import SmoothingKernel
+from cortado.discretise.smoothing import SmoothingKernel
 from reference import slope, value
 
 FLOOR = 1e-3

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from cortado.device.fields import Entry, StateField
-from cortado.parameters.registry import Axis, Parameter
+from cortado.particles.fields import Entry, StateField
+from cortado.scene.parameters.registry import Axis, Parameter
 from cortado.solvers.build import particle_system
 from cortado.solvers.loop import Loop, LoopLimits
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent

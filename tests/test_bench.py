@@ -17,7 +17,7 @@ from cortado.bench.passes import AGAIN, PassTimer
 from cortado.bench.scene import ITERATIONS, dam_break
 from cortado.bench.text import as_text
 from cortado.bench.timing import LaunchTimer, median_seconds
-from cortado.commands.bench import bench_dam_break
+from cortado.cli.commands.bench import bench_dam_break
 from cortado.device.launching import KernelLauncher, watched
 
 STEP = [

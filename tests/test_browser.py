@@ -17,8 +17,8 @@ from PIL import Image
 
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.cli import main
-from cortado.commands.view import opened
-from cortado.commands.view_window import PULL
+from cortado.cli.commands.view import opened
+from cortado.cli.viewer.window import PULL
 
 PORT = 18410
 BLOCK = (

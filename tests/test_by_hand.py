@@ -7,9 +7,9 @@ import pytest
 import warp as wp
 
 from benchmarks.by_hand import ROOT, noting_factories, pairs, without_walls
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type
 from cortado.device.precision import FLOAT32, FLOAT64
-from cortado.lattice.smoothing import CUBIC_SPLINE
+from cortado.discretise.smoothing import CUBIC_SPLINE
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from test_kernels import array, cloud
 
 ALL = {precision: pairs(Discretisation(CUBIC_SPLINE, precision, periodic=True)) for precision in (FLOAT64, FLOAT32)}

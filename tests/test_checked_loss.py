@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado.device.fields import POSITIONS, VELOCITIES
 from cortado.device.precision import FLOAT32, FLOAT64
-from cortado.device.state import Layout, State
 from cortado.errors import InputError
 from cortado.losses import FinalPositions, Frames, Snapshot, SnapshotAdjoint
 from cortado.losses.checked import as_loss
+from cortado.particles.fields import POSITIONS, VELOCITIES
+from cortado.particles.state import Layout, State
 from cortado.sph.mixture import MASS_FRACTIONS
 
 N, PHASES = 5, 2

@@ -16,18 +16,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import cortado.commands.optimise
-import cortado.commands.run
-import cortado.io.vtkhdf
+import cortado.cli.commands.optimise
+import cortado.cli.commands.run
+import cortado.files.vtkhdf
 from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
 from cortado import Problem, Scene, Trajectory
-from cortado.inverse.chapters import Chapters
-from cortado.inverse.task import load_task
-from cortado.io.folder_lock import locked
-from cortado.io.pictures import heart, rosetta, write_picture
-from cortado.io.run_folder import FIGURES, RunFolder
+from cortado.files.folder_lock import locked
+from cortado.optimisation.inverse.chapters import Chapters
+from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.transforms import TimeInterpolation
+from cortado.pictures.image_files import heart, rosetta, write_picture
+from cortado.runs.run_folder import FIGURES, RunFolder
 from full_disk import largest_file
 
 ALWAYS = {"scene.json", "environment.json", "metrics.jsonl", "figures", "report.html", "result.json"}
@@ -40,8 +40,9 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     (tmp_path / "task.toml").write_text(GOOD_TASK)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("cortado.commands.run_report.run_pictures", lambda *_: [])  # tests/test_shading.py draws them
-    monkeypatch.setattr("cortado.commands.optimise.shaded_figures", lambda *_: Chapters())
+    # tests/test_shading.py draws them
+    monkeypatch.setattr("cortado.cli.commands.run_report.run_pictures", lambda *_: [])
+    monkeypatch.setattr("cortado.cli.commands.optimise.shaded_figures", lambda *_: Chapters())
     return tmp_path
 
 
@@ -171,7 +172,7 @@ def interrupting(after):
 
 
 def test_an_interrupted_run_keeps_its_frames(cortado_command, folder, monkeypatch):
-    monkeypatch.setattr(cortado.commands.run, "track", interrupting(after=3))
+    monkeypatch.setattr(cortado.cli.commands.run, "track", interrupting(after=3))
     code, out, err = cortado_command("run", "scene.toml", "--steps", 20, "--out", "dam")
     assert (code, out) == (130, "")
     assert_one_sentence(err.removesuffix("\n"))
@@ -183,8 +184,8 @@ def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(cortado_comm
     def stopped(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("cortado.commands.run_report.lacking", lambda _: None)
-    monkeypatch.setattr("cortado.commands.run_report.run_pictures", stopped)
+    monkeypatch.setattr("cortado.cli.commands.run_report.lacking", lambda _: None)
+    monkeypatch.setattr("cortado.cli.commands.run_report.run_pictures", stopped)
     code, _, err = cortado_command("run", "scene.toml", "--steps", 5, "--out", "dam")
     there = Path("dam").absolute()
     sentence = f"Interrupted; the run has ended, and is in {there}; cortado picture {there} --film draws it."
@@ -194,9 +195,9 @@ def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(cortado_comm
 
 @pytest.mark.parametrize("command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"])
 def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command, monkeypatch, command):
-    for module in (cortado.commands.run, cortado.commands.optimise):
+    for module in (cortado.cli.commands.run, cortado.cli.commands.optimise):
         monkeypatch.setattr(module, "track", interrupting(after=-1))
-    monkeypatch.setattr(cortado.commands.run, "frame_writer", interrupting(after=-1))
+    monkeypatch.setattr(cortado.cli.commands.run, "frame_writer", interrupting(after=-1))
     assert cortado_command(*command, "--out", "dam") == (130, "", "Interrupted.\n")
 
 
@@ -304,7 +305,7 @@ def test_what_came_out_is_told_before_it_is_drawn(cortado_command, monkeypatch, 
     def stopped(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(f"cortado.commands.{drawing}", stopped)
+    monkeypatch.setattr(f"cortado.cli.commands.{drawing}", stopped)
     code, out, err = cortado_command(*command, "--out", "found")
     assert code == 130 and re.fullmatch(told, out), out
     assert ("the search has ended" in err and "--resume draws its pictures" in err) == (command[0] == "optimise")
@@ -374,7 +375,7 @@ def test_progress_counts_updates_and_not_evaluations(cortado_command, monkeypatc
         yield advance
         assert total == 8
 
-    monkeypatch.setattr("cortado.commands.optimise.track", track)
+    monkeypatch.setattr("cortado.cli.commands.optimise.track", track)
     overrides = ["--set", f"optimise.optimiser={optimiser}", "--set", "optimise.iterations=8"]
     assert cortado_command("optimise", "task.toml", "--out", "found", *overrides)[0] == 0
     assert all(n in (0, 1) for n, _ in shown) and sum(n for n, _ in shown) == 8
@@ -482,7 +483,7 @@ def test_an_interrupted_optimisation_resumes_bit_for_bit(cortado_command, monkey
     options = ["check.loss_reduction=1", "check.parameter_error=100", *(f"gradient.{one}" for one in estimator)]
     task = ["optimise", "task.toml", *(word for one in options for word in ("--set", f"optimise.{one}"))]
     with monkeypatch.context() as patch:
-        patch.setattr(cortado.commands.optimise, "track", interrupting(after=3))
+        patch.setattr(cortado.cli.commands.optimise, "track", interrupting(after=3))
         assert cortado_command(*task, "--out", "stopped")[0] == 130
     assert len(metrics("stopped")) == 4
     assert cortado_command(*task, "--out", "stopped", "--resume")[0] == 0
@@ -554,14 +555,14 @@ def test_a_run_on_a_full_disk_says_so(cortado_command, size):
 @pytest.mark.parametrize("full", ["trajectory.vtkhdf", "metrics.jsonl", "particles.png", "run.mp4", "report.html"])
 def test_frames_stay_when_a_disk_fills_up(cortado_command, monkeypatch, full):
     Path("scene.toml").write_text(TINY_LATTE.partition("[problem]")[0])
-    replace, write = os.replace, cortado.io.vtkhdf.write_fully
+    replace, write = os.replace, cortado.files.vtkhdf.write_fully
     left = iter(range(20))
 
     def until_full(*arguments):
         return refuse() if next(left, None) is None else write(*arguments)
 
     if full == "trajectory.vtkhdf":
-        monkeypatch.setattr(cortado.io.vtkhdf, "write_fully", until_full)
+        monkeypatch.setattr(cortado.files.vtkhdf, "write_fully", until_full)
     elif full == "metrics.jsonl":
         monkeypatch.setattr(RunFolder, "metrics", Path("/dev/full"))
     else:
@@ -693,7 +694,7 @@ def test_an_image_that_is_not_matched_fails_and_keeps_its_files(cortado_command)
 def test_an_optimisation_of_images_resumes_bit_for_bit(cortado_command, monkeypatch):
     Path("task.toml").write_text(TINY_LATTE)
     with monkeypatch.context() as patch:
-        patch.setattr(cortado.commands.optimise, "track", interrupting(after=1))
+        patch.setattr(cortado.cli.commands.optimise, "track", interrupting(after=1))
         assert cortado_command("optimise", "task.toml", "--out", "stopped")[0] == 130
     assert len(metrics("stopped")) == 2
     assert cortado_command("optimise", "task.toml", "--out", "stopped", "--resume")[0] == 0

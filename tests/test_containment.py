@@ -9,13 +9,13 @@ import warp as wp
 
 from cortado import CortadoWarning, DivergedError, InputError, Problem, Scene, Simulation, Trajectory, losses
 from cortado.bench.scene import dam_break
-from cortado.device.arrays import to_device
-from cortado.device.fields import POSITIONS, VELOCITIES
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import precision_named
-from cortado.device.state import Layout
-from cortado.lattice.region import Region
-from cortado.lattice.shapes import corners
+from cortado.discretise.region import Region
+from cortado.discretise.shapes import corners
+from cortado.particles.arrays import to_device
+from cortado.particles.fields import POSITIONS, VELOCITIES
+from cortado.particles.state import Layout
 from cortado.scene.containers import CylinderContainer
 from cortado.solvers.containment import Containment, Walled
 from scenes import jet, plane, scene

@@ -10,11 +10,11 @@ import cortado
 from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, PARTICLES, TINY_LATTE, TINY_SCENE
 from cortado.cli import main
-from cortado.commands.run_summary import Energy, RunSummary
-from cortado.inverse.in_words import task_in_words
-from cortado.inverse.task import load_task
-from cortado.io.pictures import read_picture
-from cortado.lattice.calibration import SLACK
+from cortado.cli.commands.run_summary import Energy, RunSummary
+from cortado.discretise.calibration import SLACK
+from cortado.optimisation.inverse.in_words import task_in_words
+from cortado.optimisation.inverse.task import load_task
+from cortado.pictures.image_files import read_picture
 from cortado.scene.stability import stability_limit, stability_limits
 from scenes import plane, two_layers
 

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from cortado import InputError, Simulation
-from cortado.device.state import State
+from cortado.particles.state import State
 from scenes import jet, plane, pour, scene, two_layers
 from test_stepper import assert_same_state, last_adjoint, scheduled
 

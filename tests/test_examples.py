@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cortado.io.pictures import read_picture
+from cortado.pictures.image_files import read_picture
 
 FOLDER = Path(__file__).parents[1] / "examples"
 MISTAKES = {

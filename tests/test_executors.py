@@ -16,11 +16,12 @@ import pytest
 
 import cortado
 from cortado import ComputationError, CortadoWarning, DivergedError, InputError, Problem, SceneError, Simulation
-from cortado.commands.executor import Where
+from cortado.cli.commands.executor import Where
 from cortado.device.cores import usable_cores
+from cortado.device.executors import calls, local
+from cortado.device.executors import distributed as of_dask
 from cortado.errors import CortadoError
-from cortado.executors import Distributed, InProcess, calls, local, local_workers
-from cortado.executors import distributed as of_dask
+from cortado.executors import Distributed, InProcess, local_workers
 from cortado.gradients import EnsembleMean, Estimate, Exact, RandomizedSmoothing
 from dask_processes import PATIENCE, scheduler
 from scenes import plane
@@ -413,7 +414,7 @@ def test_what_is_launched_at_a_time_follows_the_workers():
 
 @pytest.mark.filterwarnings("ignore:The worker .* was lost")
 def test_each_process_has_one_gpu_also_when_it_is_started_again(monkeypatch):
-    monkeypatch.setattr("cortado.executors.local.visible_gpus", lambda: ["3", "GPU-5f1c"])
+    monkeypatch.setattr("cortado.device.executors.local.visible_gpus", lambda: ["3", "GPU-5f1c"])
 
     def at_work(executor):
         """Processes by their GPUs."""
@@ -461,7 +462,7 @@ def test_worker_processes_are_there_again_however_they_ended():
 
 
 def test_cores_are_shared_out(monkeypatch):
-    monkeypatch.setattr("cortado.executors.local.usable_cores", lambda: 8)
+    monkeypatch.setattr("cortado.device.executors.local.usable_cores", lambda: 8)
     environments = local._environments
     assert environments(None, "cpu") == [{"CORTADO_CORES": "1"}] * 8
     assert environments(3, "cpu") == [{"CORTADO_CORES": "2"}] * 3
@@ -470,7 +471,7 @@ def test_cores_are_shared_out(monkeypatch):
 
 def test_no_more_processes_than_items(monkeypatch):
     """Nor than make sense on this machine, whatever there is to compute."""
-    monkeypatch.setattr("cortado.executors.local.usable_cores", lambda: 2)
+    monkeypatch.setattr("cortado.device.executors.local.usable_cores", lambda: 2)
     started = []
 
     @contextmanager
@@ -478,7 +479,7 @@ def test_no_more_processes_than_items(monkeypatch):
         started.append((number, device))
         yield InProcess()
 
-    monkeypatch.setattr("cortado.commands.executor.local_workers", local_workers)
+    monkeypatch.setattr("cortado.cli.commands.executor.local_workers", local_workers)
     for workers, items in ((40, 1), (3, 8), (2, 0)):
         with Where(workers=workers).executor("cuda:0", items):
             pass
@@ -503,7 +504,7 @@ def test_no_more_processes_than_items(monkeypatch):
     ],
 )
 def test_wrong_local_workers_are_a_sentence(monkeypatch, number, device, words):
-    monkeypatch.setattr("cortado.executors.local.visible_gpus", list)
+    monkeypatch.setattr("cortado.device.executors.local.visible_gpus", list)
     with pytest.raises(InputError, match=words), local_workers(number, device):
         pass
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cortado import figures
 from cortado.errors import InputError
-from cortado.io.run_figures import density_errors
-from cortado.io.srgb import to_srgb
-from cortado.io.trajectory import Trajectory
+from cortado.files.srgb import to_srgb
+from cortado.pictures import figures
+from cortado.runs.run_figures import density_errors
+from cortado.runs.trajectory import Trajectory
 
 
 def pixels(path) -> np.ndarray:

@@ -16,13 +16,13 @@ import cortado
 from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_SCENE
 from cortado.cli import main
-from cortado.cli.commands import app
+from cortado.cli.commands.new import scene_text
+from cortado.cli.commands.overview import COMMANDS
 from cortado.cli.gradient_commands import gradients
-from cortado.commands.new import scene_text
-from cortado.commands.overview import COMMANDS
-from cortado.inverse.file_schema import file_schema, file_schema_text
-from cortado.io.shipped import SCHEMA, examples_folder
-from cortado.io.usage import usage_sentence
+from cortado.cli.subcommands import app
+from cortado.cli.usage import usage_sentence
+from cortado.files.shipped import SCHEMA, examples_folder
+from cortado.optimisation.inverse.file_schema import file_schema, file_schema_text
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted(examples_folder().glob("*.toml"))
@@ -246,7 +246,7 @@ def test_zsh_has_a_script(cortado_command):
 
 
 def test_quiet_says_nothing_but_what_was_asked_for(cortado_command, monkeypatch):
-    monkeypatch.setattr("cortado.io.progress.LINE_INTERVAL", 0.0)
+    monkeypatch.setattr("cortado.files.progress.LINE_INTERVAL", 0.0)
     Path("scene.toml").write_text(TINY_SCENE)
     assert cortado_command("run", "scene.toml", "--steps", 2, "--quiet") == (0, "", "")
     assert Path("runs/run/report.html").exists()

@@ -11,13 +11,13 @@ import sys
 import pytest
 
 from cortado.errors import InputError
-from cortado.io import file_lock
-from cortado.io.folder_lock import LOCK, locked
+from cortado.files import file_lock
+from cortado.files.folder_lock import LOCK, locked
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from cortado.io.folder_lock import locked
+from cortado.files.folder_lock import locked
 
 with locked(Path(sys.argv[1])):
     print("locked", flush=True)

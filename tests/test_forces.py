@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 
 from cortado import Simulation
-from cortado.device.arrays import Fields
 from cortado.device.precision import FLOAT64
-from cortado.device.state import Layout
+from cortado.particles.arrays import Fields
+from cortado.particles.state import Layout
 from cortado.solvers.pcisph.derivatives import PcisphAdjoint
 from cortado.sph.gravity import Gravity
 from cortado.sph.parts import Adjoints, Shares

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from cortado.errors import InputError
-from cortado.inverse.task import load_task
-from cortado.io.trajectory import Trajectory
+from cortado.optimisation.inverse.task import load_task
+from cortado.runs.trajectory import Trajectory
 from cortado.scene.scene import scene_from_dict
 from fuzz import answers, bases, judge, oddities
 from fuzz.campaign import Campaign

@@ -7,7 +7,7 @@ import pytest
 
 from cortado import InputError, Problem, Scene, Simulation, losses
 from cortado.device.precision import FLOAT64
-from cortado.lattice.smoothing import CUBIC_SPLINE
+from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.losses.image_losses import Pyramid, SquaredDifference
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import scene_renderer

@@ -5,7 +5,7 @@ import socket
 
 import pytest
 
-from cortado.io.input_files import content, reason, regular_file
+from cortado.files.input_files import content, reason, regular_file
 
 
 def a_pipe(path):

@@ -11,7 +11,7 @@ from signals import NEEDED, listen
 
 STOPPED = "print('here', flush=True); time.sleep(60)"
 SLOW_IMPORT = f"import time; {STOPPED}"
-START = "import time; from cortado.io import interruption; interruption.leave_at_once(); "
+START = "import time; from cortado.files import interruption; interruption.leave_at_once(); "
 KEEPING = f"""{START}
 class Late:
     def __del__(self):
@@ -28,7 +28,7 @@ except KeyboardInterrupt as stop:
 WORKERS = f"""{START}
 import os, signal
 from multiprocessing.context import SpawnProcess
-from cortado.commands.executor import Where
+from cortado.cli.commands.executor import Where
 
 start, begun = SpawnProcess.start, []
 

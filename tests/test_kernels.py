@@ -16,14 +16,14 @@ import warp as wp
 
 from cortado.device.binding import bound
 from cortado.device.bundles import Bundles, bundles_of
-from cortado.device.cells import Grid
 from cortado.device.launching import TreeReduction, add, sum_and_maximum, sum_of
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type
-from cortado.device.neighbours import NeighbourSearch
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
-from cortado.device.state import Layout
-from cortado.lattice.smoothing import CUBIC_SPLINE
-from cortado.parameters.reference_density import (
+from cortado.discretise.smoothing import CUBIC_SPLINE
+from cortado.particles.cells import Grid
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.neighbours import NeighbourSearch
+from cortado.particles.state import Layout
+from cortado.scene.parameters.reference_density import (
     reference_density,
     reference_density_adjoint,
     reference_density_tangent,

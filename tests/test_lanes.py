@@ -7,12 +7,12 @@ import pytest
 import warp as wp
 
 from cortado.device.lanes import BY_SIZE, lanes_for, lanes_of
-from cortado.device.neighbourhood import Discretisation
-from cortado.device.neighbours import fill_kernel
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.device.reduction import SHARED, sum_and_maximum_kernel, sum_kernel
+from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C4
 from cortado.gradients.filter_kernels import adjoint_filter_kernels
-from cortado.lattice.smoothing import CUBIC_SPLINE, WENDLAND_C4
+from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.neighbours import fill_kernel
 from cortado.solvers.pcisph.density_ratio_relaxation import density_ratio_kernels
 from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.pcisph.pressure import pressure_kernels

@@ -9,10 +9,10 @@ from cortado import Problem, Simulation, losses
 from cortado.device.binding import bound
 from cortado.device.bundles import Bundles
 from cortado.device.launching import KernelLauncher, launch, launch_together, watched
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type
-from cortado.device.pair_sums import fluid_sum
 from cortado.device.precision import FLOAT64
-from cortado.lattice.smoothing import CUBIC_SPLINE
+from cortado.discretise.smoothing import CUBIC_SPLINE
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.pair_sums import fluid_sum
 from cortado.sph.integration import integration_kernels
 from scenes import plane, two_layers
 

@@ -10,14 +10,14 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cortado.device import candidates
-from cortado.device.cells import Grid
-from cortado.device.neighbourhood import UNROLL, Discretisation, neighbourhood_type
-from cortado.device.neighbours import NeighbourSearch
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
-from cortado.device.state import Layout
-from cortado.lattice.calibration import SKIN
-from cortado.lattice.smoothing import CUBIC_SPLINE
+from cortado.discretise.calibration import SKIN
+from cortado.discretise.smoothing import CUBIC_SPLINE
+from cortado.particles import candidates
+from cortado.particles.cells import Grid
+from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type
+from cortado.particles.neighbours import NeighbourSearch
+from cortado.particles.state import Layout
 
 SUPPORT = 0.1
 REACH = (1 + SKIN) * SUPPORT

@@ -13,10 +13,10 @@ import pytest
 
 import cortado
 from cortado.errors import ComputationError, DivergedError, InputError
-from cortado.io.run_folder import REPLAY_LOG
 from cortado.optimisation.named_optimisers import BY_NAME
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch
+from cortado.runs.run_folder import REPLAY_LOG
 from rosenbrock_valley import Interrupted, Rosenbrock, rosenbrock
 
 OPTIMISERS = [Adam(learning_rate=0.05), GradientDescent(learning_rate=1e-3, momentum=0.5), LBFGS(), LineSearch()]

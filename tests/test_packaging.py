@@ -20,7 +20,7 @@ PACKAGE = (
     "src/cortado/__init__.py",
     "src/cortado/py.typed",
     "src/cortado/scene.schema.json",
-    "src/cortado/io/particle_view.js",
+    "src/cortado/pictures/particle_view.js",
 )
 EXAMPLE = "examples/pour.toml"
 needs_cmake = pytest.mark.skipif(shutil.which("cmake") is None, reason="CMake is not installed")

@@ -5,10 +5,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 import cortado
-from cortado.discretise.discrete_scene import DiscreteScene, discretise
-from cortado.discretise.sampling import period
-from cortado.lattice.pairs import apart, are_near, pairs_among, pairs_within
-from cortado.lattice.region import Region
+from cortado.discretise.pairs import apart, are_near, pairs_among, pairs_within
+from cortado.discretise.region import Region
+from cortado.scene.discrete_scene import DiscreteScene, discretise
+from cortado.scene.sampling import period
 from cortado.scene.scene import Scene
 
 SPACING = 0.05

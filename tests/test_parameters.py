@@ -7,9 +7,9 @@ import pytest
 
 from cortado import InputError, Problem, Simulation, losses
 from cortado.gradients import Exact
-from cortado.parameters.registry import BY_NAME, PARAMETERS, Role, names
-from cortado.parameters.table import markdown
-from cortado.parameters.values import scene_values
+from cortado.scene.parameters.registry import BY_NAME, PARAMETERS, Role, names
+from cortado.scene.parameters.table import markdown
+from cortado.scene.parameters.values import scene_values
 from scenes import plane, plane_of_three, scene
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "parameters.md"

@@ -11,8 +11,8 @@ from PIL import Image
 from bad_scenes import assert_one_sentence
 from cortado import CortadoWarning
 from cortado.errors import InputError
-from cortado.io.pictures import COFFEE, MILK, WHITE, heart, read_picture, rosetta, write_picture
-from cortado.io.srgb import from_srgb, to_srgb
+from cortado.files.srgb import from_srgb, to_srgb
+from cortado.pictures.image_files import COFFEE, MILK, WHITE, heart, read_picture, rosetta, write_picture
 
 DRAWINGS = [heart, rosetta]
 
@@ -183,7 +183,7 @@ def test_bands_of_rows_make_the_same_picture(tmp_path, monkeypatch, mode):
     wanted = [read_picture(tmp_path / "a.png", size) for size in (None, 16)]
     over_white = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image.convert("RGBA"))
     np.testing.assert_array_equal(wanted[0], from_srgb(np.asarray(over_white)[..., :3]))
-    monkeypatch.setattr("cortado.io.pictures.PIXELS_AT_ONCE", 100)
+    monkeypatch.setattr("cortado.pictures.image_files.PIXELS_AT_ONCE", 100)
     for size, one in zip((None, 16), wanted, strict=True):
         np.testing.assert_array_equal(read_picture(tmp_path / "a.png", size), one)
 

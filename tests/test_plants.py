@@ -13,7 +13,7 @@ import pytest
 import cortado
 from cortado import Problem, Simulation
 from cortado.device.launching import KernelLauncher
-from cortado.rollout import Rollout
+from cortado.rollout.rollout import Rollout
 from planting import adjoints, case, plant_all
 from scenes import HONEY, MIXING, OIL, plane, scene
 
@@ -26,8 +26,8 @@ UNNAMED = {
 }
 """Functions of adjoints, by module, whose names do not say so."""
 SHARED = {
-    "device.neighbourhood": {"pair_functions.factor_gradient", "pair_functions.hessian_product"},
-    "device.smoothing": {"_cubic_spline.hessian_factor", "smoothing_functions.slope_change"},
+    "particles.neighbourhood": {"pair_functions.factor_gradient", "pair_functions.hessian_product"},
+    "particles.smoothing": {"_cubic_spline.hessian_factor", "smoothing_functions.slope_change"},
     "losses.image_losses": {"adjoint", "reduce_transposed"},
     "losses.matching": {"matching_kernels.difference"},
     "render.absorption": {"brightness_functions.brightness_derivative", "absorption_kernels.gather"},
@@ -40,9 +40,9 @@ SHARED = {
 }
 """Derivatives that forward mode uses too, and those of pictures, so that only differences can tell."""
 ELSEWHERE = {
-    "device.by_hand": "it notes adjoints and has none",
+    "particles.by_hand": "it notes adjoints and has none",
     "device.compiling": "it compiles adjoints and has none",
-    "device.made_derivatives": "it makes them of terms, in texts: tests/test_by_hand.py",
+    "particles.made_derivatives": "it makes them of terms, in texts: tests/test_by_hand.py",
     "sph.body": "made from functions of users, which scenes do not have: tests/test_own_functions.py",
     "sph.pair": "the same",
     "sph.begin_adjoint": "for solvers from outside, as PCISPH has a kernel of its own: tests/test_solver.py",

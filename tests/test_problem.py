@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cortado import CortadoWarning, InputError, Problem, Simulation, gradients, losses
-from cortado.checkpoints import checkpoint_interval
+from cortado.rollout.checkpoints import checkpoint_interval
 from cortado.sph.free_energy import MISCIBLE
 from scenes import jet, plane, plane_of_three, splash, two_layers
 

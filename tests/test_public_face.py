@@ -101,6 +101,6 @@ def test_types_are_checked_where_cortado_is_used(tmp_path):
     )
     command = [sys.executable, "-m", "mypy", "--config-file=", "--follow-imports=silent", "use.py"]
     found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stdout
-    assert 'Revealed type is "cortado.io.trajectory.Frame"' in found
-    assert 'Revealed type is "cortado.io.trajectory.Trajectory"' in found
+    assert 'Revealed type is "cortado.runs.trajectory.Frame"' in found
+    assert 'Revealed type is "cortado.runs.trajectory.Trajectory"' in found
     assert '"Simulation" has incompatible type "int"' in found

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import cortado.commands.bench
-import cortado.commands.check
-import cortado.commands.describe
-import cortado.commands.figure
-import cortado.commands.new
-import cortado.commands.optimise
-import cortado.commands.run
-import cortado.commands.sweep
+import cortado.cli.commands.bench
+import cortado.cli.commands.check
+import cortado.cli.commands.describe
+import cortado.cli.commands.figure
+import cortado.cli.commands.new
+import cortado.cli.commands.optimise
+import cortado.cli.commands.run
+import cortado.cli.commands.sweep
 from cortado.cli import main
-from cortado.inverse.task import load_task
+from cortado.optimisation.inverse.task import load_task
 from cortado.scene.scene import load_scene
 from cortado.study.experiment_files import load_experiment
 
@@ -47,14 +47,14 @@ def test_the_code_runs_as_printed(capsys):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_is_one(command, monkeypatch):
     for module, function in (
-        (cortado.commands.new, "new_scene"),
-        (cortado.commands.describe, "describe_scene"),
-        (cortado.commands.run, "run_scene"),
-        (cortado.commands.optimise, "optimise_task"),
-        (cortado.commands.check, "check_scene"),
-        (cortado.commands.figure, "measure_figure"),
-        (cortado.commands.bench, "bench_dam_break"),
-        (cortado.commands.sweep, "run_sweep"),
+        (cortado.cli.commands.new, "new_scene"),
+        (cortado.cli.commands.describe, "describe_scene"),
+        (cortado.cli.commands.run, "run_scene"),
+        (cortado.cli.commands.optimise, "optimise_task"),
+        (cortado.cli.commands.check, "check_scene"),
+        (cortado.cli.commands.figure, "measure_figure"),
+        (cortado.cli.commands.bench, "bench_dam_break"),
+        (cortado.cli.commands.sweep, "run_sweep"),
     ):
         monkeypatch.setattr(module, function, lambda *arguments: "done")
     words = shlex.split(command)

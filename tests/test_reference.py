@@ -10,7 +10,7 @@ import pytest
 
 import reference as twins
 from cortado import DivergedError, InputError, Problem, Simulation, losses, reference
-from cortado.commands.bench import bench_reference
+from cortado.cli.commands.bench import bench_reference
 from cortado.reference import Digits, Terms
 from scenes import plane, scene, splash, two_layers
 

@@ -9,8 +9,8 @@ import pytest
 import scene_page
 import task_page
 
-from cortado.inverse.tables import TaskTables
-from cortado.inverse.task import load_task
+from cortado.optimisation.inverse.tables import TaskTables
+from cortado.optimisation.inverse.task import load_task
 from cortado.scene.scene import Scene, load_scene
 
 

@@ -8,8 +8,8 @@ import pytest
 import warp as wp
 
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
+from cortado.discretise.smoothing import CUBIC_SPLINE, KERNELS, WENDLAND_C2, SmoothingKernel
 from cortado.errors import InputError
-from cortado.lattice.smoothing import CUBIC_SPLINE, KERNELS, WENDLAND_C2, SmoothingKernel
 from cortado.render.cameras import Camera, Orthographic, Perspective
 from cortado.render.renderer import RenderAdjoint, Renderer
 from cortado.render.views import TopView, View, Volume

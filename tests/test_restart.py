@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cortado import InputError, Scene, Simulation, Trajectory
-from cortado.restart import Clock
+from cortado.scene.restart import Clock
 from scenes import jet, plane, plane_of_three, pour, two_layers
 
 FIRST, REST = 17, 24

@@ -12,16 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import cortado.io.run_folder
+import cortado.runs.run_folder
 from bad_scenes import plane
 from bad_tasks import TINY_SCENE
 from cortado import Scene
 from cortado.errors import InputError
-from cortado.io.files import unfinished
-from cortado.io.particle_view import Cloud, particle_view, thinned
-from cortado.io.progress import track
-from cortado.io.report import Section, write_report, written
-from cortado.io.run_folder import RunFolder
+from cortado.files.atomic import unfinished
+from cortado.files.progress import track
+from cortado.pictures.particle_view import Cloud, particle_view, thinned
+from cortado.runs.report import Section, write_report, written
+from cortado.runs.run_folder import RunFolder
 from cortado.scene.picture import Picture
 
 SCENE = '{"name": "drop", "dimension": 2}'
@@ -179,7 +179,7 @@ class Killed(BaseException):
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_a_kill_while_a_folder_is_made_leaves_one_to_overwrite_or_resume(tmp_path, monkeypatch, overwrite):
     """Killed at every file that is written, made or removed."""
-    events = [(Path, "unlink"), (Path, "mkdir"), (Path, "rmdir"), (cortado.io.run_folder, "write_atomically")]
+    events = [(Path, "unlink"), (Path, "mkdir"), (Path, "rmdir"), (cortado.runs.run_folder, "write_atomically")]
     finished = False
     for moment in range(100):
         path = tmp_path / str(moment)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cortado.discretise.discrete_scene import discretise
-from cortado.discretise.sampling import fluid_particles, period, wall_particles
 from cortado.errors import InputError
+from cortado.scene.discrete_scene import discretise
+from cortado.scene.sampling import fluid_particles, period, wall_particles
 from cortado.scene.scene import Scene
 
 SPACING = 0.05

@@ -13,9 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bad_scenes import BAD_SCENES, EMITTER, GOOD_SCENE, MIXTURE, RENDER, assert_one_sentence, plane
+from cortado.discretise.calibration import laplacian_rate, pairwise_rate
+from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.errors import CortadoWarning, DivergedError, InputError, SceneError
-from cortado.lattice.calibration import laplacian_rate, pairwise_rate
-from cortado.lattice.smoothing import CUBIC_SPLINE
 from cortado.scene.fluids import BoxFluid
 from cortado.scene.mixture import Mixture
 from cortado.scene.model import Discretisation

@@ -8,10 +8,10 @@ from scipy.spatial import cKDTree
 
 from bad_scenes import plane
 from cortado import Problem, Simulation, losses
-from cortado.discretise.sampling import fluid_particles
+from cortado.discretise.shapes import across, disc
 from cortado.errors import CortadoWarning, SceneError
-from cortado.lattice.shapes import across, disc
 from cortado.scene.emitter import Emitter
+from cortado.scene.sampling import fluid_particles
 from cortado.scene.scene import Scene
 from cortado.scene.stability import stability_limit
 

@@ -5,9 +5,9 @@ import tomllib
 import pytest
 
 from bad_scenes import GOOD_SCENE, MIXTURE, plane
-from cortado.discretise.sampling import fluid_particles
 from cortado.errors import SceneError
 from cortado.scene.mixture import Mixture
+from cortado.scene.sampling import fluid_particles
 from cortado.scene.scene import Scene, scene_from_dict
 
 PHASES = [{"name": name, "rest_density": 1000, "viscosity": 0.001} for name in ("water", "oil", "ink")]

@@ -8,7 +8,7 @@ import pytest
 
 from bad_scenes import GOOD_SCENE, assert_one_sentence, plane
 from cortado.errors import InputError, SceneError
-from cortado.io.vtkhdf import TrajectoryWriter
+from cortado.files.vtkhdf import TrajectoryWriter
 from cortado.scene.points import read_points
 from cortado.scene.scene import Scene, load_scene
 

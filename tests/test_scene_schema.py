@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 import cortado.study.registry  # noqa: F401  so that the tables of all experiments are there
-from cortado.inverse.tables import TaskTables
+from cortado.optimisation.inverse.tables import TaskTables
 from cortado.scene.scene import Scene
 from cortado.scene.tables import Table
 

@@ -10,9 +10,9 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_SCENE
 from cortado import CortadoWarning, InputError, Problem, Scene, SceneError, Simulation, losses, reference
 from cortado.certificate import certify
-from cortado.commands.run_summary import Energy, RunSummary
-from cortado.parameters.tilt import Tilt
+from cortado.cli.commands.run_summary import Energy, RunSummary
 from cortado.scene.in_words import scene_in_words
+from cortado.scene.parameters.tilt import Tilt
 from cortado.scene.schedule import Course
 from cortado.scene.stability import stability_limit
 from cortado.study.experiment_files import load_experiment

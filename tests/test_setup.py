@@ -6,13 +6,13 @@ import pytest
 from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, LATTE_PARTICLES, PARTICLES, PLANE_PICTURE, TINY_LATTE
 from cortado import InputError, optimise
-from cortado.inverse.setup import setup
-from cortado.inverse.task import load_task
-from cortado.io.pictures import heart, rosetta, write_picture
 from cortado.losses.image_losses import Pyramid, SquaredDifference
+from cortado.optimisation.inverse.setup import setup
+from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.optimisers import LBFGS, Adam
 from cortado.optimisation.transforms import Logarithm, Softmax, TimeInterpolation
-from cortado.parameters.tilt import Tilt
+from cortado.pictures.image_files import heart, rosetta, write_picture
+from cortado.scene.parameters.tilt import Tilt
 
 
 @pytest.fixture

@@ -11,22 +11,22 @@ import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.cli import main
 from cortado.device.launching import launch
+from cortado.discretise.shapes import corners
 from cortado.errors import ComputationError, CortadoWarning, InputError, SceneError
-from cortado.io.run_folder import RunFolder
-from cortado.io.srgb import to_srgb
-from cortado.lattice.shapes import corners
+from cortado.files.srgb import to_srgb
 from cortado.losses import FinalPositions
+from cortado.pictures import film as shading_film
+from cortado.pictures.film import film, lacking
+from cortado.pictures.labels import labelled, side_by_side
+from cortado.pictures.page import Page
+from cortado.pictures.painter import colours_of, painter
+from cortado.pictures.scenery import sceneries, scenery
+from cortado.pictures.shadow import floor_shadow
+from cortado.pictures.stage import Stage, screen_axes, upright
+from cortado.pictures.surface import spheres
+from cortado.pictures.trace import find_contrast
+from cortado.runs.run_folder import RunFolder
 from cortado.scene.picture import Picture
-from cortado.shading import film as shading_film
-from cortado.shading.film import film, lacking
-from cortado.shading.labels import labelled, side_by_side
-from cortado.shading.page import Page
-from cortado.shading.painter import colours_of, painter
-from cortado.shading.scenery import sceneries, scenery
-from cortado.shading.shadow import floor_shadow
-from cortado.shading.stage import Stage, screen_axes, upright
-from cortado.shading.surface import spheres
-from cortado.shading.trace import find_contrast
 
 SMALL = {"width": 96, "height": 64}
 FILLED = np.array([[0.05, 0.05, 0.05], [0.25, 0.25, 0.25]])
@@ -260,7 +260,7 @@ def _killed(*_):
 def test_a_process_that_is_killed_is_a_sentence(monkeypatch):
     positions, colours = first_state(scene_of())
     stage = Stage.of(scene_of(), positions)
-    monkeypatch.setattr("cortado.shading.scenery.scenery", _killed)
+    monkeypatch.setattr("cortado.pictures.scenery.scenery", _killed)
     with pytest.raises(ComputationError, match="CORTADO_CORES"):
         list(sceneries(stage, [(positions, colours)], 2))
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cortado.commands.new import new_scene
+from cortado.cli.commands.new import new_scene
 from cortado.errors import CortadoWarning
-from cortado.inverse.task import load_task
-from cortado.parameters.checks import unstable_sentence
-from cortado.parameters.tilt import Tilt
+from cortado.optimisation.inverse.task import load_task
+from cortado.rollout.parameter_checks import unstable_sentence
+from cortado.scene.parameters.tilt import Tilt
 from cortado.scene.scene import load_scene
 
 ROOT = Path(__file__).parents[1]

@@ -37,7 +37,7 @@ def test_a_shortage_is_told(cortado_command, monkeypatch, tmp_path, error, begin
     def end(*_):
         raise error
 
-    monkeypatch.setattr("cortado.commands.run.write_run_report", end)
+    monkeypatch.setattr("cortado.cli.commands.run.write_run_report", end)
     code, _, err = cortado_command("run", "scene.toml", "--steps", 2, "--out", "dam")
     assert code == 1 and err.splitlines()[-1].startswith(begin)
     assert (tmp_path / "dam" / "trajectory.vtkhdf").exists() and (tmp_path / "dam" / "result.json").exists()
@@ -57,7 +57,7 @@ def test_limits_of_a_shell(tmp_path, limit, word):
 
 
 def test_a_library_that_does_not_fit_is_not_called_missing(monkeypatch):
-    from cortado.io.video import _pyav
+    from cortado.files.video import _pyav
 
     real = builtins.__import__
 

@@ -9,9 +9,7 @@ import pytest
 import warp as wp
 
 from cortado.device.precision import FLOAT32, FLOAT64
-from cortado.device.smoothing import smoothing_functions
-from cortado.errors import InputError
-from cortado.lattice.calibration import (
+from cortado.discretise.calibration import (
     RATE_LIMIT,
     SLACK,
     greatest_rate,
@@ -20,7 +18,9 @@ from cortado.lattice.calibration import (
     rest_volume,
     wall_response,
 )
-from cortado.lattice.smoothing import KERNELS, smoothing_kernel
+from cortado.discretise.smoothing import KERNELS, smoothing_kernel
+from cortado.errors import InputError
+from cortado.particles.smoothing import smoothing_functions
 from finite_differences import decades, plateau
 
 SUPPORT = 0.13

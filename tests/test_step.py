@@ -6,10 +6,10 @@ import pytest
 import reference
 import reference_mixture
 from cortado import Simulation
+from cortado.discretise.smoothing import KERNELS
 from cortado.gradients import Exact
-from cortado.lattice.smoothing import KERNELS
 from cortado.losses.loss import ADJOINT_FIELDS
-from cortado.parameters.space import ParameterSpace
+from cortado.rollout.parameter_space import ParameterSpace
 from scenes import jet, plane, plane_of_three, pour, scene, two_layers
 from twins import emitter_twin, nozzle_of, tension_twin, twin
 

@@ -14,8 +14,8 @@ from bad_scenes import assert_one_sentence
 from bad_tasks import TINY_LATTE
 from cortado.cli import main
 from cortado.gradients import Exact, FrozenGeometry
-from cortado.inverse.setup import setup
-from cortado.inverse.task import load_task
+from cortado.optimisation.inverse.setup import setup
+from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.optimise import optimise
 from cortado.optimisation.optimisers import Adam
 from cortado.reference import Simulation, Terms
@@ -230,7 +230,7 @@ def folder(tmp_path):
 
 
 def test_a_study_resumes_and_leaves_out_what_needs_a_gpu(folder, tmp_path, gradients, monkeypatch):
-    monkeypatch.setattr("cortado.commands.study._has_gpu", lambda: False)
+    monkeypatch.setattr("cortado.cli.commands.study._has_gpu", lambda: False)
     out = tmp_path / "study"
     code, printed, err = gradients("study", folder, "--out", out)
     assert code == 0 and err == "quick ...\n"
@@ -245,7 +245,7 @@ def test_a_study_resumes_and_leaves_out_what_needs_a_gpu(folder, tmp_path, gradi
 
 
 def test_an_experiment_that_fails_does_not_stop_the_study(folder, tmp_path, gradients, monkeypatch):
-    monkeypatch.setattr("cortado.commands.study._has_gpu", lambda: True)
+    monkeypatch.setattr("cortado.cli.commands.study._has_gpu", lambda: True)
     code, printed, err = gradients("study", folder, "--out", tmp_path / "study")
     assert code == 1 and "These experiments failed: remote." in err
     assert "Failed: device is 'cuda:99'" in printed and "Analytic, all forces" in printed

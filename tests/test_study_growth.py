@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cortado.lattice.smoothing import CUBIC_SPLINE
+from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.reference import Simulation
 from cortado.scene.scene import scene_from_dict
 from cortado.study import spatial_scales

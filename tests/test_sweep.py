@@ -12,18 +12,18 @@ from pathlib import Path
 
 import pytest
 
-import cortado.commands.sweep
+import cortado.cli.commands.sweep
 from bad_scenes import assert_one_sentence
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from compiling_notice import without_compiling
 from cortado import InputError
 from cortado.cli import main
+from cortado.device.executors import distributed as of_dask
 from cortado.executors import Distributed, InProcess
-from cortado.executors import distributed as of_dask
-from cortado.io.interruption import Interrupted
-from cortado.io.trajectory import Trajectory
-from cortado.sweep.combinations import combinations
-from cortado.sweep.table import write_table
+from cortado.files.interruption import Interrupted
+from cortado.optimisation.sweep.combinations import combinations
+from cortado.optimisation.sweep.table import write_table
+from cortado.runs.trajectory import Trajectory
 from dask_processes import PATIENCE, scheduler
 
 RATES = ("--set", "optimise.learning_rate=0.5,0.25")
@@ -185,7 +185,7 @@ def test_a_scene_is_run_and_what_diverges_is_in_the_table(sweep, folder):
 
 
 def test_an_interrupted_sweep_goes_on(sweep, folder, monkeypatch):
-    optimise_task, begun = cortado.commands.sweep.optimise_task, []
+    optimise_task, begun = cortado.cli.commands.sweep.optimise_task, []
 
     def stopped(*arguments):
         begun.append(arguments)
@@ -193,7 +193,7 @@ def test_an_interrupted_sweep_goes_on(sweep, folder, monkeypatch):
             raise Interrupted(signal.SIGINT, "the evaluations so far are somewhere; --resume goes on with them")
         return optimise_task(*arguments)
 
-    monkeypatch.setattr(cortado.commands.sweep, "optimise_task", stopped)
+    monkeypatch.setattr(cortado.cli.commands.sweep, "optimise_task", stopped)
     code, out, err = sweep("task.toml", *RATES, "--out", "all")
     wanted = f"Interrupted; 1 of 2 are finished, in {folder / 'all'}; the same command goes on with the rest.\n"
     assert (code, out, err) == (130, "", wanted)
@@ -212,7 +212,7 @@ def test_another_task_is_not_gone_on_with(sweep, folder):
 
 
 def test_a_worker_that_does_not_see_the_folder_says_so(folder):
-    member = cortado.commands.sweep.Member(folder / "task.toml", None, folder / "elsewhere", "cpu", "float32")
+    member = cortado.cli.commands.sweep.Member(folder / "task.toml", None, folder / "elsewhere", "cpu", "float32")
     with pytest.raises(InputError, match=r"^A worker does not see \S+elsewhere, but the task and the folder"):
         member(combinations(["problem.steps=4"])[0])
 
@@ -248,7 +248,7 @@ def test_a_sweep_has_no_more_processes_than_combinations(sweep, monkeypatch):
         numbers.append(number)
         yield InProcess()
 
-    monkeypatch.setattr("cortado.commands.executor.local_workers", local_workers)
+    monkeypatch.setattr("cortado.cli.commands.executor.local_workers", local_workers)
     one = ("task.toml", "--set", "problem.steps=4", "--out", "all")
     assert sweep(*one, "--workers", 40)[0] == 0 and numbers == [1]
     code, out, err = sweep(*one, "--workers", 10**6)

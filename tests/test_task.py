@@ -9,9 +9,9 @@ import pytest
 from bad_scenes import assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK
 from cortado import gradients
-from cortado.commands.optimise import found_in_words, judge
+from cortado.cli.commands.optimise import found_in_words, judge
 from cortado.errors import SceneError
-from cortado.inverse.task import load_task
+from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.optimise import Record, Result
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent
 

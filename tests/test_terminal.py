@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from cortado.io.terminal import printable
+from cortado.files.terminal import printable
 
 MISTAKE = ("run", "absent.toml")
 SENTENCE = "absent.toml: the scene cannot be read: No such file or directory.\n"

@@ -5,11 +5,11 @@ import re
 import pytest
 import warp as wp
 
-from cortado.device.made_derivatives import made_adjoint, made_tangent
-from cortado.device.neighbourhood import Discretisation
-from cortado.device.pair_sums import fluid_sum, pair_sum, wall_sum
 from cortado.device.precision import FLOAT64
-from cortado.lattice.smoothing import CUBIC_SPLINE
+from cortado.discretise.smoothing import CUBIC_SPLINE
+from cortado.particles.made_derivatives import made_adjoint, made_tangent
+from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.pair_sums import fluid_sum, pair_sum, wall_sum
 
 D = Discretisation(CUBIC_SPLINE, FLOAT64)
 real, vector = FLOAT64.real, FLOAT64.vector

@@ -13,17 +13,17 @@ import h5py
 import numpy as np
 import pytest
 
-import cortado.io.vtkhdf
+import cortado.files.vtkhdf
 from cortado.errors import ComputationError, InputError
-from cortado.io.trajectory import Trajectory
-from cortado.io.vtkhdf import TrajectoryWriter, read
+from cortado.files.vtkhdf import TrajectoryWriter, read
+from cortado.runs.trajectory import Trajectory
 from full_disk import largest_file
 
 WRITER = """
 import sys
 import time
 import numpy as np
-from cortado.io.vtkhdf import TrajectoryWriter
+from cortado.files.vtkhdf import TrajectoryWriter
 
 rows = np.arange(50.0)[:, None] * np.ones(3)
 times = 0.25 * np.arange(100_000)
@@ -273,7 +273,7 @@ def test_a_disk_that_fills_up_leaves_the_frames_before(tmp_path, monkeypatch):
         writer.append(rows, rows)
         writer.append_steps(iterations=3)
         with monkeypatch.context() as patch:
-            patch.setattr(cortado.io.vtkhdf, "write_fully", refuse)
+            patch.setattr(cortado.files.vtkhdf, "write_fully", refuse)
             with pytest.raises(ComputationError, match="No space left on device; the 1 frames so far are kept"):
                 writer.append(2 * rows, rows)
             with pytest.raises(ComputationError, match="No space left on device"):

@@ -14,8 +14,8 @@ from scipy.interpolate import CubicSpline
 
 import potential_flow
 from cortado import Scene, Simulation
-from cortado.lattice.calibration import rest_volume
-from cortado.lattice.smoothing import smoothing_kernel
+from cortado.discretise.calibration import rest_volume
+from cortado.discretise.smoothing import smoothing_kernel
 
 DATA = Path(__file__).parent / "data"
 GRAVITY = 9.81

@@ -13,8 +13,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from cortado import Scene, Simulation, Trajectory
-from cortado.lattice.calibration import shear_factor
-from cortado.parameters.reference_density import reference_density
+from cortado.discretise.calibration import shear_factor
+from cortado.scene.parameters.reference_density import reference_density
 
 
 def resting(

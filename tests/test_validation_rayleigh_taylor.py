@@ -12,8 +12,8 @@ import pytest
 from scipy.optimize import brentq
 
 from cortado import Scene, Simulation
-from cortado.lattice.calibration import lattice_offsets
-from cortado.lattice.smoothing import smoothing_kernel
+from cortado.discretise.calibration import lattice_offsets
+from cortado.discretise.smoothing import smoothing_kernel
 
 GRAVITY = 1.0
 HEAVY, LIGHT = 1800.0, 1000.0

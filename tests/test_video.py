@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from cortado.errors import InputError
-from cortado.io.pictures import COFFEE, MILK, heart
-from cortado.io.srgb import to_srgb
-from cortado.io.video import write_video
+from cortado.files.srgb import to_srgb
+from cortado.files.video import write_video
+from cortado.pictures.image_files import COFFEE, MILK, heart
 
 
 def levels_of(frame: av.VideoFrame) -> np.ndarray:

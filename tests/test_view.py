@@ -9,15 +9,15 @@ import pytest
 import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
 from cortado.cli import main
-from cortado.commands import view_quantities
-from cortado.commands.view import opened
-from cortado.commands.view_live import LiveView
-from cortado.commands.view_quantities import AHEAD, upwards
-from cortado.commands.view_task import TaskView
-from cortado.commands.view_window import LONGEST_ARROW, PULL
-from cortado.io.trajectory import Trajectory
+from cortado.cli.commands.view import opened
+from cortado.cli.viewer import quantities as view_quantities
+from cortado.cli.viewer.live import LiveView
+from cortado.cli.viewer.quantities import AHEAD, upwards
+from cortado.cli.viewer.task import TaskView
+from cortado.cli.viewer.window import LONGEST_ARROW, PULL
+from cortado.pictures.scene_view import outline
+from cortado.runs.trajectory import Trajectory
 from cortado.scene.scene import Scene
-from cortado.shading.scene_view import outline
 
 viser = pytest.importorskip("viser")
 PORT = 18310
@@ -212,7 +212,7 @@ def test_a_step_that_fails_says_why(task, monkeypatch):
     def fails(*_args, **_options):
         raise cortado.ComputationError("The run diverged.")
 
-    monkeypatch.setattr("cortado.commands.view_task.optimise", fails)
+    monkeypatch.setattr("cortado.cli.viewer.task.optimise", fails)
     task._wished, loss = True, task.loss
     task.tick()
     assert "The run diverged." in task.told.content and task.loss == loss and not task.button.disabled

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cortado.discretise.discrete_scene import DiscreteScene, discretise
+from cortado.discretise.calibration import SLACK
+from cortado.discretise.smoothing import KERNELS
 from cortado.discretise.walls.layers import SHALLOW, wall_layers
-from cortado.lattice.calibration import SLACK
-from cortado.lattice.smoothing import KERNELS
+from cortado.scene.discrete_scene import DiscreteScene, discretise
 from cortado.scene.scene import Scene
 
 SPACING = 0.05

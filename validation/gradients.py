@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 
 from cortado import Problem, Scene, Simulation, gradients, losses
-from cortado.figures.canvas import INK, PALETTE, drawing
-from cortado.io.progress import track
+from cortado.files.progress import track
 from cortado.losses.image_losses import Pyramid
+from cortado.pictures.canvas import INK, PALETTE, drawing
 from cortado.render.scene_renderer import scene_renderer
 
 SPACING, GRAVITY = 0.025, (0.0, -9.81)

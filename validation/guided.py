@@ -29,8 +29,8 @@ from gradients import GRAVITY, POSITION_NOISE, SCENES, SPACING, SPREAD, TILT, TR
 
 from cortado import Problem, Simulation, gradients, losses
 from cortado.errors import DivergedError
+from cortado.files.progress import track
 from cortado.gradients import Estimate
-from cortado.io.progress import track
 
 BLOCKS, HALF_SAMPLES, TOGETHER = 4, 6, 1024
 OTHER_HALF = "the other half"

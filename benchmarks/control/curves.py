@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from cortado import DivergedError, InputError, Problem
-from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE, drawing
-from cortado.io.srgb import to_srgb
+from cortado.files.srgb import to_srgb
 from cortado.losses import Image
+from cortado.pictures.canvas import DASHED, FAINT, INK, PALETTE, drawing
 
 from .catalogue import task
 from .contenders import CONTENDERS

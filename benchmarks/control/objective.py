@@ -10,7 +10,7 @@ import numpy as np
 from cortado import DivergedError, Problem
 from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator
 from cortado.optimisation.transforms import Transformed
-from cortado.parameters.values import Arrays, Values
+from cortado.scene.parameters.values import Arrays, Values
 
 from ..counting import Counted, Steps
 from .task import Task

@@ -11,7 +11,7 @@ from typing import Any
 from cortado import CortadoError, InputError, __version__
 from cortado.bench.environment import environment
 from cortado.executors import InProcess, local_workers
-from cortado.io.progress import track
+from cortado.files.progress import track
 
 from .cells import HORIZONS, TRUTH, Bench, Cell
 from .controls import CONTROLS

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from cortado.errors import DivergedError as DivergedError
     from cortado.errors import InputError as InputError
     from cortado.errors import SceneError as SceneError
-    from cortado.io.trajectory import Trajectory as Trajectory
     from cortado.optimisation.evaluate import evaluate as evaluate
     from cortado.optimisation.optimise import optimise as optimise
     from cortado.optimisation.optimise import optimize as optimize
     from cortado.problem import Problem as Problem
+    from cortado.runs.trajectory import Trajectory as Trajectory
     from cortado.scene.scene import Scene as Scene
     from cortado.scene.scene import load_scene as load_scene
     from cortado.simulation import Simulation as Simulation
@@ -45,7 +45,7 @@ _HOMES = {
     "Scene": "scene.scene",
     "SceneError": "errors",
     "Simulation": "simulation",
-    "Trajectory": "io.trajectory",
+    "Trajectory": "runs.trajectory",
     "certify": "certificate",
     "evaluate": "optimisation.evaluate",
     "load_scene": "scene.scene",

@@ -1,13 +1,13 @@
 """The process of the command ``cortado``, also ``python -m cortado``: ready for signals before anything large is
 imported."""
 
-from cortado.io import interruption
+from cortado.files import interruption
 
 
 def main() -> None:
     """Run the command line; always exits."""
     interruption.leave_at_once()
-    from cortado.io.terminal import steady_streams
+    from cortado.files.terminal import steady_streams
 
     steady_streams()
     from cortado import cli

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 
 from cortado.device.memory import require
-from cortado.device.state import Parameters, State
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import InputError
 from cortado.gradients import AdjointEstimator
 from cortado.losses import SnapshotAdjoint
 from cortado.losses.loss import StepBar
-from cortado.parameters.space import ParameterSpace
-from cortado.parameters.values import Arrays
-from cortado.residual import Residual, without_lost
-from cortado.rollout import BackwardStep, Observer, Rollout
+from cortado.particles.state import Parameters, State
+from cortado.rollout.parameter_space import ParameterSpace
+from cortado.rollout.residual import Residual, without_lost
+from cortado.rollout.rollout import BackwardStep, Observer, Rollout
+from cortado.scene.parameters.values import Arrays
 
 
 @dataclass(frozen=True)

@@ -8,24 +8,24 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import check_steps, require_at_most, require_function, require_methods, whole_number
-from cortado.device.state import State
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import CortadoWarning, DivergedError, InputError, shown
 from cortado.fixed import fixed
 from cortado.forward_pass import ForwardPass
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator, estimate
 from cortado.gradients.estimator import checked_reverse
-from cortado.io.trajectory import noted
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch, batch, fingerprint
 from cortado.losses.checked import as_loss
 from cortado.losses.loss import Adjoint, by_field, moment_of
-from cortado.parameters.restarts import one_for_each
-from cortado.parameters.space import ParameterSpace
-from cortado.parameters.values import NAMES, UNITS, Arrays, Values, require_points
-from cortado.quantities.moment import Moment, row_of
-from cortado.residual import Residual
-from cortado.restart import RestartState
-from cortado.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
+from cortado.particles.state import State
+from cortado.rollout.parameter_space import ParameterSpace
+from cortado.rollout.residual import Residual
+from cortado.rollout.restarts import one_for_each
+from cortado.rollout.rollout import MEMORY_BUDGET, BackwardStep, Observer, Rollout
+from cortado.runs.quantities.moment import Moment, row_of
+from cortado.runs.trajectory import noted
+from cortado.scene.parameters.values import NAMES, UNITS, Arrays, Values, require_points
+from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation
 from cortado.sph.makers import fingerprint as parts_fingerprint
 from cortado.words import counted
@@ -44,7 +44,7 @@ class Problem:
 
     - ``gravity`` (d,) or (steps, d) [m / s2]; ``time_step`` [s];
     - in the place of gravity ``tilt`` (d - 1,) or (steps, d - 1) [degrees], how far the scene's gravity leans, with its
-      size kept: where it is along -y, towards x and, in 3-D, z; see `cortado.parameters.tilt.Tilt`;
+      size kept: where it is along -y, towards x and, in 3-D, z; see `cortado.scene.parameters.tilt.Tilt`;
     - ``initial_positions`` [m] and ``initial_velocities`` [m / s], (n, d);
     - ``viscosity`` [Pa s] and ``rest_density`` [kg / m3], a number, with several phases (phases,);
     - with several phases the first ``mass_fractions`` (n, phases), ``mobility`` [m2 / s], ``interface_width`` [m];

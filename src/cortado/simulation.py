@@ -18,29 +18,30 @@ from cortado.device.kernel_cache import start_warp
 from cortado.device.memory import frame_parts, require, simulation_parts, within
 from cortado.device.precision import precision_named
 from cortado.device.reduction import sum_and_maximum_kernel
-from cortado.device.state import State
 from cortado.device.threads import WARP, Turn, in_turn
-from cortado.discretise.discrete_scene import DiscreteScene, discretise
-from cortado.discretise.distance import check_distance
 from cortado.errors import CortadoWarning, InputError, shown
-from cortado.figures.particle_sets import particles
 from cortado.fixed import fixed
-from cortado.io.notebook import with_picture
-from cortado.io.trajectory import Trajectory
-from cortado.measuring import Measuring
-from cortado.outcome import trouble
-from cortado.parameters.checks import check_sizes
-from cortado.parameters.restarts import one_for_each
-from cortado.parameters.scene_parameters import SceneParameters
-from cortado.parameters.space import ParameterSpace
-from cortado.parameters.values import scene_values
-from cortado.picturing import Picturing
-from cortado.recorded import recorded
-from cortado.restart import RestartState
-from cortado.rollout import Rollout
+from cortado.particles.state import State
+from cortado.pictures.notebook import with_picture
+from cortado.pictures.particle_sets import particles
+from cortado.rollout.outcome import trouble
+from cortado.rollout.parameter_checks import check_sizes
+from cortado.rollout.parameter_space import ParameterSpace
+from cortado.rollout.restarts import one_for_each
+from cortado.rollout.rollout import Rollout
+from cortado.rollout.scene_parameters import SceneParameters
+from cortado.rollout.stepping import Stepping
+from cortado.runs.measuring import Measuring
+from cortado.runs.picturing import Picturing
+from cortado.runs.recorded import recorded
+from cortado.runs.sensors.sensor import Sensor
+from cortado.runs.trajectory import Trajectory
+from cortado.scene.discrete_scene import DiscreteScene, discretise
+from cortado.scene.distance import check_distance
+from cortado.scene.parameters.values import scene_values
+from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.solvers import OWN
-from cortado.sensors.sensor import Sensor
 from cortado.solvers.build import first_capacity
 from cortado.solvers.makers import SolverMaker, SolverSetting, built, called, checked_solver
 from cortado.solvers.named import forces_named, solver_named
@@ -48,7 +49,6 @@ from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FREE_ENERGIES, FreeEnergy
 from cortado.sph.makers import ForceMaker, check_own, checked_makers, known_of
 from cortado.sph.substeps import stable_substeps
-from cortado.stepping import Stepping
 from cortado.watching import Watch
 from cortado.words import counted
 

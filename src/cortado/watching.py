@@ -5,18 +5,18 @@ from functools import cache
 
 import numpy as np
 
-from cortado.device.state import State
 from cortado.errors import InputError
 from cortado.losses.loss import Snapshot
-from cortado.measuring import Measured
-from cortado.parameters.values import Arrays
-from cortado.quantities.evaluator import Evaluator
-from cortado.quantities.moment import Moment
-from cortado.quantities.recorder import Recorder
-from cortado.rollout import Rollout
-from cortado.sensors.log import Readings, SensorLog
-from cortado.sensors.of_scene import sensors_of
-from cortado.sensors.sensor import Sensor
+from cortado.particles.state import State
+from cortado.rollout.rollout import Rollout
+from cortado.runs.measuring import Measured
+from cortado.runs.quantities.evaluator import Evaluator
+from cortado.runs.quantities.moment import Moment
+from cortado.runs.quantities.recorder import Recorder
+from cortado.runs.sensors.log import Readings, SensorLog
+from cortado.runs.sensors.of_scene import sensors_of
+from cortado.runs.sensors.sensor import Sensor
+from cortado.scene.parameters.values import Arrays
 
 
 class Watch:

@@ -15,7 +15,7 @@ from cortado.bench.timing import median_seconds
 from cortado.device.launching import CapturedGraph
 from cortado.losses import FinalPositions
 from cortado.problem import Problem
-from cortado.rollout import Rollout
+from cortado.rollout.rollout import Rollout
 from cortado.simulation import Simulation
 
 Row = dict[str, Any]

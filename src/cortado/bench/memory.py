@@ -6,7 +6,7 @@ import warp as wp
 
 from cortado.bench.scene import search_of
 from cortado.device.memory import gradient_parts, simulation_parts
-from cortado.rollout import Rollout
+from cortado.rollout.rollout import Rollout
 from cortado.simulation import Simulation
 
 MEASURED, ESTIMATED = "measured: high-water mark of the memory pool", "estimated: cortado.device.memory"

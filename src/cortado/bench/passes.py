@@ -12,9 +12,9 @@ from typing import Any
 from cortado.bench.floor import least_bytes, sums_over_neighbours
 from cortado.bench.timing import LaunchTimer
 from cortado.device.launching import watched
-from cortado.device.neighbours import NeighbourSearch
 from cortado.gradients import Exact
-from cortado.rollout import Rollout
+from cortado.particles.neighbours import NeighbourSearch
+from cortado.rollout.rollout import Rollout
 
 LOG_ROWS = 100_000
 """Steps that a log has room for while the launch that counts steps is repeated."""

@@ -1,6 +1,6 @@
 """The scene of benchmarks, of any size; the programs in ``benchmarks/peers`` simulate the same block."""
 
-from cortado.device.neighbours import NeighbourSearch
+from cortado.particles.neighbours import NeighbourSearch
 from cortado.scene.containers import BoxContainer
 from cortado.scene.fluids import BoxFluid
 from cortado.scene.model import Discretisation, Forces, Phase

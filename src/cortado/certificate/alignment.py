@@ -16,8 +16,8 @@ from cortado.gradients import (
     Guided,
     RandomizedSmoothing,
 )
-from cortado.parameters.values import Arrays
 from cortado.problem import Problem
+from cortado.scene.parameters.values import Arrays
 
 MOST_NUMBERS = 12
 """Components that a smoothed gradient is computed for at most: each costs two runs a sample."""

@@ -25,10 +25,10 @@ from cortado.certificate.text import consistency_words, gradient_table, horizon_
 from cortado.certificate.twin import in_float64
 from cortado.errors import InputError, shown
 from cortado.gradients import AdjointNorms
-from cortado.io.notebook import as_text
 from cortado.losses import FinalPositions
-from cortado.parameters.values import Arrays, Values
+from cortado.pictures.notebook import as_text
 from cortado.problem import Problem
+from cortado.scene.parameters.values import Arrays, Values
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 from cortado.words import counted

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cortado.certificate.loss_history import LossHistory
-from cortado.parameters.values import Arrays
+from cortado.scene.parameters.values import Arrays
 from cortado.words import Brief
 
 WITHIN = 0.25

@@ -7,13 +7,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cortado.certificate.twin import Rounded
-from cortado.device.state import State
 from cortado.errors import DivergedError
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint
 from cortado.losses.checked import as_loss
 from cortado.losses.loss import Adjoint, by_field
-from cortado.parameters.values import Arrays
+from cortado.particles.state import State
 from cortado.problem import Problem
+from cortado.scene.parameters.values import Arrays
 
 SAMPLE_STEPS = 25
 """Sample steps at most, where the loss is one of the last state."""

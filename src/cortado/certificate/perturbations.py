@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from cortado.errors import InputError, shown
-from cortado.parameters.registry import BY_NAME, Axis, Parameter, Range, Role
-from cortado.parameters.space import ParameterSpace
-from cortado.parameters.values import Arrays, Values
 from cortado.problem import Problem
+from cortado.rollout.parameter_space import ParameterSpace
+from cortado.scene.parameters.registry import BY_NAME, Axis, Parameter, Range, Role
+from cortado.scene.parameters.values import Arrays, Values
 
 PERTURBATION = 0.05
 """Size of a meaningful perturbation, relative to that of the parameter or, for states, of the flow (`scales`)."""

@@ -4,7 +4,6 @@ from dataclasses import replace
 from typing import Any
 
 from cortado.device.precision import FLOAT64
-from cortado.device.state import State
 from cortado.losses import (
     CentreOfMass,
     CentreOfMassAlong,
@@ -17,6 +16,7 @@ from cortado.losses import (
 )
 from cortado.losses.checked import as_loss
 from cortado.losses.loss import Adjoint, by_field
+from cortado.particles.state import State
 from cortado.problem import Problem
 from cortado.render.renderer import Renderer
 from cortado.simulation import Simulation

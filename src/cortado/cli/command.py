@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from tyro.conf import arg
 from tyro.extras import SubcommandApp
 
-from cortado.io.terminal import quietly
+from cortado.files.terminal import quietly
 
 Work = Callable[[], str]
 """What a command does once its arguments are understood; returns what it prints."""

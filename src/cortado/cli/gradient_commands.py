@@ -41,7 +41,7 @@ def check(
         seed: Of the random directions.
     """
     require_at_least(0, seed, "--seed")
-    from cortado.commands.check import check_scene
+    from cortado.cli.commands.check import check_scene
 
     words = as_text(overrides)
     return partial(check_scene, scene, steps, parameters, loss, perturbation, out, words, device, json, seed)
@@ -64,7 +64,7 @@ def figure(
         reduced: The quick form, with the settings that the file has in [reduced].
         redraw: Draw and judge the numbers that are there again.
     """
-    from cortado.commands.figure import measure_figure
+    from cortado.cli.commands.figure import measure_figure
 
     return partial(measure_figure, experiment, out, as_text(overrides), reduced, redraw)
 
@@ -84,6 +84,6 @@ def study(
         only: The name of an experiment, such as figure_4; may be given again.
         reduced: The quick form of each.
     """
-    from cortado.commands.study import run_study
+    from cortado.cli.commands.study import run_study
 
     return partial(run_study, folder, out, reduced, as_text(only))

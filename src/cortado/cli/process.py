@@ -10,14 +10,14 @@ from contextlib import redirect_stderr
 from signal import SIGINT
 
 from cortado.cli.command import Work
-from cortado.cli.commands import app
 from cortado.cli.parsing import parsed
 from cortado.cli.shortage import shortage
+from cortado.cli.subcommands import app
+from cortado.cli.usage import usage_sentence
 from cortado.device.kernel_cache import complaint, start_warp
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
-from cortado.io.interruption import Interrupted
-from cortado.io.terminal import say, tell, to_stdout
-from cortado.io.usage import usage_sentence
+from cortado.files.interruption import Interrupted
+from cortado.files.terminal import say, tell, to_stdout
 from cortado.version import __version__
 
 BROKEN_PIPE = 141
@@ -59,7 +59,7 @@ def _understood(arguments: Sequence[str]) -> Work:
     try:
         with redirect_stderr(box), to_stdout():
             if not arguments:
-                from cortado.commands.overview import overview
+                from cortado.cli.commands.overview import overview
 
                 print(overview())
                 sys.exit(0)

@@ -1,4 +1,4 @@
-"""What runs on a device: precisions, launches, cells, neighbours, states; Warp, its cache and its threads."""
+"""What runs on a device: precisions, launches, compiling, memory, threads, and processes that share work."""
 
 from typing import TYPE_CHECKING
 

@@ -22,7 +22,7 @@ import warp as wp
 from cortado.device.cores import usable_cores
 from cortado.device.kernels import is_derivative
 from cortado.device.threads import MOST_CORES, helpers
-from cortado.io.terminal import note, timed_note
+from cortado.files.terminal import note, timed_note
 
 BUILDERS = ("build_cpu", "build_cuda")
 """Functions of Warp that compile the file of a module, one of their first two arguments."""

@@ -18,7 +18,7 @@ from pathlib import Path
 from cortado.device.compiling import watch_compilation
 from cortado.device.silence import silenced
 from cortado.errors import ComputationError
-from cortado.io.terminal import say
+from cortado.files.terminal import say
 
 VARIABLE = "WARP_CACHE_PATH"
 _COMPILING = re.compile(r"_p\d+_t\d+$")

@@ -1,1 +1,1 @@
-"""A scene cut into particles, with walls. NumPy, float64."""
+"""The rest lattice, smoothing kernels, shapes, packing and walls. NumPy, float64."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.discretise.pairs import pairs_within
+from cortado.discretise.shapes import Points
+from cortado.discretise.smoothing import SmoothingKernel
 from cortado.errors import InputError
-from cortado.lattice.pairs import pairs_within
-from cortado.lattice.shapes import Points
-from cortado.lattice.smoothing import SmoothingKernel
 
 MOST_AVERAGE_COMPRESSION = 0.1
 """Of the first particles, the mean of (n - 1)+ where n is the number density: a lattice that is squeezed by more

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.discretise.calibration import SLACK, rest_volume
+from cortado.discretise.pairs import apart, are_near, pairs_among, pairs_within
+from cortado.discretise.shapes import Points
 from cortado.discretise.walls.weights import RestLattice
-from cortado.io.terminal import timed_note
-from cortado.lattice.calibration import SLACK, rest_volume
-from cortado.lattice.pairs import apart, are_near, pairs_among, pairs_within
-from cortado.lattice.shapes import Points
+from cortado.files.terminal import timed_note
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

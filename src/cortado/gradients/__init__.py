@@ -23,8 +23,8 @@ from cortado.gradients.estimator import (
 from cortado.gradients.exact import Exact, FrozenGeometry, Tape
 from cortado.gradients.filters import AdjointViscosity, Damped
 from cortado.gradients.guided import Guided
-from cortado.parameters.values import Values
-from cortado.rollout import Observer
+from cortado.rollout.rollout import Observer
+from cortado.scene.parameters.values import Values
 
 __all__ = [
     "AdjointEstimator",

@@ -3,8 +3,8 @@
 import numpy as np
 import warp as wp
 
-from cortado.device.state import Parameters, State
 from cortado.gradients.filter_kernels import adjoint_filter_kernels
+from cortado.particles.state import Parameters, State
 from cortado.solvers.solver import Solver
 
 

@@ -6,16 +6,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cortado.arrays import as_numbers, is_whole, require_at_most, require_whole
+from cortado.device.executors.executor import Executor, InProcess, checked_executor
 from cortado.device.memory import require
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
-from cortado.executors.executor import Executor, InProcess, checked_executor
 from cortado.fixed import keep_own
 from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator
 from cortado.gradients.points import Point, Sample, evaluated
-from cortado.parameters.values import Arrays, Values
-from cortado.rollout import Observer
+from cortado.rollout.rollout import Observer
 from cortado.scene.fields import as_number
+from cortado.scene.parameters.values import Arrays, Values
 
 MOST_SAMPLES = 100_000
 """Samples of an ensemble; more are taken for a mistake."""

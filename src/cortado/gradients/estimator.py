@@ -8,10 +8,10 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number
-from cortado.device.state import Parameters, State
 from cortado.errors import DivergedError, InputError, shown
-from cortado.parameters.values import Arrays, Values
-from cortado.rollout import BackwardStep, Observer, Rollout
+from cortado.particles.state import Parameters, State
+from cortado.rollout.rollout import BackwardStep, Observer, Rollout
+from cortado.scene.parameters.values import Arrays, Values
 from cortado.solvers.solver import Counts
 from cortado.words import counted, sized
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import warp as wp
 
-from cortado.adjoint_step import AdjointStep
-from cortado.device.state import Parameters, State
 from cortado.gradients.estimator import AdjointEstimator
-from cortado.rollout import BackwardStep, Rollout
+from cortado.particles.state import Parameters, State
+from cortado.rollout.adjoint_step import AdjointStep
+from cortado.rollout.rollout import BackwardStep, Rollout
 from cortado.solvers.solver import Counts
 
 

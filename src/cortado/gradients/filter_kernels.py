@@ -22,8 +22,8 @@ from typing import Any
 import warp as wp
 
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.device.pair_sums import fluid_sum
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.pair_sums import fluid_sum
 
 STRONGEST = 0.6
 """Strength s of the viscosity at most: waves of two spacings are damped by a factor, and do not change their sign."""

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cortado.arrays import is_whole
-from cortado.device.state import State
 from cortado.errors import InputError, shown
 from cortado.gradients.adjoint_filters import Drag, EddyViscosity, Limit
 from cortado.gradients.estimator import AdjointEstimator, Differentiable, Estimate, Filtered, checked_estimator
 from cortado.gradients.exact import Exact
-from cortado.parameters.values import Values
-from cortado.rollout import BackwardStep, Observer, Rollout
+from cortado.particles.state import State
+from cortado.rollout.rollout import BackwardStep, Observer, Rollout
 from cortado.scene.fields import as_number
+from cortado.scene.parameters.values import Values
 
 EXACT = Exact()
 

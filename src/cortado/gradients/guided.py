@@ -13,8 +13,8 @@ from cortado.gradients.estimator import Differentiable, Estimate, GradientEstima
 from cortado.gradients.filters import AdjointViscosity
 from cortado.gradients.left_out import remaining
 from cortado.gradients.points import Point
-from cortado.parameters.values import Arrays, Values
-from cortado.rollout import Observer
+from cortado.rollout.rollout import Observer
+from cortado.scene.parameters.values import Arrays, Values
 
 SURROGATE = AdjointViscosity()
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from cortado.device.executors.executor import Executor, OnResult
 from cortado.errors import DivergedError, InputError
-from cortado.executors.executor import Executor, OnResult
 from cortado.gradients.estimator import (
     AdjointEstimator,
     Batchable,
@@ -17,8 +17,8 @@ from cortado.gradients.estimator import (
     GradientEstimator,
     checked_estimate,
 )
-from cortado.parameters.values import Values
-from cortado.rollout import Observer
+from cortado.rollout.rollout import Observer
+from cortado.scene.parameters.values import Values
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from typing import Protocol, overload, runtime_checkable
 import numpy as np
 
 from cortado.device.precision import Precision
-from cortado.device.state import State
 from cortado.losses.loss import Loss, Snapshot, SnapshotAdjoint, by_field, precision_of
-from cortado.quantities.moment import Moment
+from cortado.particles.state import State
+from cortado.runs.quantities.moment import Moment
 from cortado.words import counted
 
 

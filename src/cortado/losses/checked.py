@@ -8,12 +8,12 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import as_numbers, as_one_number
-from cortado.device.state import State
 from cortado.errors import InputError, shown
 from cortado.losses import Loss, Recorded, Snapshot, SnapshotAdjoint, SnapshotBatch
 from cortado.losses.batch import Together
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
-from cortado.quantities.known import check_quantity
+from cortado.particles.state import State
+from cortado.scene.quantities import check_quantity
 
 FORMS = tuple(name.replace("_", " ") for name in ADJOINT_FIELDS)
 """What the arrays of an adjoint are derivatives with respect to, in words."""

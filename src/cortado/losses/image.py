@@ -9,8 +9,8 @@ import warp as wp
 from cortado.arrays import read_only, require_methods
 from cortado.device.threads import WARP
 from cortado.errors import InputError
+from cortado.files.srgb import LIGHT, check_light
 from cortado.fixed import fixed
-from cortado.io.srgb import LIGHT, check_light
 from cortado.losses.image_losses import ImageLoss, SquaredDifference
 from cortado.losses.loss import Snapshot, SnapshotAdjoint
 

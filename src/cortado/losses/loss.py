@@ -10,12 +10,12 @@ import numpy as np
 from cortado.arrays import is_whole
 from cortado.device.launching import add
 from cortado.device.precision import FLOAT32, FLOAT64, Precision
-from cortado.device.state import State
-from cortado.discretise.discrete_scene import Lattice
 from cortado.errors import InputError, shown
 from cortado.fixed import FixedDict, fixed
-from cortado.quantities.known import check_quantity
-from cortado.quantities.moment import Moment
+from cortado.particles.state import State
+from cortado.runs.quantities.moment import Moment
+from cortado.scene.discrete_scene import Lattice
+from cortado.scene.quantities import check_quantity
 from cortado.words import counted
 
 

@@ -7,15 +7,15 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import read_only
-from cortado.device.arrays import to_device
 from cortado.device.launching import TreeReduction, launch, sum_of
-from cortado.device.state import State
 from cortado.device.threads import WARP
 from cortado.errors import InputError
 from cortado.fixed import fixed
 from cortado.losses.batch import SnapshotBatch
 from cortado.losses.loss import Snapshot
 from cortado.losses.matching import matching_kernels
+from cortado.particles.arrays import to_device
+from cortado.particles.state import State
 
 
 @fixed

@@ -9,7 +9,7 @@ from cortado.arrays import as_numbers, as_one_number, read_only, whole_number
 from cortado.errors import InputError
 from cortado.fixed import fixed
 from cortado.losses.loss import Adjoint, Frames, Snapshot
-from cortado.sensors.sensor import Sensor
+from cortado.runs.sensors.sensor import Sensor
 
 
 @fixed

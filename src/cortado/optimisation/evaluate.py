@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from cortado.arrays import as_one_number, require_function, require_methods, require_table
+from cortado.device.executors.executor import Executor, InProcess, OnResult, checked_executor
 from cortado.errors import CortadoWarning, InputError, shown
-from cortado.executors.executor import Executor, InProcess, OnResult, checked_executor
 from cortado.gradients import Estimate, GradientEstimator
 from cortado.gradients.estimator import Differentiable, checked_estimator
 from cortado.gradients.points import Daring, evaluated
-from cortado.parameters.values import Values
+from cortado.scene.parameters.values import Values
 from cortado.words import counted
 
 

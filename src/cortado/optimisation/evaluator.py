@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from cortado.arrays import as_numbers, as_one_number
+from cortado.device.executors.executor import InProcess
 from cortado.errors import ComputationError, DivergedError, InputError
-from cortado.executors.executor import InProcess
 from cortado.gradients.points import Daring, evaluated
 from cortado.optimisation.differentiable import Differentiable, loss_and_gradient
 from cortado.optimisation.replay_log import Evaluation, Log, ParameterLayout, Vector

@@ -14,7 +14,7 @@ import numpy as np
 
 from cortado.arrays import require_function, require_truth
 from cortado.errors import InputError
-from cortado.io.input_files import as_path
+from cortado.files.input_files import as_path
 from cortado.optimisation.differentiable import Differentiable, LossFunction, as_differentiable
 from cortado.optimisation.evaluator import Evaluator, as_given
 from cortado.optimisation.named_optimisers import as_optimiser

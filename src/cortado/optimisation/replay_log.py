@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cortado.errors import ComputationError, InputError
-from cortado.io.files import parsed_json, sentences, write_atomically, write_fully
-from cortado.io.run_folder import REPLAY_LOG
+from cortado.files.atomic import parsed_json, sentences, write_atomically, write_fully
+from cortado.runs.run_folder import REPLAY_LOG
 
 Vector = npt.NDArray[np.float64]
 

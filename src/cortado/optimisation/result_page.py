@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from cortado.errors import CortadoError
-from cortado.figures import images, loss_curve, particles
-from cortado.io.notebook import as_words, picture, table
 from cortado.losses import FinalPositions, Frames, Image, Snapshot
-from cortado.parameters.values import UNITS
+from cortado.pictures.figures import images, loss_curve, particles
+from cortado.pictures.notebook import as_words, picture, table
 from cortado.problem import Problem
+from cortado.scene.parameters.values import UNITS
 
 MOST_NUMBERS = 6
 """Of a parameter that the table shows; of more the smallest and the greatest."""

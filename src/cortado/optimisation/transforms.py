@@ -16,9 +16,9 @@ from cortado.arrays import as_numbers, read_only, require_methods, require_table
 from cortado.errors import DivergedError, InputError
 from cortado.fixed import FixedDict, fixed
 from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator, estimate
-from cortado.parameters.values import Arrays, Values, check_known, require_points
 from cortado.problem import Problem
-from cortado.rollout import BackwardStep, Observer
+from cortado.rollout.rollout import BackwardStep, Observer
+from cortado.scene.parameters.values import Arrays, Values, check_known, require_points
 
 SMALLEST = 1e-4
 """Smaller fractions are replaced by this one where their coordinates are computed: that of 0 is minus infinity."""

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 
 from cortado.device.cores import usable_cores
-from cortado.discretise.discrete_scene import DiscreteScene, discretise
+from cortado.discretise.calibration import SKIN
+from cortado.discretise.region import TOLERANCE
 from cortado.errors import DivergedError, InputError, shown
-from cortado.lattice.calibration import SKIN
-from cortado.lattice.region import TOLERANCE
-from cortado.parameters.registry import BY_NAME
-from cortado.parameters.values import checked_value
 from cortado.reference.digits import Digits
 from cortado.reference.engine import extension, precisions
 from cortado.reference.histories import Gradient, History
 from cortado.reference.losses import Loss
+from cortado.scene.discrete_scene import DiscreteScene, discretise
+from cortado.scene.parameters.registry import BY_NAME
+from cortado.scene.parameters.values import checked_value
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.solvers import PcisphSolver
 from cortado.scene.stability import divergence_advice

@@ -8,13 +8,13 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import as_numbers
-from cortado.device.arrays import padded
 from cortado.device.kernel_cache import start_warp
 from cortado.device.precision import Precision, precision_named
 from cortado.device.threads import WARP
+from cortado.discretise.smoothing import SmoothingKernel
 from cortado.errors import InputError, shown
 from cortado.fixed import fixed
-from cortado.lattice.smoothing import SmoothingKernel
+from cortado.particles.arrays import padded
 from cortado.render.cameras import positive, vector
 from cortado.render.fields import ColourField
 from cortado.render.marching import RayMarcher

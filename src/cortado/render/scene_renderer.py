@@ -6,11 +6,11 @@ import numpy as np
 from pydantic import AfterValidator, TypeAdapter
 
 from cortado.device.precision import Precision
-from cortado.discretise.discrete_scene import Lattice
-from cortado.lattice.smoothing import SmoothingKernel
+from cortado.discretise.smoothing import SmoothingKernel
 from cortado.render.cameras import Perspective
 from cortado.render.renderer import Renderer
 from cortado.render.views import TopView, View, Volume
+from cortado.scene.discrete_scene import Lattice
 from cortado.scene.render import Render
 from cortado.scene.scene import Scene
 from cortado.scene.sentences import sentences

@@ -4,9 +4,8 @@ import numpy as np
 from pydantic_core import PydanticCustomError
 
 from cortado.device.memory import sampling_parts, shortage
+from cortado.discretise.shapes import Points
 from cortado.errors import InputError, Words, shown
-from cortado.lattice.shapes import Points
-from cortado.parameters.registry import BY_NAME
 from cortado.scene.containers import check_length
 from cortado.scene.emitter import Emitter
 from cortado.scene.fields import MISSING, FieldPath, field_error
@@ -14,6 +13,7 @@ from cortado.scene.fluids import Body, Fluid, PointsFluid
 from cortado.scene.mixture import Mixture
 from cortado.scene.model import SceneTables
 from cortado.scene.overlaps import check_distinct, check_overlaps
+from cortado.scene.parameters.registry import BY_NAME
 from cortado.scene.sentences import point_in_words
 
 MOST_PARTICLES = 2e8

@@ -7,11 +7,11 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from cortado.discretise.region import Region
+from cortado.discretise.shapes import Points
 from cortado.discretise.walls.places import Places, box_places, cup_places
 from cortado.discretise.walls.points import box_walls, cup_walls
 from cortado.errors import Words
-from cortado.lattice.region import Region
-from cortado.lattice.shapes import Points
 from cortado.scene.fields import FieldPath, Flag, Length, Vector, field_error, quantity
 from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
 from cortado.scene.tables import Table

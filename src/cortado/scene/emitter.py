@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import field_validator
 
-from cortado.lattice.shapes import ROUND_OFF, Points, across, disc, disc_cells
+from cortado.discretise.shapes import ROUND_OFF, Points, across, disc, disc_cells
 from cortado.scene.fields import GREATEST, Length, Vector, field_error, quantity
 from cortado.scene.fluids import Body
 

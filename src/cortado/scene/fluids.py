@@ -7,8 +7,8 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from cortado.lattice.region import Region
-from cortado.lattice.shapes import ROUND_OFF, Block, Points, block_about, block_between, corners, grid
+from cortado.discretise.region import Region
+from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, block_between, corners, grid
 from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
 from cortado.scene.points import read_points
 from cortado.scene.tables import Table

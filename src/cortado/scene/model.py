@@ -7,13 +7,13 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, ValidationInfo, create_model, field_validator
 
-from cortado.parameters.registry import PARAMETERS
 from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import Emitter
 from cortado.scene.fields import Colour, Flag, Several, Text, Vector, count, field_error, quantity
 from cortado.scene.fluids import AnyFluid
 from cortado.scene.mixture import Mixture
 from cortado.scene.package_tables import AnyForces
+from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.picture import Picture
 from cortado.scene.render import Render
 from cortado.scene.schedule import Schedule

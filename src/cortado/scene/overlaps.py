@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from cortado.discretise.shapes import Points
+from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.errors import Words
-from cortado.lattice.shapes import Points
-from cortado.lattice.smoothing import CUBIC_SPLINE
 from cortado.scene.fields import FieldPath, field_error
 from cortado.scene.fluids import Body, Fluid, PointsFluid
 from cortado.scene.sentences import field_name, point_in_words

@@ -8,9 +8,9 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from cortado.errors import SceneError
-from cortado.parameters.registry import PARAMETERS
 from cortado.scene.entry_points import checked_keys, loaded, made, registered
 from cortado.scene.fields import FieldPath, Text, field_error, without_numpy
+from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.tables import Table
 
 

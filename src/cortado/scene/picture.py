@@ -4,8 +4,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ValidationInfo, field_validator
 
-from cortado.quantities.known import NAMES
 from cortado.scene.fields import Colour, FieldPath, Flag, Length, OneOf, components, count, field_error, quantity
+from cortado.scene.quantities import NAMES
 from cortado.scene.tables import Table
 
 MOST_FRAMES = 120

@@ -79,7 +79,7 @@ def _hdf5(path: str) -> Any:
 
 def _trajectory(path: str) -> Any:
     from cortado.errors import InputError
-    from cortado.io import vtkhdf
+    from cortado.files import vtkhdf
 
     try:
         positions = vtkhdf.read(path)["positions"]

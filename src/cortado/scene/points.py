@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
+from cortado.discretise.shapes import Points
 from cortado.errors import InputError, Words, shown
-from cortado.io.input_files import reason, regular_file
-from cortado.lattice.shapes import Points
+from cortado.files.input_files import reason, regular_file
 from cortado.scene.point_reader import MOST_POINTS, READERS, REFUSED
 
 SUFFIXES = (".npy", *READERS)

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from pydantic import Field, create_model, model_validator
 
 from cortado.errors import Words
-from cortado.parameters.registry import PARAMETERS, Axis, Parameter
 from cortado.scene.fields import FieldPath, Several, field_error, quantity
+from cortado.scene.parameters.registry import PARAMETERS, Axis, Parameter
 from cortado.scene.tables import Table
 
 

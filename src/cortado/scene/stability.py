@@ -4,13 +4,13 @@ from math import inf, sqrt
 
 import numpy as np
 
-from cortado.lattice.calibration import laplacian_rate, pairwise_rate
-from cortado.lattice.shapes import Points
-from cortado.lattice.smoothing import smoothing_kernel
-from cortado.parameters.registry import PARAMETERS
-from cortado.parameters.tilt import Tilt
-from cortado.parameters.values import Arrays
+from cortado.discretise.calibration import laplacian_rate, pairwise_rate
+from cortado.discretise.shapes import Points
+from cortado.discretise.smoothing import smoothing_kernel
 from cortado.scene.model import SceneTables
+from cortado.scene.parameters.registry import PARAMETERS
+from cortado.scene.parameters.tilt import Tilt
+from cortado.scene.parameters.values import Arrays
 
 VISCOUS_RATES = {"pairwise": (pairwise_rate, 0.65), "laminar": (laplacian_rate, 0.5)}
 """By the form of the viscous force: what gives its greatest rate on a lattice, and which part of a lattice's longest

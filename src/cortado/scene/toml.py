@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from cortado.errors import LONGEST, InputError, SceneError, shown
-from cortado.io.input_files import as_path, content, reason
+from cortado.files.input_files import as_path, content, reason
 
 MOST_BYTES = 1_000_000
 """Of a file: TOML of that size, made to be as bad as it can, takes a few seconds and some hundred MB."""

@@ -6,17 +6,17 @@ from importlib import import_module
 
 import numpy as np
 
-from cortado.device.arrays import padded
-from cortado.device.cells import Grid
 from cortado.device.lanes import lanes_for
-from cortado.device.neighbourhood import Discretisation
-from cortado.device.neighbours import NeighbourSearch
-from cortado.device.state import Layout
-from cortado.discretise.discrete_scene import DiscreteScene
+from cortado.discretise.calibration import SKIN
 from cortado.errors import InputError
-from cortado.lattice.calibration import SKIN
-from cortado.parameters.registry import PARAMETERS
+from cortado.particles.arrays import padded
+from cortado.particles.cells import Grid
+from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.neighbours import NeighbourSearch
+from cortado.particles.state import Layout
 from cortado.scene.containers import NoContainer
+from cortado.scene.discrete_scene import DiscreteScene
+from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.scene import Scene
 from cortado.solvers.containment import Walled
 from cortado.solvers.makers import SolverSetting

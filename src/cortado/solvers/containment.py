@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.arrays import padded
 from cortado.device.host import HostCopy
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import Precision
-from cortado.device.state import Layout, State
-from cortado.lattice.region import TOLERANCE, Region
+from cortado.discretise.region import TOLERANCE, Region
+from cortado.particles.arrays import padded
+from cortado.particles.state import Layout, State
 from cortado.solvers.containment_kernels import NO_PARTICLE, bounds_type, lost_kernel
 
 FURTHEST = 1e6

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cortado.device.host import HostCopy
 from cortado.device.launching import KernelLauncher, sum_and_maximum
-from cortado.device.state import Layout
+from cortado.particles.state import Layout
 from cortado.solvers.containment import Containment
 from cortado.solvers.convergence import UNKNOWN, convergence_kernels
 from cortado.solvers.solver import Counts

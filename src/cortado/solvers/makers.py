@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from cortado.device.precision import Precision
-from cortado.discretise.discrete_scene import DiscreteScene
 from cortado.errors import InputError, shown
-from cortado.parameters.known import Known
+from cortado.scene.discrete_scene import DiscreteScene
+from cortado.scene.parameters.known import Known
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import Solver as SolverTable
 from cortado.solvers.solver import Solver

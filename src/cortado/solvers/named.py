@@ -2,7 +2,7 @@
 
 from importlib import import_module
 
-from cortado.parameters.known import REGISTRY, Known
+from cortado.scene.parameters.known import REGISTRY, Known
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import PackageSolver, Solver
 from cortado.solvers.makers import SolverMaker, checked_solver

@@ -4,8 +4,8 @@ from weakref import finalize
 
 import warp as wp
 
-from cortado.device.arrays import Fields
-from cortado.device.state import Parameters, State
+from cortado.particles.arrays import Fields
+from cortado.particles.state import Parameters, State
 from cortado.solvers.particles import ParticleSolver
 from cortado.sph.begin_adjoint import begin_adjoint_kernel
 from cortado.sph.carried import Carried

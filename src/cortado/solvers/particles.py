@@ -12,17 +12,17 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.arrays import Fields
-from cortado.device.fields import POSITIONS, VELOCITIES, StateField, check_fields
 from cortado.device.launching import KernelLauncher
 from cortado.device.memory import gradient_parts
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type
-from cortado.device.neighbours import NeighbourSearch
-from cortado.device.state import Layout, Parameters, State
 from cortado.device.threads import Turn
-from cortado.discretise.discrete_scene import Lattice
+from cortado.discretise.calibration import SKIN
 from cortado.errors import MissingDerivativeError
-from cortado.lattice.calibration import SKIN
+from cortado.particles.arrays import Fields
+from cortado.particles.fields import POSITIONS, VELOCITIES, StateField, check_fields
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.neighbours import NeighbourSearch
+from cortado.particles.state import Layout, Parameters, State
+from cortado.scene.discrete_scene import Lattice
 from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.convergence import convergence_kernels
 from cortado.solvers.loop import IterationLog, Loop

@@ -11,9 +11,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.launching import KernelLauncher
-from cortado.device.neighbourhood import Discretisation
-from cortado.device.state import Layout, Parameters, State
 from cortado.device.threads import Turn
+from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.state import Layout, Parameters, State
 from cortado.solvers.containment import Containment
 from cortado.sph.parts import StepContext
 

@@ -9,7 +9,7 @@ from functools import cache
 import warp as wp
 
 from cortado.device.kernels import Kernels
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.sph.formula import Formula
 from cortado.sph.formula_kernels import applied, change_along, work_of
 from cortado.sph.own_force import OwnForce, topic

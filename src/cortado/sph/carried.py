@@ -7,11 +7,11 @@ from collections.abc import Iterable, Mapping
 
 import warp as wp
 
-from cortado.device.fields import StateField
 from cortado.device.kernels import kind_of
 from cortado.device.reduction import type_name
-from cortado.device.state import Layout, State
-from cortado.parameters.registry import Axis
+from cortado.particles.fields import StateField
+from cortado.particles.state import Layout, State
+from cortado.scene.parameters.registry import Axis
 from cortado.sph.order import OrderKernels, order_kernels
 from cortado.sph.parts import StepContext
 

@@ -21,7 +21,7 @@ import warp as wp
 from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.sph.free_energy import FreeEnergy, Mobility
 from cortado.sph.pairwise_laplacian import pairwise_laplacian_functions
 

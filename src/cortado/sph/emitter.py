@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from cortado.device.arrays import to_device
-from cortado.device.fields import POSITIONS, VELOCITIES, Entry, StateField
-from cortado.device.state import Layout, Parameters, State
-from cortado.parameters.registry import Axis
+from cortado.particles.arrays import to_device
+from cortado.particles.fields import POSITIONS, VELOCITIES, Entry, StateField
+from cortado.particles.state import Layout, Parameters, State
+from cortado.scene.parameters.registry import Axis
 from cortado.sph.emitter_kernels import emitter_kernels, nozzle_type
 from cortado.sph.part import Part, PartAdjoint, PartTangent
 from cortado.sph.parts import StepContext, Tangents

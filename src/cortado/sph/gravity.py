@@ -7,7 +7,7 @@ import warp as wp
 from cortado.device.kernels import Kernels
 from cortado.device.launching import TreeReduction
 from cortado.device.precision import Precision
-from cortado.device.state import Layout
+from cortado.particles.state import Layout
 from cortado.sph.integration import integration_module
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 

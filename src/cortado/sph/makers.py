@@ -7,9 +7,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from cortado.errors import InputError, shown
-from cortado.parameters.known import Known
-from cortado.parameters.registry import Parameter, Source
-from cortado.parameters.values import checked_value
+from cortado.scene.parameters.known import Known
+from cortado.scene.parameters.registry import Parameter, Source
+from cortado.scene.parameters.values import checked_value
 from cortado.sph.parts import Force, Setting
 
 
@@ -46,7 +46,7 @@ def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
 def checked_parameters(what: str, maker: Any, parameters: Any) -> Sequence[Parameter]:
     """Those of a maker of ``what``; raises `InputError`."""
     if not isinstance(parameters, (list, tuple)) or not all(isinstance(p, Parameter) for p in parameters):
-        wanted = "a list of cortado.parameters.registry.Parameter, which may be empty"
+        wanted = "a list of cortado.scene.parameters.registry.Parameter, which may be empty"
         raise InputError(f"the {what} {shown(maker)} has parameters {shown(parameters)}, but must have {wanted}.")
     return parameters
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import warp as wp
 
-from cortado.device.fields import Entry, StateField
-from cortado.device.state import Layout, State
+from cortado.particles.fields import Entry, StateField
+from cortado.particles.state import Layout, State
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.materials import mixture_kernels
 from cortado.sph.part import Part, PartAdjoint, PartTangent

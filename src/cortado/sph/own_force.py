@@ -11,11 +11,11 @@ import warp as wp
 
 from cortado.arrays import read_only
 from cortado.device.kernels import Kernels
-from cortado.device.neighbourhood import Discretisation
 from cortado.errors import InputError, shown
 from cortado.fixed import fixed
-from cortado.parameters.known import TIME
-from cortado.parameters.registry import Axis, Parameter, Source
+from cortado.particles.neighbourhood import Discretisation
+from cortado.scene.parameters.known import TIME
+from cortado.scene.parameters.registry import Axis, Parameter, Source
 from cortado.scene.schedule import Course
 from cortado.sph.formula import Formula, compiled, formula, keep_source, plain_function, source_of
 from cortado.sph.packed import Packed

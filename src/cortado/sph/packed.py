@@ -8,8 +8,8 @@ from typing import Any
 import warp as wp
 
 from cortado.device.precision import Precision
-from cortado.device.state import Layout, Parameters
-from cortado.parameters.registry import Parameter
+from cortado.particles.state import Layout, Parameters
+from cortado.scene.parameters.registry import Parameter
 from cortado.sph.integration import integration_module
 from cortado.sph.parts import Adjoints, StepContext
 

@@ -15,9 +15,9 @@ import warp as wp
 
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.made_derivatives import made_adjoint, made_tangent
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.device.pair_sums import fluid_sum
+from cortado.particles.made_derivatives import made_adjoint, made_tangent
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.pair_sums import fluid_sum
 from cortado.sph.formula import Formula
 from cortado.sph.formula_kernels import applied
 from cortado.sph.own_force import OwnForce, topic

@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 
 
 @dataclass(frozen=True)

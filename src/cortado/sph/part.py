@@ -12,9 +12,9 @@ stand in arrays that `begin`, `sort` or `settle` write.
 
 from typing import Protocol
 
-from cortado.device.fields import StateField
-from cortado.device.state import Layout, Parameters, State
 from cortado.errors import MissingDerivativeError
+from cortado.particles.fields import StateField
+from cortado.particles.state import Layout, Parameters, State
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 

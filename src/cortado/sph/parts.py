@@ -11,15 +11,15 @@ from typing import Any, Protocol
 
 import warp as wp
 
-from cortado.device.arrays import Arrays, Fields, zeros
 from cortado.device.binding import Named
 from cortado.device.launching import KernelLauncher, add
-from cortado.device.neighbourhood import Discretisation
-from cortado.device.state import Layout, Parameters
-from cortado.discretise.discrete_scene import Lattice
 from cortado.discretise.walls.layers import WallLayers
-from cortado.parameters.known import argument
-from cortado.parameters.registry import Axis
+from cortado.particles.arrays import Arrays, Fields, zeros
+from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.state import Layout, Parameters
+from cortado.scene.discrete_scene import Lattice
+from cortado.scene.parameters.known import argument
+from cortado.scene.parameters.registry import Axis
 from cortado.scene.scene import Scene
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from cortado.discretise.calibration import diffusion_limit
+from cortado.discretise.smoothing import smoothing_kernel
 from cortado.errors import InputError
-from cortado.lattice.calibration import diffusion_limit
-from cortado.lattice.smoothing import smoothing_kernel
 from cortado.scene.scene import Scene
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy
 

@@ -14,10 +14,10 @@ from math import pi, sqrt
 import numpy as np
 import warp as wp
 
-from cortado.device.neighbourhood import Discretisation
-from cortado.device.state import Layout
+from cortado.discretise.calibration import lattice_offsets
 from cortado.errors import CortadoWarning
-from cortado.lattice.calibration import lattice_offsets
+from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.state import Layout
 from cortado.scene.scene import Scene
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.surface_normals import normal_kernels

@@ -18,11 +18,11 @@ import warp as wp
 
 from cortado.device.arithmetic import arithmetic
 from cortado.device.bundles import bundle
-from cortado.device.by_hand import adjoint_of, tangent_of
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type
-from cortado.device.pair_sums import fluid_sum, pair_sum
+from cortado.particles.by_hand import adjoint_of, tangent_of
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.pair_sums import fluid_sum, pair_sum
 from cortado.sph.pair_forces import PairForm, laminar, pairwise
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 

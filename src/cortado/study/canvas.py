@@ -7,15 +7,15 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cortado.figures.canvas import STYLE
-from cortado.io.files import write_atomically
+from cortado.files.atomic import write_atomically
+from cortado.pictures.canvas import STYLE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 def blank(width: float = 9.0, height: float = 5.2) -> Figure:
-    """An empty figure of so many inches; `cortado.figures.canvas` has the colours."""
+    """An empty figure of so many inches; `cortado.pictures.canvas` has the colours."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine

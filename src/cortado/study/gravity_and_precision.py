@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from cortado.figures.canvas import DASHED, FAINT, PALETTE
+from cortado.pictures.canvas import DASHED, FAINT, PALETTE
 from cortado.scene.fields import OneOf, Several, count, quantity
 from cortado.study.canvas import blank
 from cortado.study.experiment import ExperimentType, Progress, SceneSettings

@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
-from cortado.figures.canvas import PALETTE
 from cortado.gradients import Exact, Tape
 from cortado.losses import FinalPositions, Image
+from cortado.pictures.canvas import PALETTE
 from cortado.problem import Problem
 from cortado.render.scene_renderer import scene_renderer
 from cortado.scene.fields import Several, Vector, count, quantity

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from cortado.figures.canvas import DASHED, FAINT, INK, PALETTE
-from cortado.lattice.smoothing import smoothing_kernel
+from cortado.discretise.smoothing import smoothing_kernel
+from cortado.pictures.canvas import DASHED, FAINT, INK, PALETTE
 from cortado.reference import History, Simulation
 from cortado.scene.fields import Vector, count, quantity
 from cortado.study import spatial_scales

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cortado.figures.canvas import INK, PALETTE
+from cortado.pictures.canvas import INK, PALETTE
 from cortado.study.canvas import blank
 from cortado.study.estimates import Estimate, Line
 from cortado.study.experiment import ExperimentType

@@ -15,9 +15,9 @@ from functools import cache
 import warp as wp
 
 from cortado.device.kernels import Kernels
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.gradients import Tape
-from cortado.rollout import BackwardStep, Rollout
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.rollout.rollout import BackwardStep, Rollout
 
 
 @dataclass(frozen=True)

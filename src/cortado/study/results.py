@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from cortado.errors import InputError
-from cortado.io.files import parsed_json, write_atomically
-from cortado.io.input_files import content
-from cortado.io.progress import track
+from cortado.files.atomic import parsed_json, write_atomically
+from cortado.files.input_files import content
+from cortado.files.progress import track
 from cortado.study.canvas import save
 from cortado.study.experiment import Experiment
 from cortado.study.tables import MOST_BYTES, Table

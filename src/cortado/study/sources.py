@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado import reference
-from cortado.device.state import State
 from cortado.gradients import AdjointEstimator, AdjointNorms, GradientEstimator
 from cortado.losses import Frames
 from cortado.losses.checked import as_loss
-from cortado.parameters.values import Arrays, Values
+from cortado.particles.state import State
 from cortado.problem import Problem
+from cortado.scene.parameters.values import Arrays, Values
 from cortado.scene.scene import Scene
 from cortado.study.reference_losses import reference_loss
 

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.lattice.smoothing import SmoothingKernel
+from cortado.discretise.smoothing import SmoothingKernel
 
 Field = NDArray[np.float64]
 

@@ -7,12 +7,12 @@ import numpy as np
 from pydantic import ValidationInfo, field_validator
 
 from cortado.errors import InputError
-from cortado.figures.canvas import PALETTE, whole_numbers
-from cortado.inverse.setup import Setup, setup
-from cortado.inverse.task import load_task
-from cortado.io.srgb import to_srgb
+from cortado.files.srgb import to_srgb
 from cortado.losses.image_losses import psnr
+from cortado.optimisation.inverse.setup import Setup, setup
+from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.optimise import Record, optimise
+from cortado.pictures.canvas import PALETTE, whole_numbers
 from cortado.scene.fields import Several, Text
 from cortado.study.canvas import blank
 from cortado.study.experiment import DeviceSettings, ExperimentType, Progress

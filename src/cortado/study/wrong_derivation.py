@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from cortado.figures.canvas import DASHED, INK, PALETTE
+from cortado.pictures.canvas import DASHED, INK, PALETTE
 from cortado.reference import History, Simulation
 from cortado.scene.fields import Vector, count, quantity
 from cortado.study.canvas import blank

@@ -5,8 +5,8 @@ from functools import cached_property
 
 import numpy as np
 
-from cortado.lattice.calibration import lattice_offsets, shear_factor
-from cortado.lattice.smoothing import SmoothingKernel
+from cortado.discretise.calibration import lattice_offsets, shear_factor
+from cortado.discretise.smoothing import SmoothingKernel
 
 SHALLOW = 0.4
 """Depth of the shallow layer, in spacings; there is one where the second lattice layer of the fluid sees the wall.

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.discretise.shapes import Points, disc, grid
 from cortado.discretise.walls.points import nearest_cells, ring, stacked
-from cortado.lattice.shapes import Points, disc, grid
 
 OVERLAP = 0.8
 """How far from the side of a cup, over the reach, fluid on the base may rest upright."""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cortado.lattice.shapes import Points, disc, grid
+from cortado.discretise.shapes import Points, disc, grid
 
 
 def nearest_cells(length: float, spacing: float) -> int:

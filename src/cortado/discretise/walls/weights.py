@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cortado.discretise.calibration import lattice_offsets
+from cortado.discretise.pairs import apart, pairs_within
+from cortado.discretise.region import Region
+from cortado.discretise.shapes import Points
+from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.walls.places import Places
-from cortado.lattice.calibration import lattice_offsets
-from cortado.lattice.pairs import apart, pairs_within
-from cortado.lattice.region import Region
-from cortado.lattice.shapes import Points
-from cortado.lattice.smoothing import SmoothingKernel
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.bundles import bundle
-from cortado.device.neighbourhood import Discretisation
+from cortado.particles.neighbourhood import Discretisation
 from cortado.sph.integration import new_state_adjoint
 
 

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.arrays import Fields
 from cortado.device.binding import Named
 from cortado.device.launching import add
-from cortado.device.state import Parameters, State
+from cortado.particles.arrays import Fields
+from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.pcisph.steps import PcisphSteps

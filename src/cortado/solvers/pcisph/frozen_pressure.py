@@ -9,8 +9,8 @@ from typing import Any
 import warp as wp
 
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.device.pair_sums import pair_sum
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.pair_sums import pair_sum
 from cortado.solvers.pcisph.pressure_force import pressure_share
 
 

@@ -19,7 +19,7 @@ import warp as wp
 from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.sph.density import density_sums
 from cortado.sph.integration import prediction_share
 

@@ -7,12 +7,12 @@ from typing import Any
 import warp as wp
 
 from cortado.device.bundles import bundle
-from cortado.device.by_hand import adjoint_of, tangent_of
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.device.pair_sums import pair_sum
 from cortado.device.precision import Precision
+from cortado.particles.by_hand import adjoint_of, tangent_of
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.pair_sums import pair_sum
 
 
 @dataclass(frozen=True)

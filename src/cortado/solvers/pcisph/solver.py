@@ -2,7 +2,7 @@
 
 from typing import Self
 
-from cortado.device.state import Parameters
+from cortado.particles.state import Parameters
 from cortado.solvers.pcisph.derivatives import FrozenPcisphAdjoint, PcisphAdjoint, PcisphTangent
 from cortado.solvers.pcisph.steps import PcisphSteps
 from cortado.solvers.solver import StepAdjoint, StepTangent

@@ -6,7 +6,7 @@ iterations and keeps every intermediate value, for `cortado.solvers.pcisph.deriv
 
 from numpy.typing import NDArray
 
-from cortado.device.state import Parameters, State
+from cortado.particles.state import Parameters, State
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.pcisph.parts import Iterates, PcisphKernels

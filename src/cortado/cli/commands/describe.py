@@ -1,0 +1,211 @@
+"""``cortado describe``: what a scene will be before it is run: particles, limits of the time step, memory, time."""
+
+import json
+import math
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.arrays import check_steps
+from cortado.bench.memory import estimated_bytes
+from cortado.device.memory import frame_parts, step_parts
+from cortado.errors import DivergedError, InputError
+from cortado.files.atomic import sentences
+from cortado.optimisation.inverse.in_words import task_in_words
+from cortado.optimisation.inverse.task import load_task
+from cortado.pictures.figures import particles
+from cortado.pictures.painter import colours_of
+from cortado.rollout.rollout import MEMORY_BUDGET, Rollout
+from cortado.scene.in_words import vector
+from cortado.scene.scene import load_scene
+from cortado.scene.stability import stability_limits
+from cortado.scene.toml import read_toml
+from cortado.simulation import Simulation
+from cortado.solvers.particles import ParticleSolver
+
+FIRST, MOST, ENOUGH = 4, 100, 0.5
+"""Steps that are timed: a few, or more if they are fast, until they take so many seconds together."""
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How long the first steps of a scene take."""
+
+    steps: int
+    """That were measured, after as many that were not."""
+    seconds: float
+    """Of one of them."""
+
+    @classmethod
+    def measured(cls, simulation: Simulation) -> "Speed":
+        """Raises `DivergedError` of a scene that does not even bear these steps."""
+        steps = FIRST
+        while True:
+            rollout = simulation.rollout(steps)
+            rollout.forward(keep=False)  # compiles, and captures graphs
+            begun = time.perf_counter()
+            rollout.forward(keep=False)
+            wp.synchronize_device(simulation.device)
+            seconds = (time.perf_counter() - begun) / steps
+            if steps == MOST or steps * seconds > 0.5 * ENOUGH:
+                return cls(steps, seconds)
+            steps = min(math.ceil(ENOUGH / seconds), MOST)
+
+
+def describe_scene(
+    scene_file: Path,
+    steps: int,
+    overrides: list[str],
+    device: str,
+    precision: str,
+    picture: Path | None,
+    as_json: bool,
+) -> str:
+    """As text, or as JSON; a picture of the first state is written where one is asked for."""
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise InputError(f"--picture is {str(picture)!r}, but must be the name of a PNG file, such as first.png.")
+    simulation = Simulation(load_scene(scene_file, overrides), device, precision)
+    found = _described(simulation, check_steps(steps))
+    if "optimise" in read_toml(scene_file):
+        found["search"] = task_in_words(load_task(scene_file, overrides))
+    if picture is not None:
+        with sentences(picture.parent):
+            picture.parent.mkdir(parents=True, exist_ok=True)
+        found["picture"] = str(_drawn(simulation, picture).absolute())
+    return json.dumps(found, indent=2) if as_json else _as_text(found)
+
+
+def _described(simulation: Simulation, steps: int) -> dict[str, Any]:
+    scene = simulation.scene
+    of_phase = Counter(np.argmax(simulation.mass_fractions, axis=1).tolist())
+    limits, ends = stability_limits(scene), scene.container.extent()
+    found: dict[str, Any] = {
+        "name": scene.name,
+        "dimension": scene.dimension,
+        "particles": simulation.particles,
+        "particles_of_phase": {phase.name: of_phase[k] for k, phase in enumerate(scene.phase)},
+        "particles_in_emitter": simulation.particles - simulation.free_particles,
+        "wall_particles": len(simulation.walls),
+        "fluid_size_m": (np.ptp(simulation.positions, axis=0) + scene.discretisation.spacing).tolist(),
+        "container_size_m": None if ends is None else (ends[1] - ends[0]).tolist(),
+        "mass_of_phase_kg": _masses(simulation),
+        "gravity_m_s2": list(scene.forces.gravity),
+        "spacing_m": scene.discretisation.spacing,
+        "time_step_s": scene.solver.time_step,
+        "time_step_limits_s": {name: limit if math.isfinite(limit) else None for name, limit in limits.items()},
+        "scheduled_until_s": {name: course.times[-1] for name, course in scene.schedule.courses.items()},
+        "device": str(simulation.device),
+        "precision": simulation.precision.name,
+        "steps": steps,
+        "simulated_time_s": steps * scene.solver.time_step,
+    }
+    return {**found, **_memory(simulation, steps), **_expected(simulation, steps)}
+
+
+def _masses(simulation: Simulation) -> dict[str, float]:
+    """By phase [kg]; in 2-D of a layer one metre thick."""
+    volumes = simulation.lattice.volume * simulation.mass_fractions.sum(axis=0)
+    phases = simulation.scene.phase
+    return {phase.name: float(phase.rest_density * volume) for phase, volume in zip(phases, volumes, strict=True)}
+
+
+def _expected(simulation: Simulation, steps: int) -> dict[str, Any]:
+    """How long so many steps will take; of a scene that does not bear the first ones, what happened."""
+    try:
+        speed = Speed.measured(simulation)
+    except DivergedError as error:
+        return {"diverged": str(error)}
+    return {
+        "milliseconds_per_step": 1e3 * speed.seconds,
+        "measured_steps": speed.steps,
+        "expected_seconds": steps * speed.seconds,
+    }
+
+
+def _memory(simulation: Simulation, steps: int) -> dict[str, float | None]:
+    """[bytes] of a run with every step recorded, and of a gradient."""
+    real, numbers = simulation.precision.bytes, simulation.numbers_in_frame(3)
+    trajectory = sum(frame_parts(steps + 1, numbers, real).values())
+    if not isinstance(simulation.solver, ParticleSolver):
+        return {"memory_bytes": None, "gradient_memory_bytes": None, "trajectory_bytes": trajectory}
+    rollout = Rollout(simulation.solver, 1)
+    forward, backward = estimated_bytes(simulation, rollout)
+    own = sum(step_parts(steps, real).values())
+    checkpoints = min(steps * sum(array.capacity for array in rollout.initial.arrays()), MEMORY_BUDGET)
+    return {
+        "memory_bytes": forward + own,
+        "gradient_memory_bytes": backward + own + checkpoints,
+        "trajectory_bytes": trajectory,
+    }
+
+
+def _drawn(simulation: Simulation, path: Path) -> Path:
+    """Where the fluid is at the start, in the colours of its phases."""
+    scene = simulation.scene
+    colours = colours_of(scene, simulation.mass_fractions, simulation.particles)
+    title = f"{scene.name}, the first state{', seen along the third axis' * (scene.dimension == 3)}"
+    return particles([simulation.positions], [title], path, colours=[colours], container=scene.container.extent())
+
+
+def _as_text(found: dict[str, Any]) -> str:
+    phases = ", ".join(f"{count} {name}" for name, count in found["particles_of_phase"].items())
+    waiting = f", {found['particles_in_emitter']} of them in the emitter" if found["particles_in_emitter"] else ""
+    limits = {name: limit for name, limit in found["time_step_limits_s"].items() if limit is not None}
+    least = min(limits.values(), default=math.inf)
+    by_name = ", ".join(f"{name} {limit:.3g}" for name, limit in sorted(limits.items(), key=lambda item: item[1]))
+    beyond = " (beyond it: the run may diverge)" if found["time_step_s"] > least * (1.0 + 1e-9) else ""
+    allowed = f"stable up to about {least:.3g} s{beyond}; limits: {by_name}" if limits else "nothing limits it"
+    rows = [
+        ("particles", f"{found['particles']} of fluid ({phases}{waiting}), {found['wall_particles']} of walls"),
+        ("spacing", f"{found['spacing_m']:g} m, in {found['dimension']}-D"),
+        ("size", _size(found)),
+        ("time step", f"{found['time_step_s']:g} s; {allowed}"),
+        (
+            "memory",
+            f"{_bytes(found['memory_bytes'])} for a run, {_bytes(found['gradient_memory_bytes'])} for a gradient, "
+            "beside Python and Warp themselves",
+        ),
+        ("time", _time(found)),
+        (
+            "trajectory",
+            f"{_bytes(found['trajectory_bytes'])} with a frame for every step; --record-every makes it less",
+        ),
+    ]
+    courses = [f"{name} changes until {last:g} s" for name, last in found["scheduled_until_s"].items()]
+    rows += [("schedule", f"{', '.join(courses)}, and is constant from then on")] if courses else []
+    rows += [("search", " ".join(found["search"]))] if "search" in found else []
+    rows += [("picture", found["picture"])] if "picture" in found else []
+    return "\n".join([found["name"], *(f"{label:<12}{text}" for label, text in rows)])
+
+
+def _size(found: dict[str, Any]) -> str:
+    """Lengths and masses, by which one sees a wrong unit."""
+    fluid, held = (
+        " x ".join(f"{length:.3g}" for length in found[key] or ()) for key in ("fluid_size_m", "container_size_m")
+    )
+    masses = ", ".join(f"{mass:.3g} kg of {name}" for name, mass in found["mass_of_phase_kg"].items())
+    layer = " in a layer of 1 m" if found["dimension"] == 2 else ""
+    container = f", in a container of {held} m" if held else ""
+    gravity = vector(found["gravity_m_s2"])
+    return f"fluid in {fluid} m{container}; {masses}{layer}; gravity {gravity} m/s2"
+
+
+def _time(found: dict[str, Any]) -> str:
+    if "diverged" in found:
+        return f"unknown. {found['diverged']}"
+    return (
+        f"{found['milliseconds_per_step']:.3g} ms a step on {found['device']} in {found['precision']}, without what is "
+        f"recorded (mean of the first {found['measured_steps']} steps; later ones may take more pressure iterations); "
+        f"{found['steps']} steps, {found['simulated_time_s']:g} s of motion: about {found['expected_seconds']:.2g} s"
+    )
+
+
+def _bytes(size: float | None) -> str:
+    if size is None:
+        return "unknown"
+    return f"about {size / 1e9:.2g} GB" if size >= 1e9 else f"about {max(size / 1e6, 0.1):.2g} MB"

@@ -1,0 +1,140 @@
+"""``cortado new``: a commented scene to begin with."""
+
+from pathlib import Path
+from string import Template
+
+from cortado.errors import InputError
+from cortado.files.atomic import is_taken, sentences, write_atomically
+from cortado.files.shipped import SCHEMA
+
+_SCENE = Template("""\
+#:schema ./scene.schema.json
+# A dam breaks: $particles particles in $dimension-D. Run it: cortado run $file
+# Lines that begin with # and no space are switched off: remove the # to try them. All units are SI.
+name = "$name"
+dimension = $dimension
+
+[discretisation]
+spacing = $spacing                      # m, between particles at rest: half of it is $more times as many
+support = 2.0                       # how far a particle sees, in spacings
+kernel = "cubic_spline"             # or "wendland_c2", "wendland_c4"
+
+# Materials: a table for each.
+[[phase]]
+name = "water"
+rest_density = 1000.0               # kg/m3
+viscosity = 0.05                    # Pa s; water has 0.001, which needs many more particles
+colour = [0.1, 0.3, 0.8]            # red, green, blue, from 0 to 1
+
+# A second fluid: switch on this table, the next [[fluid]], and [mixture] if the two shall mix.
+#[[phase]]
+#name = "oil"
+#rest_density = 800.0
+#viscosity = 0.2
+#colour = [0.9, 0.7, 0.1]
+
+# Bodies of fluid: a table for each, with the shape "box", $shapes or "points".
+[[fluid]]
+shape = "box"
+lower = $water_lower             # m
+upper = $water_upper
+velocity = $zero          # m/s
+phase = "water"
+
+#[[fluid]]
+#shape = "box"
+#lower = $oil_lower
+#upper = $oil_upper
+#phase = "oil"
+
+#[mixture]
+#free_energy = "miscible"           # or "double_well", whose phases separate
+#mobility = 1e-5                    # m2/s, how fast they diffuse into each other
+
+[container]
+shape = "box"                       # or $containers
+lower = $zero
+upper = $room
+slip = "free"                       # "no" for walls that hold the fluid back
+
+[forces]
+gravity = $gravity        # m/s2
+viscosity = "pairwise"              # or "laminar", "none"
+#surface_tension = 0.07             # N/m
+
+[solver]
+time_step = 0.002                   # s; `cortado describe` says what limits it
+minimum_iterations = 3              # of the pressure, in every step
+maximum_iterations = 50
+density_tolerance = 0.01            # the average compression at which they end
+
+# What changes over time: gravity, as in a box that is shaken, "tilt", or the "nozzle_path" of an [emitter].
+#[schedule.gravity]
+#times = [0.0, 0.1, 0.2, 0.3]       # s; linear in between
+#values = $shake
+
+# Pictures of the fluid itself, beside those of its particles.
+#[render]
+#view = "$view"
+#resolution = [192, 144]
+""")
+_DIMENSIONS = {
+    2: {
+        "particles": 288,
+        "spacing": "0.02",
+        "more": 4,
+        "shapes": '"sphere"',
+        "containers": '"none"',
+        "water_lower": "[0.0, 0.0]",
+        "water_upper": "[0.24, 0.48]",
+        "oil_lower": "[0.4, 0.0]",
+        "oil_upper": "[0.6, 0.2]",
+        "zero": "[0.0, 0.0]",
+        "room": "[0.8, 0.6]",
+        "gravity": "[0.0, -9.81]",
+        "shake": "[[0.0, -9.81], [6.0, -9.81], [-6.0, -9.81], [0.0, -9.81]]",
+        "view": "plane",
+    },
+    3: {
+        "particles": 864,
+        "spacing": "0.04",
+        "more": 8,
+        "shapes": '"sphere", "cylinder"',
+        "containers": '"cylinder", "none"',
+        "water_lower": "[0.0, 0.0, 0.0]",
+        "water_upper": "[0.24, 0.48, 0.48]",
+        "oil_lower": "[0.4, 0.0, 0.0]",
+        "oil_upper": "[0.6, 0.2, 0.48]",
+        "zero": "[0.0, 0.0, 0.0]",
+        "room": "[0.8, 0.6, 0.48]",
+        "gravity": "[0.0, -9.81, 0.0]",
+        "shake": "[[0.0, -9.81, 0.0], [6.0, -9.81, 0.0], [-6.0, -9.81, 0.0], [0.0, -9.81, 0.0]]",
+        "view": "top",
+    },
+}
+"""What differs between 2-D and 3-D."""
+
+
+def new_scene(path: Path, dimension: int) -> str:
+    """Write a scene, and beside it the schema that editors complete and check it with; nothing that is there is
+    replaced."""
+    if dimension not in _DIMENSIONS:
+        raise InputError(f"--dimension is {dimension}, but must be 2 or 3.")
+    if path.name in ("", ".."):
+        raise InputError("NAME must be the name of a file, such as dam.toml.")
+    file = path if path.suffix == ".toml" else path.with_name(f"{path.name}.toml")
+    if is_taken(file):
+        raise InputError(f"{file} is already there; choose another NAME, or remove it.")
+    schema = file.with_name(SCHEMA.name)
+    with sentences(file.parent):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(file, scene_text(file, dimension))
+    if not is_taken(schema):
+        write_atomically(schema, SCHEMA.read_bytes())
+    return f"The scene is {file}; {schema} tells editors what may stand in it. Run it: cortado run {file}"
+
+
+def scene_text(file: Path, dimension: int) -> str:
+    """The scene that is written to a file."""
+    named = "".join(letter if letter.isprintable() and letter not in '"\\' else "_" for letter in file.name)
+    return _SCENE.substitute(_DIMENSIONS[dimension], dimension=dimension, file=named, name=named.removesuffix(".toml"))

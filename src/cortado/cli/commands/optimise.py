@@ -1,0 +1,223 @@
+"""``cortado optimise``: solve the inverse problem of a task, resume the search, and judge the result."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cortado.cli.commands.executor import HERE, Where
+from cortado.cli.commands.found import found_lines, found_rows, worst_in_words
+from cortado.cli.commands.optimise_report import asked, for_machines, sections
+from cortado.cli.commands.verdict import Verdict, found_in_words, judge
+from cortado.errors import ComputationError, DivergedError, InputError
+from cortado.executors import Executor
+from cortado.files.folder_lock import locked
+from cortado.files.interruption import keeping
+from cortado.files.progress import announce, track
+from cortado.files.terminal import say
+from cortado.losses.image_losses import psnr
+from cortado.optimisation.inverse.chapters import Chapters
+from cortado.optimisation.inverse.figures import task_figures
+from cortado.optimisation.inverse.knots import knot_values
+from cortado.optimisation.inverse.setup import Setup, setup
+from cortado.optimisation.inverse.shaded import shaded_figures
+from cortado.optimisation.inverse.task import Task, load_task
+from cortado.optimisation.optimise import Record, Result, optimise
+from cortado.pictures.film import lacking
+from cortado.runs.report import Section, write_report
+from cortado.runs.run_folder import TO_RESUME, RunFolder
+
+LITTLE = 2.0
+"""How many times smaller a loss must be for a search to have come to something."""
+LONG = 100
+"""Steps from which on a search that came to nothing may have had meaningless gradients."""
+
+
+def optimise_task(
+    task_file: Path,
+    out: Path,
+    overrides: list[str],
+    device: str,
+    precision: str,
+    resume: bool,
+    overwrite: bool,
+    command: list[str],
+    where: Where = HERE,
+    pictures: bool = False,
+) -> str:
+    """Optimise, write the run folder, shaded ``pictures`` too if wished, and return a sentence that says where the
+    results are. The samples of an ensemble are computed ``where`` is asked for."""
+    task = load_task(task_file, overrides)
+    if where.option and task.optimise.gradient.samples == 1:
+        raise InputError(f"{where.option} is given, but must be left out, as optimise.gradient.samples is 1.")
+    made = setup(task, device, precision)
+    if resume:
+        RunFolder.open(out, TO_RESUME)
+    with where.executor(device, task.optimise.gradient.samples) as executor, locked(out):
+        folder = _run_folder(made, out, resume, overwrite, command)
+        with keeping(lambda: f"{_kept(folder)}; --resume goes on with them" if _kept(folder) else ""):
+            return _solved(made, folder, resume, executor, pictures)
+
+
+def _run_folder(made: Setup, out: Path, resume: bool, overwrite: bool, command: list[str]) -> RunFolder:
+    """A new one, or the one that is there; a search goes on with other iterations and another check if so wished."""
+    task, simulation = made.task, made.problem.simulation
+    settings = search_settings(task, simulation.precision.name)
+    noted: dict[str, Any] = {"kind": "optimise", "settings": settings, "device": str(simulation.device)}
+    if resume:
+        return RunFolder.resume(out, task.scene.to_json(), command, **noted)
+    return RunFolder.create(out, task.scene.to_json(), command, overwrite=overwrite, **noted)
+
+
+def search_settings(task: Task, precision: str) -> dict[str, Any]:
+    """What must be the same, beside the scene, where a search goes on."""
+    return {
+        "precision": precision,
+        "problem": task.problem.model_dump(),
+        "optimise": task.optimise.model_dump(exclude={"iterations", "check"}),
+    }
+
+
+def _kept(folder: RunFolder) -> str:
+    """Where the evaluations are; empty where there are none."""
+    return f"the evaluations so far are in {folder.checkpoint}" if folder.read_metrics() else ""
+
+
+def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pictures: bool) -> str:
+    """Search, judge, and write what came out; returns the sentence about it."""
+    try:
+        result = _search(made, folder, resume, executor)
+    except DivergedError as error:
+        evaluations = len(folder.read_metrics())
+        ended = Section("What came out", [f"The search ended early, in evaluation {evaluations}."], [error])
+        write_report(folder, made.task.scene.name, [asked(made), ended])
+        told = error.with_advice("; ".join(filter(None, [error.advice, _kept(folder)])))
+        folder.write_result(evaluations=evaluations, failures=[str(told)])
+        raise told from error
+    estimate = made.search.parameters(result.parameters)
+    noise = None
+    if made.renderer is not None:
+        last, target = max(made.targets.items())
+        noise = psnr(made.image(made.problem.states(estimate, [last])[last]), target)
+    first = made.search.value(made.start) if len(made.searches) > 1 else result.history[0].loss
+    verdict = judge(made.task, result, estimate, noise, first)
+    knots = knot_values(made, result.parameters, estimate)
+    summary, advice = _summary(made, estimate, result, verdict), _advice(made, result, verdict)
+    said = [summary, *advice]
+    announce("\n".join([summary, *found_lines(made, estimate, knots), *advice]))
+    with keeping(lambda: f"the search has ended, and is in {folder.checkpoint}; --resume draws its pictures"):
+        shaded = _shaded(made, result, folder.figures, pictures)
+        figures = shaded + task_figures(made, result, folder.figures)
+        rows = found_rows(made, estimate, knots, verdict.errors)
+        write_report(folder, made.task.scene.name, sections(made, estimate, result, verdict, said, figures, rows))
+        folder.write_result(**for_machines(result, estimate, verdict, knots))
+    if verdict.failures:
+        raise ComputationError(f"{' '.join(verdict.failures)} The results are in {folder.path}.")
+    films = [f"figures/{Path(path).name}" for _, path in shaded.found if Path(path).suffix == ".mp4"]
+    to_open = ", or ".join([*films[:1], "report.html"])
+    return f"The results are in {folder.path}; open {to_open}."
+
+
+def _shaded(made: Setup, result: Result, folder: Path, wished: bool) -> Chapters:
+    """Shaded pictures and films, where they are wished; none, and a sentence, where a package is missing."""
+    missing = lacking(made.task.scene) if wished else None
+    if missing:
+        say(missing)
+    return shaded_figures(made, result, folder) if wished and not missing else Chapters()
+
+
+def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> Result:
+    settings = made.task.optimise
+    known = len(folder.read_metrics()) if resume else 0
+    history: list[Record] = []
+    start, shown, updates, refused = made.start, 0, 0, 0
+    with track(len(made.searches) * settings.iterations, "optimise") as advance:
+
+        def show(made: int, **fields: Any) -> None:
+            """The progress after so many updates of this search; a search before it may have ended early."""
+            nonlocal shown
+            advance(k * settings.iterations + made - shown, **fields)
+            shown = k * settings.iterations + made
+
+        def keep(record: Record) -> None:
+            made_updates = record.updates
+            record = replace(
+                record,
+                iteration=len(history),
+                updates=updates + record.updates,
+                refused=refused + record.refused,
+            )
+            if record.iteration + 1 == known:
+                announce(_resumed(record, len(made.searches) * settings.iterations))
+            if record.iteration >= known:
+                folder.append_metrics(
+                    iteration=record.iteration,
+                    loss=record.loss,
+                    gradient_norm=record.gradient_norm,
+                    refused=record.refused,
+                )
+            history.append(record)
+            show(made_updates, loss=record.loss, evaluations=len(history))
+
+        for k, search in enumerate(made.searches):
+            result = optimise(
+                search,
+                start,
+                settings.algorithm(),
+                settings.iterations,
+                bounds=made.bounds,
+                gradient=settings.gradient.estimator(executor),
+                checkpoint=folder.checkpoint / str(k) if k else folder.checkpoint,
+                resume=resume,
+                on_iteration=keep,
+            )
+            if result.updates > result.history[-1].updates:
+                show(result.updates)
+            start, updates, refused = result.last_parameters, updates + result.updates, refused + result.refused
+    return replace(result, history=tuple(history), updates=updates, evaluations=len(history), refused=refused)
+
+
+def _resumed(last: Record, iterations: int) -> str:
+    """Where a search goes on, given the last evaluation that is known."""
+    return f"The search goes on from iteration {last.updates} of {iterations}, after {last.iteration + 1} evaluations."
+
+
+def _advice(made: Setup, result: Result, verdict: Verdict) -> list[str]:
+    """What to try where a search came to next to nothing, and which of its bounds it ended on."""
+    met = [name for name, pair in made.bounds.items() if _on_bound(result.parameters[name], *pair)]
+    found = [f"The search of {name} ended on its bounds: what is best may lie beyond them." for name in met]
+    task, steps = made.task, made.task.problem.steps
+    if verdict.reduction >= LITTLE:
+        return found
+    if steps < LONG or task.optimise.gradient.name != "exact":
+        other = "small" if result.refused else "large, or as small"
+        return [*found, f"The loss hardly fell: try an optimise.learning_rate that is 10 times as {other}."]
+    return [
+        *found,
+        f"The loss hardly fell. Over {steps} steps the exact gradient may mean nothing: cortado gradients check says "
+        'up to which step it is of use. Beyond it set optimise.gradient.name = "adjoint_viscosity" and '
+        'optimise.optimiser = "line_search".',
+    ]
+
+
+def _on_bound(value: Any, lower: Any, upper: Any) -> bool:
+    """Whether a number of a parameter's coordinates is as small or as large as it may be."""
+    least, most = np.asarray(-np.inf if lower is None else lower), np.asarray(np.inf if upper is None else upper)
+    return bool(((value <= least) | (value >= most)).any())
+
+
+def _summary(made: Setup, estimate: Mapping[str, np.ndarray], result: Result, verdict: Verdict) -> str:
+    reached = [
+        f"{name} is {found_in_words(error)}{worst_in_words(made, name, estimate[name], error)}"
+        for name, error in verdict.errors.items()
+    ]
+    if verdict.psnr is not None:
+        reached.append(f"the image is matched to {verdict.psnr:.3g} dB")
+    fell = f"fell {verdict.reduction:.3g} times" if result.loss > 0.0 else f"went from {verdict.first:.3g} to 0"
+    unit = "" if made.renderer else " m²"
+    refused = f" and {result.refused} more that diverged and were refused" if result.refused else ""
+    ends = f", from {verdict.first:.3g}{unit} to {result.loss:.3g}{unit}" if result.loss > 0.0 else unit
+    text = f"The loss {fell}{ends} in {len(result.history)} evaluations{refused}"
+    return f"{'; '.join([text, *reached])}."

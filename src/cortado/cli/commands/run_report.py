@@ -1,0 +1,128 @@
+"""The report of ``cortado run``, at first without shaded pictures, which take long, then with them."""
+
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from cortado.files.interruption import keeping
+from cortado.files.terminal import say
+from cortado.files.video import MOST_FRAMES, write_video
+from cortado.pictures.figures import images, particles
+from cortado.pictures.film import lacking
+from cortado.rollout.outcome import not_converged_sentence
+from cortado.rollout.rollout import Rollout
+from cortado.runs.measuring import coloured_by
+from cortado.runs.report import Figures, Section, write_report
+from cortado.runs.run_figures import density_errors, readings
+from cortado.runs.run_folder import RunFolder
+from cortado.runs.run_pictures import run_pictures, trajectory_view
+from cortado.runs.sensors.log import Readings
+from cortado.runs.trajectory import Trajectory
+from cortado.scene.in_words import scene_in_words
+from cortado.scene.scene import Scene
+from cortado.simulation import Simulation
+
+
+def write_run_report(
+    simulation: Simulation,
+    rollout: Rollout,
+    folder: RunFolder,
+    told: Section,
+    pictures: bool,
+    read: Mapping[str, Readings] | None = None,
+) -> None:
+    """Write the report, and shaded ``pictures`` too if wished; ``told``: what came out; ``read``: by sensors."""
+    scene, trajectory = simulation.scene, Trajectory.load(folder.trajectory)
+    asked = Section("What was asked", _asked(simulation, rollout))
+    view = Section("To turn and to play", view=trajectory_view(scene, trajectory))
+    figures, solver = _figures(simulation, trajectory, folder.figures), _solver(rollout, trajectory, scene, folder)
+
+    sensors = [_sensors(read, folder)] if read else []
+
+    def write(shaded: Figures) -> None:
+        films = [(caption, path) for caption, path in shaded if Path(path).suffix == ".mp4"]
+        stills = [pair for pair in shaded if pair not in films]
+        looks = Section("What it looks like", figures=films)
+        chapters = [asked, looks, view, told, *sensors, Section("Pictures", figures=[*stills, *figures]), solver]
+        write_report(folder, scene.name, chapters)
+
+    write([])
+    missing = lacking(scene) if pictures else None
+    if missing:
+        say(missing)
+    elif pictures:
+        with keeping(
+            lambda: f"the run has ended, and is in {folder.path}; cortado picture {folder.path} --film draws it"
+        ):
+            values = coloured_by(scene, trajectory, lambda: simulation)
+            write(run_pictures(scene, trajectory, folder.figures, simulation.device, values))
+
+
+def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Figures:
+    """Plain ones, of the first, the middle and the last frame."""
+    scene = simulation.scene
+    shown = sorted({0, len(trajectory.times) // 2, len(trajectory.times) - 1})
+    titles = [f"t = {trajectory.times[frame]:.3f} s" for frame in shown]
+    path = particles(
+        [trajectory.positions[frame] for frame in shown],
+        titles,
+        folder / "particles.png",
+        colours=[np.linalg.norm(trajectory.velocities[frame], axis=1) for frame in shown],
+        colour_label="speed [m/s]",
+        container=scene.container.extent(),
+    )
+    along = ", seen along the third axis" * (scene.dimension == 3)
+    figures: Figures = [(f"The fluid at the start, half-way and at the end{along}.", path)]
+    return figures if scene.render is None else figures + _rendered(simulation, trajectory, shown, folder)
+
+
+def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], folder: Path) -> Figures:
+    """Pictures of a scene that says how it is rendered, and a video where it can be written."""
+    renderer = simulation.renderer()
+
+    def image(frame: int) -> np.ndarray:
+        return renderer.render(trajectory[frame])
+
+    titles = [f"t = {trajectory.times[frame]:.3f} s" for frame in shown]
+    path = images(map(image, shown), titles, folder / "rendered.png")
+    figures: Figures = [("The same, rendered.", path)]
+    if len(trajectory.times) > 1 and find_spec("av"):
+        frames = range(0, len(trajectory.times), -(-len(trajectory.times) // MOST_FRAMES))
+        figures.append(("The same, in motion.", write_video(folder / "run.mp4", map(image, frames), 20)))
+    return figures
+
+
+def _sensors(read: Mapping[str, Readings], folder: RunFolder) -> Section:
+    """What sensors have read."""
+    path = readings(read, folder.figures / "sensors.png")
+    told = f"The sensors of the scene, read in every step; the numbers are in {folder.sensors.name}."
+    return Section("Sensors", [told], figures=[("What the sensors read.", path)])
+
+
+def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:
+    """The run in words."""
+    scene, step = simulation.scene, float(rollout.time_steps[0])
+    length = f"{rollout.steps} steps of {step:g} s, {rollout.steps * step:.4g} s of fluid"
+    wall = f" Walls are made of {len(simulation.walls)} particles." if len(simulation.walls) else ""
+    substeps = f" Each step has {rollout.substeps} substeps of diffusion." if rollout.substeps else ""
+    where = f"{simulation.precision.name} on {simulation.device}"
+    question = f"How does the fluid move? The scene: {scene_in_words(scene, simulation.particles)}"
+    return [question, f"{length}, in {where}.{wall}{substeps}"]
+
+
+def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunFolder) -> Section:
+    """Whether steps converged, and their errors of density."""
+    figures: Figures = []
+    if len(trajectory.converged) and "density_errors" in trajectory.diagnostics and scene.forces.pressure:
+        path = folder.figures / "density_errors.png"
+        density_errors(trajectory, path, tolerance=getattr(scene.solver, "density_tolerance", None))
+        figures.append(("Average density error of each step, and the tolerance asked.", path))
+    converged = rollout.diagnostics["converged"]
+    if not len(converged):
+        return Section("The solver", figures=figures)
+    every = "The pressure converged in every step."
+    return Section(
+        "The solver", [every if converged.all() else not_converged_sentence(converged, scene)], figures=figures
+    )

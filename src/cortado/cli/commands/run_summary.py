@@ -1,0 +1,135 @@
+"""What the last lines of ``cortado run`` say: the time a step takes, energies, and densities."""
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from cortado.discretise.region import TOLERANCE
+from cortado.particles.state import State
+from cortado.rollout.rollout import Rollout
+from cortado.simulation import Simulation
+from cortado.solvers.particles import ParticleSolver
+
+
+@dataclass(frozen=True)
+class Energy:
+    """Of all particles [J], in 2-D of a layer one metre thick."""
+
+    kinetic: float
+    potential: float
+    """In the gravity that acts then, from the lowest place of the container, or of the origin if there is none."""
+
+    @property
+    def total(self) -> float:
+        """[J]"""
+        return self.kinetic + self.potential
+
+    @classmethod
+    def of(cls, simulation: Simulation, rollout: Rollout, state: State, step: int) -> "Energy":
+        """Of a state, in the gravity of a step, counted from 0."""
+        fields = state.numpy(simulation.dimension, only=["positions", "velocities", "reference_density"])
+        masses = simulation.lattice.volume * fields["reference_density"].astype(np.float64)
+        positions, velocities = (fields[name].astype(np.float64) for name in ("positions", "velocities"))
+        gravity = rollout.parameters["gravity"].numpy()[0, step, : simulation.dimension].astype(np.float64)
+        ends = simulation.scene.container.extent()
+        corners = np.zeros((1, simulation.dimension)) if ends is None else list(product(*zip(*ends, strict=True)))
+        lowest = float((np.asarray(corners) @ gravity).max())
+        return cls(
+            kinetic=0.5 * float(masses @ (velocities**2).sum(axis=1)),
+            potential=float(masses @ (lowest - positions @ gravity)),
+        )
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """Of a run that has gone through all of its steps."""
+
+    steps: int
+    time_step: float
+    """[s]"""
+    seconds: float
+    """That the steps took, with what was recorded of them."""
+    first: Energy
+    last: Energy
+    turned: bool
+    """Whether gravity changed during the run, and potential energies are those of other gravities."""
+    densities: tuple[float, float] | None
+    """The least and the greatest at the end [kg/m3]; None of a solver without particles."""
+    spilt: int
+    """Particles beside or below an open cup at the end."""
+    particles: int
+    """That did not begin in an emitter."""
+
+    @classmethod
+    def of(cls, simulation: Simulation, rollout: Rollout, last: State, seconds: float) -> "RunSummary":
+        """``last``: the state at the end."""
+        solver, found = rollout.solver, None
+        if isinstance(solver, ParticleSolver):
+            densities = solver.densities(last, rollout.parameters)
+            found = float(densities.min()), float(densities.max())
+        return cls(
+            steps=rollout.steps,
+            time_step=float(rollout.time_steps[0]),
+            seconds=seconds,
+            first=Energy.of(simulation, rollout, rollout.initial, 0),
+            last=Energy.of(simulation, rollout, last, rollout.steps - 1),
+            turned=bool(np.ptp(rollout.parameters["gravity"].numpy()[0], axis=0).any()),
+            densities=found,
+            spilt=_spilt(simulation, last),
+            particles=simulation.free_particles,
+        )
+
+    @property
+    def milliseconds(self) -> float:
+        """That a step took."""
+        return 1e3 * self.seconds / self.steps
+
+    def for_machines(self) -> dict[str, Any]:
+        """What is the same in every run, by names."""
+        energies = {"first": vars(self.first), "last": vars(self.last)}
+        least, greatest = self.densities or (None, None)
+        return {"energy": energies, "density": {"least": least, "greatest": greatest}, "spilt": self.spilt}
+
+    def rows(self) -> list[tuple[object, ...]]:
+        """(what, value, unit) of each row of a table."""
+        energies = [
+            (f"{kind} energy, {when}", f"{getattr(energy, kind):.4g}", "J")
+            for when, energy in (("at the start", self.first), ("at the end", self.last))
+            for kind in ("kinetic", "potential", "total")
+        ]
+        densities = zip(("least", "greatest"), self.densities or (), strict=False)
+        return [
+            ("steps", self.steps, ""),
+            ("simulated time", f"{self.steps * self.time_step:.4g}", "s"),
+            ("time that a step took", f"{self.milliseconds:.3g}", "ms"),
+            ("time that all steps took", f"{self.seconds:.3g}", "s"),
+            *energies,
+            *([("particles that left the cup over its rim", self.spilt, "")] if self.spilt else []),
+            *((f"{which} density at the end", f"{density:.4g}", "kg/m³") for which, density in densities),
+        ]
+
+    def __str__(self) -> str:
+        last = self.last
+        text = (
+            f"{self.steps} steps of {self.time_step:g} s in {self.seconds:.3g} s, {self.milliseconds:.3g} ms a step; "
+            f"energy {last.total:.4g} J (kinetic {last.kinetic:.3g}, potential {last.potential:.3g}), at the start "
+            f"{self.first.total:.4g} J"
+        )
+        if self.turned:
+            text += " in the gravity of that time"
+        if self.densities is not None:
+            text += f"; density {self.densities[0]:.4g} to {self.densities[1]:.4g} kg/m3"
+        if self.spilt:
+            text += f". Over the rim of the cup went {self.spilt} of {self.particles} particles"
+        return f"{text}."
+
+
+def _spilt(simulation: Simulation, state: State) -> int:
+    """How many particles that did not begin in an emitter are outside of a cup without a lid."""
+    scene, container = simulation.scene, simulation.scene.container
+    if not np.isfinite(container.region(simulation.dimension).rim):
+        return 0
+    positions = state.numpy(simulation.dimension, only=["positions"])["positions"][: simulation.free_particles]
+    return int((~container.contains(positions, TOLERANCE * scene.discretisation.spacing)).sum())

@@ -1,0 +1,215 @@
+"""``cortado sweep``: a scene or a task with every combination of some values, on any number of processes."""
+
+import warnings
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+from typing import Any
+
+from cortado.arrays import check_steps
+from cortado.cli.commands.executor import HERE, Where
+from cortado.cli.commands.optimise import optimise_task, search_settings
+from cortado.cli.commands.run import run_scene, run_settings
+from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
+from cortado.files.folder_lock import LOCK, locked
+from cortado.files.interruption import Interrupted, keeping
+from cortado.files.progress import track, untracked
+from cortado.optimisation.inverse.task import load_task
+from cortado.optimisation.sweep.combinations import Combination, combinations
+from cortado.optimisation.sweep.table import NAME, failed, write_table
+from cortado.runs.run_folder import RunFolder
+from cortado.scene.scene import load_scene
+from cortado.scene.toml import read_toml
+from cortado.words import counted
+
+STEPS = 200
+"""Of a scene, where nothing else is asked for."""
+SAME_TIME = 1e-9
+"""Relative: times that differ by less are the same."""
+
+
+@dataclass(frozen=True)
+class Member:
+    """How each combination of a sweep is computed: what a worker process is sent."""
+
+    file: Path
+    """The scene or the task."""
+    duration: float | None
+    """Of a scene [s]; None for a task, which says itself."""
+    out: Path
+    """The folder of the sweep."""
+    device: str
+    precision: str
+
+    def __call__(self, combination: Combination) -> dict[str, Any]:
+        """What came out, as in result.json; of a folder that is finished, what is there. Warnings name the folder."""
+        if not (self.out / LOCK).exists():
+            raise InputError(
+                f"A worker does not see {self.out}, but the task and the folder of a sweep must be in a file system "
+                "that all machines share."
+            )
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            found = self.finished(combination) or self._computed(combination)
+        for warning in caught:
+            if issubclass(warning.category, CortadoWarning):
+                warnings.warn(f"{combination.name}: {warning.message}", CortadoWarning, stacklevel=2)
+        return found
+
+    def finished(self, combination: Combination) -> dict[str, Any] | None:
+        """What came out of a combination; None where it has not ended. Raises `InputError` where its scene or task is
+        wrong, or another one than that in its folder."""
+        overrides = combination.overrides
+        if self.duration is None:
+            task = load_task(self.file, overrides)
+            scene, kind, settings = task.scene, "optimise", search_settings(task, self.precision)
+        else:
+            scene, kind, steps = load_scene(self.file, overrides), "run", self.steps(combination)
+            settings = run_settings(steps, self.precision, _record_every(steps))
+        folder = self._folder(combination)
+        if folder is None:
+            return None
+        folder.require(scene.to_json(), kind, settings)
+        return folder.read_result()
+
+    def _folder(self, combination: Combination) -> RunFolder | None:
+        """The folder of a combination; None where there is no run in it."""
+        path = self.out / combination.name
+        return RunFolder.open(path) if (path / "environment.json").exists() else None
+
+    def time_step(self, combination: Combination) -> float:
+        """Of the scene [s]."""
+        return _time_step(self.file, combination)
+
+    def steps(self, combination: Combination) -> int:
+        """How many of them come nearest to the duration; at least one."""
+        assert self.duration is not None
+        return check_steps(max(round(self.duration / self.time_step(combination)), 1))
+
+    def _computed(self, combination: Combination) -> dict[str, Any]:
+        """Compute a combination, or go on with it; what fails is said in the result."""
+        out, overrides = self.out / combination.name, combination.overrides
+        begun = self._folder(combination) is not None
+        words = [str(self.file), *(word for one in overrides for word in ("--set", one)), "--out", str(out)]
+        words += ["--device", self.device, "--precision", self.precision]
+        try:
+            with untracked():
+                if self.duration is None:
+                    command = ["cortado", "optimise", *words]
+                    optimise_task(self.file, out, overrides, self.device, self.precision, begun, False, command)
+                else:
+                    steps = self.steps(combination)
+                    every = _record_every(steps)
+                    command = ["cortado", "run", *words, "--steps", str(steps), "--record-every", str(every)]
+                    run_scene(self.file, steps, out, overrides, self.device, self.precision, every, begun, command)
+        except Interrupted as stop:  # what is kept of one combination says less than the sweep does
+            raise Interrupted(stop.args[0]) from None
+        except CortadoError as error:
+            folder = self._folder(combination)
+            return (folder and folder.read_result()) or {"failures": [str(error)]}
+        folder = self._folder(combination)
+        assert folder is not None
+        return folder.read_result() or {"failures": ["It left no result."]}
+
+
+def run_sweep(
+    file: Path,
+    options: list[str],
+    steps: int | None,
+    time: float | None,
+    out: Path,
+    device: str,
+    precision: str,
+    where: Where,
+) -> str:
+    """Compute what is not there yet; returns a sentence that says where the table is. Raises `ComputationError` where
+    some combinations failed."""
+    chosen = combinations(options)
+    member = Member(file.absolute(), _duration(file, chosen, steps, time), out.absolute(), device, precision)
+    done = _there(member, chosen)
+    left = [number for number in range(len(chosen)) if number not in done]
+    there = len(done)
+
+    def kept() -> str:
+        return f"{len(done)} of {len(chosen)} are finished, in {out.absolute()}; the same command goes on with the rest"
+
+    def note(number: int, result: dict[str, Any]) -> None:
+        done[left[number]] = result
+        write_table(out, chosen, done)
+        advance(failed=sum(map(failed, done.values())))
+
+    with (
+        (where if left else HERE).executor(device, len(left)) as executor,
+        locked(out),
+        keeping(kept),
+        track(len(left), "sweep") as advance,
+    ):
+        write_table(out, chosen, done)
+        executor.map(member, [chosen[number] for number in left], note)
+    failures = sum(map(failed, done.values()))
+    _warn_of_times(member, [chosen[number] for number in done if not failed(done[number])])
+    all_of_them = f"Of {counted(len(chosen), 'combination')}{f', {there} of them there already,' if there else ''}"
+    table = f"table is {out.absolute() / NAME}, beside a folder for each."
+    if failures:
+        first = next(number for number in sorted(done) if failed(done[number]))
+        why = " ".join(done[first]["failures"])
+        raise ComputationError(
+            f"{all_of_them} {failures} failed, the first of them {chosen[first].name}: {why} The {table}"
+        )
+    return f"{all_of_them} none failed; the {table}"
+
+
+def _there(member: Member, chosen: list[Combination]) -> dict[int, dict[str, Any]]:
+    """What came out of the combinations that have ended, by their numbers. All of them are looked at, so that a mistake
+    is found before anything is computed; what there is to warn of is said when they are."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CortadoWarning)
+        found = {number: member.finished(one) for number, one in enumerate(chosen)}
+    return {number: result for number, result in found.items() if result is not None}
+
+
+def _duration(file: Path, chosen: list[Combination], steps: int | None, time: float | None) -> float | None:
+    """How long a scene is simulated [s]: so many steps of the smallest time step are, or the time itself. None for a
+    task, which is a file with the table [optimise]."""
+    if "optimise" in read_toml(file):
+        for name, value in (("steps", steps), ("time", time)):
+            if value is not None:
+                raise InputError(f"--{name} is given, but must be left out, as the task says problem.steps.")
+        return None
+    if time is not None and steps is not None:
+        raise InputError("--time is given, but must be left out, as --steps says how long the scene is simulated.")
+    if time is not None:
+        if not 0.0 < time < inf:
+            raise InputError(f"--time is {time:g}, but must be a number of seconds greater than 0.")
+        return time
+    number = check_steps(STEPS if steps is None else steps)
+    return number * min(_time_step(file, one) for one in chosen)
+
+
+def _time_step(file: Path, combination: Combination) -> float:
+    """Of a scene [s]; what there is to warn of is said when it is run."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CortadoWarning)
+        return load_scene(file, combination.overrides).solver.time_step
+
+
+def _record_every(steps: int) -> int:
+    """About a hundred frames."""
+    return max(steps // 100, 1)
+
+
+def _warn_of_times(member: Member, done: list[Combination]) -> None:
+    """Say where runs end at different times, as no whole number of their time steps is the duration."""
+    duration = member.duration
+    if duration is None or not done:
+        return
+    ends = [member.steps(one) * member.time_step(one) for one in done]
+    off = max(ends, key=lambda end: abs(end - duration))
+    if abs(off - duration) > SAME_TIME * duration:
+        last = done[ends.index(off)].name
+        warnings.warn(
+            f"not all combinations end at {duration:g} s, which is no whole number of their time steps: {last} "
+            f"ends at {off:g} s. Choose a --time that is a multiple of every time step.",
+            CortadoWarning,
+            stacklevel=2,
+        )

@@ -1,0 +1,299 @@
+"""Every command but those of ``cortado gradients``: their arguments and their help."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, UseAppendAction, arg
+from tyro.extras import SubcommandApp
+
+from cortado.cli.arguments import Flag, Overrides, Scene, as_text, command_line, require_at_least
+from cortado.cli.command import Work, command
+from cortado.cli.gradient_commands import gradients
+from cortado.cli.parsing import completion_script
+from cortado.errors import InputError
+
+app = SubcommandApp()
+app.command(gradients, name="gradients", help="Check the gradients of a scene; the gradient study.")
+
+
+@command(app)
+def new(
+    name: Annotated[Positional[Path], arg(metavar="NAME")],
+    dimension: int = 2,
+) -> Work:
+    """Write a commented scene that runs at once, and the schema with which editors check it.
+
+    Args:
+        name: The file, dam.toml or only dam.
+        dimension: 2 or 3.
+    """
+    from cortado.cli.commands.new import new_scene
+
+    return partial(new_scene, name, dimension)
+
+
+@command(app, answers=True)
+def examples(
+    copy: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (),
+    to: Path = Path(),
+) -> Work:
+    """List the examples that come with Cortado, or copy some of them.
+
+    Args:
+        copy: One to copy, or all of them with the name "all"; may be given again.
+        to: The folder to copy to; made if it is missing.
+    """
+    from cortado.cli.commands.examples import list_examples
+
+    return partial(list_examples, as_text(copy), to)
+
+
+@command(app, answers=True)
+def describe(
+    scene: Scene,
+    steps: int = 200,
+    picture: Path | None = None,
+    overrides: Overrides = (),
+    device: str = "cpu",
+    precision: str = "float32",
+    json: Flag = False,
+) -> Work:
+    """Describe a scene before it is run: its particles, what limits its time step, its memory, its time.
+
+    Args:
+        scene: The scene file, or a task file.
+        steps: Number of time steps that it shall run.
+        picture: Draw its first state into this PNG file.
+        overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
+        device: "cpu", or "cuda:0" for the first GPU.
+        precision: "float32" or "float64".
+        json: Print JSON for machines.
+    """
+    from cortado.cli.commands.describe import describe_scene
+
+    return partial(describe_scene, scene, steps, as_text(overrides), device, precision, picture, json)
+
+
+@command(app)
+def run(
+    scene: Scene,
+    steps: int = 200,
+    out: Path = Path("runs/run"),
+    overrides: Overrides = (),
+    device: str = "cpu",
+    precision: str = "float32",
+    record_every: int = 1,
+    overwrite: Flag = False,
+    pictures: Flag = True,
+    record: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (),
+) -> Work:
+    """Run a scene forward and write its trajectory.
+
+    Args:
+        scene: The scene file.
+        steps: Number of time steps.
+        out: Folder of the run.
+        overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
+        device: "cpu", or "cuda:0" for the first GPU.
+        precision: "float32" or "float64".
+        record_every: Steps from one frame of the trajectory to the next.
+        overwrite: Replace an earlier run in the same folder.
+        pictures: Leave out the shaded pictures and the film.
+        record: A quantity of the particles for the trajectory, such as pressure or vorticity; may be given again.
+    """
+    require_at_least(1, record_every, "--record-every")
+    from cortado.cli.commands.run import run_scene
+
+    words, told = as_text(overrides), command_line()
+    wanted = as_text(record)
+    return partial(
+        run_scene, scene, steps, out, words, device, precision, record_every, overwrite, told, pictures, wanted
+    )
+
+
+@command(app, answers=True)
+def compare(
+    first: Annotated[Positional[Path], arg(metavar="RUN")],
+    second: Annotated[Positional[Path], arg(metavar="RUN")],
+    json: Flag = False,
+) -> Work:
+    """Compare two runs: their scenes and settings, their last states, their metrics, and where they were made.
+
+    Args:
+        first: The folder of a run.
+        second: The folder of another.
+        json: Print JSON for machines.
+    """
+    from cortado.cli.commands.compare import compare_runs
+
+    return partial(compare_runs, first, second, json)
+
+
+@command(app)
+def optimise(
+    task: Annotated[Positional[Path], arg(metavar="TASK.toml")],
+    out: Path = Path("runs/optimise"),
+    overrides: Overrides = (),
+    device: str = "cpu",
+    precision: str = "float32",
+    resume: Flag = False,
+    overwrite: Flag = False,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    pictures: Flag = True,
+) -> Work:
+    """Optimise what a task file names, and check the result as the file asks.
+
+    Args:
+        task: A scene file with the tables [problem] and [optimise].
+        out: Folder of the run.
+        overrides: Replace a value of the file, such as optimise.iterations=50; may be given again.
+        device: "cpu", or "cuda:0" for the first GPU.
+        precision: "float32" or "float64".
+        resume: Go on with the run in the folder, bit for bit.
+        overwrite: Replace an earlier run in the same folder.
+        scheduler: Address of a scheduler of Dask's, whose workers compute the samples of an ensemble.
+        workers: Number of worker processes on this machine that do; on a GPU each has one of its own.
+        pictures: Leave out the shaded pictures and the films.
+    """
+    if resume and overwrite:
+        raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
+    from cortado.cli.commands.executor import Where
+    from cortado.cli.commands.optimise import optimise_task
+
+    where, words, told = Where(scheduler, workers), as_text(overrides), command_line()
+    return partial(optimise_task, task, out, words, device, precision, resume, overwrite, told, where, pictures)
+
+
+@command(app)
+def picture(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    frame: int = -1,
+    film: Flag = False,
+    out: Path | None = None,
+    overrides: Overrides = (),
+    device: str = "cpu",
+) -> Work:
+    """Draw a shaded picture, or a film, of a run that `cortado run` wrote.
+
+    Args:
+        run: The folder of the run.
+        frame: Number of a recorded frame, counted from the end where it is negative.
+        film: A film of all frames in its place.
+        out: Where to write it; into the run's figures if left out.
+        overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
+        device: "cpu", or "cuda:0" for the first GPU.
+    """
+    from cortado.cli.commands.picture import draw_run
+
+    return partial(draw_run, run, frame, film, out, as_text(overrides), device)
+
+
+@command(app)
+def view(
+    path: Annotated[Positional[Path], arg(metavar="RUN|SCENE.toml|TASK.toml")],
+    overrides: Overrides = (),
+    device: str = "cpu",
+    precision: str = "float32",
+    port: int = 8080,
+) -> Work:
+    """Show a run in the browser, or a scene that runs meanwhile, with gravity on sliders, or the search of a task, with
+    a button for its next step; Ctrl-C ends it.
+
+    Args:
+        path: The folder of a run, a scene file, or a task file.
+        overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
+        device: "cpu", or "cuda:0" for the first GPU.
+        precision: "float32" or "float64", of a scene or a task that runs.
+        port: Of the page on this machine; the next one that is free if it is taken.
+    """
+    from cortado.cli.commands.view import view as show
+
+    return partial(show, path, as_text(overrides), device, precision, port)
+
+
+@command(app)
+def sweep(
+    file: Annotated[Positional[Path], arg(metavar="FILE.toml")],
+    sets: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE,VALUE")] = (),
+    steps: int | None = None,
+    time: float | None = None,
+    out: Path = Path("runs/sweep"),
+    device: str = "cpu",
+    precision: str = "float32",
+    scheduler: str | None = None,
+    workers: int | None = None,
+) -> Work:
+    """Run a scene, or optimise a task, with every combination of some values, each in a folder of its own; folders that
+    are finished already are not repeated.
+
+    Args:
+        file: The scene file, or the task file.
+        sets: What changes, such as solver.time_step=0.001,0.002; may be given again, for every combination.
+        steps: Time steps of a scene with the smallest one of the sweep, 200 if left out; longer ones end at its time.
+        time: Seconds that a scene is simulated, in the place of steps.
+        out: Folder of the sweep, with a folder for each combination and a table of them all.
+        device: "cpu", or "cuda:0" for the first GPU, of each worker.
+        precision: "float32" or "float64".
+        scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
+        workers: Number of worker processes on this machine; on a GPU each has one of its own.
+    """
+    from cortado.cli.commands.executor import Where
+    from cortado.cli.commands.sweep import run_sweep
+
+    return partial(run_sweep, file, as_text(sets), steps, time, out, device, precision, Where(scheduler, workers))
+
+
+@command(app, answers=True)
+def bench(
+    particles: tuple[int, ...] = (8000,),
+    steps: int = 20,
+    repeats: int = 5,
+    device: str = "cpu",
+    precision: str = "float32",
+    engine: Literal["warp", "reference"] = "warp",
+    json: Flag = False,
+) -> Work:
+    """Time a dam break: each pass of a step, the step, a rollout and its gradient, beside what the hardware allows.
+
+    Args:
+        particles: Numbers of fluid particles, about; one measurement for each.
+        steps: Number of time steps.
+        repeats: The median of so many repeats counts.
+        device: "cpu", or "cuda:0" for the first GPU.
+        precision: "float32" or "float64"; of the reference engine also "float80" and "float128".
+        engine: The one in Warp, or the reference engine in C++.
+        json: Print JSON for machines, with more numbers, instead of tables.
+    """
+    require_at_least(1, len(particles), "the number of --particles")
+    require_at_least(1, min(particles), "--particles")
+    require_at_least(1, repeats, "--repeats")
+    from cortado.arrays import require_at_most
+    from cortado.bench.timing import MOST_REPEATS
+
+    require_at_most("--repeats", repeats, MOST_REPEATS)
+    from cortado.cli.commands.bench import bench_dam_break, bench_reference
+
+    if engine == "reference":
+        return partial(bench_reference, particles, steps, repeats, precision, json)
+    else:
+        return partial(bench_dam_break, particles, steps, repeats, device, precision, json)
+
+
+@command(app, answers=True)
+def schema() -> Work:
+    """Print the JSON schema of scenes and tasks, with which editors complete and check them."""
+    from cortado.cli.commands.schema import print_schema
+
+    return print_schema
+
+
+@command(app, answers=True)
+def completion(shell: Annotated[Positional[Literal["bash", "zsh"]], arg(metavar="SHELL")]) -> Work:
+    """Print what makes a shell complete commands and options: eval "$(cortado completion bash)".
+
+    Args:
+        shell: bash or zsh.
+    """
+    return partial(completion_script, app, shell)

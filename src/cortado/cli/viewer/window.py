@@ -1,0 +1,219 @@
+"""A window in the browser with particles, the container around them, and what they are coloured by."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from cortado.discretise.shapes import Points
+from cortado.errors import CortadoError, InputError
+from cortado.files.srgb import to_srgb
+from cortado.pictures.scene_view import outline
+from cortado.pictures.stage import upright
+from cortado.scene.scene import Scene
+
+RADIUS = 0.4
+"""Of a particle that is drawn, in spacings."""
+DISTANCE = 1.7
+"""Of the camera at the start, in radii of what is shown."""
+PALETTE = "cividis"
+BRIGHTEST, BRIGHTEST_PULL = 99.5, 90.0
+"""Percentiles at the upper end of the colours, so that a few particles do not darken all the others; the pulls of a
+splash differ by orders of magnitude."""
+MOST_ARROWS = 1500
+"""Of more particles, every k-th has an arrow."""
+LONGEST_ARROW = 2.5
+"""Of pulls that are as large as the colours go or larger, in spacings."""
+BESIDE_ARROWS = 0.4
+"""Of the size of particles, where they would hide arrows."""
+ARROWS = (170, 30, 15)
+"""sRGB"""
+PULL = "pull of the loss"
+
+Quantity = Callable[[], np.ndarray]
+"""Something of the particles that are shown, computed when it is asked for; may raise a `CortadoError`."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Particles at a moment."""
+
+    positions: Points
+    """(n, d) [m]"""
+    colours: Points
+    """(n, 3) their own, linear."""
+    quantities: Mapping[str, Quantity]
+    """(n,) by name."""
+    pull: Quantity
+    """(n, d) where the loss pulls them: minus its derivative with respect to their positions."""
+
+
+class Window:
+    """A page of viser's; y is up, whatever the axes of the scene."""
+
+    def __init__(self, scene: Scene, port: int, units: Mapping[str, str]):
+        """``units``: of the quantities that colours may show, by their names, `PULL` among them; "phase" is there
+        without."""
+        try:
+            import viser  # noqa: F401  for the sentence
+
+            from cortado.cli.viewer.server import GuardedServer
+        except ModuleNotFoundError:
+            raise InputError("viser is not installed, which shows it: pip install 'cortado-sph[view]'.") from None
+        self.scene = scene
+        self._guarded = GuardedServer(port, f"Cortado: {scene.name}")
+        self.server: Any = self._guarded.viser
+        self._turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
+        self._units = units
+        self._cloud: Any = None
+        self._arrows: Any = None
+        self._shown: Shown | None = None
+        self._stale = False
+        """Whether the user wants to see something else of what is shown; `refresh` draws it."""
+        self.server.scene.set_up_direction("+y")
+        gui, first = self.server.gui, "phase" if len(scene.phase) > 1 else next(iter(units))  # one colour has no depth
+        self.colour = gui.add_dropdown("Colour", ["phase", *units], initial_value=first)
+        self.legend = gui.add_html("")
+        self.arrows = gui.add_checkbox("Arrows: where the loss pulls", False)
+        self.arrows_legend = gui.add_html("")
+        for choice in (self.colour, self.arrows):
+            choice.on_update(lambda _: setattr(self, "_stale", True))  # in a thread of viser's, which computes nothing
+        self._frame_container()
+
+    @property
+    def address(self) -> str:
+        """Where a browser finds it, with the token that lets it in."""
+        return self._guarded.address
+
+    def close(self) -> None:
+        """Nobody can see it from now on."""
+        self._guarded.close()
+
+    def show(self, shown: Shown) -> None:
+        """Draw particles in the place of those before."""
+        self._shown = shown
+        self._draw()
+
+    def add_still(self, name: str, positions: Points) -> Any:
+        """Grey points at positions (n, d) [m] that stay where they are, hidden at first."""
+        size = 0.6 * RADIUS * self.scene.discretisation.spacing
+        style = {"point_size": size, "point_shape": "circle", "precision": "float32", "visible": False}
+        return self.server.scene.add_point_cloud(name, self._space(positions), (150, 146, 140), **style)
+
+    def refresh(self) -> None:
+        """Draw again where the user has chosen other colours or arrows."""
+        if self._stale and self._shown is not None:
+            self._draw()
+
+    def _draw(self) -> None:
+        assert self._shown is not None
+        self._stale = False
+        points, colours = self._space(self._shown.positions), self._colours(self._shown)
+        arrows = self._arrows_of(self._shown) if self.arrows.value else None
+        with self.server.atomic():
+            self._draw_particles(points, colours)
+            self._draw_arrows(arrows)
+
+    def _draw_particles(self, points: np.ndarray, colours: np.ndarray) -> None:
+        size = 2.0 * RADIUS * self.scene.discretisation.spacing * (BESIDE_ARROWS if self.arrows.value else 1.0)
+        if self._cloud is None:
+            style = {"point_size": size, "point_shape": "circle", "precision": "float32"}
+            self._cloud = self.server.scene.add_point_cloud("/particles", points, colours, **style)
+            return
+        self._cloud.points, self._cloud.colors, self._cloud.point_size = points, colours, size
+
+    def _draw_arrows(self, ends: np.ndarray | None) -> None:
+        """From (k, 2, 3) ends; none without."""
+        if ends is None:
+            self.arrows_legend.content = "" if not self.arrows.value else self.arrows_legend.content
+            if self._arrows is not None:
+                self._arrows.visible = False
+            return
+        if self._arrows is None or len(self._arrows.points) != len(ends):
+            spacing = self.scene.discretisation.spacing
+            style = {"shaft_radius": 0.06 * spacing, "head_radius": 0.18 * spacing, "head_length": 0.4 * spacing}
+            self._arrows = self.server.scene.add_arrows("/pull", ends, ARROWS, **style)
+            return
+        self._arrows.points, self._arrows.visible = ends, True
+
+    def _colours(self, shown: Shown) -> np.ndarray:
+        """(n, 3) sRGB; the legend says from where to where they go, or why there are none."""
+        from matplotlib import colormaps
+
+        name, own = self.colour.value, to_srgb(shown.colours[None])[0]
+        if name == "phase":
+            self.legend.content = ""
+            return own
+        try:
+            values = np.linalg.norm(shown.pull(), axis=1) if name == PULL else np.asarray(shown.quantities[name]())
+        except CortadoError as error:
+            self.legend.content = in_words(str(error))
+            return own
+        least, greatest = float(values.min()), _upper_end(values, BRIGHTEST_PULL if name == PULL else BRIGHTEST)
+        self.legend.content = _scale(name, self._units[name], least, greatest, clips=values.max() > greatest)
+        share = np.clip((values - least) / (greatest - least or 1.0), 0.0, 1.0)
+        return (255.0 * colormaps[PALETTE](share)[:, :3]).astype(np.uint8)
+
+    def _arrows_of(self, shown: Shown) -> np.ndarray | None:
+        """(k, 2, 3) ends of arrows from particles; None, with the reason in the legend, where there is no pull."""
+        try:
+            pull = shown.pull()
+        except CortadoError as error:
+            self.arrows_legend.content = in_words(str(error))
+            return None
+        lengths = np.linalg.norm(pull, axis=1)
+        longest = _upper_end(lengths, BRIGHTEST_PULL)
+        self.arrows_legend.content = in_words(f"The longest arrows: {longest:.4g} {self._units[PULL]} or more.")
+        reach = LONGEST_ARROW * self.scene.discretisation.spacing
+        scaled = pull * (np.minimum(lengths / (longest or 1.0), 1.0) * reach / np.where(lengths, lengths, 1.0))[:, None]
+        chosen = slice(None, None, -(-len(pull) // MOST_ARROWS))
+        starts = shown.positions[chosen]
+        return self._space(np.stack([starts, starts + scaled[chosen]], axis=1))
+
+    def _space(self, points: Points) -> np.ndarray:
+        """(..., 3) float32, of points (..., d), with y up."""
+        turned = np.asarray(points, dtype=np.float32) @ self._turn.T.astype(np.float32)
+        return np.pad(turned, [(0, 0)] * (turned.ndim - 1) + [(0, 3 - turned.shape[-1])])
+
+    def _frame_container(self) -> None:
+        lines = self._space(outline(self.scene))
+        if len(lines):
+            style = {"thickness": 1.5, "thickness_units": "screen"}
+            self.server.scene.add_line_segments("/container", lines, (130, 125, 118), **style)
+
+    def look_at(self, positions: Points) -> None:
+        """Put the camera where the container, or else the particles (n, d) [m], fill the window."""
+        lines = self._space(outline(self.scene)).reshape(-1, 3)
+        points = lines if len(lines) else self._space(positions)
+        lower, upper = points.min(axis=0), points.max(axis=0)
+        middle, radius = 0.5 * (lower + upper), 0.5 * float(np.linalg.norm(upper - lower))
+        away = np.array([0.4, 0.35, 1.0]) if self.scene.dimension == 3 else np.array([0.0, 0.0, 1.0])
+        camera = self.server.initial_camera
+        camera.look_at = middle
+        camera.position = middle + DISTANCE * radius * away / np.linalg.norm(away)
+
+
+def _upper_end(values: np.ndarray, percentile: float) -> float:
+    """A percentile of (n,) values that is one of them."""
+    return float(np.percentile(values, percentile, method="higher"))
+
+
+def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> str:
+    """HTML of a bar with the colours, and the numbers at its ends."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    stops = ", ".join(to_hex(colormaps[PALETTE](share)) for share in np.linspace(0.0, 1.0, 9))
+    ends = f"<span>{least:.4g}</span><span>{'≥ ' if clips else ''}{greatest:.4g}</span>"
+    return (
+        f'<div style="padding: 0 .8em .4em; font-size: .85em">{escape(name)} [{escape(unit)}]'
+        f'<div style="height: .8em; border-radius: 3px; background: linear-gradient(90deg, {stops})"></div>'
+        f'<div style="display: flex; justify-content: space-between">{ends}</div></div>'
+    )
+
+
+def in_words(words: str) -> str:
+    """HTML of plain words."""
+    return f'<p style="padding: 0 .8em .4em; margin: 0; font-size: .85em">{escape(words)}</p>'

@@ -1,0 +1,92 @@
+"""Where fluid may be: in a box, whose sides may be infinitely far, and in a cylinder, which may be open on top, or a
+sphere."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cortado.discretise.shapes import Points
+
+TOLERANCE = 0.5
+"""In spacings: how far outside of its container a particle may be. Walls bring back what is less far; light fluid among
+heavier is pressed there at times."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A convex region in d dimensions; by default all of space."""
+
+    lower: Points
+    """(d,) [m]"""
+    upper: Points
+    """(d,) [m]"""
+    base: Points
+    """(d,) a point on the axis of the cylinder [m]"""
+    across: Points
+    """(d,) 1 for the axes of space that lie across the cylinder, 0 for the one along it; all 0 without a cylinder, and
+    all 1 for a sphere, whose middle ``base`` then is"""
+    radius: float = np.inf
+    """Of the cylinder or the sphere [m]."""
+    rim: float = np.inf
+    """Where the open end of a cylinder is along its axis [m], infinite if it has a lid."""
+
+    @classmethod
+    def between(cls, lower: Points, upper: Points) -> "Region":
+        """A box without a cylinder."""
+        return cls(lower, upper, np.zeros(len(lower)), np.zeros(len(lower)))
+
+    @classmethod
+    def everywhere(cls, dimension: int) -> "Region":
+        """All of space."""
+        return cls.between(np.full(dimension, -np.inf), np.full(dimension, np.inf))
+
+    @classmethod
+    def ball(cls, centre: Points, radius: float) -> "Region":
+        """A sphere, or a disc in 2-D."""
+        everywhere = cls.everywhere(len(centre))
+        return cls(everywhere.lower, everywhere.upper, centre, np.ones(len(centre)), radius)
+
+    @classmethod
+    def cylinder(cls, base: Points, radius: float, height: float, axis: int) -> "Region":
+        """A cylinder that stands on its base along an axis of space."""
+        across = np.where(np.arange(len(base)) == axis, 0.0, 1.0)
+        lower, upper = base - radius * across, base + radius * across
+        upper[axis] += height
+        return cls(lower, upper, base, across, radius)
+
+    def distance(self, points: Points) -> Points:
+        """(n,) how far points (n, d) [m] are outside of the region, negative inside [m]; beyond an edge or a corner it
+        is the distance from the nearer face, which is less."""
+        from_axis = np.linalg.norm((points - self.base) * self.across, axis=1)
+        from_faces = np.maximum(self.lower - points, points - self.upper).max(axis=1)
+        return np.asarray(np.maximum(from_faces, from_axis - self.radius))
+
+    def contains(self, points: Points, tolerance: float) -> np.ndarray:
+        """(n,) whether points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
+        from_axis = np.linalg.norm((points - self.base) * self.across, axis=1)
+        within = (points >= self.lower - tolerance) & (points <= self.upper + tolerance)
+        return np.asarray(within.all(axis=1) & (from_axis <= self.radius + tolerance))
+
+    def cell_shares(self, points: Points, spacing: float) -> Points:
+        """(n,) the part of the cell, a spacing [m] wide, around each of the points (n, d) [m] that is within the
+        region; along a cylinder's side the cell counts as turned with it."""
+        half, from_axis = 0.5 * spacing, np.linalg.norm((points - self.base) * self.across, axis=1)
+        widths = np.minimum(points + half, self.upper) - np.maximum(points - half, self.lower)
+        along_axes = np.clip(widths / spacing, 0.0, 1.0).prod(axis=1)
+        return np.asarray(along_axes * np.clip((self.radius - from_axis) / spacing + 0.5, 0.0, 1.0))
+
+    def escaped(self, before: Points, after: Points, tolerance: float) -> np.ndarray:
+        """(n,) whether particles at ``before`` (n, d) [m] went through a wall to be at ``after`` (n, d) [m].
+
+        Over the rim of an open cup they may go, and what was outside already has not gone through.
+        """
+        through = self.contains(before, tolerance) & ~self.contains(after, tolerance)
+        if np.isfinite(self.rim):
+            along = 1.0 - self.across
+            through &= (before @ along < self.rim) & (after @ along < self.rim)
+        return through
+
+    def opened(self, periods: Points) -> "Region":
+        """Without sides along the axes that have a period; ``periods`` (d,) [m], 0 for the others."""
+        lower, upper = np.where(periods > 0.0, -np.inf, self.lower), np.where(periods > 0.0, np.inf, self.upper)
+        return Region(lower, upper, self.base, self.across, self.radius, self.rim)

@@ -1,0 +1,310 @@
+"""Frames of particles in one temporal VTKHDF file, which ParaView opens and a killed run leaves readable.
+
+A frame is written at the places of its datasets (`Layout`) without HDF5, which a full disk can kill.
+Then one number of eight bytes counts it, and carries the CRC-32 of all frames so far: a SIGKILL comes before or
+after it. The checksums are not those of HDF5, which need datasets in chunks, whose index a killed process
+leaves half written.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from cortado.errors import ComputationError, InputError
+from cortado.files.atomic import sentences, unfinished, write_fully
+from cortado.files.vtkhdf_layout import FORMAT, WRITTEN, Layout, frames_seed, steps_seed
+
+
+class TrajectoryWriter:
+    """Writes frames as they are computed; a context manager.
+
+    The file appears at `path` with its first frame and can be opened, by ParaView too, while it grows: frames that
+    are not written yet, or never were because the run ended early, have no particles there.
+
+    Args:
+        path: the file, replaced when it exists.
+        times: (frames,) [s] of the frames that will come.
+        particles: n.
+        dimension: 2 or 3; in 2-D the stored points have z = 0.
+        precision: of the stored positions, velocities and scalars.
+        steps: the most steps of which `append_steps` will be told.
+        scalars: names of further scalar fields of every frame, such as "density" and "pressure", which ParaView shows.
+        vectors: names of further fields of vectors.
+        others: further arrays of every frame by name, as they are in the first: their types and shapes are kept.
+        constants: arrays by name that hold for the whole run.
+        diagnostics: the type of each number that `append_steps` will be told of a step, by name.
+        origin: what the particles are of, as a text of JSON.
+
+    Raises:
+        InputError: a size that makes no sense, or a path that cannot be written.
+        ComputationError: the disk has not enough room for all frames.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        times: ArrayLike,
+        particles: int,
+        dimension: int,
+        precision: Literal["float32", "float64"] = "float32",
+        steps: int = 0,
+        scalars: Sequence[str] = (),
+        vectors: Sequence[str] = (),
+        others: Mapping[str, ArrayLike] | None = None,
+        constants: Mapping[str, ArrayLike] | None = None,
+        diagnostics: Mapping[str, DTypeLike] | None = None,
+        origin: str = "",
+    ) -> None:
+        moments = np.array(times, dtype=np.float64, ndmin=1)
+        if len(moments) < 1 or particles < 1 or dimension not in (2, 3) or steps < 0:
+            raise InputError(
+                f"A trajectory needs at least 1 frame, 1 particle and dimension 2 or 3, but was given "
+                f"{len(moments)} frames, {particles} particles, dimension {dimension} and {steps} steps."
+            )
+        self.path = Path(path)
+        self.frames_written = 0
+        self.steps_written = 0
+        self._layout = Layout(
+            moments,
+            (particles, dimension),
+            np.dtype(precision),
+            steps,
+            tuple(scalars),
+            tuple(vectors),
+            {name: np.asarray(value) for name, value in (others or {}).items()},
+            {name: np.asarray(value) for name, value in (constants or {}).items()},
+            {name: np.dtype(dtype) for name, dtype in (diagnostics or {}).items()},
+            origin,
+        )
+        self._unfinished = unfinished(self.path)
+        with sentences(self.path):
+            _require_room(self._layout, self.path)
+            self._file = open(self._unfinished, "x+b", buffering=0)  # noqa: SIM115
+            try:
+                pages, self._places = self._layout.create()
+                pages.save(self._file)
+            except BaseException:
+                self.close()
+                raise
+        self._frames_checksum, self._steps_checksum = self._layout.seed, steps_seed(self._layout.records)
+
+    def append(
+        self,
+        positions: ArrayLike,
+        velocities: ArrayLike,
+        *,
+        step: int | None = None,
+        others: Mapping[str, ArrayLike] | None = None,
+        **scalars: ArrayLike,
+    ) -> None:
+        """Writes one frame.
+
+        Args:
+            positions: (n, d) [m]
+            velocities: (n, d) [m/s]
+            step: number of steps taken so far; the number of this frame when left out.
+            others: exactly those given at construction.
+            scalars: (n,) each, and vectors (n, d), exactly those named at construction.
+
+        Raises:
+            InputError: shapes or names other than announced, or more frames than announced.
+            ComputationError: the disk refused; the frames before this one stay readable.
+        """
+        frame = self.frames_written
+        frames = len(self._layout.times)
+        if frame >= frames:
+            raise InputError(f"{self.path} was laid out for {frames} frames, and one more came.")
+        for what, found, wanted in (
+            ("scalar fields", scalars, (*self._layout.scalars, *self._layout.vectors)),
+            ("other fields", others or {}, self._layout.others),
+        ):
+            if set(found) != set(wanted):
+                raise InputError(f"Expected the {what} {sorted(wanted)}, found {sorted(found)}.")
+        fields = {"VTKHDF/Points": self._vectors("positions", positions)}
+        fields["VTKHDF/PointData/velocity"] = self._vectors("velocities", velocities)
+        for name, values in scalars.items():
+            shape = self._layout.shape[:1]
+            array = self._vectors(name, values) if name in self._layout.vectors else self._checked(name, values, shape)
+            fields[f"VTKHDF/PointData/{name}"] = array
+        number = np.int64(frame if step is None else step)
+        rows = {name: fields[name].tobytes() for name in self._layout.rows}
+        for name, first in sorted(self._layout.others.items()):
+            array = np.asarray((others or {})[name], dtype=first.dtype)
+            if array.shape != first.shape:
+                raise InputError(f"Expected {name} of shape {first.shape}, found {array.shape}.")
+            rows[f"cortado/states/{name}"] = array.tobytes()
+        checksum = _frame_checksum(self._frames_checksum, self._layout.times[frame], number, rows.values())
+        with self._refusal():
+            for name, row in rows.items():
+                self._write(name, frame * len(row), row)
+            self._write("cortado/frame_steps", 8 * frame, number.tobytes())
+            self._write("VTKHDF/Steps/PartOffsets", 8 * frame, struct.pack("<q", WRITTEN))
+            self._write("cortado/progress", 0, struct.pack("<II", frame + 1, checksum))
+            if frame == 0:
+                os.replace(self._unfinished, self.path)
+        self.frames_written, self._frames_checksum = frame + 1, checksum
+
+    def append_steps(self, **diagnostics: ArrayLike) -> None:
+        """Writes what the solver noted of one step (scalars) or of several ((k,) each), by name.
+
+        Raises:
+            InputError: names other than announced, or more steps than announced.
+            ComputationError: the disk refused.
+        """
+        kinds = self._layout.diagnostics
+        if set(diagnostics) != set(kinds):
+            raise InputError(f"Expected the diagnostics {sorted(kinds)}, found {sorted(diagnostics)}.")
+        records = _records(diagnostics, self._layout.records)
+        first, last = self.steps_written, self.steps_written + len(records)
+        if last > self._layout.steps:
+            raise InputError(f"{self.path} was laid out for {self._layout.steps} steps, and {last} came.")
+        checksum = zlib.crc32(records.tobytes(), self._steps_checksum)
+        with self._refusal():
+            for name, dtype in kinds.items():
+                self._write(f"cortado/diagnostics/{name}", first * dtype.itemsize, records[name].tobytes())
+            self._write("cortado/progress", 8, struct.pack("<II", last, checksum))
+        self.steps_written, self._steps_checksum = last, checksum
+
+    def close(self) -> None:
+        """Ends the file; without any frame, none is left behind."""
+        self._file.close()
+        if self.frames_written == 0:
+            self._unfinished.unlink(missing_ok=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _checked(self, name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[Any]:
+        array = np.asarray(values, dtype=self._layout.dtype)
+        if array.shape != shape:
+            raise InputError(f"Expected {name} of shape {shape}, found {array.shape}.")
+        return array
+
+    def _vectors(self, name: str, values: ArrayLike) -> NDArray[Any]:
+        """The values as (n, 3), with z = 0 in 2-D."""
+        array = self._checked(name, values, self._layout.shape)
+        return np.pad(array, ((0, 0), (0, 3 - array.shape[1])))
+
+    def _write(self, name: str, offset: int, content: bytes) -> None:
+        self._file.seek(self._places[name] + offset)
+        write_fully(self._file, content)
+
+    @contextmanager
+    def _refusal(self) -> Iterator[None]:
+        """Any trouble with the disk within ends the computation, in a sentence."""
+        try:
+            yield
+        except OSError as problem:
+            raise ComputationError(
+                f"{self.path} cannot be written: {problem.strerror or problem}; the {self.frames_written} frames so "
+                f"far are kept, free some space or choose another place."
+            ) from problem
+
+
+def read(path: str | Path) -> dict[str, Any]:
+    """Reads the frames and steps that were completed, while the writer is at work or after its death.
+
+    Returns:
+        times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s],
+        under its own name every scalar field (frames, n); by name others, further arrays of every frame, constants,
+        what holds for the whole run, and diagnostics, (steps,) each; and origin, a text.
+
+    Raises:
+        InputError: the file is missing, damaged, or none of Cortado's trajectories.
+    """
+    import h5py
+
+    if not Path(path).is_file():
+        raise InputError(f"There is no trajectory file {path}.")
+    try:
+        with h5py.File(path, "r") as file:
+            if "cortado" not in file:
+                raise InputError(f"{path} is an HDF5 file, but not a trajectory that Cortado wrote.")
+            if file["cortado"].attrs.get("format") != FORMAT:
+                raise InputError(f"{path} was written by another version of Cortado, or is damaged; run it again.")
+            arrays = _read_arrays(file, os.path.getsize(path))
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError, OverflowError) as problem:
+        reason = " ".join(str(problem).split())
+        raise InputError(f"{path} cannot be read as a VTKHDF trajectory: {reason}.") from problem
+    if arrays is None:
+        raise InputError(f"{path} is damaged: its checksums are not those of what it holds; restore or repeat it.")
+    return arrays
+
+
+def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
+    """None where a checksum is wrong."""
+    vtk, own = file["VTKHDF"], file["cortado"]
+    (frames, frames_checksum), (steps, steps_checksum) = own["progress"][:].tolist()
+    dimension, particles = int(own.attrs["dimension"]), int(vtk["NumberOfPoints"][0])
+    rows = {"VTKHDF/Points": vtk["Points"]}
+    rows |= {f"VTKHDF/PointData/{name}": dataset for name, dataset in sorted(vtk["PointData"].items())}
+    groups = {name: dict(sorted(own[name].items())) for name in ("constants", "states", "diagnostics")}
+    columns = [vtk["Steps/Values"], own["frame_steps"]]
+    for dataset in (*columns, *rows.values(), *(dataset for group in groups.values() for dataset in group.values())):
+        if dataset.nbytes > size or dataset.dtype.kind not in "fiub":
+            return None
+    constants = {name: dataset[()] for name, dataset in groups["constants"].items()}
+    others = {name: dataset[:frames] for name, dataset in groups["states"].items()}
+    times, numbers = (column[:frames] for column in columns)
+    diagnostics = {name: dataset[:steps] for name, dataset in groups["diagnostics"].items()}
+    record = np.dtype([(name, column.dtype) for name, column in diagnostics.items()])
+    points = {name: dataset[: frames * particles] for name, dataset in rows.items()}
+    points = {name: field.reshape(frames, particles, *field.shape[1:]) for name, field in points.items()}
+
+    fields = points | others
+    kinds = {name: (field.dtype, field.shape[1:]) for name, field in fields.items()}
+    origin = str(own.attrs.get("origin", ""))
+    checksum = frames_seed((particles, dimension), kinds, constants, origin)
+    for k in range(frames):
+        checksum = _frame_checksum(checksum, times[k], numbers[k], [field[k].tobytes() for field in fields.values()])
+    records = _records(diagnostics, record) if record.names else np.zeros(0)
+    if checksum != frames_checksum or zlib.crc32(records.tobytes(), steps_seed(record)) != steps_checksum:
+        return None
+    arrays = {name.rpartition("/")[2]: field for name, field in points.items()}
+    arrays["velocities"] = np.ascontiguousarray(arrays.pop("velocity")[..., :dimension])
+    arrays["positions"] = np.ascontiguousarray(arrays.pop("Points")[..., :dimension])
+    named = {"others": others, "constants": constants, "diagnostics": diagnostics}
+    return arrays | {"times": times, "steps": numbers, "origin": origin, **named}
+
+
+def _frame_checksum(checksum: int, time: Any, number: Any, rows: Iterable[bytes]) -> int:
+    """The CRC-32 of the frames so far with one more: its time [s], its number of steps, and its fields."""
+    for content in (time.tobytes(), number.tobytes(), *rows):
+        checksum = zlib.crc32(content, checksum)
+    return checksum
+
+
+def _records(columns: Mapping[str, ArrayLike], record: np.dtype[Any]) -> NDArray[Any]:
+    """(steps,) records from one array for each of their names."""
+    arrays = {name: np.atleast_1d(column) for name, column in columns.items()}
+    records = np.zeros(max((len(array) for array in arrays.values()), default=0), record)
+    for name, array in arrays.items():
+        records[name] = array
+    return records
+
+
+def _require_room(layout: Layout, path: Path) -> None:
+    """Raise ComputationError if the disk has no room for all the frames."""
+    free = shutil.disk_usage(path.absolute().parent).free
+    if layout.size > free:
+        raise ComputationError(
+            f"{path} needs {layout.size / 1e6:.4g} MB for {len(layout.times)} frames, but {free / 1e6:.4g} MB are "
+            f"free on its disk; record fewer frames, free some space, or choose another place."
+        )

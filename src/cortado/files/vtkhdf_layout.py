@@ -1,0 +1,231 @@
+"""The layout of a trajectory file: room for every frame from the start, so that nothing changes its place or size.
+
+Every dataset is contiguous, sparse on disk and has its place; `PointOffsets` leads from a frame to its rows. The
+datasets that count points and cells have two parts: one with all particles, and an empty one. A frame that is
+not there yet is the empty part. One number in `PartOffsets` makes it appear, so that a program that reads the
+file, such as ParaView, finds every size as it was when it looked first.
+
+HDF5 lays the file out in memory, and plain writes take it to the disk. With writes of HDF5 a file would be as readable
+after a kill, but a full disk then ends the process with a segmentation fault, always while the file is laid out and
+often later (HDF5 2.0). Its mode for one writer and many readers leaves files of killed writers that VTK does not open.
+
+Format: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/vtkhdf_specifications.html
+"""
+
+from __future__ import annotations
+
+import io
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.files.atomic import write_fully
+
+FORMAT = 3
+"""Of the group "cortado"; the first had no checksums, the second no states to go on from."""
+WRITTEN, MISSING = 0, 1
+"""The parts of a frame that is there, and of one that is not."""
+_TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")
+_PAGE = 4096
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a file has room for."""
+
+    times: NDArray[np.float64]
+    """(frames,) [s]"""
+    shape: tuple[int, int]
+    """n, d"""
+    dtype: np.dtype[Any]
+    """Of positions, velocities and scalars."""
+    steps: int
+    scalars: tuple[str, ...]
+    vectors: tuple[str, ...]
+    """Further fields of three components, besides the velocity."""
+    others: Mapping[str, NDArray[Any]]
+    """Further arrays of every frame, as they are in the first."""
+    constants: Mapping[str, NDArray[Any]]
+    """Arrays of any shape that hold for the whole run."""
+    diagnostics: Mapping[str, np.dtype[Any]]
+    """Numbers of every step."""
+    origin: str
+    """What the particles are of, in JSON; empty where nothing is known."""
+
+    @property
+    def rows(self) -> dict[str, tuple[int, ...]]:
+        """The datasets that have n rows a frame, in the order of their checksum, with the shape of a row."""
+        fields: dict[str, tuple[int, ...]] = {
+            **dict.fromkeys(("velocity", *self.vectors), (3,)),
+            **dict.fromkeys(self.scalars, ()),
+        }
+        return {"VTKHDF/Points": (3,)} | {f"VTKHDF/PointData/{name}": fields[name] for name in sorted(fields)}
+
+    @property
+    def records(self) -> np.dtype[Any]:
+        """What is kept of a step."""
+        return np.dtype(sorted(self.diagnostics.items()))
+
+    @property
+    def seed(self) -> int:
+        """The checksum of no frames."""
+        particles = self.shape[0]
+        kinds = {name: (self.dtype, (particles, *row)) for name, row in self.rows.items()}
+        kinds |= {name: (array.dtype, array.shape) for name, array in sorted(self.others.items())}
+        return frames_seed(self.shape, kinds, self.constants, self.origin)
+
+    @property
+    def size(self) -> int:
+        """About how many bytes the file takes when it is full."""
+        numbers = sum(int(np.prod(row, dtype=int)) for row in self.rows.values())
+        others, constants = (sum(a.nbytes for a in arrays.values()) for arrays in (self.others, self.constants))
+        frame = (
+            self.shape[0] * numbers * self.dtype.itemsize + others + 8 * (17 + len(self.scalars) + len(self.vectors))
+        )
+        return len(self.times) * frame + self.steps * self.records.itemsize + 8 * 2 * self.shape[0] + constants
+
+    def create(self) -> tuple[Pages, dict[str, int]]:
+        """The empty file, and the byte at which each dataset begins."""
+        import h5py
+
+        pages = Pages()
+        # Numbers that are aligned lie in one page and change in one go.
+        with h5py.File(pages, "w", libver=("earliest", "v108"), alignment_threshold=1, alignment_interval=8) as file:
+            places = self._create_own(file.create_group("cortado"))
+            places |= self._create_vtk(file.create_group("VTKHDF"))
+        return pages, places
+
+    def _create_own(self, own: Any) -> dict[str, int]:
+        own.attrs["format"], own.attrs["dimension"] = FORMAT, self.shape[1]
+        if self.origin:
+            own.attrs["origin"] = self.origin
+        group = own.create_group("constants")
+        for name, array in self.constants.items():
+            group[name] = array
+        own["progress"] = np.array([[0, self.seed], [0, steps_seed(self.records)]], np.uint32)
+        places = {"cortado/progress": own["progress"].id.get_offset()}
+        places["cortado/frame_steps"] = _reserve(own, "frame_steps", (len(self.times),), np.int64)
+        states, steps = own.create_group("states"), own.create_group("diagnostics")
+        for name, array in self.others.items():
+            shape = (len(self.times), *array.shape)
+            places[f"cortado/states/{name}"] = _reserve(states, name, shape, array.dtype)
+        for name, dtype in self.diagnostics.items():
+            places[f"cortado/diagnostics/{name}"] = _reserve(steps, name, (max(self.steps, 1),), dtype)
+        return places
+
+    def _create_vtk(self, vtk: Any) -> dict[str, int]:
+        import h5py
+
+        frames, particles = len(self.times), self.shape[0]
+        vtk.attrs["Version"] = np.array([2, 2], np.int64)
+        vtk.attrs.create("Type", b"PolyData", dtype=h5py.string_dtype("ascii", 8))
+        vtk["NumberOfPoints"] = np.array([particles, 0])
+        for topology in _TOPOLOGIES:
+            _write_cells(vtk.create_group(topology), particles if topology == "Vertices" else 0)
+        series = vtk.create_group("Steps")
+        series.attrs["NSteps"] = np.int64(frames)
+        series["Values"] = self.times
+        series["PartOffsets"] = np.full(frames, MISSING)
+        series["NumberOfParts"] = np.ones(frames, np.int64)
+        series["PointOffsets"] = np.arange(frames) * particles
+        for name in ("CellOffsets", "ConnectivityIdOffsets"):
+            series[name] = np.zeros((frames, len(_TOPOLOGIES)), np.int64)
+        for name in ("velocity", *self.scalars, *self.vectors):
+            series[f"PointDataOffsets/{name}"] = np.arange(frames) * particles
+        vtk.create_group("PointData")
+        places = {
+            name: _reserve(vtk.file, name, (frames * particles, *row), self.dtype) for name, row in self.rows.items()
+        }
+        return places | {"VTKHDF/Steps/PartOffsets": series["PartOffsets"].id.get_offset()}
+
+
+def frames_seed(
+    shape: tuple[int, int],
+    kinds: Mapping[str, tuple[np.dtype[Any], tuple[int, ...]]],
+    constants: Mapping[str, NDArray[Any]],
+    origin: str,
+) -> int:
+    """The checksum that those of the frames begin with: it changes with whatever says how to read them, and with what
+    holds for all of them. ``kinds``: type and shape of each field of a frame."""
+    fixed = [(name, array.dtype.str, array.shape, array.tobytes()) for name, array in sorted(constants.items())]
+    varying = [(name, dtype.str, sizes) for name, (dtype, sizes) in kinds.items()]
+    return zlib.crc32(origin.encode(), zlib.crc32(repr((shape, varying, fixed)).encode()))
+
+
+def steps_seed(records: np.dtype[Any]) -> int:
+    """The checksum of no steps, of which such records are kept."""
+    return zlib.crc32(repr(records.descr).encode())
+
+
+def _reserve(group: Any, name: str, shape: tuple[int, ...], dtype: Any) -> int:
+    """Creates a contiguous dataset with its place in the file, unwritten; returns where it begins [byte]."""
+    from h5py import h5d, h5p, h5s, h5t
+
+    options = h5p.create(h5p.DATASET_CREATE)
+    options.set_alloc_time(h5d.ALLOC_TIME_EARLY)
+    options.set_fill_time(h5d.FILL_TIME_NEVER)
+    kind = h5t.py_create(np.dtype(dtype), logical=True)
+    return h5d.create(group.id, name.encode(), kind, h5s.create_simple(shape), options).get_offset()
+
+
+def _write_cells(group: Any, cells: int) -> None:
+    """One cell per point for all frames (their offsets into it are zero), and none for the empty part."""
+    group["NumberOfConnectivityIds"] = np.array([cells, 0])
+    group["NumberOfCells"] = np.array([cells, 0])
+    group["Connectivity"] = np.arange(cells)
+    group["Offsets"] = np.append(np.arange(cells + 1), 0)
+
+
+class Pages(io.RawIOBase):
+    """A file in memory of which only the pages that were written to take room."""
+
+    def __init__(self) -> None:
+        self._pages: dict[int, bytearray] = {}
+        self._place = self._end = 0
+
+    def save(self, file: Any) -> None:
+        """Writes it to a file on disk, which stays sparse."""
+        file.truncate(self._end)
+        for number, page in sorted(self._pages.items()):
+            file.seek(number * _PAGE)
+            write_fully(file, bytes(page[: self._end - number * _PAGE]))
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Go to a byte."""
+        self._place = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._place, io.SEEK_END: self._end}[whence]
+        return self._place
+
+    def tell(self) -> int:
+        """The byte at which the next operation begins."""
+        return self._place
+
+    def truncate(self, size: int | None = None) -> int:
+        """Set the size [byte]."""
+        self._end = self._place if size is None else size
+        return self._end
+
+    def write(self, content: Any) -> int:
+        """Write all of it."""
+        for page, place, part in self._parts(content):
+            page[place : place + len(part)] = part
+        self._end = max(self._end, self._place)
+        return len(content)
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill the buffer, with zeros where nothing was written."""
+        for page, place, part in self._parts(buffer):
+            part[:] = page[place : place + len(part)]
+        return len(buffer)
+
+    def _parts(self, content: Any) -> Iterator[tuple[bytearray, int, memoryview]]:
+        """Page by page: the page, where in it, and the part of the content; moves on."""
+        rest = memoryview(content)
+        while rest:
+            number, place = divmod(self._place, _PAGE)
+            part, rest = rest[: _PAGE - place], rest[_PAGE - place :]
+            yield self._pages.setdefault(number, bytearray(_PAGE)), place, part
+            self._place += len(part)

@@ -1,0 +1,81 @@
+"""Shaded pictures of a solved task: before, after, target and the search in motion."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cortado.discretise.shapes import Points
+from cortado.losses import Snapshot
+from cortado.optimisation.inverse.chapters import Chapters
+from cortado.optimisation.inverse.setup import Setup
+from cortado.optimisation.optimise import Result
+from cortado.pictures.film import film
+from cortado.pictures.image_files import write_picture
+from cortado.pictures.labels import labelled, side_by_side
+from cortado.pictures.page import Page
+from cortado.pictures.painter import colours_of, painter
+from cortado.pictures.scenery import State
+from cortado.runs.report import Figures
+from cortado.scene.picture import Picture
+
+EVALUATIONS = (1, 5, 20, 100)
+"""Whose runs are shown, as far as the search went; 0 is the first guess."""
+Run = Mapping[int, Snapshot]
+"""States by the number of steps before them."""
+
+
+def shaded_figures(made: Setup, result: Result, folder: Path) -> Chapters:
+    """Draw them into a folder."""
+    picture, device = made.task.scene.picture or Picture(), made.problem.simulation.device
+    steps = np.unique(np.linspace(0, made.problem.steps, max(picture.most_frames, 2)).astype(int)).tolist()
+
+    def run(parameters: Mapping[str, Any]) -> Run:
+        return made.problem.states(dict(parameters), steps)
+
+    def found(u: dict[str, np.ndarray]) -> Run:
+        return run(made.search.parameters(u))
+
+    before, after = found(made.start), found(result.parameters)
+    runs = {"first guess": before, "found": after}
+    if made.task.problem.picture is None:  # else there is a picture to aim at, and no run
+        runs["target"] = run(made.task.true_parameters)
+    page = partial(_page, made, device=device)
+    three = page(list(runs), list(runs.values()))
+    path = folder / "found.png"
+    write_picture(path, three.image(steps[-1]))
+    compared: Figures = [(f"The end of the run: {', '.join(runs)}.", path)]
+    shown = [k for k in EVALUATIONS if k < len(result.history)] or [0]
+    searched = page([f"evaluation {k}" for k in shown], [found(result.history[k].parameters) for k in shown])
+    path = folder / "search.png"
+    write_picture(path, searched.image(steps[-1]))
+    search: Figures = [("The end of the run as the search went on.", path)]
+    if not picture.most_frames or len(steps) < 2:
+        return Chapters(compared=compared, search=search)
+    pair = {name: runs[name] for name in (("found", "target") if "target" in runs else ("first guess", "found"))}
+    two = page(list(pair), list(pair.values()))
+    motion = film(folder / "found.mp4", two, steps, picture.film_frames)
+    search.insert(0, ("The search in motion.", film(folder / "search.mp4", searched, steps, picture.film_frames)))
+    return Chapters(found=[(f"The run: {' and '.join(pair)}.", motion)], compared=compared, search=search)
+
+
+def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -> Page:
+    """The runs after a number of steps, side by side, each with its name."""
+    scene, across = made.task.scene, len(runs) if len(runs) < 4 else 2
+    picture, half = scene.picture or Picture(), len(runs) > 1
+    size = {"width": picture.width // (1 + half), "height": picture.height // (1 + (len(runs) > across))}
+    panel = picture.model_copy(update=size)
+    places = np.stack([run[step].positions for run in runs for step in run])
+    artist = painter(scene.model_copy(update={"picture": panel}), places, device)
+
+    def composed(images: list[Points]) -> Points:
+        return side_by_side([labelled(*one) for one in zip(images, names, strict=True)], across)
+
+    return Page(artist, [partial(_state, made, run) for run in runs], composed)
+
+
+def _state(made: Setup, run: Run, step: int) -> State:
+    state = run[step]
+    return state.positions, colours_of(made.task.scene, state.mass_fractions, len(state.positions), state.colours)

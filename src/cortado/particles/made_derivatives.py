@@ -1,0 +1,148 @@
+"""Derivatives of sums over the fluid, made by Warp from the term of one pair (`cortado.particles.terms`).
+
+For the sums S_i = sum_j T(x_ij, c_i, c_j, v_ij, theta) and their adjoints S_i^, the adjoint gathers what the pair gives
+to particle i, from its own sum and from that of its neighbour:
+
+    x_i^ = sum_j d(T_ij . S_i^) / dx_ij - d(T_ji . S_j^) / dx_ji
+    c_i^ = sum_j d(T_ij . S_i^) / dc_i + d(T_ji . S_j^) / dc_i
+
+and likewise for all entries of arrays; theta^ is sum_j d(T_ij . S_i^) / dtheta of each particle. The tangent is put
+together of the gradients of the components of T. Both are exact. They are slower than what one can write by hand, and
+are meant for forces of one's own and for what is seldom computed.
+
+A term is given as the function that makes it for a `Discretisation`, and is made for one that is ``taped``, whose
+functions Warp can differentiate. Call a made derivative from the kernel itself: from a `wp.func` that the kernel calls,
+its C++ does not compile.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import warp as wp
+
+from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.pair_loops import Body, Types, over_fluid, summed, type_name, zero
+from cortado.particles.terms import NUMBERS, Term, array_of, own_entry
+
+TermMaker = Callable[[Discretisation], Callable[..., Any]]
+
+
+def made_adjoint(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
+    """The Warp function ``f(i, *arrays, *bars, *others, s)`` of the term that is made, given the arrays of the adjoints
+    of its sums. It returns the adjoints of the entries of particle i in each array, and of each of the others.
+    ``module`` is the Warp module of the function, if not that of the file."""
+    term = _differentiable(make, d)
+    arrays = {**term.arrays, **_bars(term)}
+    loop = over_fluid(d, arrays, _adjoint(term), ahead=True, numbered="j" in term.parameters)
+    return _made(term, d, arrays, term.others, (*term.arrays.values(), *term.others.values()), loop, module)
+
+
+def made_tangent(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
+    """The Warp function ``f(i, *arrays, *others, s)`` of the tangents of the sums of the term that is made, in which
+    each array and each of the others is followed by its tangent."""
+    term = _differentiable(make, d)
+    arrays, others = _with_tangents(term.arrays), _with_tangents(term.others)
+    if len(arrays) + len(others) < 2 * len(term.arrays | term.others):
+        raise TypeError(f"term {term.name} has a name and the same with _dot, but tangents have such names.")
+    loop = over_fluid(d, arrays, _tangent(term, d), ahead=False, numbered="j" in term.parameters)
+    return _made(term, d, arrays, others, term.results, loop, module)
+
+
+def _differentiable(make: TermMaker, d: Discretisation) -> Term:
+    term = Term.of(make(replace(d, taped=True)))
+    if "x_ij" not in term.parameters:
+        raise TypeError(f"term {term.name} has no x_ij, but must have it for derivatives to be made of it.")
+    return term
+
+
+def _made(
+    term: Term, d: Discretisation, arrays: Types, others: Types, results: Iterable[Any], loop: str, module: Any
+) -> Any:
+    module = module or wp.get_module(term.function.__module__)
+    return summed(term.name, d, arrays, others, results, loop, {"_work": _work(term, d, module), "_wp": wp}, module)
+
+
+def _work(term: Term, d: Discretisation, module: Any) -> Any:
+    """The Warp function T . bar of the arguments of a term and of an adjoint of each of its results."""
+    types, bars = {**term.parameters, **_bars(term)}, _bars(term)
+    products = (
+        f"_term_{n} * {bar}" if kind is d.precision.real else f"_wp.dot(_term_{n}, {bar})"
+        for n, (bar, kind) in enumerate(bars.items())
+    )
+    text = f"""\
+def _work({", ".join(types)}):
+    {", ".join(f"_term_{n}" for n in range(len(bars)))} = _term({", ".join(term.parameters)})
+    return {" + ".join(products)}
+"""
+    known: dict[str, Any] = {"_term": wp.func(term.function, module=module), "_wp": wp}
+    exec(text, known)
+    made: Any = known["_work"]
+    made.__annotations__ = {**types, "return": d.precision.real}
+    return wp.Function(made, f"{term.name}_work", "", module=module, source=text)
+
+
+def _bars(term: Term) -> dict[str, Any]:
+    """Names and types of the adjoints of the results."""
+    return {f"_bar_{n}": kind for n, kind in enumerate(term.results)}
+
+
+def _with_tangents(types: Types) -> dict[str, Any]:
+    return {each: kind for name, kind in types.items() for each in (name, f"{name}_dot")}
+
+
+def _gradient(label: str, term: Term, arguments: str, bars: Iterable[str]) -> str:
+    """The line that assigns the derivative of T . bar by each parameter to ``label_parameter``."""
+    names = ", ".join(f"_{label}_{name}" for name in (*term.parameters, *_bars(term)))
+    return f"{names} = _wp.grad(_work)({arguments}, {', '.join(bars)})"
+
+
+def _adjoint(term: Term) -> Body:
+    def body(of_j: Mapping[str, str]) -> Iterator[str]:
+        yield _gradient("own", term, term.seen_from_i(of_j), map(own_entry, _bars(term)))
+        yield _gradient("other", term, term.seen_from_j(of_j), (of_j[bar] for bar in _bars(term)))
+        for n, array in enumerate(term.arrays):
+            shares = {
+                f"{array}_i": f"_own_{array}_i",
+                f"{array}_j": f"_other_{array}_j",
+                f"{array}_ij": f"_own_{array}_ij - _other_{array}_ij",
+            }
+            yield f"_total_{n} += {' + '.join(share for name, share in shares.items() if name in term.parameters)}"
+        for n, name in enumerate(term.others, len(term.arrays)):
+            yield f"_total_{n} += _own_{name}"
+
+    return body
+
+
+def _tangent(term: Term, d: Discretisation) -> Body:
+    """Of each component of each result the gradient times the tangents of the parameters."""
+    kinds = {**term.parameters, **_bars(term)}
+
+    def change_of(name: str, of_j: Mapping[str, str]) -> str:
+        array = array_of(name)
+        if not array:
+            return f"{name}_dot"
+        own, other = own_entry(f"{array}_dot"), of_j[f"{array}_dot"]
+        return {"i": own, "j": other, "ij": f"{own} - {other}"}[name.rpartition("_")[2]]
+
+    def product(first: str, name: str, second: str) -> str:
+        return f"{first} * ({second})" if kinds[name] is d.precision.real else f"_wp.dot({first}, {second})"
+
+    def body(of_j: Mapping[str, str]) -> Iterator[str]:
+        moved = [name for name in term.parameters if name not in (*NUMBERS, "s")]
+        for n, kind in enumerate(term.results):
+            components = 1 if kind is d.precision.real else len(kind())
+            for k in range(components):
+                bars = [_unit(each, d, k) if m == n else zero(each, d) for m, each in enumerate(term.results)]
+                yield _gradient(f"by_{n}_{k}", term, term.seen_from_i(of_j), bars)
+                terms = (product(f"_by_{n}_{k}_{name}", name, change_of(name, of_j)) for name in moved)
+                yield f"_total_{n} += ({' + '.join(terms)}) * {_unit(kind, d, k)}"
+
+    return body
+
+
+def _unit(kind: Any, d: Discretisation, k: int) -> str:
+    """The text of a result whose component k is 1, and all others 0."""
+    if kind is d.precision.real:
+        return "_real(1.0)"
+    return f"{type_name(kind, d)}({', '.join(f'_real({float(m == k)})' for m in range(len(kind())))})"

@@ -1,0 +1,238 @@
+"""What a particle sees: its neighbours and the walls, as one argument of every kernel that sums over them."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.arithmetic import arithmetic
+from cortado.device.kernels import kind_of
+from cortado.device.lanes import set_lanes
+from cortado.device.precision import Precision
+from cortado.discretise.smoothing import SmoothingKernel
+from cortado.particles.loads import loads
+from cortado.particles.smoothing import smoothing_functions
+
+UNROLL = 4
+"""Fluid neighbours that a loop takes at a time, so that their loads overlap; lists are filled up to a multiple of it
+with the particle itself, which adds nothing to a sum but W(0) to the density's."""
+
+
+@dataclass(frozen=True)
+class Discretisation:
+    """A smoothing kernel in a precision: what a kernel factory is asked for."""
+
+    smoothing: SmoothingKernel
+    precision: Precision
+    lanes: int = 1
+    """Threads for each particle, in kernels that are made for them: see `cortado.device.lanes`."""
+    periodic: bool = False
+    """Whether particles see the nearest images of one another: see ``period`` in the neighbourhood."""
+    taped: bool = False
+    """Whether a tape can differentiate the forward kernels: they get Warp's own adjoint, which takes one lane."""
+
+    def module(self, forward: bool, topic: str) -> Any:
+        """The Warp module of forward kernels, or of those of the adjoint; `tangent_module` has the others. ``topic``
+        tells the modules of one file or solver from those of others."""
+        return self._module(kind_of(forward, self.taped), topic, forward and self.taped)
+
+    def tangent_module(self, topic: str) -> Any:
+        """The Warp module of the kernels of forward mode, which no gradient needs."""
+        return self._module("tangent", topic, False)
+
+    def _module(self, kind: str, topic: str, enable_backward: bool) -> Any:
+        images = "_periodic" if self.periodic else ""
+        lanes = "" if self.lanes == 1 else f"_{self.lanes}_lanes"
+        beside = f"{images}{lanes}_beside_taped" if self.taped and not enable_backward else f"{images}{lanes}"
+        module = wp.get_module(f"cortado_{topic}_{kind}_{self.smoothing.name}_{self.precision.name}{beside}")
+        module.options["enable_backward"] = enable_backward
+        set_lanes(module, self.lanes)
+        return module
+
+
+@cache
+def neighbourhood_type(precision: Precision) -> Any:
+    """The Warp struct of one precision; arrays are sorted by cell, lists are [neighbour, particle]."""
+    real, vector = precision.real, precision.vector
+
+    class Neighbourhood:
+        first: wp.int32
+        """Particle of a launch's first thread: a launch may be cut into ranges of particles."""
+        part: wp.int32
+        """Number of the range."""
+        particles: wp.int32
+        """Of one scene: particle i belongs to scene i // particles of a batch."""
+        neighbours: wp.array2d(dtype=wp.int32)
+        """First the fluid neighbours of a particle, filled up with itself, then its wall neighbours."""
+        fluid_count: wp.array(dtype=wp.int32)
+        """Of the filled list, a multiple of `UNROLL`."""
+        filling: wp.array(dtype=wp.int32)
+        """How many of them are the particle itself."""
+        count: wp.array(dtype=wp.int32)
+        wall_positions: wp.array(dtype=vector)
+        """[m]"""
+        wall_weights: wp.array(dtype=real)
+        """w_b [-]: what a wall particle counts for in the density, a fluid particle being 1."""
+        support: real
+        """Support radius h [m]."""
+        per_support: real
+        """1 / h [1 / m]."""
+        reach: real
+        """Neighbours are listed up to this distance [m], a little beyond the support."""
+        normalisation: real
+        """sigma of the kernel [1 / m^d]."""
+        self_weight: real
+        """W(0) [1 / m^d]."""
+        response_scale: real
+        """(sum_j G_j . G_j)^(-1/2) of a filled neighbourhood [m^(d + 1)], for the relaxation beside walls."""
+        laplacian_correction: real
+        """What second derivatives are multiplied with [-], see `cortado.discretise.calibration`."""
+        volume: real
+        """Volume V of a particle on the rest lattice [m^d]: with it that lattice has the rest density."""
+        period: vector
+        """[m], 0 along an axis that is not periodic; read where the `Discretisation` is periodic."""
+        frequency: vector
+        """1 / period [1 / m], or 0."""
+
+    Neighbourhood.__qualname__ = f"Surroundings_{precision.name}"
+    Neighbourhood.__name__ = Neighbourhood.__qualname__
+    return wp.struct(Neighbourhood)
+
+
+@dataclass(frozen=True)
+class PairFunctions:
+    """Warp functions of a pair of particles: see `pair_functions`."""
+
+    separation: Any
+    weight: Any
+    slope: Any
+    slope_change: Any
+    gradient: Any
+    hessian_product: Any
+    per_size: Any
+    factor: Any
+    factor_gradient: Any
+    neighbour: Any
+    wall_position: Any
+    wall_weight: Any
+    vectors: Any
+    numbers: Any
+
+
+@cache
+def pair_functions(discretisation: Discretisation) -> PairFunctions:
+    """Warp functions of a separation in given neighbourhood.
+
+    ``separation`` (x_i - x_j, of the nearest image), ``weight``, ``slope`` (a of G = a x), ``slope_change``
+    (grad a . u), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x); ``per_size``
+    (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction per_size x . G, of
+    second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the list of i),
+    ``wall_position`` and ``wall_weight``; and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have
+    before any of it is used, so that the loads do not wait for one another (on a GPU a tenth of a whole step).
+    """
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    neighbourhood = neighbourhood_type(discretisation.precision)
+    smooth = smoothing_functions(discretisation.smoothing, discretisation.precision, discretisation.taped)
+    smooth_weight, smooth_slope, smooth_slope_change = smooth.weight, smooth.slope, smooth.slope_change
+    reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
+    load = loads(discretisation.precision, discretisation.taped)
+    load_neighbour, load_vector, load_number = load.neighbour, load.vector, load.number
+    rows = wp.types.matrix(shape=(UNROLL, 3), dtype=real)
+    row = wp.types.vector(length=UNROLL, dtype=real)
+
+    @wp.func
+    def difference(x_i: vector, x_j: vector, s: neighbourhood) -> vector:
+        return x_i - x_j
+
+    @wp.func
+    def nearest_image(x_i: vector, x_j: vector, s: neighbourhood) -> vector:
+        x_ij = x_i - x_j
+        turns = vector(
+            wp.round(x_ij[0] * s.frequency[0]),
+            wp.round(x_ij[1] * s.frequency[1]),
+            wp.round(x_ij[2] * s.frequency[2]),
+        )
+        return x_ij - wp.cw_mul(turns, s.period)
+
+    @wp.func
+    def weight(x: vector, s: neighbourhood) -> real:
+        return smooth_weight(x, s.per_support, s.normalisation)
+
+    @wp.func
+    def slope(x: vector, s: neighbourhood) -> real:
+        return smooth_slope(x, s.per_support, s.normalisation)
+
+    @wp.func
+    def slope_change(x: vector, u: vector, s: neighbourhood) -> real:
+        return smooth_slope_change(x, u, s.per_support, s.normalisation)
+
+    @wp.func
+    def gradient(x: vector, s: neighbourhood) -> vector:
+        return slope(x, s) * x
+
+    @wp.func
+    def hessian_product(x: vector, u: vector, s: neighbourhood) -> vector:
+        return slope(x, s) * u + slope_change(x, u, s) * x
+
+    @wp.func
+    def per_size(x: vector, s: neighbourhood) -> real:
+        return reciprocal(wp.dot(x, x) + real(0.01) * s.support * s.support)
+
+    @wp.func
+    def factor(x: vector, s: neighbourhood) -> real:
+        return s.laplacian_correction * slope(x, s) * wp.dot(x, x) * per_size(x, s)
+
+    @wp.func
+    def factor_gradient(x: vector, s: neighbourhood) -> vector:
+        per_d = per_size(x, s)
+        a = slope(x, s)
+        change = real(2.0) * a + slope_change(x, x, s) - real(2.0) * a * wp.dot(x, x) * per_d
+        return (s.laplacian_correction * per_d * change) * x
+
+    @wp.func
+    def neighbour(k: int, i: int, s: neighbourhood) -> int:
+        return load_neighbour(s.neighbours, k, i)
+
+    @wp.func
+    def wall_position(b: int, s: neighbourhood) -> vector:
+        return load_vector(s.wall_positions, b)
+
+    @wp.func
+    def wall_weight(b: int, s: neighbourhood) -> real:
+        return load_number(s.wall_weights, b)
+
+    @wp.func
+    def vectors(a: wp.array(dtype=vector), k: int, i: int, s: neighbourhood) -> rows:
+        return wp.matrix_from_rows(
+            load_vector(a, neighbour(k, i, s)),
+            load_vector(a, neighbour(k + 1, i, s)),
+            load_vector(a, neighbour(k + 2, i, s)),
+            load_vector(a, neighbour(k + 3, i, s)),
+        )
+
+    @wp.func
+    def numbers(a: wp.array(dtype=real), k: int, i: int, s: neighbourhood) -> row:
+        return row(
+            load_number(a, neighbour(k, i, s)),
+            load_number(a, neighbour(k + 1, i, s)),
+            load_number(a, neighbour(k + 2, i, s)),
+            load_number(a, neighbour(k + 3, i, s)),
+        )
+
+    return PairFunctions(
+        separation=nearest_image if discretisation.periodic else difference,
+        weight=weight,
+        slope=slope,
+        slope_change=slope_change,
+        gradient=gradient,
+        hessian_product=hessian_product,
+        per_size=per_size,
+        factor=factor,
+        factor_gradient=factor_gradient,
+        neighbour=neighbour,
+        wall_position=wall_position,
+        wall_weight=wall_weight,
+        vectors=vectors,
+        numbers=numbers,
+    )

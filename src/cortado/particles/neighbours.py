@@ -1,0 +1,175 @@
+"""Neighbours: particles sorted by cell, and a symmetric list that the step keeps.
+
+The list reaches a little beyond the support radius (`SKIN`), because the density is also taken at predicted positions:
+without it a pair that comes into touch within the step would count or not depending on which side of the support it
+started, a jump in the map from one state to the next (and lattices start with pairs at just that distance).
+
+The list holds j for i exactly when it holds i for j, because |x_i - x_j| is computed with the same bits from both
+sides.
+"""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.device.host import HostCopy
+from cortado.device.lanes import lane_functions
+from cortado.device.launching import MOST_PARTS, KernelLauncher
+from cortado.particles.candidates import scan_around
+from cortado.particles.cells import CellSort, Grid, cell_functions, cell_grid_type
+from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type
+from cortado.particles.state import Layout
+
+
+@cache
+def fill_kernel(discretisation: Discretisation) -> Any:
+    precision = discretisation.precision
+    vector = precision.vector
+    grid_type = cell_grid_type(precision)
+    neighbourhood = neighbourhood_type(precision)
+    cell_of = cell_functions(precision).cell_of
+    scan = scan_around(discretisation)
+    LANES = discretisation.lanes
+    lane = lane_functions(precision, LANES).lane
+
+    @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
+    def fill(
+        s: neighbourhood,
+        grid: grid_type,
+        wall_grid: grid_type,
+        near_walls: wp.array(dtype=wp.bool),
+        bad_step: wp.array(dtype=wp.int32),
+        x: wp.array(dtype=vector),
+        # out
+        fluid_count: wp.array(dtype=wp.int32),
+        filling: wp.array(dtype=wp.int32),
+        count: wp.array(dtype=wp.int32),
+        needed: wp.array(dtype=wp.int32),
+    ):
+        """``needed``, for each range, becomes the longest list, also where that is more than there is room for. Scenes
+        that have lost a particle, in ``bad_step``, get empty lists. ``near_walls`` as `_near_walls`."""
+        i = s.first + wp.tid() // LANES
+        member = i // s.particles
+        if bad_step[member] >= 0:
+            if lane() == 0:
+                filling[i] = 0
+                fluid_count[i] = 0
+                count[i] = 0
+            return
+        x_i = x[i]
+        c = cell_of(x_i, grid)
+        capacity = s.neighbours.shape[0]
+        found = scan(i, i, member * grid.shape[2], c, 0, x_i, x, grid, s)
+        filled = (found + wp.static(UNROLL - 1)) // wp.static(UNROLL) * wp.static(UNROLL)
+        for k in range(found + lane(), wp.min(filled, capacity), LANES):
+            s.neighbours[k, i] = i
+        to_fill = filled - found
+        found = filled
+        if near_walls[(c[2] * grid.shape[1] + c[1]) * grid.shape[0] + c[0]]:
+            found = scan(i, -1, 0, c, found, x_i, s.wall_positions, wall_grid, s)
+        if lane() > 0:
+            return
+        filling[i] = to_fill
+        fluid_count[i] = wp.min(filled, capacity)
+        count[i] = wp.min(found, capacity)
+        if found > needed[s.part]:
+            wp.atomic_max(needed, s.part, found)
+
+    return fill
+
+
+def _near_walls(grid: Grid, starts: np.ndarray) -> np.ndarray:
+    """(cells,) whether there are walls in a cell or around it; ``starts`` (cells + 1,): where each has its first wall
+    particle."""
+    near = np.diff(starts).reshape(grid.shape[::-1]) > 0
+    for axis in range(3):
+        near = near | np.roll(near, 1, axis) | np.roll(near, -1, axis)
+    return near.ravel()
+
+
+class NeighbourSearch:
+    """Sorts a fixed number of particles by cell and lists their neighbours, on one device and without a host read.
+
+    The list is stored [particle][neighbour] on a CPU and [neighbour][particle] on a GPU, whichever a device reads
+    fastest; kernels index it [neighbour, particle] on both.
+    """
+
+    def __init__(
+        self,
+        discretisation: Discretisation,
+        grid: Grid,
+        walls: np.ndarray,
+        wall_weights: np.ndarray,
+        layout: Layout,
+        capacity: int,
+    ):
+        """``walls`` (b, 3) [m], ``wall_weights`` (b,) [-], the same ones for all scenes of a batch."""
+        precision, device, particles = discretisation.precision, layout.device, layout.all_particles
+        self.particles, self.device = particles, device
+        self._fill = fill_kernel(discretisation)
+        self._sort = CellSort(grid, layout.particles, precision, device, layout.members)
+        self.order = self._sort.order
+        self.fluid_count = wp.zeros(particles, dtype=wp.int32, device=device)
+        self.filling = wp.zeros(particles, dtype=wp.int32, device=device)
+        self.count = wp.zeros(particles, dtype=wp.int32, device=device)
+        self._launch = KernelLauncher(particles, device, record_tape=False)
+        self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
+        self._seen = HostCopy(self._needed)
+        self.wall_positions = wp.array(walls, dtype=precision.vector, device=device)
+        self.wall_weights = wp.array(wall_weights, dtype=precision.real, device=device)
+        self._wall_sort = CellSort(grid, len(walls), precision, device)
+        self._unsorted_walls: tuple[np.ndarray, np.ndarray] | None = (walls, wall_weights)
+        self._grid, self._near_walls = grid, wp.zeros(grid.cells, dtype=wp.bool, device=device)
+        self.allocate(capacity)
+
+    def allocate(self, capacity: int) -> None:
+        """Make room for lists of that length, rounded up to a multiple of `UNROLL`."""
+        self.capacity = -(-capacity // UNROLL) * UNROLL
+        shape = (self.particles, self.capacity)
+        if self.device.is_cpu:
+            self.neighbours = wp.empty(shape, dtype=wp.int32, device=self.device).transpose((1, 0))
+        else:
+            self.neighbours = wp.empty(shape[::-1], dtype=wp.int32, device=self.device)
+
+    def sort(self, positions: wp.array) -> None:
+        """Find the order of cells (``order``: sorted -> given) of positions (members n,) [m]; ties keep the given
+        order."""
+        if self._unsorted_walls is not None:  # once, and not before kernels are compiled side by side
+            self._sort_walls(*self._unsorted_walls)
+            self._unsorted_walls = None
+        self._sort(positions)
+
+    def _sort_walls(self, walls: np.ndarray, wall_weights: np.ndarray) -> None:
+        self._wall_sort(self.wall_positions)
+        sorted_to_given = self._wall_sort.order.numpy()
+        self.wall_positions.assign(walls[sorted_to_given])
+        self.wall_weights.assign(wall_weights[sorted_to_given])
+        self._near_walls.assign(_near_walls(self._grid, self._wall_sort.grid.starts.numpy()))
+
+    def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:
+        """List the neighbours of sorted positions (members n,) [m], but none where the ``bad_step`` (members,) of a
+        scene is not -1; `needed` tells whether the lists were long enough."""
+        self._launch(
+            self._fill,
+            s=neighbourhood,
+            grid=self._sort.grid,
+            wall_grid=self._wall_sort.grid,
+            near_walls=self._near_walls,
+            bad_step=bad_step,
+            x=positions,
+            fluid_count=self.fluid_count,
+            filling=self.filling,
+            count=self.count,
+            needed=self._needed,
+        )
+
+    @property
+    def needed(self) -> int:
+        """The longest list since `forget_needed`; more than the capacity if there was too little room."""
+        return int(self._seen.read().max())
+
+    def forget_needed(self) -> None:
+        """Begin anew with `needed`."""
+        self._needed.zero_()

@@ -1,0 +1,162 @@
+"""The smoothing kernels of `cortado.discretise.smoothing` as Warp functions, with their gradients and Hessians:
+
+    W = sigma w(q),    grad W = (sigma / h) f(q) s,    H u = (sigma / h^2) (f(q) u + (f'(q) / q) (s . u) s),
+
+with q = r / h, s = x / h and f(q) = w'(q) / q.
+
+A GPU has one instruction for the reciprocal of a root, and none for a root or a quotient: q is q^2 / q, and what is
+divided by q is multiplied with 1 / q. Pieces are chosen between and not branched to, so that what two functions of one
+pair have in common is computed once.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.arithmetic import arithmetic
+from cortado.device.precision import Precision
+from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C2, WENDLAND_C4, SmoothingKernel
+
+
+@dataclass(frozen=True)
+class RadialFunctions:
+    """Warp functions of a kernel's dimensionless form: w, f = w' / q for its gradient, and f' / q for its Hessian."""
+
+    value: Any
+    """Of q."""
+    gradient_factor: Any
+    """Of q and 1 / q."""
+    hessian_factor: Any
+    """Of q and 1 / q."""
+
+
+def _cubic_spline(precision: Precision) -> RadialFunctions:
+    real = precision.real
+
+    @wp.func
+    def value(q: real) -> real:
+        t = wp.max(real(1.0) - q, real(0.0))
+        return wp.where(q <= real(0.5), real(6.0) * q * q * (q - real(1.0)) + real(1.0), real(2.0) * t * t * t)
+
+    @wp.func
+    def gradient_factor(q: real, per_q: real) -> real:
+        t = wp.max(real(1.0) - q, real(0.0))
+        return wp.where(q <= real(0.5), real(18.0) * q - real(12.0), real(-6.0) * t * t * per_q)
+
+    @wp.func
+    def hessian_factor(q: real, per_q: real) -> real:
+        t = wp.max(real(1.0) - q, real(0.0))
+        return wp.where(q <= real(0.5), real(18.0), real(6.0) * t * (real(2.0) * q + t) * per_q * per_q) * per_q
+
+    return RadialFunctions(value=value, gradient_factor=gradient_factor, hessian_factor=hessian_factor)
+
+
+def _wendland_c2(precision: Precision) -> RadialFunctions:
+    real = precision.real
+
+    @wp.func
+    def value(q: real) -> real:
+        t = wp.max(real(1.0) - q, real(0.0))
+        return t * t * t * t * (real(1.0) + real(4.0) * q)
+
+    @wp.func
+    def gradient_factor(q: real, per_q: real) -> real:
+        t = wp.max(real(1.0) - q, real(0.0))
+        return real(-20.0) * t * t * t
+
+    @wp.func
+    def hessian_factor(q: real, per_q: real) -> real:
+        t = wp.max(real(1.0) - q, real(0.0))
+        return real(60.0) * t * t * per_q
+
+    return RadialFunctions(value=value, gradient_factor=gradient_factor, hessian_factor=hessian_factor)
+
+
+def _wendland_c4(precision: Precision) -> RadialFunctions:
+    real = precision.real
+
+    @wp.func
+    def value(q: real) -> real:
+        t = wp.max(real(1.0) - q, real(0.0))
+        t_2 = t * t
+        return t_2 * t_2 * t_2 * (real(1.0) + real(6.0) * q + (real(35.0) / real(3.0)) * q * q)
+
+    @wp.func
+    def gradient_factor(q: real, per_q: real) -> real:
+        t = wp.max(real(1.0) - q, real(0.0))
+        t_2 = t * t
+        return (real(-56.0) / real(3.0)) * (real(1.0) + real(5.0) * q) * t_2 * t_2 * t
+
+    @wp.func
+    def hessian_factor(q: real, per_q: real) -> real:
+        t = wp.max(real(1.0) - q, real(0.0))
+        t_2 = t * t
+        return real(560.0) * t_2 * t_2
+
+    return RadialFunctions(value=value, gradient_factor=gradient_factor, hessian_factor=hessian_factor)
+
+
+RADIAL_FUNCTIONS = {
+    CUBIC_SPLINE.name: _cubic_spline,
+    WENDLAND_C2.name: _wendland_c2,
+    WENDLAND_C4.name: _wendland_c4,
+}
+"""By the kernel's name: for a precision, ``value`` w, ``gradient_factor`` f and ``hessian_factor`` f' / q."""
+
+
+@dataclass(frozen=True)
+class SmoothingFunctions:
+    """Warp functions of W at a separation x, and of what its derivatives are made of."""
+
+    weight: Any
+    slope: Any
+    """a of grad W = a x."""
+    slope_change: Any
+    """The derivative of a along a vector u, grad a . u; with it H u = a u + (grad a . u) x."""
+    gradient: Any
+
+
+@cache
+def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bool = False) -> SmoothingFunctions:
+    """Warp functions of a separation x [m]: ``weight``, ``slope``, ``slope_change`` and ``gradient``.
+
+    Each takes 1 / h, h being the support radius [m], and the normalisation sigma [1 / m^d]. A tape can differentiate
+    ``taped`` ones.
+    """
+    real, vector = precision.real, precision.vector
+    radial = RADIAL_FUNCTIONS[kernel.name](precision)
+    value, gradient_factor, hessian_factor = radial.value, radial.gradient_factor, radial.hessian_factor
+    functions = arithmetic(precision, taped)
+    root, inverse_root = functions.root, functions.inverse_root
+    tiny = wp.constant(real(precision.tiny))
+
+    @wp.func
+    def square(x: vector, per_h: real) -> real:
+        """q^2. tiny guards coincident particles: there 1 / q is finite and s = 0, so that the second term of the
+        Hessian is 0 and H = W''(0) I, as it should be."""
+        return wp.dot(x, x) * (per_h * per_h) + tiny
+
+    @wp.func
+    def weight(x: vector, per_h: real, sigma: real) -> real:
+        return sigma * value(root(square(x, per_h)))
+
+    @wp.func
+    def slope(x: vector, per_h: real, sigma: real) -> real:
+        q_2 = square(x, per_h)
+        per_q = inverse_root(q_2)
+        return sigma * (per_h * per_h) * gradient_factor(q_2 * per_q, per_q)
+
+    @wp.func
+    def slope_change(x: vector, u: vector, per_h: real, sigma: real) -> real:
+        q_2 = square(x, per_h)
+        per_q = inverse_root(q_2)
+        # of numbers of a size with q and W, as 1 / h^4 overflows where spacings are small
+        return sigma * (per_h * per_h) * hessian_factor(q_2 * per_q, per_q) * (per_h * per_h * wp.dot(x, u))
+
+    @wp.func
+    def gradient(x: vector, per_h: real, sigma: real) -> vector:
+        return slope(x, per_h, sigma) * x
+
+    return SmoothingFunctions(weight, slope, slope_change, gradient)

@@ -1,0 +1,206 @@
+"""What a step depends on, as Warp arrays by name: the state before it, and the parameters."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+import warp as wp
+
+from cortado.device.launching import TreeReduction, sum_of
+from cortado.device.precision import Precision
+from cortado.particles.arrays import Arrays, padded, zeros
+from cortado.particles.fields import Entry, StateField
+from cortado.scene.parameters.known import REGISTRY, Known
+from cortado.scene.parameters.registry import Axis
+
+
+class State(Arrays):
+    """All that a step depends on besides parameters, by the names of the fields that the solver declares. Also the type
+    of its derivatives.
+
+    Every state has ``positions`` (n,) vectors [m], ``velocities`` (n,) vectors [m / s] and ``mass_fractions`` (n,) of
+    as many numbers as there are phases [-], in the scene's order of particles; in a batch of scenes one scene stands
+    behind the other.
+    """
+
+    def __init__(self, fields: tuple[StateField, ...], arrays: Mapping[str, wp.array], batch: int | None = None):
+        """``batch`` as that of `Layout`."""
+        super().__init__(arrays)
+        self.fields, self.batch = fields, batch
+
+    @property
+    def positions(self) -> wp.array:
+        """(n,) vectors [m]."""
+        return self["positions"]
+
+    @property
+    def velocities(self) -> wp.array:
+        """(n,) vectors [m / s]."""
+        return self["velocities"]
+
+    @property
+    def mass_fractions(self) -> wp.array:
+        """(n,) of as many numbers as there are phases [-]."""
+        return self["mass_fractions"]
+
+    def like(self) -> Self:
+        """One of the same fields and sizes, all 0."""
+        zero = {name: wp.zeros_like(self[name], requires_grad=False) for name in self.names}
+        return type(self)(self.fields, zero, self.batch)
+
+    def following(self) -> Self:
+        """A later state of the same run that is still to be written: what no step changes is the same array."""
+        new = {f.name: self[f.name] if f.is_constant else wp.empty_like(self[f.name]) for f in self.fields}
+        return type(self)(self.fields, new, self.batch)
+
+    def copy(self) -> Self:
+        """The same in arrays of its own."""
+        own = {name: wp.clone(self[name], requires_grad=False) for name in self.names}
+        return type(self)(self.fields, own, self.batch)
+
+    def member(self, number: int) -> Self:
+        """One scene of a batch, as a view of these arrays."""
+        assert self.batch is not None
+        sizes = {name: len(self[name]) // self.batch for name in self.names}
+        views = {name: self[name][number * size : (number + 1) * size] for name, size in sizes.items()}
+        return type(self)(self.fields, views)
+
+    def numbers(self, name: str) -> wp.array:
+        """A field as a Warp array of numbers, vectors (n, 3), fractions (n, phases), in a batch (batch, n, ...), that
+        shares its memory: what speaks DLPack, such as PyTorch and JAX, takes it without a copy."""
+        field = self[name]
+        shape = (len(field),) if self.batch is None else (self.batch, len(field) // self.batch)
+        entries = getattr(field.dtype, "_shape_", ())
+        dtype = getattr(field.dtype, "_wp_scalar_type_", field.dtype)
+        view = wp.array(ptr=field.ptr, dtype=dtype, shape=(*shape, *entries), device=field.device)
+        view._ref = field  # keeps the memory
+        return view
+
+    def set(self, values: Mapping[str, Any]) -> None:
+        """Write fields by name: vectors (n, d), numbers (n,), fractions (n, phases), in a batch (batch, n, ...)."""
+        for field in self.fields:
+            if field.name in values:
+                given = np.asarray(values[field.name])
+                flat = given if self.batch is None else given.reshape(-1, *given.shape[2:])
+                self[field.name].assign(padded(flat) if field.entry is Entry.VECTOR else flat)
+
+    def numpy(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+        """Every field, or only those of some names, as a new array: vectors (n, dimension), numbers (n,), fractions
+        (n, phases), in a batch (batch, n, ...)."""
+        names = set(self.names if only is None else only)
+        arrays = {f: self[f.name].numpy() for f in self.fields if f.name in names}
+        found = {f.name: (a[:, :dimension] if f.entry is Entry.VECTOR else a).copy() for f, a in arrays.items()}
+        if self.batch is None:
+            return found
+        return {name: a.reshape(self.batch, -1, *a.shape[1:]) for name, a in found.items()}
+
+
+class StateSeries:
+    """States of one run one behind the other in the same arrays, so that all of them are copied at once."""
+
+    def __init__(self, like: State, length: int):
+        """``length`` states of the fields and sizes of one, still to be written; what no step changes is its array."""
+        self._like, self._length = like, length
+        changed = {field.name: like[field.name] for field in like.fields if not field.is_constant}
+        self._whole = {name: wp.empty(length * len(a), dtype=a.dtype, device=a.device) for name, a in changed.items()}
+
+    def state(self, k: int) -> State:
+        """One of them, as a view of the arrays."""
+        size = {name: len(array) // self._length for name, array in self._whole.items()}
+        own = {name: array[k * size[name] : (k + 1) * size[name]] for name, array in self._whole.items()}
+        arrays = {field.name: own.get(field.name, self._like[field.name]) for field in self._like.fields}
+        return State(self._like.fields, arrays, self._like.batch)
+
+    def like(self) -> Self:
+        """As many, still to be written."""
+        return type(self)(self._like, self._length)
+
+    def assign(self, other: Self) -> None:
+        """Copy as many others of the same run."""
+        for name, array in self._whole.items():
+            wp.copy(array, other._whole[name])
+
+
+class Parameters(Arrays):
+    """What steps depend on besides the state, by the names of parameters. Also the type of its derivatives.
+
+    A parameter over time is (members, steps) vectors or numbers, one of phases (members, phases) numbers, any other
+    (members,) numbers or vectors, with one member for each scene of a batch.
+    """
+
+    def __init__(self, arrays: Mapping[str, wp.array]):
+        super().__init__(arrays)
+        self._written: dict[str, np.ndarray] = {}
+        """What `set` has written last, and need not write again."""
+
+    @property
+    def written(self) -> Mapping[str, np.ndarray]:
+        """What `set` has written, by name."""
+        return dict(self._written)
+
+    def set(self, values: Mapping[str, Any]) -> None:
+        """Write some by name, the same for all members or with an axis of them: a vector (d,) or vectors
+        (steps, d); numbers or arrays of them. Nothing else may write to arrays that are set again."""
+        for name, value in values.items():
+            array, given = self[name], np.array(value, dtype=np.float64)
+            if name in self._written and np.array_equal(self._written[name], given):
+                continue
+            self._written[name] = given
+            if hasattr(array.dtype, "_shape_"):
+                table = np.zeros((*array.shape, 3))
+                table[..., : given.shape[-1]] = given
+                array.assign(table)
+            else:
+                array.assign(np.broadcast_to(given, array.shape))
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How large the arrays of one solver are, and where they are: those of one scene, or of several in one launch, one
+    behind the other. A kernel has one thread for each particle of all of them."""
+
+    particles: int
+    """Of one scene."""
+    phases: int
+    precision: Precision
+    device: Any
+    batch: int | None = None
+    """How many scenes; None for a single one, whose arrays have no axis for it."""
+    known: Known = REGISTRY
+    """Their parameters."""
+
+    @property
+    def members(self) -> int:
+        """How many scenes there are."""
+        return self.batch or 1
+
+    @property
+    def all_particles(self) -> int:
+        """Of all scenes."""
+        return self.members * self.particles
+
+    def sum_of(self, dtype: Any) -> TreeReduction:
+        """Sums over the particles of each scene of numbers, vectors or matrices of a Warp type."""
+        return sum_of(dtype, self.particles, self.device, self.members)
+
+    def state(self, fields: tuple[StateField, ...], requires_grad: bool = False) -> State:
+        """A state of these fields, all 0."""
+        precision = self.precision
+        dtypes = {
+            Entry.NUMBER: precision.real,
+            Entry.VECTOR: precision.vector,
+            Entry.FRACTIONS: precision.fractions(self.phases),
+            Entry.DOUBLE: wp.float64,
+        }
+        sizes = {Axis.PARTICLE: self.all_particles, Axis.SCALAR: self.members}
+        kinds = {field.name: (sizes[field.axis], dtypes[field.entry]) for field in fields}
+        return State(fields, zeros(kinds, self.device, requires_grad), self.batch)
+
+    def parameters(self, steps: int, requires_grad: bool = False) -> Parameters:
+        """Parameters of a run of so many steps, all 0."""
+        real, vector, members = self.precision.real, self.precision.vector, self.members
+        sizes: dict[Axis, Any] = {Axis.STEP: (members, max(steps, 1)), Axis.PHASE: (members, self.phases)}
+        used = [self.known[name] for name in self.known.run]
+        kinds = {p.name: (sizes.get(p.axis, members), vector if p.rank else real) for p in used}
+        return Parameters(zeros(kinds, self.device, requires_grad))

@@ -1,0 +1,22 @@
+"""Pictures to aim at, in files, shaded ones to show, films, figures. `cortado.render` has those with derivatives."""
+
+from cortado.lazy import getter
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from cortado.pictures.image_files import COFFEE as COFFEE
+    from cortado.pictures.image_files import MILK as MILK
+    from cortado.pictures.image_files import WHITE as WHITE
+    from cortado.pictures.image_files import heart as heart
+    from cortado.pictures.image_files import read_picture as read_picture
+    from cortado.pictures.image_files import rosetta as rosetta
+    from cortado.pictures.image_files import write_picture as write_picture
+
+__all__ = ["COFFEE", "MILK", "WHITE", "heart", "read_picture", "rosetta", "write_picture"]
+
+if not TYPE_CHECKING:
+    __getattr__ = getter(__name__, dict.fromkeys(__all__, "image_files"))
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,261 @@
+"""Pictures to aim at: latte art drawn at any resolution, and picture files read and written.
+
+A picture is (rows, columns, 3) red, green and blue, linear light from 0 to 1, float64, its first row at the top. A
+resolution is (columns, rows), as in a scene, or one number for a square.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cortado.device.memory import require
+from cortado.errors import CortadoWarning, InputError
+from cortado.files.atomic import write_atomically
+from cortado.files.input_files import as_path, reason, regular_file
+from cortado.files.srgb import check_light, from_srgb, to_srgb
+from cortado.render.cameras import check_resolution, positive, vector
+
+Picture = NDArray[np.float64]
+Resolution = int | tuple[int, int]
+Colour = tuple[float, float, float]
+Shape = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]]
+"""Whether the points x, y are inside; a shape fills -1 to 1 from its bottom to its top."""
+
+MILK: Colour = (0.96, 0.93, 0.86)
+COFFEE: Colour = (0.30, 0.16, 0.08)
+WHITE: Colour = (1.0, 1.0, 1.0)
+DRAWN = 100.0
+"""Bytes for each pixel of a picture that is drawn, about."""
+SAMPLES = 6
+"""Points along either side of a pixel that tell how much of it a shape covers."""
+FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
+"""Of the files that are read."""
+MOST_BYTES = 2**28
+"""Of a file."""
+MOST_PIXELS = 2**26
+"""Of a picture that is resampled."""
+MOST_PIXELS_KEPT = 2**24
+"""Of one that is not."""
+PIXELS_AT_ONCE = 2**20
+MOST_CROPPED = 0.8
+"""Of a picture: where less of it is taken, a warning says so."""
+LIGHT = from_srgb(np.arange(256, dtype=np.uint8))
+"""Linear light of every value in a file."""
+
+
+def heart(
+    resolution: Resolution,
+    *,
+    cup: float | None = None,
+    size: float = 0.6,
+    milk: Colour = MILK,
+    coffee: Colour = COFFEE,
+    background: Colour = WHITE,
+) -> Picture:
+    """A heart, its tip down.
+
+    Args:
+        resolution: columns and rows of pixels, or one number for both.
+        cup: radius of a round cup in the middle, relative to half of the shorter side of the picture; outside it
+            is the background. None: coffee everywhere.
+        size: of the shape, relative to the cup or, without one, to the shorter side of the picture.
+        milk, coffee, background: red, green and blue, linear, from 0 to 1.
+    """
+    return _drawn(_in_heart, resolution, cup, size, (milk, coffee, background))
+
+
+def rosetta(
+    resolution: Resolution,
+    *,
+    cup: float | None = None,
+    size: float = 0.75,
+    milk: Colour = MILK,
+    coffee: Colour = COFFEE,
+    background: Colour = WHITE,
+) -> Picture:
+    """A rosetta: layers of milk like the leaves of a fern, drawn together by a stem, a small heart on top.
+
+    The arguments are those of `heart`.
+    """
+    return _drawn(_in_rosetta, resolution, cup, size, (milk, coffee, background))
+
+
+def read_picture(path: str | Path, resolution: Resolution | None = None) -> Picture:
+    """The picture of a file of one of `FORMATS`, transparent parts on white.
+
+    Args:
+        resolution: columns and rows wanted: the largest part in the middle with their proportions is resampled,
+            in linear light. None keeps the pixels as they are.
+
+    Raises:
+        InputError: there is no such file, no picture in it, or one of too many pixels.
+    """
+    from PIL import Image, ImageOps, UnidentifiedImageError
+
+    most = MOST_PIXELS_KEPT if resolution is None else MOST_PIXELS
+    shape = None if resolution is None else _columns_and_rows(resolution)
+    try:
+        regular_file(as_path("path", path), MOST_BYTES)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow warns of large pictures, which are judged here
+            with Image.open(path, formats=FORMATS) as file:
+                _check_header(path, file, most)
+                file.load()
+                ImageOps.exif_transpose(file, in_place=True)
+                picture = _whole(file) if shape in (None, file.size) else _resampled(file, *shape)
+    except InputError:
+        raise
+    except Image.DecompressionBombError:
+        raise _too_many(path, "very many pixels", most) from None
+    except UnidentifiedImageError:
+        raise InputError(f"The picture {path} cannot be read: it is none of {', '.join(FORMATS)}.") from None
+    except Exception as problem:  # of many types, where a file is damaged
+        raise InputError(f"The picture {path} cannot be read: {reason(problem)}.") from problem
+    if shape is not None:
+        _warn_of_cropping(path, file.size, shape)
+    return picture
+
+
+def _warn_of_cropping(path: str | Path, size: tuple[int, int], shape: tuple[int, int]) -> None:
+    """Of a picture that is ``size`` pixels wide and high, whose proportions are to be those of ``shape``."""
+    left, top, right, bottom = _middle(size, shape)
+    share = (right - left) * (bottom - top) / (size[0] * size[1])
+    if share < MOST_CROPPED:
+        found = f"The picture {path} has {size[0]} x {size[1]} pixels, but {shape[0]} x {shape[1]} are wanted"
+        warnings.warn(f"{found}: only its middle is taken, {share:.0%} of it.", CortadoWarning, stacklevel=3)
+
+
+def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom of the largest part in the middle of a picture that has these proportions."""
+    (width, height), (columns, rows) = size, shape
+    scale = min(width / columns, height / rows)
+    left, top = 0.5 * (width - scale * columns), 0.5 * (height - scale * rows)
+    return left, top, width - left, height - top
+
+
+def _check_header(path: str | Path, file: Any, most: int) -> None:
+    """Before anything is decoded."""
+    if file.width * file.height > most:
+        raise _too_many(path, f"{file.width} x {file.height} pixels", most)
+    if file.mode.startswith(("I", "F")):
+        raise InputError(f"The picture {path} has more than 8 bits for a colour; save it with 8.")
+
+
+def _too_many(path: str | Path, found: str, most: int) -> InputError:
+    return InputError(f"The picture {path} has {found}, but must have at most {most} of them; save it smaller.")
+
+
+def write_picture(path: str | Path, image: ArrayLike) -> Path:
+    """Writes a linear image (rows, columns, 3) as a PNG with 8 bits of sRGB, clipped to 0..1, and returns its path.
+
+    Raises:
+        InputError: another shape, whole numbers, values that are not finite or up to 255, a name that does not end in
+            .png, or a file that cannot be written.
+    """
+    from PIL import Image
+
+    if Path(as_path("path", path)).suffix.lower() != ".png":
+        raise InputError(f"path is {str(path)!r}, but must be the name of a PNG file, such as picture.png.")
+    pixels, content = to_srgb(image), BytesIO()
+    check_light("The image", image)
+    Image.fromarray(pixels).save(content, format="PNG")
+    write_atomically(Path(path), content.getvalue())
+    return Path(path)
+
+
+def _drawn(
+    shape: Shape, resolution: Resolution, cup: float | None, size: float, colours: tuple[Colour, Colour, Colour]
+) -> Picture:
+    for name, value in (("cup", 1.0 if cup is None else cup), ("size", size)):
+        positive(name, value)
+    columns, rows = _columns_and_rows(resolution)
+    require({"a picture": DRAWN * columns * rows}, "take a smaller resolution")
+    milk, coffee, background = (np.array(vector("A colour", colour)) for colour in colours)
+    scale = size * (1.0 if cup is None else cup)
+    picture = _mixed(_coverage(lambda x, y: shape(x / scale, y / scale), columns, rows), milk, coffee)
+    if cup is None:
+        return picture
+    return _mixed(_coverage(lambda x, y: x**2 + y**2 < cup**2, columns, rows), picture, background)
+
+
+def _mixed(share: Picture, inside: Picture, outside: Picture) -> Picture:
+    return share * inside + (1.0 - share) * outside
+
+
+def _coverage(shape: Shape, columns: int, rows: int) -> Picture:
+    """(rows, columns, 1) share of every pixel that is inside; the shorter side goes from -1 to 1, y upwards."""
+    half = 0.5 * min(columns, rows)
+    covered = np.zeros((rows, columns, 1))
+    offsets = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    for down in offsets:
+        y = (0.5 * rows - np.arange(rows) - down)[:, None] / half
+        for right in offsets:
+            x = (np.arange(columns) + right - 0.5 * columns)[None, :] / half
+            covered[..., 0] += shape(x, y)
+    return covered / SAMPLES**2
+
+
+def _in_heart(x: Any, y: Any) -> Any:
+    """The sextic (x^2 + y^2 - 1)^3 = x^2 y^3, which goes from y = -1 to 1.2367, moved and shrunk."""
+    x, y = 1.1183 * x, 1.1183 * y + 0.1183
+    return (x**2 + y**2 - 1.0) ** 3 < x**2 * y**3
+
+
+def _in_rosetta(x: Any, y: Any) -> Any:
+    """Six layers, all bent in the same way so that coffee of the same width stays between them, a stem and a heart."""
+    x = np.abs(x)
+    inside = _in_heart(x / 0.31, (y - 0.69) / 0.31) | ((x < 0.02) & (np.abs(y + 0.2) < 0.8))
+    height = y - (x**0.75 - 0.55 * x**2)  # of the point of the stem where the layer through x, y leaves it
+    for k in np.linspace(0.0, 1.0, 6):
+        reach = 0.55 - 0.13 * k + 0.95 * k * (1.0 - k)
+        along = np.minimum(x / reach, 1.0)
+        inside |= np.abs(height + 0.86 - k) < 0.1 * along**0.35 * np.sqrt(1.0 - along**5)
+    return inside
+
+
+def _columns_and_rows(resolution: Resolution) -> tuple[int, int]:
+    found = (resolution, resolution) if isinstance(resolution, int) else resolution
+    check_resolution(found)
+    return found
+
+
+def _bands(picture: Any) -> Iterator[tuple[int, Any]]:
+    """A few rows after the other, opaque, each with the number of its first row: what is made of all rows at once would
+    take many times the room of the picture."""
+    from PIL import Image
+
+    height = max(PIXELS_AT_ONCE // picture.width, 1)
+    for top in range(0, picture.height, height):
+        band = picture.crop((0, top, picture.width, min(top + height, picture.height)))
+        if picture.has_transparency_data:
+            band = band.convert("RGBA")
+            band = Image.alpha_composite(Image.new("RGBA", band.size, "white"), band)
+        yield top, band.convert("RGB")
+
+
+def _whole(picture: Any) -> Picture:
+    linear = np.empty((picture.height, picture.width, 3))
+    for top, band in _bands(picture):
+        linear[top : top + band.height] = LIGHT[np.asarray(band)]
+    return linear
+
+
+def _resampled(picture: Any, columns: int, rows: int) -> Picture:
+    """(rows, columns, 3) from the largest part in the middle that has these proportions."""
+    from PIL import Image
+
+    box = _middle(picture.size, (columns, rows))
+    small, light = np.empty((rows, columns, 3)), LIGHT.astype(np.float32)
+    for k in range(3):
+        channel = Image.new("F", picture.size)
+        for first, band in _bands(picture):
+            channel.paste(Image.fromarray(light[np.asarray(band.getchannel(k))]), (0, first))
+        small[..., k] = np.asarray(channel.resize((columns, rows), Image.Resampling.BILINEAR, box=box))
+    return small

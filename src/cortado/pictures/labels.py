@@ -1,0 +1,48 @@
+"""Words on pictures, and pictures side by side."""
+
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cortado.discretise.shapes import Points
+from cortado.files.srgb import from_srgb
+
+INK = from_srgb(np.array([43, 42, 40], dtype=np.uint8))
+
+
+def labelled(image: Points, text: str) -> Points:
+    """A picture (rows, columns, 3), linear, with a word at its top, on the left."""
+    from PIL import Image, ImageDraw
+
+    size = max(round(0.042 * image.shape[0]), 11)
+    labelled = np.array(image)
+    strip = labelled[: 3 * size]
+    mask = Image.new("L", strip.shape[1::-1])
+    ImageDraw.Draw(mask).text((round(0.9 * size), round(0.7 * size)), text, fill=255, font=_font(size))
+    cover = (np.asarray(mask) / 255.0)[..., None]
+    strip[:] = strip * (1.0 - cover) + INK * cover
+    return labelled
+
+
+def side_by_side(images: Sequence[Points], across: int) -> Points:
+    """Pictures of one size in rows of so many, a thin light line between them; the end of the last row may be empty."""
+    rows, columns = images[0].shape[:2]
+    down = -(-len(images) // across)
+    page = np.ones((down * rows, across * columns, 3), images[0].dtype)
+    for k, image in enumerate(images):
+        row, column = divmod(k, across)
+        page[row * rows : (row + 1) * rows, column * columns : (column + 1) * columns] = image
+    page[[row * rows for row in range(1, down)]] = 1.0
+    page[:, [column * columns for column in range(1, across)]] = 1.0
+    return page
+
+
+@cache
+def _font(size: int) -> Any:
+    import matplotlib
+    from PIL import ImageFont
+
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"), size)

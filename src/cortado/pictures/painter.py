@@ -1,0 +1,46 @@
+"""Who draws a scene: a ray tracer in 3-D, a painter of the plane in 2-D."""
+
+from collections.abc import Iterable, Iterator
+from typing import Any, Protocol
+
+import numpy as np
+
+from cortado.discretise.shapes import Points
+from cortado.pictures.plane import PlanePainter
+from cortado.pictures.scenery import State
+from cortado.pictures.space import SpacePainter
+from cortado.pictures.stage import Stage, extent_of
+from cortado.scene.scene import Scene
+
+ENOUGH = 1_000_000
+"""Positions, of all particles in all frames, that tell where the fluid comes to."""
+
+
+class Painter(Protocol):
+    """Draws states of one scene."""
+
+    @property
+    def at_once(self) -> int:
+        """How many states `images` works on at a time."""
+
+    def image(self, positions: Points, colours: Points) -> Points:
+        """A picture (rows, columns, 3), linear from 0 to 1: particles at positions (n, d) [m] with colours (n, 3)."""
+
+    def images(self, states: Iterable[State]) -> Iterator[Points]:
+        """The `image` of each state in their order."""
+
+
+def painter(scene: Scene, positions: Points, device: Any = "cpu") -> Painter:
+    """The painter of a scene, whose fluid will be at positions (frames, n, d) [m]; ``device``: that of the rays."""
+    count, particles = np.shape(positions)[-2], np.asarray(positions).reshape(-1, scene.dimension)
+    particles = particles[:: max(len(particles) // ENOUGH, 1)]
+    if scene.dimension == 2:
+        return PlanePainter.of(scene, *extent_of(particles))
+    return SpacePainter(Stage.of(scene, particles), count, device)
+
+
+def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:
+    """(n, 3) the colour of each particle: of what it is made of, in the scene's colours or in others (phases, 3)."""
+    palette = np.array([phase.colour for phase in scene.phase]) if colours is None else np.asarray(colours)
+    fractions = np.ones((particles, 1)) if mass_fractions is None else np.asarray(mass_fractions)
+    return np.clip(fractions, 0.0, 1.0) @ np.clip(palette, 0.0, 1.0)

@@ -1,0 +1,163 @@
+"""Particles in motion as a piece of a page: it plays from a file, without a server and without a network."""
+
+from __future__ import annotations
+
+import json
+from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cortado.files.srgb import to_srgb
+
+MOST_BYTES = 2_200_000
+"""Of the positions, speeds and colours in one view; base64 makes them a third larger."""
+LEAST_FRAMES, MOST_FRAMES = 24, 120
+"""A view of many particles leaves out particles rather than show fewer frames than the least, if there are as many."""
+SHORTEST, LONGEST = 3.0, 12.0
+"""[s] that playing takes."""
+LARGEST = 32767
+"""Of a position, as a 16-bit number; the smallest is its negative."""
+_PLAIN = (0.1, 0.3, 0.8)
+"""The linear colour of particles that have none."""
+
+STYLE = """
+.particle-view { margin: 0 0 1.5rem; }
+.particle-view .stage { position: relative; }
+.particle-view canvas { width: 100%; display: block; border: 1px solid var(--line, #e6e2db); border-radius: 6px;
+                        cursor: grab; touch-action: pan-y; box-sizing: border-box; }
+.particle-view .name { position: absolute; padding: .3rem .7rem; color: #2b2a28; pointer-events: none; }
+.particle-view .controls { display: flex; flex-wrap: wrap; gap: .5rem; align-items: center; margin-top: .5rem; }
+.particle-view input { flex: 1 1 8rem; min-width: 0; }
+.particle-view output { font-variant-numeric: tabular-nums; min-width: 4.5em; }
+.particle-view button, .particle-view select { font: inherit; padding: .15rem .7rem; }
+.particle-view p { margin: .4rem 0 0; color: var(--faint, #6d6860); font-size: .93rem; }
+"""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Particles in motion."""
+
+    name: str
+    positions: NDArray[Any]
+    """(frames, n, d) [m]"""
+    speeds: NDArray[Any]
+    """(frames, n) [m/s]"""
+    colours: NDArray[Any] | None = None
+    """(n, 3) or (frames, n, 3), linear, from 0 to 1"""
+
+
+def script() -> str:
+    """What brings all the views of a page to life; it stands once in the page, after them."""
+    source = Path(__file__).with_suffix(".js").read_text(encoding="utf-8")
+    return f"<script>\n{source}</script>"
+
+
+def thinned(frames: int, particles: int, numbers: int, most_bytes: int = MOST_BYTES) -> tuple[NDArray[np.intp], int]:
+    """Which frames to show, and that of every so many particles one is, until a view has no more than so many bytes.
+
+    ``numbers``: bytes of one particle in one frame, two for each component of a position, one for the speed, three for
+    a colour that changes, of all clouds together.
+    """
+    count = min(frames, MOST_FRAMES, max(most_bytes // (numbers * particles), LEAST_FRAMES))
+    stride = max(-(-count * numbers * particles // most_bytes), 1)
+    return np.unique(np.linspace(0, frames - 1, count).astype(int)), stride
+
+
+def particle_view(
+    clouds: Sequence[Cloud], times: ArrayLike, spacing: float, *, lines: ArrayLike = (), stride: int = 1
+) -> str:
+    """HTML that shows the clouds side by side, turned together; y is up. `script` must follow, and `STYLE` be there.
+
+    Args:
+        clouds: of the same frames and as many particles each.
+        times: (frames,) [s].
+        spacing: between particles at rest [m].
+        lines: (k, 2, d) ends of lines [m], such as the edges of a container.
+        stride: the clouds have one of so many particles (`thinned`).
+    """
+    times, dimension = np.asarray(times, dtype=float), clouds[0].positions.shape[2]
+    ends = np.asarray(lines, dtype=float).reshape(-1, 2, dimension)
+    lower, upper = _extent([*(cloud.positions for cloud in clouds), ends])
+    middle, half = 0.5 * (lower + upper), np.maximum(0.5 * (upper - lower), 0.5 * spacing)
+    fastest = max(float(np.nanmax(cloud.speeds, initial=0.0)) for cloud in clouds) or 1.0
+    drawn = [
+        {
+            "name": cloud.name,
+            "still": cloud.colours is None or np.ndim(cloud.colours) == 2,
+            "positions": _base64(np.round((cloud.positions - middle) / half * LARGEST).astype("<i2")),
+            "speeds": _base64(np.round(cloud.speeds / fastest * 255).astype(np.uint8)),
+            "colours": _base64(_colours(cloud)),
+        }
+        for cloud in clouds
+    ]
+    data = {
+        "dimension": dimension,
+        "particles": clouds[0].positions.shape[1],
+        "times": [float(f"{t:.6g}") for t in times],
+        "seconds": float(np.clip(len(times) / 20.0, SHORTEST, LONGEST)),
+        "half": _space(half).tolist(),
+        "radius": 0.56 * spacing * stride ** (1.0 / dimension),
+        "lines": _space(ends - middle).tolist(),
+        "clouds": drawn,
+    }
+    return _page(data, clouds, fastest, stride)
+
+
+def _page(data: dict[str, Any], clouds: Sequence[Cloud], fastest: float, stride: int) -> str:
+    """The element with its controls."""
+    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    several = len(clouds) > 1
+    names = "".join(f'<span class="name">{escape(cloud.name)}</span>' for cloud in clouds) if several else ""
+    hint = "Drag to turn it. " if data["dimension"] == 3 else ""
+    left_out = f" One particle in {stride} is shown." if stride > 1 else ""
+    coloured = any(cloud.colours is not None for cloud in clouds)
+    choices = [("phase", "phase"), ("speed", "speed")] if coloured else [("speed", "speed")]
+    options = "".join(f'<option value="{value}">{word}</option>' for value, word in choices)
+    what = escape(" and ".join(cloud.name for cloud in clouds))
+    last = len(data["times"]) - 1
+    still = "" if last else " hidden"
+    return f"""<div class="particle-view">
+<div class="stage">{names}
+<canvas tabindex="0" role="img" aria-label="Particles in motion: {what}"></canvas></div>
+<div class="controls">
+<button data-play{still}>Play</button>
+<input type="range" min="0" max="{last}" step="any" value="0" aria-label="Time"{still}><output>0 s</output>
+<label>colour <select>{options}</select></label>
+<button data-farther aria-label="Farther">&minus;</button><button data-closer aria-label="Closer">+</button>
+<button data-reset>Reset</button>
+</div>
+<p>{hint}Speeds go from 0 (blue) to {fastest:.3g} m/s (yellow).{left_out}</p>
+<script type="application/json">{text}</script>
+</div>"""
+
+
+def _extent(clouds: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Lower and upper ends (d,) [m] of points (..., d)."""
+    points = [cloud.reshape(-1, cloud.shape[-1]) for cloud in clouds if cloud.size]
+    lower = np.min([np.nanmin(cloud, axis=0) for cloud in points], axis=0).astype(float)
+    return lower, np.max([np.nanmax(cloud, axis=0) for cloud in points], axis=0).astype(float)
+
+
+def _space(vectors: NDArray[Any]) -> NDArray[Any]:
+    """(..., 3) of vectors (..., d), with few digits."""
+    missing = 3 - vectors.shape[-1]
+    padded = np.pad(vectors, [(0, 0)] * (vectors.ndim - 1) + [(0, missing)])
+    return np.array([float(f"{number:.6g}") for number in padded.ravel()]).reshape(padded.shape)
+
+
+def _colours(cloud: Cloud) -> NDArray[Any]:
+    """(n, 3) or (frames, n, 3), sRGB."""
+    particles = cloud.positions.shape[1]
+    colours = np.tile(_PLAIN, (particles, 1)) if cloud.colours is None else np.asarray(cloud.colours)
+    return to_srgb(colours.reshape(1, -1, 3)).reshape(colours.shape)
+
+
+def _base64(array: NDArray[Any]) -> str:
+    return b64encode(np.ascontiguousarray(array).tobytes()).decode()

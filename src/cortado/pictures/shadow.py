@@ -1,0 +1,56 @@
+"""The shadow that fluid casts on the floor: soft, and in the colour of the fluid."""
+
+import numpy as np
+
+from cortado.discretise.shapes import Points
+from cortado.pictures.stage import Stage
+
+NODES = 320
+"""Along either side of the floor that may lie in shadow."""
+REACH = 1.5
+"""Half the width of that part of the floor, in sizes of what is shown."""
+
+
+def floor_shadow(stage: Stage, positions: Points, colours: Points) -> tuple[Points, Points, float]:
+    """The part of the light that reaches the floor, (nodes, nodes, 3), by x and z; where its first node is, (3,) [m];
+    and how far nodes are apart [m].
+
+    ``positions`` (n, 3) [m] are in the frame of the picture, ``colours`` (n, 3) linear.
+    """
+    cell = 2.0 * REACH * stage.size / (NODES - 1)
+    middle = 0.5 * (stage.lower + stage.upper)
+    corner = np.array([middle[0], stage.lower[1], middle[2]]) - np.array([REACH, 0.0, REACH]) * stage.size
+    height = positions[:, 1:2] - stage.lower[1]
+    cast = positions[:, ::2] - height * stage.sun[::2] / stage.sun[1]
+    volume = stage.spacing**3
+    near, least = np.exp(-height[:, 0] / (0.15 * stage.size)), 0.8 * stage.spacing
+    key = _thickness(cast, colours, corner, cell, volume, max(0.022 * stage.size, least))
+    around = _thickness(positions[:, ::2], colours, corner, cell, volume * near, max(0.05 * stage.size, least))
+    light = 1.0 - 0.48 * _hidden(stage, *key) - 0.32 * _hidden(stage, *around)
+    return light, corner, cell
+
+
+def _thickness(
+    places: Points, colours: Points, corner: Points, cell: float, volume: Points | float, blur: float
+) -> tuple[Points, Points]:
+    """How thick the fluid is above every node, (nodes, nodes) [m], and its mean colour (nodes, nodes, 3)."""
+    from scipy.ndimage import gaussian_filter
+
+    at = np.rint((places - corner[[0, 2]]) / cell).astype(int)
+    on = ((at >= 0) & (at < NODES)).all(axis=1)
+    flat, weights = at[on, 0] * NODES + at[on, 1], np.broadcast_to(volume, len(places))[on] / cell**2
+
+    def spread(values: Points) -> Points:
+        total = np.bincount(flat, weights * values, minlength=NODES * NODES).reshape(NODES, NODES)
+        return gaussian_filter(total, blur / cell)
+
+    total = spread(np.ones(len(flat)))
+    tinted = np.stack([spread(colours[on, k]) for k in range(3)], axis=-1)
+    return total, tinted / np.maximum(total, 1e-12)[..., None]
+
+
+def _hidden(stage: Stage, thickness: Points, colour: Points) -> Points:
+    """(nodes, nodes, 3) the part of the light that fluid of a thickness keeps off."""
+    reached = 1.0 - np.exp(-thickness / (0.75 * stage.spacing))
+    hue = colour / np.maximum(colour.max(axis=-1, keepdims=True), 1e-6)
+    return reached[..., None] * (1.0 - 0.4 * stage.transparency * (0.35 + 0.65 * hue))

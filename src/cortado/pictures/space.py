@@ -1,0 +1,179 @@
+"""Pictures of fluid in 3-D, by a ray tracer on the device of the run."""
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import wait
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.device.cores import usable_cores
+from cortado.device.launching import launch
+from cortado.device.threads import MOST_CORES, WARP, helpers
+from cortado.discretise.shapes import Points
+from cortado.pictures.meeting import FluidSurface
+from cortado.pictures.scenery import Scenery, State, processes_for, sceneries, scenery
+from cortado.pictures.stage import Stage, screen_axes
+from cortado.pictures.surface import Surface
+from cortado.pictures.surroundings import GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Surroundings
+from cortado.pictures.trace import Eye, find_contrast, illuminate, trace
+
+ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
+"""Where in a pixel four more rays go, in pixels from its middle."""
+CONTRAST = 0.03
+"""Between neighbouring pixels, in linear light: above, four more rays go through both."""
+BANDS = 8
+"""Parts of a picture for each core, and one core may do more of them than another."""
+LIGHT_RAYS = {"liquid": (20, 4), "spheres": (10, 1)}
+"""Rays that find how much light falls on a point of the surface: from all around, and from the lamp."""
+
+
+class SpacePainter:
+    """Draws states of one scene of so many particles: `image` and `images`."""
+
+    def __init__(self, stage: Stage, particles: int, device: Any = "cpu"):
+        self.stage, self.device, self.at_once = stage, wp.get_device(device), processes_for(particles)
+        self._compiled: set[Any] = set()
+        self._surroundings, self._eye = _surroundings(stage), _eye(stage)
+        around, lamp = LIGHT_RAYS[stage.picture.surface]
+        self._around = wp.array(_directions(around), dtype=wp.vec3, device=self.device)
+        in_lamp = stage.sun + (0.16 if lamp > 1 else 0.0) * _directions(lamp)
+        in_lamp /= np.linalg.norm(in_lamp, axis=1)[:, None]
+        self._in_lamp = wp.array(in_lamp, dtype=wp.vec3, device=self.device)
+
+    def image(self, positions: Points, colours: Points) -> Points:
+        """A picture (rows, columns, 3), linear from 0 to 1: particles at positions (n, 3) [m] with colours (n, 3)."""
+        return self._traced(scenery(self.stage, positions, colours))
+
+    def images(self, states: Iterable[State]) -> Iterator[Points]:
+        """The `image` of each state in their order; surfaces of large fluids are computed in several processes."""
+        return map(self._traced, sceneries(self.stage, states, self.at_once))
+
+    def _traced(self, fluid: Scenery) -> Points:
+        s = self._surroundings
+        light, corner, cell = fluid.shadow
+        s.shadow_corner, s.shadow_cell = wp.vec3(*corner), cell
+        shadow = wp.array(light, dtype=wp.vec3, device=self.device)
+        with WARP:
+            return self._rays(fluid.surface, s, shadow)
+
+    def _rays(self, surface: Surface, s: Any, shadow: wp.array) -> Points:
+        picture, device = self.stage.picture, self.device
+        points = wp.array(surface.points, dtype=wp.vec3, device=device)
+        corners = wp.array(surface.triangles.ravel(), dtype=wp.int32, device=device)
+        mesh = wp.Mesh(points, corners)
+        fluid = FluidSurface()
+        fluid.mesh, fluid.corners, fluid.scattering = mesh.id, corners, self._scattering
+        fluid.reach = 2.0 * self.stage.spacing
+        fluid.normals = wp.array(surface.normals, dtype=wp.vec3, device=device)
+        fluid.colours = wp.array(surface.colours, dtype=wp.vec3, device=device)
+        fluid.light = wp.zeros(len(points), dtype=wp.vec3, device=device)
+        given = {"s": s, "surface": fluid}
+        lit = {"points": points, "directions": self._around, "sun_directions": self._in_lamp, "light": fluid.light}
+        reach = 0.2 * self.stage.size
+        self._launch(illuminate, len(points), **given, **lit, reach=reach, clearness=self.stage.clearness)
+
+        def rays(pixels: np.ndarray, offset: tuple[float, float]) -> wp.array:
+            found = wp.zeros(len(pixels), dtype=wp.vec3, device=device)
+            asked = wp.array(pixels, dtype=wp.int32, device=device)
+            where = wp.vec2(*offset)
+            self._launch(
+                trace, len(pixels), **given, eye=self._eye, shadow=shadow, pixels=asked, offset=where, image=found
+            )
+            return found
+
+        count = picture.width * picture.height
+        once, mask = rays(np.arange(count), (0.0, 0.0)), wp.zeros(count, dtype=bool, device=device)
+        self._launch(find_contrast, count, columns=picture.width, image=once, contrast=CONTRAST, found=mask)
+        image, rough = once.numpy(), np.flatnonzero(mask.numpy())
+        if len(rough):
+            image[rough] = np.mean([rays(rough, offset).numpy() for offset in ROTATED_GRID], axis=0)
+        return image.reshape(picture.height, picture.width, 3)
+
+    @property
+    def _scattering(self) -> float:
+        return self.stage.scattering if self.stage.picture.surface == "liquid" else 1e3 / self.stage.spacing
+
+    def _launch(self, kernel: wp.Kernel, count: int, **arguments: Any) -> None:
+        """On a CPU Warp launches in one thread: there the work is cut into bands, which all cores take in turn."""
+        cores = min(usable_cores(), MOST_CORES) if self.device.is_cpu else 1
+        bands = BANDS * cores if cores > 1 and count > 10_000 else 1
+        bounds = [count * band // bands for band in range(bands + 1)]
+
+        def work(band: int) -> None:
+            launch(kernel, bounds[band + 1] - bounds[band], self.device, first=bounds[band], **arguments)
+
+        begin = 0
+        if kernel not in self._compiled:
+            work(0)
+            self._compiled.add(kernel)
+            begin = 1
+        _shared(partial(map, work), range(begin, bands), cores)
+
+
+def _shared(work: Callable[[Any], Any], items: Any, cores: int) -> None:
+    """Do work for each item, on so many cores."""
+    waiting = iter(items)
+
+    def take() -> None:
+        for _ in work(waiting):
+            pass
+
+    called = [helpers().submit(take) for _ in range(cores - 1)]
+    try:
+        take()
+    finally:
+        begun = [helper for helper in called if not helper.cancel()]
+        wait(begun)
+    for helper in begun:
+        helper.result()
+
+
+def _directions(count: int) -> Points:
+    """(count, 3) unit vectors, evenly all around: the spiral of Fibonacci."""
+    k = np.arange(count) + 0.5
+    height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
+    away = np.sqrt(1.0 - height**2)
+    return np.stack([away * np.cos(turn), height, away * np.sin(turn)], axis=1)
+
+
+def _surroundings(stage: Stage) -> Any:
+    picture, s = stage.picture, Surroundings()
+    horizon = np.asarray(picture.background)
+    s.size, s.nearest = stage.size, 1e-4 * stage.size
+    s.sun, s.fill = wp.vec3(*stage.sun), wp.vec3(*stage.fill)
+    s.horizon, s.zenith = wp.vec3(*horizon), wp.vec3(*(horizon * (0.62, 0.72, 0.84)))
+    s.has_floor, s.floor_height = int(picture.floor), float(stage.lower[1])
+    s.floor_colour = wp.vec3(*(0.93 * horizon))
+    s.floor_centre = wp.vec3(*(0.5 * (stage.lower + stage.upper)))
+    s.grid = _round_length(stage.size / 6.0)
+    s.glass = NO_GLASS
+    if stage.container.extent() is not None:
+        lower, upper = stage.glass_ends
+        s.glass = GLASS_BOX if stage.container.shape == "box" else GLASS_CYLINDER
+        s.glass_frame = wp.mat33(*stage.glass_frame.ravel())
+        s.glass_lower, s.glass_upper = wp.vec3(*lower), wp.vec3(*upper)
+        lower, upper = (np.clip(end, -1e8, 1e8) for end in stage.room)
+        s.room_lower, s.room_upper = wp.vec3(*lower), wp.vec3(*upper)
+        s.has_room = int(stage.cuts and picture.surface == "liquid")
+        s.panes = wp.mat33(*stage.panes.ravel(), 0.0, 0.0, 0.0)
+    return s
+
+
+def _round_length(length: float) -> float:
+    """The next of 1, 2 and 5 times a power of ten below a length."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= length * (1.0 + 1e-9)))
+
+
+def _eye(stage: Stage) -> Any:
+    picture, eye = stage.picture, Eye()
+    forward = stage.look_at - stage.eye
+    forward = forward / np.linalg.norm(forward)
+    right, up = screen_axes(forward)
+    half = np.tan(0.5 * np.radians(picture.field_of_view))
+    eye.position, eye.forward = wp.vec3(*stage.eye), wp.vec3(*forward)
+    eye.right, eye.up = wp.vec3(*(half * right)), wp.vec3(*(half * picture.height / picture.width * up))
+    eye.columns, eye.rows = picture.width, picture.height
+    return eye

@@ -1,0 +1,234 @@
+"""Where a picture is taken: which way is up, the floor, the container of glass, the lamps, and a camera."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cortado.discretise.shapes import Points, corners
+from cortado.scene.containers import BoxContainer, Container, CylinderContainer
+from cortado.scene.fluids import INDEX_OF_AXIS
+from cortado.scene.picture import Picture
+from cortado.scene.scene import Scene
+
+MARGIN = 1.10
+"""How much wider a picture is than what it shows."""
+AIR = 0.1
+"""Beside fluid that no container holds, in its widths."""
+FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
+"""Elevation of the camera [degrees]: where the fluid is drawn on, as in latte art, and elsewhere."""
+TOUCHING, TOUCHING_ROUND = 0.8, 1.5
+"""In spacings: fluid that is nearer to a flat and to a round wall touches it. A cubic lattice in a round cup ends up to
+one and a half spacings from its wall."""
+AZIMUTH = 24.0
+"""Of the camera, to the right of the direction towards the viewer [degrees]."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Everything around the fluid, in the frame of the picture: y is up, the origin in the middle of what is shown."""
+
+    frame: Points
+    """(3, 3) rotation from the scene's axes to those of the picture"""
+    origin: Points
+    """(3,) [m], in the scene's axes"""
+    lower: Points
+    """(3,) of what is shown [m], in the frame of the picture"""
+    upper: Points
+    """(3,) [m]"""
+    eye: Points
+    """(3,) where the camera is [m]"""
+    look_at: Points
+    """(3,) [m]"""
+    picture: Picture
+    container: Any
+    spacing: float
+    """[m]"""
+    transparency: float
+    """From 0 to 1."""
+    cuts: bool
+    """Whether fluid is shown within the container only."""
+
+    @classmethod
+    def of(cls, scene: Scene, positions: Points) -> "Stage":
+        """That of a scene in 3-D, whose fluid will be at positions (n, 3) [m]."""
+        lower, upper = extent_of(positions)
+        picture = scene.picture or Picture()
+        ends = scene.container.extent()
+        frame = upright(np.asarray(scene.forces.gravity))
+        if ends is None:
+            air = 0.5 * scene.discretisation.spacing + AIR * (1.0 - np.abs(frame[1])) * (upper - lower)
+            lower, upper = lower - air, upper + air
+        else:
+            lower, upper = np.minimum(lower, ends[0]), np.maximum(upper, ends[1])
+        origin = 0.5 * (lower + upper)
+        shown = (corners(lower, upper) - origin) @ frame.T
+        low, high = shown.min(axis=0), shown.max(axis=0)
+        several = len(scene.phase) > 1
+        from_above = several and (scene.render is None or scene.render.view == "top")
+        elevation = FROM_ABOVE if from_above and isinstance(scene.container, CylinderContainer) else FROM_THE_SIDE
+        eye, look_at = fitted(low, high, elevation, picture)
+        if picture.look_at is not None:
+            eye, look_at = eye + frame @ (picture.look_at - origin) - look_at, frame @ (picture.look_at - origin)
+        if picture.camera is not None:
+            eye = frame @ (picture.camera - origin)
+        transparency = picture.transparency
+        if transparency is None:
+            transparency = 0.0 if several or picture.colour_by is not None else 0.9
+        spacing = scene.discretisation.spacing
+        cuts = ends is not None and not spilled(scene.container, positions, spacing)
+        return cls(frame, origin, low, high, eye, look_at, picture, scene.container, spacing, transparency, cuts)
+
+    @property
+    def size(self) -> float:
+        """The longest side of what is shown [m]."""
+        return float((self.upper - self.lower).max())
+
+    @property
+    def scattering(self) -> float:
+        """[1/m]; a layer of particles hides what is behind it where the fluid is opaque."""
+        opaque = 3.0 / self.spacing
+        return min(-np.log(self.transparency) / (0.1 * self.size), opaque) if self.transparency else opaque
+
+    @property
+    def clearness(self) -> float:
+        """The part of the light that fluid lets through onto other fluid."""
+        return 0.85 * self.transparency
+
+    def placed(self, positions: Points) -> Points:
+        """Positions (n, 3) [m] of the scene in the frame of the picture."""
+        return (positions - self.origin) @ self.frame.T
+
+    def wetting(self, points: Points) -> tuple[Points, np.ndarray]:
+        """Points (n, 3) [m] in the frame of the picture and others behind walls that they touch, and which point each
+        shows, (m,): a surface around them all goes on beyond the walls, at which it is cut."""
+        of = np.arange(len(points))
+        if not self.cuts:
+            return points, of
+        own, box = points @ self.glass_frame.T, isinstance(self.container, BoxContainer)
+        if not box:
+            more, shown = self._behind_round_wall(own)
+            own, of = np.concatenate([own, more]), np.concatenate([of, shown])
+        for axis, place in ((k, end[k]) for k in range(3) for end in self.room if box or k == 1):
+            if np.isfinite(place):
+                near = np.abs(own[:, axis] - place) < TOUCHING * self.spacing
+                behind = own[near]
+                behind[:, axis] = 2.0 * place - behind[:, axis]
+                own, of = np.concatenate([own, behind]), np.concatenate([of, of[near]])
+        return own @ self.glass_frame, of
+
+    def _behind_round_wall(self, own: Points) -> tuple[Points, np.ndarray]:
+        """Points one and two spacings further out than those (n, 3) that touch the wall, and which they show."""
+        lower, upper = self.glass_ends
+        off = (own - 0.5 * (lower + upper)) * (1.0, 0.0, 1.0)
+        away = np.linalg.norm(off, axis=1)
+        near = np.flatnonzero(np.abs(0.5 * (upper - lower)[0] - away) < TOUCHING_ROUND * self.spacing)
+        step = self.spacing * off[near] / np.maximum(away[near], 1e-30)[:, None]
+        return np.concatenate([own[near] + step, own[near] + 2.0 * step]), np.tile(near, 2)
+
+    @property
+    def glass_frame(self) -> Points:
+        """(3, 3) from the frame of the picture to one in which the axis of a cylinder is the second."""
+        if not isinstance(self.container, CylinderContainer):
+            return np.eye(3)
+        axis = INDEX_OF_AXIS[self.container.axis]
+        to_second = np.roll(np.eye(3), 1 - axis, axis=0)  # rows: the scene's axes, that of the cylinder second
+        return to_second @ self.frame.T
+
+    @property
+    def glass_ends(self) -> tuple[Points, Points]:
+        """Lower and upper ends of the container [m], (3,) each, in the frame of the glass."""
+        points = self.placed(corners(*self.container.extent())) @ self.glass_frame.T
+        return points.min(axis=0), points.max(axis=0)
+
+    @property
+    def room(self) -> tuple[Points, Points]:
+        """Where fluid is shown, (3,) each [m], in the frame of the glass; infinite upwards, where an emitter may be,
+        and along an axis that is periodic."""
+        lower, upper = (end.copy() for end in self.glass_ends)
+        up = self.glass_frame @ (0.0, 1.0, 0.0)
+        axis = int(np.abs(up).argmax())
+        if isinstance(self.container, BoxContainer) or axis == 1:
+            (upper if up[axis] > 0.0 else lower)[axis] = np.copysign(np.inf, up[axis])
+        if isinstance(self.container, BoxContainer):
+            periodic = np.abs(self.frame) @ np.asarray(self.container.periodic, dtype=float) > 0.5
+            lower[periodic], upper[periodic] = -np.inf, np.inf
+        return lower, upper
+
+    @property
+    def panes(self) -> Points:
+        """(2, 3) 1 where a box has a pane of glass at its lower and at its upper ends; it is open on top."""
+        found = np.ones((2, 3))
+        if isinstance(self.container, BoxContainer):
+            found *= 1.0 - np.abs(self.frame) @ np.asarray(self.container.periodic, dtype=float)
+        found[:, 1] = 0.0  # nor is one on the floor
+        return found
+
+    @property
+    def sun(self) -> Points:
+        """(3,) unit vector towards the lamp: behind the camera, on its left."""
+        return self._direction(-62.0, 50.0)
+
+    @property
+    def fill(self) -> Points:
+        """(3,) unit vector towards the weak lamp: on the right, low."""
+        return self._direction(70.0, 28.0)
+
+    def _direction(self, azimuth: float, elevation: float) -> Points:
+        """(3,) unit vector; the azimuth [degrees] counts from the camera, to the right."""
+        back = self.eye - self.look_at
+        return _towards(np.degrees(np.arctan2(back[0], back[2])) + azimuth, elevation)
+
+
+def extent_of(positions: Points) -> tuple[Points, Points]:
+    """Lower and upper ends (d,) [m] of nearly all positions (n, d) [m]: a few drops may be further away."""
+    return np.quantile(positions, 0.002, axis=0), np.quantile(positions, 0.998, axis=0)
+
+
+def spilled(container: Container, positions: Points, spacing: float) -> bool:
+    """Whether fluid at positions (n, 3) [m] came over the rim of a cup."""
+    if not isinstance(container, CylinderContainer) or container.lid:
+        return False
+    off = np.delete(positions - np.asarray(container.base), INDEX_OF_AXIS[container.axis], axis=1)
+    return bool((np.linalg.norm(off, axis=1) > container.radius + 0.5 * spacing).any())
+
+
+def upright(gravity: Points) -> Points:
+    """(3, 3) rotation from the scene's axes to right, up, towards the viewer: up is the axis against gravity (3,), y
+    where there is none."""
+    axis = int(np.abs(gravity).argmax()) if gravity.any() else 1
+    up, towards = np.zeros(3), np.zeros(3)
+    up[axis] = -1.0 if gravity[axis] > 0.0 else 1.0
+    towards[(axis + 1) % 3] = 1.0
+    return np.stack([np.cross(up, towards), up, towards])
+
+
+def _towards(azimuth: float, elevation: float) -> Points:
+    a, e = np.radians([azimuth, elevation])
+    return np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
+
+
+def fitted(lower: Points, upper: Points, elevation: float, picture: Picture) -> tuple[Points, Points]:
+    """A place for the camera and one to look at, (3,) each [m], for a box to fill the picture."""
+    back, box = _towards(AZIMUTH, elevation), corners(lower, upper)
+    half = np.tan(0.5 * np.radians(picture.field_of_view)) / MARGIN
+    halves = half, half * picture.height / picture.width
+    right, up = screen_axes(-back)
+    look_at, distance = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower)) / halves[1]
+    for _ in range(20):
+        depth = distance - (box - look_at) @ back
+        places = [(box - look_at) @ axis / depth for axis in (right, up)]
+        spans = [0.5 * (p.max() - p.min()) / h for p, h in zip(places, halves, strict=True)]
+        for axis, p in zip((right, up), places, strict=True):
+            look_at = look_at + 0.5 * (p.max() + p.min()) * distance * axis
+        distance *= max(spans)
+    return look_at + distance * back, look_at
+
+
+def screen_axes(forward: Points) -> tuple[Points, Points]:
+    """Unit vectors (3,) to the right and upwards on the screen of a camera that looks along ``forward`` (3,)."""
+    helper = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.999 * np.linalg.norm(forward) else np.array([0, 0, -1.0])
+    right = np.cross(forward, helper)
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    return right, up / np.linalg.norm(up)

@@ -1,0 +1,233 @@
+"""A ray tracer for one surface of fluid: light that it reflects, refracts, absorbs and scatters.
+
+A ray that meets the fluid is split in two, by Fresnel's law. What is reflected sees the surroundings, or other fluid.
+What is refracted goes on through the fluid and out of it, up to `SEGMENTS` times; on a way L within the fluid it loses
+the part 1 - exp(-scattering L), in the place of which it gets the colour of the fluid in the light that falls on it,
+and of what remains fluid takes away the colours that it does not have.
+"""
+
+import warp as wp
+
+from cortado.pictures.glass import background, glass
+from cortado.pictures.meeting import FluidSurface, leave, meet
+from cortado.pictures.surroundings import FAR, Surroundings, mirrored, schlick, sky
+
+SEGMENTS = 4
+INDEX = wp.constant(wp.float32(1.33))
+"""Refractive index, of water."""
+TINT = wp.constant(wp.float32(2.6))
+"""How much sooner light takes the colour of the fluid than it is scattered."""
+
+
+@wp.struct
+class Eye:
+    """A camera; pixel (column, row) looks along ``forward + a right + b up``, a and b from -1 to 1."""
+
+    position: wp.vec3
+    forward: wp.vec3
+    right: wp.vec3
+    up: wp.vec3
+    columns: wp.int32
+    rows: wp.int32
+
+
+@wp.func
+def toned(colour: wp.vec3):
+    """Bright light is bent below 1; up to 0.75 it stays what it is."""
+    found = wp.vec3(0.0)
+    for k in range(3):
+        x = colour[k]
+        if x > 0.75:
+            x = 0.75 + 0.25 * (1.0 - wp.exp(-(x - 0.75) / 0.25))
+        found[k] = wp.max(x, 0.0)
+    return found
+
+
+@wp.func
+def within(
+    s: Surroundings,
+    shadow: wp.array2d(dtype=wp.vec3),
+    surface: FluidSurface,
+    start: wp.vec3,
+    direction: wp.vec3,
+    colour: wp.vec3,
+    light: wp.vec3,
+    spread: wp.float32,
+):
+    """Light that comes out of the fluid against a ray that was refracted into it."""
+    found = wp.vec3(0.0)
+    through = wp.vec3(1.0)
+    o = start
+    d = direction
+    c = colour
+    lit = light
+    inside = wp.bool(True)
+    for _ in range(SEGMENTS):
+        if inside:
+            met = leave(s, surface, o, d)
+            left = wp.exp(-surface.scattering * met.t)
+            soft = 0.55 * lit + wp.vec3(0.40)
+            found += wp.cw_mul(through, wp.cw_mul(c, soft)) * (1.0 - left)
+            taken = surface.scattering * met.t * TINT
+            tint = wp.vec3(
+                wp.pow(wp.max(c[0], 0.02), taken), wp.pow(wp.max(c[1], 0.02), taken), wp.pow(wp.max(c[2], 0.02), taken)
+            )
+            through = wp.cw_mul(through, tint) * left
+        else:
+            met = meet(s, surface, o, d)
+        if not met.found or wp.max(wp.max(through[0], through[1]), through[2]) < 0.02:
+            break
+        p = o + met.t * d
+        n = met.normal
+        cosine = -wp.dot(n, d)
+        if inside:
+            sine2 = INDEX * INDEX * (1.0 - cosine * cosine)
+            if sine2 >= 1.0:
+                d = wp.normalize(mirrored(d, n))
+                o = p + s.nearest * n
+            else:
+                d = wp.normalize(INDEX * d + (INDEX * cosine - wp.sqrt(1.0 - sine2)) * n)
+                o = p - s.nearest * n
+                inside = False
+        else:
+            passed = glass(s, o, d, met.t, spread)
+            found += wp.cw_mul(through, passed.light)
+            through = through * passed.through
+            reflectance = schlick(0.02, cosine)
+            r = wp.normalize(mirrored(d, n))
+            found += wp.cw_mul(through, sky(s, wp.vec3(r[0], wp.abs(r[1]), r[2]))) * reflectance
+            through = through * (1.0 - reflectance)
+            c = met.colour
+            lit = met.light
+            sine2 = (1.0 - cosine * cosine) / (INDEX * INDEX)
+            d = wp.normalize(d / INDEX + (cosine / INDEX - wp.sqrt(1.0 - sine2)) * n)
+            o = p - s.nearest * n
+            inside = True
+    if inside:
+        return found + wp.cw_mul(through, wp.cw_mul(c, lit))
+    return found + wp.cw_mul(through, background(s, shadow, o, d, spread))
+
+
+@wp.func
+def seen(
+    s: Surroundings,
+    shadow: wp.array2d(dtype=wp.vec3),
+    surface: FluidSurface,
+    o: wp.vec3,
+    d: wp.vec3,
+    spread: wp.float32,
+):
+    """The light that comes to the eye against a ray."""
+    met = meet(s, surface, o, d)
+    floor_at = FAR
+    if s.has_floor > 0 and d[1] < -1.0e-4:
+        floor_at = (s.floor_height - o[1]) / d[1]
+    if met.t > floor_at or not met.found:
+        found = background(s, shadow, o, d, spread)
+        if floor_at < FAR:  # the floor is a little glossy
+            r = wp.vec3(d[0], -d[1], d[2])
+            image = meet(s, surface, o + floor_at * d, r)
+            if image.found:
+                strength = schlick(0.04, -d[1]) * wp.exp(-2.5 * image.t / s.size)
+                found += strength * (wp.cw_mul(image.colour, image.light) - sky(s, r))
+        return toned(found)
+    p = o + met.t * d
+    n = met.normal
+    cosine = -wp.dot(n, d)
+    reflectance = schlick(0.02, cosine)
+    r = wp.normalize(mirrored(d, n))
+    start = p + s.nearest * n
+    other = meet(s, surface, start, r)
+    reflected = wp.cw_mul(other.colour, other.light)
+    if not other.found:
+        reflected = background(s, shadow, start, r, spread)
+    sine2 = (1.0 - cosine * cosine) / (INDEX * INDEX)
+    refracted = wp.normalize(d / INDEX + (cosine / INDEX - wp.sqrt(1.0 - sine2)) * n)
+    body = within(s, shadow, surface, p - s.nearest * n, refracted, met.colour, met.light, spread)
+    passed = glass(s, o, d, met.t + 2.0 * s.nearest, spread)
+    return toned(passed.light + passed.through * (reflectance * reflected + (1.0 - reflectance) * body))
+
+
+@wp.kernel(module=wp.get_module("cortado_shading"), enable_backward=False)
+def trace(
+    first: wp.int32,
+    eye: Eye,
+    s: Surroundings,
+    surface: FluidSurface,
+    shadow: wp.array2d(dtype=wp.vec3),
+    pixels: wp.array(dtype=wp.int32),
+    offset: wp.vec2,
+    image: wp.array(dtype=wp.vec3),
+):
+    """The light of some pixels, through a point of each; ``offset``: where in the pixel, from -0.5 to 0.5."""
+    i = first + wp.tid()
+    pixel = pixels[i]
+    a = 2.0 * (wp.float32(pixel % eye.columns) + 0.5 + offset[0]) / wp.float32(eye.columns) - 1.0
+    b = 1.0 - 2.0 * (wp.float32(pixel / eye.columns) + 0.5 + offset[1]) / wp.float32(eye.rows)
+    d = wp.normalize(eye.forward + a * eye.right + b * eye.up)
+    spread = 2.0 * wp.length(eye.right) / wp.float32(eye.columns)
+    image[i] = seen(s, shadow, surface, eye.position, d, spread)
+
+
+@wp.kernel(module=wp.get_module("cortado_shading"), enable_backward=False)
+def find_contrast(
+    first: wp.int32,
+    columns: wp.int32,
+    image: wp.array(dtype=wp.vec3),
+    contrast: wp.float32,
+    found: wp.array(dtype=wp.bool),
+):
+    """Whether a pixel differs by more than ``contrast``, in one of its colours, from one beside, above or below it."""
+    i = first + wp.tid()
+    column = i % columns
+    greatest = wp.float32(0.0)
+    if column > 0:
+        greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i - 1])))
+    if column < columns - 1:
+        greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i + 1])))
+    if i >= columns:
+        greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i - columns])))
+    if i < image.shape[0] - columns:
+        greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i + columns])))
+    found[i] = greatest > contrast
+
+
+@wp.kernel(module=wp.get_module("cortado_shading"), enable_backward=False)
+def illuminate(
+    first: wp.int32,
+    s: Surroundings,
+    surface: FluidSurface,
+    points: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    sun_directions: wp.array(dtype=wp.vec3),
+    reach: wp.float32,
+    clearness: wp.float32,
+    light: wp.array(dtype=wp.vec3),
+):
+    """The light that falls on each point of the surface: from all around, as far as no other fluid is within ``reach``
+    [m], and from the lamp; ``clearness``: the part of it that goes through fluid, from 0 to 1."""
+    i = first + wp.tid()
+    n = surface.normals[i]
+    p = points[i] + s.nearest * n
+    around = wp.vec3(0.0)
+    for k in range(directions.shape[0]):
+        d = wp.normalize(n + 0.999 * directions[k])  # cosine-weighted
+        arriving = wp.lerp(s.horizon, s.zenith, wp.max(d[1], 0.0))
+        if d[1] < 0.0:
+            arriving = 0.55 * s.floor_colour
+        hit = wp.mesh_query_ray(surface.mesh, p, d, reach)
+        if hit.result:
+            arriving = arriving * wp.max(clearness, 0.35 * hit.t / reach)
+        around += arriving
+    around = around / wp.float32(directions.shape[0])
+    cosine = wp.max(wp.dot(n, s.sun), 0.0)
+    sunlight = wp.float32(0.0)
+    if cosine > 0.0:
+        for k in range(sun_directions.shape[0]):
+            hit = wp.mesh_query_ray(surface.mesh, p, sun_directions[k], FAR)
+            if hit.result:
+                sunlight += clearness
+            else:
+                sunlight += 1.0
+        sunlight = sunlight * cosine / wp.float32(sun_directions.shape[0])
+    light[i] = 0.70 * around + wp.vec3(0.62, 0.60, 0.57) * sunlight

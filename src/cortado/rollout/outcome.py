@@ -1,0 +1,45 @@
+"""What to say of a run whose pressure did not converge, and of a batch that lost scenes."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from cortado.errors import DivergedError
+from cortado.rollout.rollout import Rollout
+from cortado.scene.scene import Scene
+from cortado.words import counted
+
+
+def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
+    """What to say of the last forward run of a rollout; nothing where all is well."""
+    converged = rollout.diagnostics["converged"]
+    if not converged.all():
+        yield not_converged_sentence(converged, scene)
+    if rollout.lost:
+        yield lost_sentence(rollout.lost, rollout.solver.layout.members)
+
+
+def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
+    """What to say of steps that ended above the tolerance."""
+    advice = "try a smaller time step, more iterations or a larger tolerance."
+    if _waits_in_a_wall(scene):
+        advice = (
+            "the column that waits in the emitter is not all inside the container, whose walls press on it. Shorten "
+            "emitter.length, or make the container larger."
+        )
+    return f"the pressure did not converge in {np.count_nonzero(~converged)} of {converged.size} steps: {advice}"
+
+
+def _waits_in_a_wall(scene: Scene) -> bool:
+    """Whether particles of the emitter start in a wall of the container, or outside of it."""
+    spacing = scene.discretisation.spacing
+    return bool(
+        scene.emitter is not None
+        and not scene.container.contains(scene.emitter.particles(spacing), -0.25 * spacing).all()
+    )
+
+
+def lost_sentence(lost: Mapping[int, DivergedError], batch: int) -> str:
+    """What to say of the scenes of a batch that lost a particle."""
+    first = min(lost, key=lambda b: lost[b].step)
+    return f"{len(lost)} of {counted(batch, 'scene')} of the batch were lost. First scene {first}: {lost[first]}"

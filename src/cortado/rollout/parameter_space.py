@@ -1,0 +1,279 @@
+"""Parameters by name: what a user writes, checked, and the way to the arrays of a rollout and back."""
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from cortado.device.threads import WARP
+from cortado.errors import CortadoWarning, InputError, shown
+from cortado.particles.state import Parameters, State
+from cortado.rollout.first_positions import FirstPositions
+from cortado.rollout.parameter_checks import check_places, check_sizes, unstable_sentence
+from cortado.rollout.restarts import check_state, origin_of
+from cortado.rollout.rollout import Rollout
+from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
+from cortado.scene.parameters.known import TIME
+from cortado.scene.parameters.registry import Role, names
+from cortado.scene.parameters.values import Arrays, Values, check_known, checked_value, scene_values
+from cortado.scene.restart import Clock, Origin, RestartState
+from cortado.scene.stability import divergence_advice
+
+STATE = names(Role.STATE)
+STATE_TIME = "time"
+"""What the time of a state is called among derivatives with respect to its fields."""
+DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
+"""Parameters that explicit steps of diffusion have to follow."""
+
+
+class ParameterSpace:
+    """The parameters of one simulation over a number of steps. In a batch of scenes a value holds for all of them, or
+    has a first axis with an entry for each."""
+
+    def __init__(self, simulation: Simulated, steps: int):
+        self._simulation, self._batch, self._steps = simulation, simulation.batch, steps
+        self._known = simulation.known
+        self._one = SceneParameters(simulation, steps)
+        self._first_positions = FirstPositions(simulation)
+        self._told: set[str] = set()
+        """The limits of stability that were warned of."""
+
+    def checked(self, values: Values, what: str = "parameter") -> Arrays:
+        """Values as float64 arrays; raises `InputError` in a sentence. A ``what`` of "direction" may be negative."""
+        if not isinstance(values, Mapping):
+            raise InputError(f"{what}s are {shown(values)}, but must be given by name, as {{'gravity': value}}.")
+        if "tilt" in values and "gravity" in values:
+            raise InputError(f"{what} gravity is given, but must be left out, as the tilt says where it points.")
+        found = {name: self._checked(name, value, what) for name, value in values.items()}
+        if what != "direction":
+            check_sizes(found, self._simulation.precision, self._known)
+            for number, own in enumerate(self._different(found)):
+                self._check(own, number)
+        return found
+
+    def checked_names(self, what: str, names: Iterable[str]) -> list[str]:
+        """Names of parameters that the scene has; raises `InputError` for anything else."""
+        if isinstance(names, str) or not isinstance(names, Iterable):
+            raise InputError(f"{what} is {shown(names)}, but must be a list of names, such as ['mobility'].")
+        found = list(names)
+        for name in found:
+            check_known(name, self._simulation.scene, what, self._known)
+        return found
+
+    def members(self, values: Arrays) -> list[Arrays]:
+        """Checked values as those of each scene of a batch; of a single scene they are the only ones."""
+        different = self._different(values)
+        return different if len(different) > 1 else different * (self._batch or 1)
+
+    def defaults(self) -> Arrays:
+        """Every parameter that the scene has, as runs of so many steps take it where it is not given: parameters that
+        the scene's schedule or a force changes with a row for each step, others as `Simulation.parameters` has them."""
+        found = {**scene_values(self._simulation, self._known), **self._one.scheduled({})}
+        return {name: value for name, value in found.items() if name != TIME.name}
+
+    def colours(self, values: Arrays) -> np.ndarray:
+        """(phases, 3) the colours of the phases in one scene."""
+        return values.get("colours", self._one.values["colours"])
+
+    @WARP
+    def begin(
+        self, rollout: Rollout, values: Arrays, varied: Iterable[str] = (), states: Sequence[RestartState] = ()
+    ) -> None:
+        """Give a rollout its first state and its parameters: ``values``, and for what is not among them the scene's, as
+        its schedule changes it.
+
+        ``varied`` are parameters that a derivative is wanted for: with the mobility among them there is a substep of
+        diffusion even where it is 0. ``states``, one for each scene, replace the scene's first state.
+        """
+        simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
+        rollout.begin_evaluation()
+        rollout.goes_on = bool(states)
+        rollout.clocks = [state.clock for state in states] or [Clock()] * len(rollout.clocks)
+        if not states:
+            rollout.initial.assign(simulation.initial)
+        firsts = [dict(state.fields) for state in states] or [self._one.first(own) for own in members]
+        rollout.initial.set(self._together(firsts))
+        if (simulation.scene.schedule.courses or self._known.courses) and len(members) < len(rollout.clocks):
+            members = members * len(rollout.clocks)  # each at its own time
+        clocks = rollout.clocks if len(members) > 1 else rollout.clocks[:1]
+        chosen = [
+            self._one.run({**self._one.scheduled(own, clock), **own})
+            for own, clock in zip(members, clocks, strict=True)
+        ]
+        rollout.time_steps[:] = [one["time_step"] for one in chosen]
+        origins = [self._origin(one["rest_density"]) for one in chosen]
+        rollout.origins = origins * (len(rollout.clocks) // len(origins))
+        each = members * (len(rollout.clocks) // len(members))
+
+        def advice(member: int) -> str:
+            return divergence_advice(simulation.scene, each[member], float(rollout.time_steps[member]))
+
+        rollout.advice = advice
+        rollout.parameters.set(_stacked(chosen))
+        substeps = {simulation.substeps(**{name: one[name] for name in DIFFUSION}) for one in chosen}
+        if len(substeps) > 1:
+            raise InputError(
+                f"The scenes of the batch take {' and '.join(map(str, sorted(substeps)))} explicit steps of diffusion "
+                f"in a time step, but must all take as many: make {', '.join(DIFFUSION)} differ less."
+            )
+        several = len(simulation.scene.phase) > 1
+        rollout.substeps = max(*substeps, 1) if "mobility" in varied and several else max(substeps)
+
+    def check_restarts(self, states: Sequence[RestartState], values: Arrays) -> None:
+        """Whether states, one for each scene, are of this simulation, and ``values`` go with them; raises
+        `InputError`."""
+        for name in STATE if states else ():
+            if name in values:
+                raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
+        simulation = self._simulation
+        sizes = len(simulation.positions), simulation.dimension, len(simulation.scene.phase)
+        shapes = {field.name: field.shape(*sizes) for field in simulation.initial.fields}
+        for state, own in zip(states, self.members(values), strict=False):
+            origin = self._origin(np.atleast_1d(own.get("rest_density", self._one.values["rest_density"])))
+            check_state(state, shapes, origin, simulation)
+
+    def check_directions(self, along: Arrays) -> None:
+        """Whether directions go with a state; raises `InputError`."""
+        for name in STATE:
+            if name in along:
+                raise InputError(
+                    f"direction {name} is given, but must be left out: give it among those of the state's fields."
+                )
+
+    def _origin(self, rest_density: np.ndarray) -> Origin:
+        """Of the particles of a run with these rest densities (phases,)."""
+        return origin_of(self._simulation, rest_density)
+
+    @WARP
+    def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
+        """A direction by name as tangents of the first state, 0 of one that was given, and of the parameters, at
+        ``values``."""
+        dot, parameters = rollout.solver.new_state(), rollout.solver.new_parameters(self._steps)
+        self.set_direction(rollout, values, along, dot, parameters)
+        return dot, parameters
+
+    @WARP
+    def set_direction(
+        self,
+        rollout: Rollout,
+        values: Arrays,
+        along: Arrays,
+        dot: State,
+        parameters: Parameters,
+        time_dots: np.ndarray | None = None,
+    ) -> None:
+        """Write a direction by name to tangents of the first state, unless it was given, and of the parameters.
+        ``time_dots`` (members,): those of the times at which the first states are."""
+        members, times = self.members(values), np.zeros(len(rollout.clocks)) if time_dots is None else time_dots
+        each = zip(members, self.members(along), rollout.clocks, times, strict=True)
+        directions = [self._one.direction(*own) for own in each]
+        if not rollout.goes_on:
+            dot.set(self._together([first for first, _ in directions]))
+        parameters.set(_stacked([run for _, run in directions]))
+
+    def time_adjoints(self, rollout: Rollout, values: Arrays, parameters: Parameters) -> np.ndarray:
+        """(members,) from the adjoints of the parameters those of the times at which the first states are."""
+        dimension = self._simulation.dimension
+        over_time = [name for name in self._known.over_time if name in self._known.run]
+        run = {name: parameters[name].numpy().astype(np.float64) for name in over_time}
+        run |= {name: run[name][..., :dimension] for name in self._known.vectors if name in run}
+        members = enumerate(zip(self.members(values), rollout.clocks, strict=True))
+        return np.array([self._one.time_adjoint(own, _entry(run, b), clock) for b, (own, clock) in members])
+
+    def state_adjoint(self, rollout: Rollout, values: Arrays, state: State, parameters: Parameters) -> Arrays:
+        """Adjoints of the first state as those of its fields, by name, and of its ``time``, all in float64; in a batch
+        each has a first axis for the scenes."""
+        found = {name: bar.astype(np.float64) for name, bar in state.numpy(self._simulation.dimension).items()}
+        times = self.time_adjoints(rollout, values, parameters)
+        return {**found, STATE_TIME: times[0] if self._batch is None else times}
+
+    def gradient(self, rollout: Rollout, values: Arrays, state: State, parameters: Parameters) -> Arrays:
+        """Adjoints of the first state, unless it was given, and of the parameters, for the names and in the shapes of
+        ``values``; in a batch each has a first axis with an entry for each scene, whether or not the value has one."""
+        dimension = self._simulation.dimension
+        read = {"gravity" if name == "tilt" else name for name in values}
+        read |= set(self._known.over_time) if "time_step" in values else set()
+        run = {name: parameters[name].numpy().astype(np.float64) for name in self._known.run if name in read}
+        run |= {name: run[name][..., :dimension] for name in self._known.vectors if name in run}
+        fields = [f.name for f in state.fields if f.first in values or f.name == DENSITY]
+        fields = [] if rollout.goes_on else fields
+        first = {name: bar.astype(np.float64) for name, bar in state.numpy(dimension, only=fields).items()}
+        if self._batch is None:
+            return self._one.gradient(values, first, _entry(run, 0), rollout.clocks[0])
+        members = enumerate(zip(self.members(values), rollout.clocks, strict=True))
+        found = _stacked(
+            [self._one.gradient(own, _entry(first, b), _entry(run, b), clock) for b, (own, clock) in members]
+        )
+        return {name: bar.reshape(self._batch, *self._row(name, values[name])) for name, bar in found.items()}
+
+    def _checked(self, name: str, value: Any, what: str) -> np.ndarray:
+        check_known(name, self._simulation.scene, what, self._known)
+        own = self._one.shapes(name)
+        array = checked_value(name, value, [*own, *self._batched(own)], what, self._known)
+        if len(own) == 2 and array.shape == own[1] and self._batch == self._steps > 1:
+            rows, *rest = own[1]
+            raise InputError(
+                f"{what} {name} has shape {array.shape}, which may be a row for each step or for each scene of the "
+                f"batch, but must be {(1, rows, *rest)} or {(rows, 1, *rest)}."
+            )
+        return array
+
+    def _batched(self, own: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
+        """The shapes in a batch of a parameter that may have these in one scene. One that may have a row for each step
+        then always has an axis of steps."""
+        if self._batch is None:
+            return []
+        if len(own) == 1:
+            return [(self._batch, *own[0])]
+        return [(self._batch, 1, *own[0]), (self._batch, *own[1]), (1, *own[1])]
+
+    def _row(self, name: str, value: np.ndarray) -> tuple[int, ...]:
+        """The shape of what a checked value holds for one scene of a batch."""
+        return value.shape if value.shape in self._one.shapes(name) else value.shape[1:]
+
+    def _different(self, values: Arrays) -> list[Arrays]:
+        """The values of each scene of a batch, or once where they are the same for all."""
+        shared, each = {}, {}
+        for name, value in values.items():
+            own = self._one.shapes(name)
+            if value.shape in own:
+                shared[name] = value
+            elif value.shape == (1, *own[-1]):
+                shared[name] = value[0]
+            else:
+                each[name] = value[:, 0] if value.shape[1:] == (1, *own[0]) else value
+        members = range(self._batch or 1) if each else range(1)
+        return [shared | {name: value[b] for name, value in each.items()} for b in members]
+
+    def _check(self, values: Arrays, number: int) -> None:
+        """Whether the values of one scene make sense for it. It warns, once, of each limit of stability that the time
+        step is beyond, and of first positions that are crowded."""
+        simulation = self._simulation
+        if self._steps == 0:
+            return
+        try:
+            check_places(values, simulation.scene, simulation.free_particles)
+            crowded = self._first_positions.check(values, number)
+        except InputError as error:
+            if self._batch is None:
+                raise
+            raise InputError(f"In scene {number} of the batch, {error}") from error
+        upright = self._one.upright(values)
+        unstable = unstable_sentence(upright, simulation.scene, self._told) if values else None
+        for sentence in filter(None, (crowded, unstable)):
+            warnings.warn(sentence, CortadoWarning, stacklevel=4)
+
+    def _together(self, fields: list[Arrays]) -> Arrays:
+        """The fields of the states of all scenes, given those of each or once those of all."""
+        return fields[0] if self._batch is None else _stacked(fields * (self._batch // len(fields)))
+
+
+def _stacked(arrays: list[Arrays]) -> Arrays:
+    """Arrays of the same names with a first axis for each of the tables."""
+    return {name: np.stack([one[name] for one in arrays]) for name in arrays[0]}
+
+
+def _entry(arrays: Arrays, number: int) -> Arrays:
+    """One entry of the first axis of each array."""
+    return {name: array[number] for name, array in arrays.items()}

@@ -1,0 +1,319 @@
+"""The only time loop: run forward, keep checkpoints, go back.
+
+Steps are launched in chunks without a host read in between; at the end of a chunk the host looks whether the
+neighbour lists were long enough (if not, they grow and the chunk is repeated) and whether a particle was lost. A chunk
+of steps, or a step back, is a captured graph on a GPU, and on a CPU where launches take one thread.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from itertools import count
+from typing import Protocol
+from weakref import WeakSet
+
+import numpy as np
+
+from cortado.device.compiling import compile_ahead, compile_ahead_adjoint
+from cortado.device.launching import CapturedGraph, add
+from cortado.device.memory import require, step_parts, within
+from cortado.device.threads import WARP, Turn, in_turn
+from cortado.errors import DivergedError, InputError
+from cortado.particles.state import Parameters, State, StateSeries
+from cortado.rollout.checkpoints import Checkpoints, checkpoint_interval
+from cortado.rollout.evaluation import Pending, PutAside
+from cortado.scene.restart import Clock, Origin
+from cortado.solvers.containment import Lost
+from cortado.solvers.solver import Counts, Solver, StepTangent
+
+CHUNK = 64
+"""Steps between two looks of the host, at most."""
+FILLED = {"cpu": 32_000, "cuda": 16_000_000}
+"""Particles in the steps of a chunk, beyond which a look of the host costs hardly anything beside them."""
+MEMORY_BUDGET = 8 * 2**30
+"""Bytes of checkpoints; beyond it states are kept less often and recomputed on the way back."""
+
+Observer = Callable[[int, State], None]
+"""Is given the number of a state and the state, which later steps overwrite."""
+
+
+OF_AN_EVALUATION = (
+    "clocks",
+    "origins",
+    "substeps",
+    "advice",
+    "lost",
+    "goes_on",
+    "evaluation",
+    "_checkpoints",
+    "_kept",
+    "_run",
+)
+"""Attributes of a rollout that are replaced, and not overwritten, from one evaluation to the next."""
+
+
+class BackwardStep(Protocol):
+    """The way back through one step, made by an `AdjointEstimator` of `cortado.gradients` for one rollout."""
+
+    capturable: bool
+    """Whether a step may be captured as a graph."""
+    rollout: "Rollout"
+    """That it was made for."""
+    solver: Solver
+    """Whose fields hold the replayed step after `step`."""
+
+    def begin(self) -> None:
+        """Forget the parameters' adjoints of an earlier way back."""
+
+    def step(self, state: State, counts: Counts, bar: State) -> None:
+        """Replace ``bar``, the adjoint of the step's result, by that of its first state."""
+
+    def parameters(self) -> Parameters:
+        """Adjoints of the parameters, of all steps since `begin`."""
+
+
+class Rollout:
+    """A number of steps of a solver from a first state, which can be repeated and differentiated."""
+
+    @WARP
+    def __init__(self, solver: Solver, steps: int, memory_budget: int = MEMORY_BUDGET):
+        self.solver, self.steps = solver, steps
+        self._device = solver.device
+        require(step_parts(steps, solver.discretisation.precision.bytes), "take fewer steps", self._device)
+        self.initial = solver.new_state()
+        self.parameters = solver.new_parameters(steps)
+        self.substeps = 0
+        """Explicit steps of diffusion within each step."""
+        self.time_steps = np.zeros(solver.layout.members)
+        """(members,) [s], as they were given: the device rounds them."""
+        self.advice: Callable[[int], str] = lambda member: "try a smaller time step, or more pressure iterations"
+        """What to try where a member diverged, in words."""
+        self.clocks = [Clock()] * solver.layout.members
+        """Of the first state of each scene of a batch."""
+        self.origins: list[Origin] = []
+        """Of the particles of each scene of a batch."""
+        self.lost: dict[int, DivergedError] = {}
+        """The scenes of a batch that lost a particle in the last forward run, by number. What stands in their states
+        after the step before means nothing."""
+        self.log = solver.new_log(steps)
+        """What the solver noted of the steps of the last forward run."""
+        state_bytes = sum(self.initial[f.name].capacity for f in self.initial.fields if not f.is_constant)
+        self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
+        self._checkpoints = Checkpoints(self.initial, self._interval)
+        self._spare: list[StateSeries] = []
+        """Those of earlier runs that nobody will come back to, for the next run that keeps states."""
+        self._buffer, self._bar = self.initial.following(), self.initial.like()
+        particles = max(solver.layout.all_particles, 1)
+        filled = FILLED["cpu" if self._device.is_cpu else "cuda"] // particles
+        length = max(min(CHUNK, filled, steps), 1)
+        self._series = StateSeries(self.initial, length)
+        self._chunk = [self._series.state(k) for k in range(length)]
+        """The states of the last chunk."""
+        self._tangent: tuple[Parameters, StepTangent] | None = None
+        """The last one, with the tangents of the parameters that it was made for."""
+        self._generation = -1
+        self._forget_stale_graphs()
+        self.goes_on = False
+        """Whether the first state was given whole, so that it depends on no parameter."""
+        self.evaluation = 0
+        """Which first state and parameters these are: a way back belongs to one evaluation."""
+        self._evaluations = count(1)
+        self.pending: WeakSet[Pending] = WeakSet()
+        """Who will come back to the present evaluation."""
+        self._kept = self._run = -1
+        """The evaluations that states were kept of, and that the last run was of."""
+
+    @property
+    def diagnostics(self) -> Mapping[str, np.ndarray]:
+        """(steps,) by name, in a batch (steps, batch), of the steps of the last forward run: see `StepLog`."""
+        return self.log.diagnostics
+
+    @property
+    def turn(self) -> Turn:
+        """What a thread holds that uses the solver."""
+        return self.solver.turn
+
+    # ---- evaluations ---------------------------------------------------------------------------------------------
+
+    def begin_evaluation(self) -> None:
+        """Before the first state and the parameters are replaced: whoever will come back to them puts them aside."""
+        if len(self.pending) > 1:
+            self._checkpoints.release()  # of several owners: not to be used again
+        for pending in list(self.pending):
+            pending.put_aside()
+        if self.pending:
+            self._checkpoints = Checkpoints(self.initial, self._interval)
+        self.pending.clear()
+        self.evaluation = next(self._evaluations)
+
+    def put_aside(self) -> PutAside:
+        """What the next evaluation overwrites."""
+        return PutAside(self, OF_AN_EVALUATION)
+
+    @in_turn
+    def bring_back(self, aside: PutAside) -> None:
+        """Have an evaluation again that was put aside."""
+        self.begin_evaluation()
+        aside.bring_back(self)
+
+    # ---- forward -------------------------------------------------------------------------------------------------
+
+    @in_turn
+    def forward(self, observe: Observer | None = None, keep: bool = True) -> State:
+        """Run all steps and return the last state, which the next run overwrites. ``observe`` is given every state;
+        ``keep`` checkpoints for a way back. Raises `DivergedError` after the good states were observed; a batch goes on
+        without the scenes that have ``lost`` a particle."""
+        self._kept = self._run = -1
+        self._spare += self._checkpoints.release()
+        self._checkpoints = Checkpoints(self.initial, self._interval)
+        self.lost = {}
+        state, step = self.initial, 0
+        self.solver.set_substeps(self.substeps)
+        self._forget_stale_graphs()
+        if self.steps > 0:
+            compile_ahead(self.solver, self._device)
+        self.solver.reset()
+        try:
+            while step < self.steps:
+                last = min(step + len(self._chunk), self.steps)
+                chunk = self._advance(state, step, last)
+                if self.solver.make_room():
+                    self._forget_stale_graphs()
+                    self.solver.reset(step)
+                    continue
+                lost = self.solver.containment.lost()
+                for b in lost.keys() - self.lost.keys():
+                    self.lost[b] = self._diverged(b, lost[b], chunk[lost[b].step - step])
+                stops = bool(lost) and self.solver.layout.batch is None
+                for number, new_state in enumerate(chunk[: lost[0].step - step] if stops else chunk, step + 1):
+                    if observe is not None:
+                        observe(number, new_state)
+                if keep and not stops:
+                    self._checkpoints.keep(step, chunk, self._series, len(self._chunk), self._spare)
+                if stops:
+                    step = lost[0].step + 1
+                    raise self.lost[0]
+                state, step = chunk[-1], last
+        finally:
+            self.log.read(step)
+        self._run = self.evaluation
+        if keep:
+            self._kept = self.evaluation
+        return state
+
+    def _advance(self, state: State, first: int, last: int) -> list[State]:
+        """Take the steps from one to another and return the states after them, which the next chunk overwrites."""
+        self.solver.step_number.fill_(first)
+        self._buffer.assign(state)
+        length = last - first
+        if length not in self._chunks:
+            self._chunks[length] = CapturedGraph(partial(self._take, length), self.solver.launch)
+        self._chunks[length]()
+        return self._chunk[:length]
+
+    def _take(self, length: int) -> None:
+        """So many steps from the state in the buffer."""
+        state = self._buffer
+        for new_state in self._chunk[:length]:
+            self.solver.step(state, new_state, self.parameters, self.log)
+            state = new_state
+
+    def _forget_stale_graphs(self) -> None:
+        """Begin anew with graphs where arrays of the solver were replaced, by this rollout or by another."""
+        if self._generation == self.solver.generation:
+            return
+        self._generation = self.solver.generation
+        self._chunks: dict[int, CapturedGraph] = {}
+        """Graphs by their number of steps."""
+        self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
+
+    def _diverged(self, member: int, lost: Lost, state: State) -> DivergedError:
+        containment, particle = self.solver.containment, member * self.solver.layout.particles + lost.particle
+        position = state.positions.numpy()[particle][: containment.walled.dimension]
+        imprecise = ", or float64 for fluid that flies that far" if containment.is_imprecise(position) else ""
+        return DivergedError(
+            step=lost.step + 1,
+            particle=lost.particle,
+            advice=f"{self.advice(member)}{imprecise}",
+            where=containment.where(position),
+            others=lost.others,
+        )
+
+    # ---- derivatives ---------------------------------------------------------------------------------------------
+
+    @in_turn
+    def backward(self, derivative: BackwardStep, bars: Mapping[int, State], observe: Observer | None = None) -> State:
+        """The adjoint of the first state, for ``bars``, adjoints of states by their number.
+
+        ``observe`` is given the adjoint of every state, from the last to the first; the next step overwrites it. Raises
+        `InputError` unless `forward` has run to its end since the first state or the parameters were replaced, and has
+        kept states. The next way back overwrites what is returned.
+        """
+        if derivative.rollout is not self:
+            raise InputError("The derivative was made for another rollout, but must be one of this rollout's own.")
+        if beyond := [step for step in bars if step not in range(self.steps + 1)]:
+            raise InputError(f"bars has the state {beyond[0]}, but must have states from 0 to {self.steps}.")
+        self._require("backward", self._kept)
+        self.solver.set_substeps(self.substeps)
+        if self.steps > 0:
+            compile_ahead_adjoint(derivative, self._device)
+        derivative.begin()
+        self._forget_stale_graphs()
+        self._bar.clear()
+        for n in reversed(range(self.steps + 1)):
+            if n in bars:
+                for bar, total in zip(bars[n].arrays(), self._bar.arrays(), strict=True):
+                    add(bar, total)
+            if observe is not None:
+                observe(n, self._bar)
+            if n > 0:
+                self._buffer.assign(self._checkpoints.state(n - 1, self._replayed))
+                self.solver.step_number.fill_(n - 1)
+                self._step_back(derivative, self.log.seek(n - 1))
+        return self._bar
+
+    def _step_back(self, derivative: BackwardStep, counts: Counts) -> None:
+        work = partial(derivative.step, self._buffer, counts, self._bar)
+        if not derivative.capturable:
+            work()
+            return
+        key = (derivative, counts)
+        if key not in self._steps_back:
+            self.solver.reserve(counts)
+            self._steps_back[key] = CapturedGraph(work, self.solver.launch)
+        self._steps_back[key]()
+
+    @in_turn
+    def tangent(self, dot: State, parameters_dot: Parameters, observe: Observer) -> None:
+        """From ``dot``, the tangent of the first state, to that of every state, given to ``observe``; `forward` has
+        run with these parameters."""
+        self._require("along a tangent", self._run)
+        solver, state = self.solver, self._buffer
+        solver.set_substeps(self.substeps)
+        if self._tangent is None or self._tangent[0] is not parameters_dot:
+            self._tangent = parameters_dot, solver.tangent(parameters_dot)
+        derivative = self._tangent[1]
+        state.assign(self.initial)
+        observe(0, dot)
+        for n in range(self.steps):
+            counts = self.log.seek(n)
+            solver.step_number.fill_(n)
+            solver.replay(state, self.parameters, counts)
+            derivative.step(counts, dot, self.parameters)
+            solver.write_state(counts, self.parameters, state)
+            observe(n + 1, dot)
+
+    def _require(self, what: str, evaluation: int) -> None:
+        """Whether a forward run was of the present evaluation; raises `InputError`."""
+        if evaluation != self.evaluation:
+            raise InputError(
+                f"The rollout cannot go {what}, as it has not gone forward with these parameters, or has kept no "
+                "states: run forward first, with keep=True."
+            )
+
+    def _replayed(self, n: int, state: State) -> State:
+        """The state after state n, computed once more."""
+        counts, new_state = self.log.seek(n), self.initial.following()
+        self.solver.step_number.fill_(n)
+        self.solver.replay(state, self.parameters, counts)
+        self.solver.write_state(counts, self.parameters, new_state)
+        return new_state

@@ -1,0 +1,220 @@
+"""The way from the parameters of one scene, by name, to what a run of it depends on, and back: as NumPy arrays.
+
+n counts fluid particles in the order in which the scene lists them, d is the scene's dimension.
+"""
+
+from typing import Protocol
+from weakref import WeakSet
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.device.precision import Precision
+from cortado.discretise.smoothing import SmoothingKernel
+from cortado.errors import InputError
+from cortado.particles.fields import first_values
+from cortado.particles.state import State
+from cortado.scene.discrete_scene import Lattice
+from cortado.scene.parameters.known import Known
+from cortado.scene.parameters.reference_density import (
+    reference_density,
+    reference_density_adjoint,
+    reference_density_tangent,
+)
+from cortado.scene.parameters.registry import Axis, Changing, Source
+from cortado.scene.parameters.tilt import Tilt
+from cortado.scene.parameters.values import Arrays, scene_values
+from cortado.scene.restart import Clock, RestartState
+
+DENSITY = "reference_density"
+"""The field of a state that the first mass fractions and the rest densities decide."""
+COMPOSITION = ("mass_fractions", "rest_density")
+
+
+class Simulated(Source, Protocol):
+    """A simulation as its parameters see it."""
+
+    initial: State
+    """The first state, on the device."""
+    known: Known
+    """Its parameters."""
+    judged_states: WeakSet[RestartState]
+    """Those that need not be judged again, as nobody can change them."""
+    batch: int | None
+    """How many scenes there are in one launch; None for a single one."""
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+
+    @property
+    def precision(self) -> Precision:
+        """Of the device's arrays."""
+
+    @property
+    def smoothing(self) -> SmoothingKernel:
+        """The smoothing kernel W."""
+
+    @property
+    def lattice(self) -> Lattice:
+        """Constants of the lattice of particles at rest."""
+
+    @property
+    def free_particles(self) -> int:
+        """How many particles, the first ones, do not wait in an emitter."""
+
+    @property
+    def carried_by(self) -> str | None:
+        """What sentences call its solver, if this has fields of its own in states."""
+
+    def substeps(self, time_step: NDArray, mobility: NDArray, interface_width: NDArray, rest_density: NDArray) -> int:
+        """Explicit steps of diffusion within a time step that are stable with these parameters."""
+
+
+class SceneParameters:
+    """The parameters of one scene over a number of steps."""
+
+    def __init__(self, simulation: Simulated, steps: int):
+        self._simulation, self._steps, self._known = simulation, steps, simulation.known
+        absent = {name: np.zeros(self.shapes(name)[0]) for name in self._known.run}
+        self.values: Arrays = absent | scene_values(simulation, self._known)
+        """As the scene has them."""
+
+    def shapes(self, name: str) -> list[tuple[int, ...]]:
+        """The shapes that a parameter may have; () is a number."""
+        simulation = self._simulation
+        return self._known[name].shapes(self._steps, len(simulation.scene.phase), simulation.positions.shape)
+
+    def upright(self, values: Arrays) -> Arrays:
+        """The values, with gravity in the place of a tilt."""
+        return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values
+
+    def _courses(self, values: Arrays) -> dict[str, Changing]:
+        """Those of the schedule, and of forces, that act: a gravity or a tilt that is given replaces either."""
+        replaced = {"gravity", "tilt"} if not values.keys().isdisjoint(("gravity", "tilt")) else set()
+        courses = {**self._simulation.scene.schedule.courses, **self._known.courses}
+        return {name: course for name, course in courses.items() if name not in values and name not in replaced}
+
+    def _times(self, name: str, values: Arrays, clock: Clock | None = None) -> NDArray:
+        """(steps,) [s] when the rows of a scheduled parameter are."""
+        time_step = float(values.get("time_step", self._simulation.scene.solver.time_step))
+        return (clock or Clock()).times(self._moments(name), time_step)
+
+    def _moments(self, name: str) -> NDArray:
+        """(steps,) the same in steps."""
+        return np.arange(max(self._steps, 1)) + self._known[name].moment
+
+    def _scheduled_rates(self, values: Arrays, clock: Clock | None, of_clock: bool = False) -> Arrays:
+        """The derivatives of `scheduled` with respect to the time step, or to the time of the clock, with a row for
+        each step."""
+        found = {}
+        for name, course in self._courses(values).items():
+            times, moments = self._times(name, values, clock), self._moments(name)
+            slopes = np.ones_like(moments) if of_clock else moments
+            rates = course.rates(times) * (slopes[:, None] if self._known[name].rank else slopes)
+            if name == "tilt":
+                found["gravity"] = self._tilt.tangent(course.at(times), rates)
+            else:
+                found[name] = rates
+        return found
+
+    def scheduled(self, values: Arrays, clock: Clock | None = None) -> Arrays:
+        """What the scene's schedule says of the steps after a clock, with a row for each, in the place of what is not
+        among the ``values``: gravity, also where it is a tilt that is scheduled, and the nozzle's path."""
+        rows = {name: course.at(self._times(name, values, clock)) for name, course in self._courses(values).items()}
+        return {name: value for name, value in self.upright(rows).items() if name in self._known.run}
+
+    def run(self, values: Arrays) -> Arrays:
+        """What steps depend on, by the upright ``values``, and the scene's for what is not among them: parameters over
+        time with a row for each step, those of phases as (phases,), others as they are."""
+        known = self._known
+        found = {name: values.get(name, self.values[name]) for name in known.run}
+        for name, value in found.items():
+            if known[name].axis is Axis.STEP:
+                row = value.shape[value.ndim - known[name].rank :]
+                found[name] = np.broadcast_to(value, (max(self._steps, 1), *row))
+            elif known[name].axis is Axis.PHASE:
+                found[name] = np.atleast_1d(value)
+        return found
+
+    def first(self, values: Arrays) -> Arrays:
+        """The fields of the first state that differ from the scene's under these values. Raises `InputError` for mass
+        fractions without a volume: a little below 0, as diffusion may leave them."""
+        fields = first_values(self._simulation.initial.fields, values)
+        if values.keys().isdisjoint(COMPOSITION):
+            return fields
+        fractions, density = self._composition(values)
+        with np.errstate(divide="ignore"):
+            found = reference_density(fractions, density)
+        bad = np.flatnonzero(~(np.isfinite(found) & (found > 0.0)))
+        if bad.size:
+            raise InputError(
+                f"mass_fractions of particle {bad[0]} are {fractions[bad[0]].tolist()}, but must be such that its "
+                "volume, the sum of the fractions over the rest densities of the phases, is greater than 0."
+            )
+        return {**fields, DENSITY: found}
+
+    def direction(
+        self, values: Arrays, along: Arrays, clock: Clock | None = None, time_dot: float = 0.0
+    ) -> tuple[Arrays, Arrays]:
+        """A direction by name as tangents of the fields of the first state and of what steps depend on, where the first
+        state is at a clock whose time has a tangent."""
+        if "gravity" in along and "tilt" in values:
+            raise InputError("direction gravity is given, but must be left out, as tilt is given in its place.")
+        if "tilt" in along:
+            if "gravity" in values:
+                raise InputError("direction tilt is given, but must be left out, as gravity is given in its place.")
+            if "tilt" not in values and self._simulation.scene.schedule.leads_gravity:
+                raise InputError(
+                    "direction tilt is given, but must be left out, as the scene's schedule says where gravity points: "
+                    "give the tilt among the parameters, too."
+                )
+            angles = values.get("tilt", np.zeros(self._simulation.dimension - 1))
+            along = {**along, "gravity": self._tilt.tangent(angles, along["tilt"])}
+        rates = self._scheduled_rates(values, clock) if "time_step" in along else {}
+        later = self._scheduled_rates(values, clock, of_clock=True) if time_dot else {}
+        along = {name: along.get(name, np.zeros_like(value)) for name, value in self.values.items()}
+        fractions_dot, density_dot = along["mass_fractions"], np.atleast_1d(along["rest_density"])
+        density = reference_density_tangent(*self._composition(values), fractions_dot, density_dot)
+        first = {**first_values(self._simulation.initial.fields, along), DENSITY: density}
+        moved = {name: along[name] + along["time_step"] * rate for name, rate in rates.items()}
+        moved |= {name: moved.get(name, along[name]) + time_dot * rate for name, rate in later.items()}
+        return first, self.run({**along, **moved})
+
+    def time_adjoint(self, values: Arrays, run: Arrays, clock: Clock) -> float:
+        """From the adjoints of what steps depend on to that of the time at which they begin."""
+        rates = self._scheduled_rates(values, clock, of_clock=True)
+        return sum(float((run[name] * rate).sum()) for name, rate in rates.items())
+
+    def gradient(self, values: Arrays, first: Arrays, run: Arrays, clock: Clock | None = None) -> Arrays:
+        """From the adjoints of what steps depend on and of those fields of the first state that depend on parameters,
+        which is at a clock, to those of ``values``, in their shapes."""
+        found = {name: run[name].copy() for name in self._known.run if name in values}
+        for field in self._simulation.initial.fields:
+            if field.first in values and field.name in first:
+                if field.first in self._known.run:  # over time: the field begins as its first row
+                    found[field.first][0] += first[field.name][0]
+                else:
+                    found[field.first] = found.get(field.first, 0.0) + first[field.name]
+        if "tilt" in values:
+            found["tilt"] = self._tilt.adjoint(values["tilt"], run["gravity"])
+        if "time_step" in values:
+            later = sum(float((run[name] * rate).sum()) for name, rate in self._scheduled_rates(values, clock).items())
+            found["time_step"] = found["time_step"] + later
+        for name in self._known.over_time:
+            if name in values and values[name].ndim == self._known[name].rank:
+                found[name] = found[name].sum(axis=0)
+        if DENSITY in first and not values.keys().isdisjoint(COMPOSITION):
+            bars = reference_density_adjoint(*self._composition(values), first[DENSITY])
+            for name, own_bar in zip(COMPOSITION, bars, strict=True):
+                if name in found:
+                    found[name] = found[name] + own_bar
+        return {name: found[name].reshape(values[name].shape) for name in values if name in found}
+
+    @property
+    def _tilt(self) -> Tilt:
+        return Tilt(self._simulation.scene.forces.gravity)
+
+    def _composition(self, values: Arrays) -> tuple[np.ndarray, np.ndarray]:
+        fractions, density = (values.get(name, self.values[name]) for name in COMPOSITION)
+        return fractions, np.atleast_1d(density)

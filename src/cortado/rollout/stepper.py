@@ -1,0 +1,193 @@
+"""Steps of a simulation as a function of a state and of parameters, with its derivatives."""
+
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from cortado.device.memory import require
+from cortado.device.threads import Turn, in_turn
+from cortado.errors import CortadoWarning, InputError, shown
+from cortado.particles.state import Parameters, State
+from cortado.rollout.adjoint_step import AdjointStep
+from cortado.rollout.device_states import DeviceState, DeviceStates
+from cortado.rollout.host_states import Given, HostStates, States
+from cortado.rollout.outcome import trouble
+from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
+from cortado.rollout.residual import Residual, without_lost
+from cortado.rollout.rollout import BackwardStep, Rollout
+from cortado.rollout.scene_parameters import Simulated
+from cortado.scene.parameters.values import Arrays, Values
+from cortado.solvers.solver import Solver
+from cortado.words import counted, sized
+
+
+class Steppable(Simulated, Protocol):
+    """A simulation as its steps see it."""
+
+    solver: Solver
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StepResidual:
+    """What `Stepper.step` leaves for `Stepper.vjp` and `Stepper.jvp`, whole: other steps may come in between."""
+
+    evaluation: Residual
+    values: Arrays
+    """The parameters that were given."""
+    place: HostStates
+    """Where its states are, and the derivatives with respect to them."""
+
+    def __repr__(self) -> str:
+        return (
+            f"StepResidual({counted(self.evaluation.rollout.steps, 'step')}, parameters {sized(self.values) or 'none'})"
+        )
+
+
+class Stepper:
+    """So many steps of a simulation, as a function of the state before them and of parameters.
+
+    Its arrays, graphs and kernels are made once and serve every call.
+    """
+
+    def __init__(self, simulation: Steppable, steps: int):
+        """``steps`` may be 0."""
+        self._simulation, self._space = simulation, ParameterSpace(simulation, steps)
+        self._rollout = Rollout(simulation.solver, steps)
+
+    @property
+    def turn(self) -> Turn:
+        """What a thread holds that uses the simulation."""
+        return self._rollout.turn
+
+    @in_turn
+    def first(self, parameters: Values | None = None) -> States:
+        """The state before the first step of a run with these parameters."""
+        self._space.begin(self._rollout, self._checked(parameters))
+        return HostStates(self._simulation).state(self._rollout, self._rollout.initial, 0)
+
+    @in_turn
+    def on_device(self, state: Given | DeviceState, fields: Values, parameters: Values | None = None) -> DeviceState:
+        """A state of a run with these parameters in arrays of its own on the device, with other ``fields``."""
+        values, place = self._checked(parameters), DeviceStates(self._simulation)
+        self._begin(state, values)
+        found = place.state(self._rollout, self._rollout.initial, 0)
+        return place.replaced(self._space, found, fields) if fields else found
+
+    @in_turn
+    def on_host(self, state: DeviceState) -> States:
+        """A state on the device as NumPy arrays."""
+        if not isinstance(state, DeviceState):
+            raise InputError(f"state is {shown(state)}, but must be a DeviceState, of simulation.on_device.")
+        return DeviceStates(self._simulation).on_host(state)
+
+    @in_turn
+    def advance(self, state: Given | DeviceState, parameters: Values | None = None) -> States | DeviceState:
+        """The state after the steps, on the device if the one before them is."""
+        place = self._begin(state, self._checked(parameters))
+        return place.state(self._rollout, self._forward(keep=False), self._rollout.steps)
+
+    @in_turn
+    def step(
+        self, state: Given | DeviceState, parameters: Values | None = None, along: Iterable[str] = ()
+    ) -> tuple[States | DeviceState, StepResidual]:
+        """The state after the steps, and what `vjp` and `jvp` take to differentiate them.
+
+        Any number of residuals may be held at a time, each with states of its own. ``along`` are further parameters
+        that `jvp` will be given directions of; only the mobility has to be said before, as where it is 0 nothing
+        diffuses.
+        """
+        values = self._checked(parameters)
+        place = self._begin(state, values, {*values, *self._space.checked_names("along", along)})
+        last = place.state(self._rollout, self._forward(keep=True), self._rollout.steps)
+        return last, StepResidual(Residual(self._rollout), values, place)
+
+    @in_turn
+    def vjp(self, residual: StepResidual, state_bar: Values) -> tuple[dict[str, Any], Arrays]:
+        """Reverse mode: from the adjoint of the state after the steps to those of the state before them and of the
+        parameters that were given.
+
+        The adjoint of a state is a table of arrays, those of its fields by name and in their shapes, and of its
+        ``time``, a number; what is left out is 0. Of a `DeviceState` it is taken and returned as arrays on the device;
+        all else that is returned is in float64. A batch has a first axis for the scenes. Raises `InputError` for fields
+        that the state does not have, or that have other shapes.
+        """
+        rollout, space, place = self._rollout, self._space, self._place_of(residual)
+        times = place.write("state_bar", state_bar, self._bar)
+        values = self._brought_back(residual)
+        first = rollout.backward(self._adjoint, {rollout.steps: self._bar})
+        found = self._adjoint.parameters()
+        before = self._shaped(space.time_adjoints(rollout, values, found)) + times
+        gradient = space.gradient(rollout, values, first, found)
+        if "time_step" in gradient:  # a longer step ends later
+            gradient["time_step"] = gradient["time_step"] + rollout.steps * times
+        time_bar = without_lost(rollout, {STATE_TIME: before})
+        return {**place.read(rollout, first), **time_bar}, without_lost(rollout, gradient)
+
+    @in_turn
+    def jvp(self, residual: StepResidual, state_dot: Values, parameter_dots: Values | None = None) -> dict[str, Any]:
+        """Forward mode: from tangents of the state before the steps and of any parameters that it does not hold to that
+        of the state after them; as `vjp` takes and returns adjoints."""
+        rollout, space, place = self._rollout, self._space, self._place_of(residual)
+        along = space.checked({} if parameter_dots is None else parameter_dots, "direction")
+        space.check_directions(along)
+        dot, parameters_dot = self._dots
+        times = place.write("state_dot", state_dot, dot)
+        values = self._brought_back(residual)
+        if "mobility" in along and not rollout.substeps:
+            raise InputError(
+                "direction mobility is given, but must be named where the step is taken, as nothing diffuses where the "
+                'mobility is 0: step(..., along=["mobility"]).'
+            )
+        space.set_direction(rollout, values, along, dot, parameters_dot, np.broadcast_to(times, len(rollout.clocks)))
+        rollout.tangent(dot, parameters_dot, lambda number, state: None)
+        sizes = along.get("time_step", np.zeros(()))
+        later = times + rollout.steps * np.broadcast_to(sizes, times.shape)
+        return {**place.read(rollout, dot), **without_lost(rollout, {STATE_TIME: later})}
+
+    def _shaped(self, times: np.ndarray) -> np.ndarray:
+        """A number of each scene, (members,), as a state of this simulation has it, () or (batch,)."""
+        return times[0] if self._simulation.batch is None else times
+
+    def _place_of(self, residual: StepResidual) -> HostStates:
+        if not isinstance(residual, StepResidual) or residual.evaluation.rollout is not self._rollout:
+            raise InputError(f"residual is {shown(residual)}, but must be one that this stepper's step returned.")
+        return residual.place
+
+    def _brought_back(self, residual: StepResidual) -> Arrays:
+        """The parameters of a step, which is the rollout's present one again."""
+        residual.evaluation.bring_back()
+        return residual.values
+
+    @cached_property
+    def _bar(self) -> State:
+        return self._rollout.solver.new_state()
+
+    @cached_property
+    def _dots(self) -> tuple[State, Parameters]:
+        return self._rollout.solver.new_state(), self._rollout.solver.new_parameters(self._rollout.steps)
+
+    @cached_property
+    def _adjoint(self) -> BackwardStep:
+        solver = self._rollout.solver
+        require(solver.gradient_memory(self._rollout.log), "take a larger spacing", solver.device)
+        return AdjointStep(self._rollout, solver.adjoint(self._rollout.steps))
+
+    def _begin(self, state: Given | DeviceState, values: Arrays, varied: Iterable[str] = ()) -> HostStates:
+        """Give the rollout a first state and parameters; returns where the state is."""
+        place = (DeviceStates if isinstance(state, DeviceState) else HostStates)(self._simulation)
+        place.begin(self._space, self._rollout, state, values, set(varied))
+        return place
+
+    def _checked(self, parameters: Values | None) -> Arrays:
+        return self._space.checked({} if parameters is None else parameters)
+
+    def _forward(self, keep: bool) -> State:
+        """Take the steps; ``keep`` checkpoints for a way back. Warnings and errors as of `Simulation.run`."""
+        last = self._rollout.forward(keep=keep)
+        for sentence in trouble(self._rollout, self._simulation.scene):
+            warnings.warn(sentence, CortadoWarning, stacklevel=6)
+        return last

@@ -1,0 +1,109 @@
+"""What can be read of a simulation's states: quantities of its particles."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.device.threads import Turn, in_turn
+from cortado.discretise.calibration import circulation_factor
+from cortado.rollout.rollout import Rollout
+from cortado.rollout.stepper import Steppable
+from cortado.runs.quantities.evaluator import Evaluator
+from cortado.runs.quantities.moment import Moment
+from cortado.runs.trajectory import Trajectory
+from cortado.scene.parameters.registry import Role, names
+from cortado.scene.parameters.values import OVER_TIME
+from cortado.scene.quantities import check_quantity, sizes
+from cortado.scene.restart import RestartState
+from cortado.scene.scene import Scene
+
+FIRST = names(Role.STATE)
+"""Parameters that a state has, and a step from it does not take."""
+
+
+class Measured(Steppable, Protocol):
+    """A simulation as its quantities see it."""
+
+    def rollout(self, steps: int, controls: Mapping[str, Any] | None, state: Any) -> Rollout:
+        """A rollout that is ready to go forward."""
+
+    def in_precision(self, precision: str) -> Any:
+        """A single one of the same scene in a precision."""
+
+    def batch_of(self, size: int) -> Any:
+        """The same scene so many times in one launch."""
+
+
+class Measuring:
+    """What a simulation can say of states."""
+
+    @property
+    def turn(self) -> Turn:
+        """What a thread holds that uses the simulation."""
+        raise NotImplementedError
+
+    @in_turn
+    def evaluator(self) -> Evaluator:
+        """What computes quantities of states on the device, made once."""
+        made = self.__dict__.get("_evaluator")
+        if made is None:
+            own = cast(Measured, self)
+            scene, lattice = own.scene, own.lattice
+            spacing, dimension = scene.discretisation.spacing, scene.dimension
+            factor = circulation_factor(own.smoothing, spacing, lattice.support, dimension)
+            made = self.__dict__["_evaluator"] = Evaluator(own.solver, dimension, factor)
+        return made
+
+    def quantity(
+        self,
+        name: str,
+        of: RestartState | Sequence[RestartState] | Trajectory | None = None,
+        controls: Mapping[str, Any] | None = None,
+    ) -> NDArray:
+        """A quantity of the particles: "density" [kg / m3], "pressure" [Pa], "speed" [m / s], "vorticity" [1 / s],
+        "wall_force" [N]; see `docs/sensors.md`.
+
+        Args:
+            name: of the quantity.
+            of: a state of this simulation, of a batch one for each scene; or a trajectory, of which it is found for
+                every frame; the scene's first state if left out.
+            controls: as of `run`; the pressure is that of the step that begins at the state, which they act in. Of a
+                trajectory they are those of its run.
+
+        Returns:
+            (n,) or (n, k), of a trajectory (frames, n, ...), float64, in the scene's order.
+
+        Raises:
+            InputError: another name, or a state that is none of this simulation's.
+        """
+        check_quantity(name)
+        if not isinstance(of, Trajectory):
+            return self._quantity(name, of, controls)
+        frames = [self._quantity(name, of[: k + 1].last_state, _at(controls, of, k)) for k in range(len(of))]
+        return np.array(frames)
+
+    @in_turn
+    def _quantity(self, name: str, state: Any, controls: Mapping[str, Any] | None) -> NDArray:
+        rollout = cast(Measured, self).rollout(1, controls, state)
+        return Moment.of(rollout, 0, rollout.initial, self.evaluator).value(name)
+
+
+def coloured_by(scene: Scene, trajectory: Trajectory, simulation: Callable[[], Measuring]) -> NDArray | None:
+    """(frames, n) what the pictures of a scene colour particles by, recorded or computed by a simulation of it; None
+    where they have the colours of phases."""
+    name = None if scene.picture is None else scene.picture.colour_by
+    if name is None:
+        return None
+    is_there = name == "speed" or name in trajectory.quantities
+    values = trajectory.quantity(name) if is_there else simulation().quantity(name, trajectory)
+    return sizes(name, values, scene.dimension)
+
+
+def _at(controls: Mapping[str, Any] | None, trajectory: Trajectory, frame: int) -> dict[str, Any]:
+    """The controls of the step after a frame of the run that they were given to."""
+    step = int(trajectory.steps[frame] - trajectory.steps[0])
+    given = {name: value for name, value in (controls or {}).items() if name not in FIRST}
+    rows = {name: value for name, value in given.items() if name in OVER_TIME and np.ndim(value) == 2}
+    return given | {name: value[min(step, len(value) - 1)] for name, value in rows.items()}

@@ -1,0 +1,79 @@
+"""A state together with what the step after it depends on, and the quantities of both."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.particles.state import State
+from cortado.rollout.rollout import Rollout
+from cortado.scene.discrete_scene import Lattice
+from cortado.scene.parameters.values import Arrays
+
+
+class Evaluates(Protocol):
+    """What computes quantities: see `cortado.runs.quantities.evaluator.Evaluator`."""
+
+    lattice: Lattice
+
+    def values(self, names: Iterable[str], moment: "Moment") -> Arrays: ...
+
+    def tangents(
+        self, names: Iterable[str], moment: "Moment", dot: Mapping[str, NDArray], parameters_dot: Mapping[str, NDArray]
+    ) -> Arrays: ...
+
+    def adjoint(self, bars: Mapping[str, NDArray], moment: "Moment") -> tuple[Arrays, Arrays]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A state, and the parameters of the step that begins at it. Quantities are computed when they are asked for, and
+    kept."""
+
+    state: State
+    """On the device."""
+    parameters: Mapping[str, NDArray]
+    """By name, with one row of those over time, and a first axis for the scenes of a batch or one for all of them."""
+    substeps: int
+    """Explicit steps of diffusion within the step."""
+    row: int
+    """Which of the steps of a run the parameters are those of."""
+    evaluator: Callable[[], Evaluates]
+    """Makes what computes quantities."""
+    _values: Arrays = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, rollout: Rollout, step: int, state: State, evaluator: Callable[[], Evaluates]) -> "Moment":
+        """A state of a rollout's present evaluation, after so many steps. After the last one the parameters are still
+        those of the last step."""
+        row = min(step, max(rollout.steps - 1, 0))
+        return cls(state, row_of(rollout, rollout.parameters.written, row), rollout.substeps, row, evaluator)
+
+    @property
+    def lattice(self) -> Lattice:
+        """Constants of the lattice of particles at rest."""
+        return self.evaluator().lattice
+
+    def value(self, name: str) -> NDArray:
+        """A quantity of the state, float64, read-only, of a batch with a first axis for the scenes."""
+        if name not in self._values:
+            found = self.evaluator().values([name], self)[name]
+            found.flags.writeable = False
+            self._values[name] = found
+        return self._values[name]
+
+    def adjoint(self, bars: Mapping[str, NDArray]) -> tuple[Arrays, Arrays]:
+        """From adjoints of quantities to those of the state's fields and of the step's parameters."""
+        return self.evaluator().adjoint(bars, self)
+
+    def tangents(self, names: list[str], dot: Mapping[str, NDArray], parameters_dot: Mapping[str, NDArray]) -> Arrays:
+        """Of quantities, along tangents of the state's fields and of the step's parameters."""
+        return self.evaluator().tangents(names, self, dot, parameters_dot)
+
+
+def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
+    """What was written of parameters for all steps of a rollout, of those over time one row."""
+    over_time = rollout.solver.layout.known.over_time
+    return {name: value[:, row : row + 1] if name in over_time else np.asarray(value) for name, value in values.items()}

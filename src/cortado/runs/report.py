@@ -1,0 +1,194 @@
+"""A run folder as one page: report.html holds its pictures and films inside and opens from disk, without a network."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import shlex
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cortado.errors import InputError
+from cortado.files.atomic import write_atomically
+from cortado.pictures import particle_view
+from cortado.runs.run_folder import RunFolder
+
+Figures = list[tuple[str, str | Path]]
+"""(caption, path) of each picture or video"""
+_KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".svg": "image/svg+xml", ".gif": "image/gif"}
+_VIDEOS = {".mp4": "video/mp4", ".webm": "video/webm"}
+MOST_NUMBERS = 12
+"""That are written out one by one."""
+
+_STYLE = f"""
+:root {{ color-scheme: light dark; --paper: #fcfbf9; --ink: #2b2a28; --faint: #6d6860; --line: #e6e2db;
+        --inset: #f3f0ea; }}
+@media (prefers-color-scheme: dark) {{
+  :root {{ --paper: #1d1c1b; --ink: #e8e4dd; --faint: #a49e94; --line: #3a3734; --inset: #282625; }}
+}}
+body {{ margin: 0 auto; max-width: 62rem; padding: 2.5rem 1.5rem 4rem; background: var(--paper); color: var(--ink);
+       font: 16px/1.55 system-ui, -apple-system, "Segoe UI", sans-serif; overflow-wrap: break-word; }}
+h1 {{ font-size: 1.7rem; font-weight: 600; margin: 0 0 1.5rem; }}
+h2 {{ font-size: 1.2rem; font-weight: 600; margin: 2.5rem 0 .8rem; }}
+p {{ max-width: 46rem; margin: 0 0 .9rem; }}
+.failed {{ border-left: 4px solid #a8504f; padding-left: .9rem; }}
+.wide {{ overflow-x: auto; margin: 1rem 0; }}
+table {{ border-collapse: collapse; }}
+th, td {{ text-align: left; vertical-align: top; padding: .35rem 1.4rem .35rem 0;
+         border-bottom: 1px solid var(--line); }}
+th {{ font-weight: 500; color: var(--faint); }}
+td {{ font-variant-numeric: tabular-nums; }}
+figure {{ margin: 0 0 2rem; }}
+img, video {{ max-width: 100%; height: auto; display: block; border: 1px solid var(--line); border-radius: 6px;
+             background: white; }}
+figcaption {{ margin-top: .5rem; color: var(--faint); font-size: .93rem; }}
+details {{ margin-top: 1rem; }}
+summary {{ cursor: pointer; color: var(--faint); }}
+pre {{ overflow-x: auto; padding: .9rem 1.1rem; background: var(--inset); border-radius: 6px; font-size: .85rem; }}
+@media (max-width: 500px) {{
+  body {{ padding: 1.2rem .9rem 3rem; }}
+  table {{ font-size: .88rem; }}
+  th, td {{ padding-right: .7rem; }}
+}}
+{particle_view.STYLE}"""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a report; what is empty is left out, and with nothing in it all of it."""
+
+    title: str
+    words: Sequence[object] = ()
+    """Paragraphs."""
+    failures: Sequence[object] = ()
+    """Paragraphs about what went wrong, which are marked."""
+    figures: Sequence[tuple[str, str | Path]] = ()
+    """(caption, path) of pictures (png, jpg, svg, gif) or videos (mp4, webm), embedded in the page"""
+    view: str = ""
+    """HTML of `particle_view`."""
+    head: Sequence[str] = ()
+    """Of the columns of the table."""
+    rows: Sequence[Sequence[object]] = ()
+    """Of the table; the first entry of each says what the others are."""
+
+
+def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> Path:
+    """Writes the report of a run and returns its path.
+
+    Args:
+        folder: the run; the command that made it, its scene and its environment end the page.
+        title: heading of the page.
+        sections: in their order.
+
+    Raises:
+        InputError: a picture that cannot be read or has an unknown ending, or a page that cannot be written.
+    """
+    parts = "\n".join(_section(section) for section in sections)
+    script = particle_view.script() if any(section.view for section in sections) else ""
+    page = f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{_safe(title)}</title>
+<style>{_STYLE}</style>
+</head>
+<body>
+<h1>{_safe(title)}</h1>
+{parts}
+<h2>How to run it again</h2>
+{_again(folder)}
+{_details("Scene", folder.scene)}
+{_details("Where it ran", folder.environment)}
+{script}
+</body>
+</html>
+"""
+    write_atomically(folder.report, page.encode(errors="backslashreplace"))  # names of files may not be UTF-8
+    return folder.report
+
+
+def written(value: Any) -> str:
+    """A number, or a few of them, written out; of more, how many there are and from where to where they go."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiub":
+        return str(value)
+    if array.ndim == 0:
+        return _number(value)
+    if array.size > MOST_NUMBERS:
+        shape = " × ".join(map(str, array.shape))
+        return f"{shape} numbers from {_number(np.nanmin(array))} to {_number(np.nanmax(array))}, in result.json"
+    rows = array.reshape(-1, array.shape[-1]) if array.size else array.reshape(0, 1)
+    return "; ".join(f"({', '.join(_number(number) for number in row)})" for row in rows)
+
+
+def _number(value: Any) -> str:
+    return f"{value}" if isinstance(value, int | np.integer | bool | np.bool_) else f"{float(value):.6g}"
+
+
+def _safe(text: object) -> str:
+    return html.escape(str(text))
+
+
+def _section(section: Section) -> str:
+    parts = [f"<p>{_safe(paragraph)}</p>" for paragraph in section.words]
+    parts += [f'<p class="failed">{_safe(paragraph)}</p>' for paragraph in section.failures]
+    parts += [_figure(caption, Path(path)) for caption, path in section.figures]
+    parts += [section.view] if section.view else []
+    parts += [_table(section)] if section.rows else []
+    return "\n".join([f"<h2>{_safe(section.title)}</h2>", *parts]) if parts else ""
+
+
+def _table(section: Section) -> str:
+    head = "".join(f'<th scope="col">{_safe(word)}</th>' for word in section.head)
+    rows = "\n".join(
+        f'<tr><th scope="row">{_safe(first)}</th>{"".join(f"<td>{_safe(written(entry))}</td>" for entry in rest)}</tr>'
+        for first, *rest in section.rows
+    )
+    return f'<div class="wide"><table>\n{f"<tr>{head}</tr>" if head else ""}\n{rows}\n</table></div>'
+
+
+def _figure(caption: str, path: Path) -> str:
+    kind = (_KINDS | _VIDEOS).get(path.suffix.lower())
+    if kind is None:
+        raise InputError(f"{path} cannot be shown; a report takes {', '.join(_KINDS | _VIDEOS)}.")
+    try:
+        content = base64.b64encode(path.read_bytes()).decode()
+    except OSError as problem:
+        raise InputError(f"The picture {path} cannot be read: {problem}.") from problem
+    source = f'src="data:{kind};base64,{content}"'
+    if kind.startswith("video"):
+        shown = f'<video controls loop muted playsinline aria-label="{_safe(caption)}" {source}></video>'
+    else:
+        shown = f'<img alt="{_safe(caption)}" {source}>'
+    return f"<figure>{shown}<figcaption>{_safe(caption)}</figcaption></figure>"
+
+
+def _again(folder: RunFolder) -> str:
+    """The command of the run, and those that went on with it."""
+    try:
+        noted = json.loads(folder.environment.read_text(encoding="utf-8"))
+        commands = [noted["command"], *(session["command"] for session in noted["resumed"])]
+    except (OSError, ValueError, KeyError):
+        return "<p>The command is not known.</p>"
+    lines = "\n".join(shlex.join(command) for command in commands)
+    return (
+        f"<pre>{_safe(lines)}</pre>\n<p>With --overwrite it takes the place of this run. The folder of the run is "
+        f"{_safe(folder.path)}; scene.json in it is the scene with everything that was replaced.</p>"
+    )
+
+
+def _details(label: str, path: Path) -> str:
+    """A JSON file of the run, folded away."""
+    if not path.exists():
+        return ""
+    text = path.read_text(encoding="utf-8")
+    with suppress(ValueError):  # what is not JSON is shown as it stands
+        text = json.dumps(json.loads(text), indent=2, ensure_ascii=False)
+    return f"<details><summary>{_safe(label)}</summary><pre>{_safe(text)}</pre></details>"

@@ -1,0 +1,340 @@
+"""The folder of one run: its scene, where and how it ran, its metrics, its trajectory and its pictures."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from cortado.errors import CortadoWarning, InputError, SceneError
+from cortado.files.atomic import UNFINISHED, parsed_json, sentences, write_atomically
+from cortado.files.input_files import content, reason
+from cortado.runs.run_environment import as_json, plain, require_same, session
+from cortado.runs.sensors.log import Readings, as_csv
+from cortado.scene.parameters.values import NAMES
+from cortado.scene.picture import MOST_FRAMES
+from cortado.scene.scene import Scene
+
+_FORMAT = 2
+"""Of run folders, in environment.json; of those before it says nothing."""
+_RESUMABLE = "optimise"
+"""The command that has --resume."""
+_LARGEST = 2**31
+"""Bytes of a file that is read again when a run goes on."""
+_FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "result.json", "sensors.csv")
+REPLAY_LOG = "replay.log"
+"""In which a search notes its evaluations."""
+_FOLDERS = ("checkpoint", "figures")
+_PICTURES = ("particles", "rendered", "density_errors", "loss", "images", "progress", *NAMES)
+_SHADED = ("first", "last", "picture", "found", "search")
+_FILMS = ("run", "estimate", "film", "found", "search")
+FIGURES = (*(f"{name}.png" for name in (*_PICTURES, *_SHADED)), *(f"{name}.mp4" for name in _FILMS))
+"""Every file that a run may have in its figures; whatever else is there is the user's."""
+TO_RESUME = "; choose another --out, or begin one without --resume"
+"""How a sentence ends that finds no run to go on with."""
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths and files of one run: `create` makes one, `open` finds one, `resume` goes on with one.
+
+    Its mark, environment.json, comes first and is removed last, so that a process that is killed in between leaves
+    a folder which can be overwritten or resumed.
+    """
+
+    path: Path
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        scene_json: str,
+        command: Sequence[str],
+        *,
+        kind: str = "run",
+        settings: Mapping[str, Any] | None = None,
+        device: str = "",
+        overwrite: bool = False,
+    ) -> Self:
+        """Makes the folder of a new run.
+
+        Args:
+            path: the folder, made with its parents when missing.
+            scene_json: the resolved scene.
+            command: the command line, word by word.
+            kind: the command that writes it; only this one resumes it.
+            settings: tables of what else must be the same when it is resumed.
+            device: where the run computes, in words.
+            overwrite: removes an earlier run in this folder (its files only).
+
+        Raises:
+            InputError: the folder holds a run already, or files that a run would replace, or is not writable.
+            ComputationError: the disk is full.
+        """
+        folder = cls(Path(path).absolute())
+        noted = {**session(command, device), "kind": kind, "settings": as_json(settings or {}), "resumed": []}
+        noted["format"] = _FORMAT
+        with sentences(folder.path):
+            folder._make_room(kind, overwrite)
+            folder.path.mkdir(parents=True, exist_ok=True)
+            folder._complete(noted, scene_json)
+        return folder
+
+    @classmethod
+    def open(cls, path: str | Path, otherwise: str = ", but RUN must be the folder of one") -> Self:
+        """The folder of an existing run; ``otherwise``: how the sentence ends if there is none.
+
+        Raises:
+            InputError: there is no run in it.
+        """
+        folder = cls(Path(path).absolute())
+        if not folder._holds_run():
+            raise InputError(f"There is no run in {folder.path}{otherwise}.")
+        return folder
+
+    @classmethod
+    def resume(
+        cls,
+        path: str | Path,
+        scene_json: str,
+        command: Sequence[str],
+        *,
+        kind: str = "run",
+        settings: Mapping[str, Any] | None = None,
+        device: str = "",
+    ) -> Self:
+        """The folder of an existing run that goes on, noted in environment.json with versions and command.
+
+        Raises:
+            InputError: there is no run in it, or one of another kind, scene or settings; the sentence says which.
+            ComputationError: the disk is full.
+        """
+        folder = cls.open(path, TO_RESUME)
+        folder.require(scene_json, kind, settings)
+        noted = _read_json(folder.environment)
+        noted.setdefault("resumed", []).append(session(command, device))
+        noted["format"] = _FORMAT
+        with sentences(folder.path):
+            folder.result.unlink(missing_ok=True)
+            folder._remove_unfinished()
+            folder._complete(noted, scene_json)
+            _cut_torn_line(folder.metrics)
+        return folder
+
+    def require(self, scene_json: str, kind: str, settings: Mapping[str, Any] | None = None) -> None:
+        """Raises `InputError` unless the run in the folder is of this kind, scene and settings; the sentence says what
+        differs."""
+        noted = _read_json(self.environment)
+        former = noted.get("kind", kind)
+        if former != kind:
+            raise InputError(
+                f"{self.path} holds what `cortado {former}` wrote, with which `cortado {kind}` cannot go on; choose "
+                f"another --out, or replace it with --overwrite."
+            )
+        if self.scene.exists():
+            require_same(_computed(_read_json(self.scene)), _computed(json.loads(scene_json)), self.path)
+        if "settings" in noted:
+            require_same(noted["settings"], as_json(settings or {}), self.path)
+
+    @property
+    def scene(self) -> Path:
+        """The resolved scene."""
+        return self.path / "scene.json"
+
+    @property
+    def environment(self) -> Path:
+        """Versions, device, command line and start of the run."""
+        return self.path / "environment.json"
+
+    @property
+    def metrics(self) -> Path:
+        """One JSON object a line."""
+        return self.path / "metrics.jsonl"
+
+    @property
+    def trajectory(self) -> Path:
+        """The recorded frames (VTKHDF)."""
+        return self.path / "trajectory.vtkhdf"
+
+    @property
+    def sensors(self) -> Path:
+        """sensors.csv: what sensors read in every step; only where the scene has some."""
+        return self.path / "sensors.csv"
+
+    def write_sensors(self, readings: Mapping[str, Readings]) -> None:
+        """Writes sensors.csv, whole or not at all; nothing without sensors."""
+        if readings:
+            write_atomically(self.sensors, as_csv(readings))
+
+    @property
+    def checkpoint(self) -> Path:
+        """The optimiser's own folder, from which it resumes."""
+        return self.path / "checkpoint"
+
+    @property
+    def figures(self) -> Path:
+        """The folder of the pictures."""
+        return self.path / "figures"
+
+    @property
+    def report(self) -> Path:
+        """The page that shows it all."""
+        return self.path / "report.html"
+
+    @property
+    def result(self) -> Path:
+        """What came out, for machines; it is there when the run has ended."""
+        return self.path / "result.json"
+
+    def read_scene(self, overrides: Sequence[str] = ()) -> Scene:
+        """The scene, with replacements as for `load_scene`; what there is to warn of was said when it ran.
+
+        Raises:
+            InputError: the file is damaged; `SceneError` where what it says, or a replacement, does not fit.
+        """
+        text = _bytes_of(self.scene).decode(errors="replace")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CortadoWarning)
+            try:
+                if "format" not in _read_json(self.environment):
+                    text = _asked_for(text)
+                return Scene.from_json(text, overrides)
+            except SceneError as error:
+                raise error.in_file(str(self.scene)) from None
+
+    def write_result(self, **values: Any) -> None:
+        """Writes result.json, by which a run is known to have ended; takes NumPy values too. A number that is not
+        finite is null."""
+        write_atomically(self.result, json.dumps(_finite(as_json(values)), indent=2) + "\n")
+
+    def read_result(self) -> dict[str, Any] | None:
+        """What result.json holds; None of a run that has not ended. Raises `InputError` for a damaged file."""
+        return _read_json(self.result) if self.result.exists() else None
+
+    def append_metrics(self, **values: Any) -> None:
+        """Adds one line to metrics.jsonl, kept even if the process is killed next; takes NumPy values too."""
+        line = json.dumps(values, default=plain) + "\n"
+        with sentences(self.metrics), open(self.metrics, "a", encoding="utf-8") as file:
+            file.write(line)
+
+    def read_metrics(self) -> list[dict[str, Any]]:
+        """All lines of metrics.jsonl; a last line that a killed run left unfinished is left out.
+
+        Raises:
+            InputError: an earlier line is damaged.
+        """
+        if not self.metrics.exists():
+            return []
+        try:
+            return [parsed_json(line) for line in _bytes_of(self.metrics).split(b"\n")[:-1]]
+        except ValueError as problem:
+            raise InputError(f"{self.metrics} holds a line that is not JSON: {problem}.") from problem
+
+    def _holds_run(self) -> bool:
+        try:
+            return "cortado" in dict(parsed_json(_bytes_of(self.environment)))
+        except (InputError, ValueError, TypeError):
+            return False
+
+    def _complete(self, noted: Mapping[str, Any], scene_json: str) -> None:
+        """What is there from the first moment on, the mark before anything else."""
+        write_atomically(self.environment, json.dumps(noted, indent=2) + "\n")
+        write_atomically(self.scene, scene_json)
+        self.figures.mkdir(exist_ok=True)
+
+    def _make_room(self, kind: str, overwrite: bool) -> None:
+        present = [name for name in (self.environment.name, *_FILES, *_FOLDERS) if (self.path / name).exists()]
+        if not present:
+            self._require_own()
+        elif not self._holds_run():
+            raise InputError(f"{self.path} holds {', '.join(present)}, but no run of Cortado; choose another --out.")
+        elif not overwrite:
+            resumable = kind == _RESUMABLE == _read_json(self.environment).get("kind")
+            advice = ", or go on with it by --resume" if resumable else ""
+            raise InputError(
+                f"{self.path} already holds a run; choose another --out, or replace it with --overwrite{advice}."
+            )
+        self._remove_unfinished()
+        if present:
+            self._remove_run()
+
+    def _require_own(self) -> None:
+        """Raises `InputError` for a folder that is not meant for one run."""
+        if Path.cwd().is_relative_to(self.path.resolve()):
+            raise InputError(f"{self.path} is the current folder, or one that it is in; choose another --out.")
+        runs = sorted(one.parent.name for one in self.path.glob(f"*/{self.environment.name}"))
+        if runs:
+            raise InputError(f"{self.path} holds other runs, such as {runs[0]}; choose another --out.")
+
+    def _remove_run(self) -> None:
+        """Removes what a run wrote, its mark last, and leaves what others put beside it."""
+        written = (*map(self.figures.joinpath, FIGURES), *map(self.path.joinpath, _FILES))
+        for path in (*(folder / REPLAY_LOG for folder in self._checkpoints()), *written):
+            path.unlink(missing_ok=True)
+        for folder in (*self._checkpoints(), self.figures):
+            with suppress(OSError):  # it is not there, or something of the user's is in it
+                folder.rmdir()
+        self.environment.unlink()
+
+    def _remove_unfinished(self) -> None:
+        """Removes what killed processes left of files that they were writing."""
+        for folder in (self.path, self.figures, *self._checkpoints()):
+            for path in folder.glob(UNFINISHED):
+                path.unlink(missing_ok=True)
+
+    def _checkpoints(self) -> list[Path]:
+        """The folders with the logs of one search after the other, that of the first one last, as it holds the rest."""
+        return [*self.checkpoint.glob("[0-9]*/"), self.checkpoint]
+
+
+def _asked_for(scene_json: str) -> str:
+    """A scene of a folder without a format, whose default of film_frames, 120, was written as if it were asked for."""
+    try:
+        scene = json.loads(scene_json)
+        if scene["picture"]["film_frames"] == MOST_FRAMES:
+            del scene["picture"]["film_frames"]
+    except (ValueError, RecursionError, LookupError, TypeError):
+        return scene_json  # what is wrong is said where it is read
+    return json.dumps(scene)
+
+
+def _computed(scene: Any) -> Any:
+    """A scene without what changes only how it is shown, and what is read of it."""
+    shown = ("picture", "sensor")
+    return {name: table for name, table in scene.items() if name not in shown} if isinstance(scene, dict) else scene
+
+
+def _finite(value: Any) -> Any:
+    """A value without numbers that JSON does not have."""
+    if isinstance(value, dict):
+        return {name: _finite(entry) for name, entry in value.items()}
+    if isinstance(value, list):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _bytes_of(path: Path) -> bytes:
+    """All of a file; raises `InputError` if it is no regular one, or very large."""
+    try:
+        return content(path, _LARGEST)
+    except OSError as problem:
+        raise InputError(f"{path} cannot be read: {reason(problem)}.") from problem
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return parsed_json(_bytes_of(path))
+    except ValueError as problem:
+        raise InputError(f"{path} cannot be read: {reason(problem)}.") from problem
+
+
+def _cut_torn_line(path: Path) -> None:
+    """Removes what a killed run left of a last line, so that the next line begins a line."""
+    if path.exists():
+        os.truncate(path, _bytes_of(path).rfind(b"\n") + 1)

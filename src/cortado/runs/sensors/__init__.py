@@ -1,0 +1,14 @@
+"""What a gauge would read in the fluid: pressure at a point, the height of its surface, a flow, a force on walls."""
+
+from cortado.runs.sensors.flow_rate import FlowRate
+from cortado.runs.sensors.log import Readings
+from cortado.runs.sensors.pressure_probe import PressureProbe
+from cortado.runs.sensors.sensor import Sensor
+from cortado.runs.sensors.wall_force import WallForce
+from cortado.runs.sensors.wave_gauge import WaveGauge
+
+__all__ = ["FlowRate", "PressureProbe", "Readings", "Sensor", "WallForce", "WaveGauge"]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,84 @@
+"""What sensors read in every step of a run."""
+
+import csv
+import io
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.errors import DivergedError, InputError, shown
+from cortado.runs.sensors.sensor import Reading, Sensor
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """What one sensor has read."""
+
+    times: NDArray[Any]
+    """(readings,) [s]"""
+    values: NDArray[Any]
+    """(readings, k)"""
+    units: Mapping[str, str]
+    """Of its numbers, by their names, in their order."""
+
+    def __repr__(self) -> str:
+        return f"Readings({len(self.times)} of {', '.join(self.units)})"
+
+    def __getitem__(self, column: str) -> NDArray[Any]:
+        """(readings,) one of its numbers, by name; raises `InputError` where there is no such."""
+        if column not in self.units:
+            raise InputError(f"a column is {shown(column)}, but must be one of {', '.join(self.units)}.")
+        return self.values[:, list(self.units).index(column)]
+
+
+class SensorLog:
+    """The numbers of several sensors, state by state."""
+
+    def __init__(self, sensors: Mapping[str, Sensor], dimension: int):
+        """``sensors`` by the names that tell them apart. Raises `InputError` for what is no sensor."""
+        if not isinstance(sensors, Mapping):
+            raise InputError(f"sensors is {shown(sensors)}, but must be a table of sensors by name.")
+        for name, sensor in sensors.items():
+            if isinstance(sensor, type) or not all(hasattr(sensor, part) for part in ("columns", "value", "adjoint")):
+                raise InputError(f"sensors has {shown(sensor)} as {name!r}, but must have a sensor of cortado.sensors.")
+        self.sensors = dict(sensors)
+        self._units = {name: dict(sensor.columns(dimension)) for name, sensor in self.sensors.items()}
+        self._rows: dict[str, list[NDArray[Any]]] = {name: [] for name in self.sensors}
+
+    def read(self, at: Reading) -> None:
+        """Have every sensor read a state."""
+        for name, sensor in self.sensors.items():
+            self._rows[name].append(self._value(name, sensor, at))
+
+    def _value(self, name: str, sensor: Sensor, at: Reading) -> NDArray[Any]:
+        """NaN where the step after the state loses a particle: the run says so where it takes it."""
+        try:
+            return np.asarray(sensor.value(at), dtype=np.float64)
+        except DivergedError:
+            return np.full(len(self._units[name]), np.nan)
+
+    def readings(self, times: NDArray[Any]) -> dict[str, Readings]:
+        """What was read, at the first of these times [s]."""
+        found = {}
+        for name, rows in self._rows.items():
+            values = np.array(rows).reshape(len(rows), len(self._units[name]))
+            found[name] = Readings(np.asarray(times)[: len(rows)], values, self._units[name])
+        return found
+
+
+def as_csv(readings: Mapping[str, Readings]) -> str:
+    """A table with a column for the time and one for each number of each sensor, the unit in its head."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    heads = [f"{name}.{column} [{unit}]" for name, own in readings.items() for column, unit in own.units.items()]
+    writer.writerow(["time [s]", *heads])
+    writer.writerows(_rows(list(readings.values())))
+    return text.getvalue()
+
+
+def _rows(readings: list[Readings]) -> Iterable[list[str]]:
+    for k, time in enumerate(readings[0].times):
+        yield [repr(float(number)) for number in (time, *(value for own in readings for value in own.values[k]))]

@@ -1,0 +1,92 @@
+"""What a sensor is, and the smooth weights with which sensors look at particles."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.arrays import as_numbers, as_one_number
+from cortado.errors import InputError
+from cortado.scene.discrete_scene import Lattice
+
+
+class Reading(Protocol):
+    """A state as sensors see it: a `cortado.losses.Snapshot`."""
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+
+    @property
+    def lattice(self) -> Lattice:
+        """Constants of the particles at rest, such as their volume."""
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """A field of the state or a quantity of its particles, float64."""
+
+
+class Sensor(Protocol):
+    """Something that reads a few numbers of a state, and their derivatives."""
+
+    def columns(self, dimension: int) -> dict[str, str]:
+        """The names of its numbers, with their units."""
+
+    def value(self, at: Reading) -> NDArray[Any]:
+        """(k,) what it reads, one number for each column."""
+
+    def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """From the adjoint of what it reads, (k,), to those of fields and quantities, by name."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """w(q) = (1 - q)^4 (1 + 4 q) of a distance q in units of a reach (Wendland 1995), 0 beyond."""
+
+    values: NDArray[Any]
+    """w"""
+    slopes: NDArray[Any]
+    """w'(q) / q"""
+
+    @classmethod
+    def of(cls, q: NDArray[Any]) -> "Weights":
+        """At distances (n,)."""
+        rest = np.clip(1.0 - q, 0.0, None)
+        return cls(rest**4 * (1.0 + 4.0 * q), -20.0 * rest**3)
+
+
+ACROSS = {1: 1.5, 2: 7.0 / np.pi}
+"""What w is multiplied with, over the reach to the number of dimensions, so that it has the integral 1."""
+
+
+def point(what: str, values: Any) -> NDArray[Any]:
+    """A place or a direction, (d,), finite; raises `InputError`."""
+    array = as_numbers(what, values)
+    if array.shape not in ((2,), (3,)):
+        raise InputError(f"{what} has shape {array.shape}, but must have 2 or 3 components.")
+    array.flags.writeable = False
+    return array
+
+
+def direction(what: str, values: Any) -> NDArray[Any]:
+    """The same of length 1."""
+    array = point(what, values)
+    length = float(np.linalg.norm(array))
+    if not length:
+        raise InputError(f"{what} is {array.tolist()}, but must not be 0.")
+    return array / length
+
+
+def positive(what: str, value: Any) -> float:
+    """A number above 0; raises `InputError`."""
+    number = as_one_number(what, value)
+    if not number > 0.0:
+        raise InputError(f"{what} is {number:g}, but must be greater than 0.")
+    return number
+
+
+def in_dimension(what: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
+    """A place with as many components as the scene has dimensions; raises `InputError`."""
+    if len(values) != dimension:
+        raise InputError(f"{what} has {len(values)} components, but must have {dimension}, as the scene has.")
+    return values

@@ -1,0 +1,307 @@
+"""The frames of one run, in memory and on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from operator import index
+from pathlib import Path
+from typing import Any, Self, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.errors import InputError, shown
+from cortado.files import vtkhdf
+from cortado.files.input_files import as_path
+from cortado.pictures.notebook import as_text, with_view
+from cortado.pictures.particle_view import Cloud, particle_view, thinned
+from cortado.runs.frame_file import FRACTION, append_frame, fraction_names, frame_writer
+from cortado.runs.sensors.log import Readings
+from cortado.scene.quantities import QUANTITIES, check_quantity
+from cortado.scene.restart import Clock, Origin, RestartState
+from cortado.words import counted
+
+IN_A_NOTEBOOK = 1_000_000
+"""Bytes of what a notebook shows in motion."""
+MANY = 2000
+"""Particles of which the nearest others are looked for."""
+SUFFIXES = (".vtkhdf", ".hdf")
+"""By which ParaView knows a trajectory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One recorded state of a run, ``trajectory[k]``; n particles in d dimensions."""
+
+    positions: NDArray[Any]
+    """(n, d) [m]"""
+    velocities: NDArray[Any]
+    """(n, d) [m/s]"""
+    mass_fractions: NDArray[Any] | None
+    """(n, phases) [-]; None with one phase"""
+    time: float
+    """[s]"""
+    quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """(n,) or (n, k) by name: those that were recorded, such as ``density``"""
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """A quantity of the particles by its name, one that was recorded or the speed.
+
+        Raises:
+            InputError: it was not recorded, or there is no such quantity.
+        """
+        if name == "speed" and name not in self.quantities:
+            return np.linalg.norm(self.velocities, axis=1)
+        return chosen(self.quantities, name)
+
+    def __repr__(self) -> str:
+        return f"Frame({counted(len(self.positions), 'particle')}, t = {self.time:.4g} s)"
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """What a run leaves: recorded frames, and what the solver noted of every step.
+
+    ``trajectory[k]`` is the `Frame` k, counted from the end where k is negative; ``trajectory[2:5]`` and
+    ``trajectory[::10]`` are trajectories of these frames alone; ``len``, ``for`` and ``reversed`` go over the frames.
+
+    Raises:
+        InputError: arrays whose shapes do not belong together.
+    """
+
+    times: NDArray[Any]
+    """(frames,) [s]"""
+    steps: NDArray[Any]
+    """(frames,) [-] steps taken before each frame; 0 is the first state"""
+    positions: NDArray[Any]
+    """(frames, n, d) [m]"""
+    velocities: NDArray[Any]
+    """(frames, n, d) [m/s]"""
+    diagnostics: Mapping[str, NDArray[Any]]
+    """(steps,) by name: ``converged``, and what else the solver notes; see `StepLog`"""
+    mass_fractions: NDArray[Any] | None = None
+    """(frames, n, phases) [-]; None with one phase"""
+    others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """(frames, ...) further fields of the states by name, with an emitter ``outlet`` [m] and ``emitted`` [m]: see
+    `RestartState`"""
+    constants: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """fields that no step changes: ``reference_density`` (n,), a particle's mass over its volume on the rest lattice
+    [kg/m3], and with one phase ``mass_fractions`` (n, 1)"""
+    substeps: int = 0
+    """[-] explicit steps of diffusion within each step"""
+    origin: Origin | None = None
+    """of which particles it is; None where nothing is known of it"""
+    quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """(frames, n) or (frames, n, k) by name: those that were recorded, such as ``density``"""
+    sensors: Mapping[str, Readings] = field(default_factory=dict)
+    """what sensors have read in every step, by their names; it is not in files"""
+
+    def __post_init__(self) -> None:
+        frames = {len(self.times), len(self.steps), len(self.positions), len(self.velocities)}
+        steps = {name: len(column) for name, column in self.diagnostics.items()}
+        if self.positions.ndim != 3 or self.positions.shape != self.velocities.shape or len(frames) > 1:
+            raise InputError(
+                f"Positions and velocities must both be (frames, n, d) with a time and a step per frame, "
+                f"but found {self.positions.shape}, {self.velocities.shape}, {self.times.shape} and "
+                f"{self.steps.shape}."
+            )
+        if len(set(steps.values())) > 1:
+            raise InputError(f"The diagnostics must be of one length, but have {steps}.")
+
+    def __repr__(self) -> str:
+        times = f", {self.times[0]:.4g} to {self.times[-1]:.4g} s" if len(self) else ""
+        return f"Trajectory({counted(len(self), 'frame')} of {counted(self.particles, 'particle')}{times})"
+
+    def _repr_html_(self) -> str:
+        """In motion, with y up; and its first, middle and last frame, coloured by speed."""
+        from cortado.pictures.particle_sets import particles
+
+        if not len(self):
+            return as_text(repr(self))
+        shown = [self[k] for k in sorted({0, len(self) // 2, len(self) - 1})]
+        titles = [f"t = {frame.time:.4g} s" for frame in shown]
+        speeds = [np.linalg.norm(frame.velocities, axis=1) for frame in shown]
+        sets, label = [frame.positions for frame in shown], "speed [m/s]"
+        chosen, stride = thinned(len(self), self.particles, 2 * self.positions.shape[2] + 1, IN_A_NOTEBOOK)
+        thin = [array[chosen, ::stride] for array in (self.positions, self.velocities)]
+        cloud = Cloud("run", thin[0], np.linalg.norm(thin[1], axis=2))
+        view = particle_view([cloud], self.times[chosen], _spacing(self.positions[0]), stride=stride)
+        return with_view(self, view, lambda path: particles(sets, titles, path, colours=speeds, colour_label=label))
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.times)
+
+    @overload
+    def __getitem__(self, k: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, k: slice) -> Trajectory: ...
+
+    def __getitem__(self, k: int | slice) -> Frame | Trajectory:
+        """A frame, or a trajectory of some; what the solver noted stays that of the whole run.
+
+        Raises:
+            IndexError: there is no such frame.
+            InputError: k is neither a whole number nor a slice.
+        """
+        if isinstance(k, slice):
+            return self._chosen(k)
+        try:
+            place = index(k)
+        except TypeError:
+            raise InputError(f"a frame is asked for by {shown(k)}, but must be by a whole number or a slice.") from None
+        if place not in range(-len(self), len(self)):
+            raise IndexError(f"frame {place} is asked for, but there are {len(self)} frames.")
+        fractions = None if self.mass_fractions is None else self.mass_fractions[place]
+        own = {name: array[place] for name, array in self.quantities.items()}
+        return Frame(self.positions[place], self.velocities[place], fractions, float(self.times[place]), own)
+
+    def quantity(self, name: str) -> NDArray[Any]:
+        """(frames, n) or (frames, n, k) a quantity of the particles, one that was recorded or the speed; that of any
+        other `Simulation.quantity` computes.
+
+        Raises:
+            InputError: it was not recorded, or there is no such quantity.
+        """
+        if name == "speed" and name not in self.quantities:
+            return np.linalg.norm(self.velocities, axis=2)
+        return chosen(self.quantities, name)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[k] for k in range(len(self)))
+
+    def _chosen(self, frames: slice) -> Trajectory:
+        """The trajectory of some frames."""
+        names = ("times", "steps", "positions", "velocities", "mass_fractions")
+        arrays = {name: getattr(self, name) for name in names}
+        kept: dict[str, Any] = {name: None if array is None else array[frames] for name, array in arrays.items()}
+        each = {name: getattr(self, name) for name in ("others", "quantities")}
+        kept |= {key: {name: array[frames] for name, array in own.items()} for key, own in each.items()}
+        return replace(self, **kept)
+
+    @property
+    def dimension(self) -> int:
+        """2 or 3."""
+        return self.positions.shape[2]
+
+    @property
+    def particles(self) -> int:
+        """n"""
+        return self.positions.shape[1]
+
+    @property
+    def _fields(self) -> dict[str, NDArray[Any]]:
+        """(frames, ...) every field that steps change, by its name."""
+        fractions = {} if self.mass_fractions is None else {"mass_fractions": self.mass_fractions}
+        return {"positions": self.positions, "velocities": self.velocities, **fractions, **self.others}
+
+    @property
+    def iterations(self) -> NDArray[Any]:
+        """(steps,) [-] pressure iterations of each step, of a solver with one loop.
+
+        Raises:
+            InputError: the solver notes something else.
+        """
+        return noted(self.diagnostics, "iterations")
+
+    @property
+    def density_errors(self) -> NDArray[Any]:
+        """(steps,) [-] average (rho - rho_0) / rho_0 at the end of each step.
+
+        Raises:
+            InputError: the solver notes something else.
+        """
+        return noted(self.diagnostics, "density_errors")
+
+    @property
+    def converged(self) -> NDArray[Any]:
+        """(steps,) bool: whether the solver reached its tolerance."""
+        return self.diagnostics["converged"]
+
+    @property
+    def not_converged(self) -> int:
+        """Number of steps at which the solver did not reach its tolerance."""
+        return int(np.count_nonzero(~self.converged))
+
+    @property
+    def last_state(self) -> RestartState:
+        """The state of the last frame, from which `Simulation.run` goes on bit for bit, in arrays of its own.
+
+        Raises:
+            InputError: there is no frame.
+        """
+        if not len(self):
+            raise InputError("The trajectory has no frame, but must have one to go on from.")
+        last = {**{name: array[-1] for name, array in self._fields.items()}, **self.constants}
+        own = {name: array.copy() for name, array in last.items()}
+        return RestartState(own, Clock(int(self.steps[-1]), float(self.times[-1])), self.origin)
+
+    def save(self, path: str | Path) -> None:
+        """Writes a VTKHDF file, which ParaView opens; a file of that name is replaced.
+
+        Raises:
+            InputError: no frames, a name that does not end in one of `SUFFIXES`, or a path that cannot be written.
+            ComputationError: the disk is full.
+        """
+        if Path(as_path("path", path)).suffix.lower() not in SUFFIXES:
+            wanted = f"must be a VTKHDF file, whose name ends in {' or '.join(SUFFIXES)}"
+            raise InputError(f"path is {str(path)!r}, but {wanted}.")
+        frames = self._fields
+        first = {name: array[0] if len(array) else array for name, array in frames.items()}
+        steps = len(self.converged)
+        own = {name: array[:1] for name, array in self.quantities.items()}
+        with frame_writer(path, self.times, first, self.constants, steps, self.diagnostics, self.origin, own) as writer:
+            writer.append_steps(**self.diagnostics)
+            for k, step in enumerate(self.steps):
+                recorded = {name: array[k] for name, array in self.quantities.items()}
+                append_frame(writer, {name: array[k] for name, array in frames.items()}, int(step), recorded)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Reads a file written by `save` or by `TrajectoryWriter`, whose writer may be dead or still at work.
+
+        Raises:
+            InputError: the file is missing, damaged, or none of Cortado's trajectories.
+        """
+        arrays = vtkhdf.read(as_path("path", path))
+        names = ("times", "steps", "positions", "velocities", "diagnostics", "others", "constants")
+        phases = sum(name.startswith(FRACTION) for name in arrays)
+        fractions = np.stack([arrays[name] for name in fraction_names(phases)], axis=-1) if phases else None
+        try:
+            origin = Origin.from_json(arrays["origin"]) if arrays["origin"] else None
+        except (ValueError, TypeError, AttributeError) as problem:
+            raise InputError(f"{path} is damaged: of which particles it is cannot be read: {problem}.") from problem
+        recorded = {name: arrays[name] for name in QUANTITIES if name in arrays}
+        for name, array in recorded.items():
+            _, *row = QUANTITIES[name].shape(1, arrays["positions"].shape[2])
+            recorded[name] = np.ascontiguousarray(array[..., : row[0]]) if row else array
+        return cls(
+            **{name: arrays[name] for name in names}, mass_fractions=fractions, origin=origin, quantities=recorded
+        )
+
+
+def _spacing(positions: NDArray[Any]) -> float:
+    """The usual distance [m] from a particle at one of positions (n, d) to the nearest other; 1 of a single one."""
+    from scipy.spatial import KDTree
+
+    if len(positions) < 2:
+        return 1.0
+    return float(np.median(KDTree(positions).query(positions[:MANY], k=2)[0][:, 1])) or 1.0
+
+
+def chosen(quantities: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
+    """A quantity that was recorded; raises `InputError` for any other name."""
+    if check_quantity(name) not in quantities:
+        found = f"{', '.join(quantities)} and the speed are" if quantities else "only the speed is"
+        advice = f'record it, as in simulation.run(steps, record=["{name}"]), or ask simulation.quantity for it'
+        raise InputError(f"{name} was not recorded, {found} there: {advice}.")
+    return quantities[name]
+
+
+def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
+    """(steps,) of that name; raises `InputError` where a solver has other diagnostics."""
+    if name not in diagnostics:
+        raise InputError(f"{name} is no diagnostic of this solver, whose diagnostics are {', '.join(diagnostics)}.")
+    return diagnostics[name]

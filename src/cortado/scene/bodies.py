@@ -1,0 +1,114 @@
+"""Bodies whose surface cuts through cells of a lattice: how many particles they have, and where these begin.
+
+Their particles are then moved until the fluid is at rest everywhere: `cortado.discretise.packing`.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+
+from cortado.discretise.pairs import apart, pairs_within
+from cortado.discretise.region import Region
+from cortado.discretise.shapes import Points, grid
+from cortado.scene.fluids import RoundFluid
+
+FINER = 4
+"""Cells at the surface are cut into so many along each axis to measure a volume."""
+LOOSENESS, MOST_LOOSENESS = 0.05, 0.008
+"""Particles that a round body lacks, over those in its outermost spacing, and over all of its own: particles off the
+lattice see each other as denser than as many on it, by 4 % with the Wendland kernels and a support of 2 spacings."""
+DIGITS = 6
+"""Decimals of distances [spacings] by which particles are ordered: what is equal but for round-off stays in order."""
+
+
+@dataclass(frozen=True)
+class CutBody:
+    """The part of a body of fluid that a container leaves room for."""
+
+    fluid: RoundFluid
+    room: Region
+    spacing: float
+    """[m]"""
+
+    def distance(self, points: Points) -> Points:
+        """(n,) how far points (n, d) [m] are outside of the body, negative inside [m]."""
+        return np.maximum(self.fluid.region().distance(points), self.room.distance(points))
+
+    def shares(self, points: Points) -> Points:
+        """(n,) the part of the cell around each of the points (n, d) [m] that is within the body."""
+        return np.clip(0.5 - self.distance(points) / self.spacing, 0.0, 1.0)
+
+    def volume(self, depth: float = 0.0) -> float:
+        """[m^d] of what is more than a depth [m] below the surface."""
+        dimension, fine = len(self.room.lower), self.spacing / FINER
+        cells = self.fluid.block(self.spacing).grown(1).points()
+        distances = self.distance(cells) + depth
+        cut = cells[np.abs(distances) < 0.5 * self.spacing * np.sqrt(dimension)]
+        whole = np.count_nonzero(distances < 0.0) - np.count_nonzero(self.distance(cut) + depth < 0.0)
+        parts = grid([np.asarray(fine * (np.arange(FINER) + 0.5) - 0.5 * self.spacing)] * dimension)
+        shares = sum(np.clip(0.5 - (self.distance(cut + part) + depth) / fine, 0.0, 1.0).sum() for part in parts)
+        return float(whole * self.spacing**dimension + shares * fine**dimension)
+
+    @cached_property
+    def count(self) -> int:
+        """The number of its particles."""
+        volume = self.volume()
+        lacking = min(LOOSENESS * (volume - self.volume(self.spacing)), MOST_LOOSENESS * volume)
+        return round((volume - lacking) / self.spacing ** len(self.room.lower))
+
+    def particles(self) -> Points:
+        """(count, d) [m] where its particles begin: on the lattice, as deep as there are points."""
+        points = self.fluid.lattice(self.spacing, self.spacing)
+        depths = np.round(self.distance(points) / self.spacing, DIGITS)
+        return points[np.sort(np.argsort(depths, kind="stable")[: self.count])]
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What lies around bodies that were cut: particles that stay where they are, air, and walls."""
+
+    bodies: tuple[CutBody, ...]
+    staying: Points
+    """(m, d) particles of other fluid [m]"""
+    lower: Points
+    """(d,) where the period begins [m]"""
+    lengths: Points
+    """(d,) the lengths of the period [m], 0 for axes without one"""
+
+    def air(self, reach: float) -> tuple[Points, Points]:
+        """Points (m, d) [m] of lattices around the bodies up to ``reach`` [m] from their surfaces, and of the cell
+        around each the part (m,) where there is neither fluid nor wall."""
+        found = [self._air_around(body, reach) for body in self.bodies]
+        points, shares = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return points[shares > 0.0], shares[shares > 0.0]
+
+    def _air_around(self, body: CutBody, reach: float) -> tuple[Points, Points]:
+        """That which is nearer to one body than to others, and no further from it than half a period."""
+        points = body.fluid.lattice(body.spacing, reach + body.spacing)
+        middle = 0.5 * np.sum(body.fluid.extent(body.spacing), axis=0)
+        within = ((self.lengths == 0.0) | (np.abs(points - middle) < 0.5 * self.lengths)).all(axis=1)
+        points = points[within & (np.abs(body.distance(points)) < reach + body.spacing)]
+        nearest = np.argmin([self._distance(other, points) for other in self.bodies], axis=0)
+        points = points[nearest == self.bodies.index(body)]
+        fluid = self._shares(points, body.spacing)
+        walls = np.clip(0.5 + body.room.distance(points) / body.spacing, 0.0, 1.0)
+        return points, np.clip(1.0 - fluid - walls, 0.0, 1.0)
+
+    def _images(self, points: Points) -> list[Points]:
+        """Points (n, d) and those a period from them."""
+        shifts = product(*[(0.0, -length, length) if length else (0.0,) for length in self.lengths])
+        return [points + np.array(shift) for shift in shifts]
+
+    def _distance(self, body: CutBody, points: Points) -> Points:
+        return np.min([body.distance(image) for image in self._images(points)], axis=0)
+
+    def _shares(self, points: Points, spacing: float) -> Points:
+        """(n,) the part of the cell around each of the points that is fluid."""
+        found = sum(body.shares(image) for body in self.bodies for image in self._images(points))
+        reach = spacing * np.sqrt(points.shape[1])
+        point, particle, _ = pairs_within(points, self.staying, reach, self.lower, self.lengths)
+        separations = np.abs(apart(points[point] - self.staying[particle], self.lengths))
+        common = np.clip(1.0 - separations / spacing, 0.0, None).prod(axis=1)
+        return np.asarray(found + np.bincount(point, common, minlength=len(points)), dtype=np.float64)

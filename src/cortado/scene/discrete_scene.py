@@ -1,0 +1,134 @@
+"""A scene cut into particles: first particles, walls, and the constants of the lattice. NumPy in float64 throughout.
+
+It is the same for every device, every precision and every engine.
+"""
+
+import warnings
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from cortado.discretise.calibration import (
+    lattice_laplacian_correction,
+    pressure_stiffness,
+    rest_volume,
+    wall_response,
+)
+from cortado.discretise.crowding import check_crowding, crowding_of
+from cortado.discretise.packing import Packing
+from cortado.discretise.region import Region
+from cortado.discretise.shapes import Points
+from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
+from cortado.discretise.walls.layers import WallLayers, wall_layers
+from cortado.discretise.walls.weights import RestLattice, Surface
+from cortado.errors import CortadoWarning
+from cortado.scene.bodies import Surroundings
+from cortado.scene.fluids import PointsFluid
+from cortado.scene.sampling import FluidSample, fluid_particles, period, wall_particles
+from cortado.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Constants of the rest lattice and of the kernel on it."""
+
+    support: float
+    """Support radius h [m]."""
+    normalisation: float
+    """sigma [1 / m^d]."""
+    self_weight: float
+    """W(0) [1 / m^d]."""
+    volume: float
+    """Rest volume V_0 of a particle [m^d]."""
+    stiffness: float
+    """k [m2]: delta = k / dt^2 [Pa m3 / kg] (Solenthaler and Pajarola 2009) for a filled neighbourhood."""
+    response: float
+    """sum_j G_j . G_j [1 / m^(2 d + 2)]: the scale of `cortado.solvers.pcisph.wall_relaxation`."""
+    laplacian_correction: float
+    """[-], see `cortado.discretise.calibration.lattice_laplacian_correction`."""
+
+    @classmethod
+    def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "Lattice":
+        """Those of a kernel with a support radius [m] on a lattice with a spacing [m]."""
+        return cls(
+            support=support,
+            normalisation=kernel.normalisation(dimension, support),
+            self_weight=float(kernel.weight(np.zeros(1), dimension, support)[0]),
+            volume=rest_volume(kernel, spacing, support, dimension),
+            stiffness=pressure_stiffness(kernel, spacing, support, dimension),
+            response=wall_response(kernel, spacing, support, dimension),
+            laplacian_correction=lattice_laplacian_correction(kernel, spacing, support, dimension),
+        )
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Wall particles."""
+
+    positions: Points
+    """(b, d) [m]"""
+    weights: Points
+    """(b,) w_b [-]: what each counts for in the density, a fluid particle being 1."""
+
+
+@dataclass(frozen=True)
+class DiscreteScene:
+    """What a solver starts from, besides what the scene says itself."""
+
+    kernel: SmoothingKernel
+    """The smoothing kernel W."""
+    lattice: Lattice
+    """Constants."""
+    fluid: FluidSample
+    """The first fluid particles."""
+    wall_layers: WallLayers
+    """How the walls lie and how they drag; also for a scene without walls."""
+    walls: Walls
+    """The wall particles; none without a container."""
+    periods: Points
+    """(d,) lengths of the period [m], 0 along an axis that is not periodic."""
+
+    @cached_property
+    def near(self) -> Region:
+        """A box around all first particles and walls."""
+        everything = np.concatenate([self.fluid.positions, self.walls.positions])
+        return Region.between(everything.min(axis=0), everything.max(axis=0))
+
+
+def discretise(scene: Scene) -> DiscreteScene:
+    """Cut a scene into particles. Raises `InputError` if a file with points is gone since the scene was read, or if
+    points are packed too densely."""
+    kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
+    spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
+    layers = wall_layers(kernel, spacing, support, dimension)
+    lattice = Lattice.of(kernel, spacing, support, dimension)
+    fluid = fluid_particles(scene)
+    at_rest = RestLattice(kernel, spacing, support)
+    walls = _walls(scene, layers, at_rest)
+    fluid = replace(fluid, positions=_packed(fluid, walls, at_rest, *period(scene)))
+    if any(isinstance(body, PointsFluid) for body in scene.fluid):
+        crowding = crowding_of(fluid.positions, kernel, lattice.support, lattice.volume, period(scene))
+        told = check_crowding(crowding, spacing, "the points of the fluid")
+        if told is not None:
+            warnings.warn(told, CortadoWarning, stacklevel=3)
+    return DiscreteScene(kernel, lattice, fluid, layers, walls, period(scene)[1])
+
+
+def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Points, lengths: Points) -> Points:
+    """(n, d) first positions [m], with those of round bodies where they fill them at the rest density."""
+    if not fluid.bodies:
+        return fluid.positions
+    stays = ~fluid.is_packed
+    air, shares = Surroundings(fluid.bodies, fluid.positions[stays], lower, lengths).air(lattice.support)
+    fixed, weights = np.concatenate([air, walls.positions]), np.append(shares, walls.weights)
+    return Packing(lattice, fixed, weights, len(air), lower, lengths).packed(fluid.positions, stays)
+
+
+def _walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
+    particles = wall_particles(scene, layers.depths)
+    flat = np.repeat(layers.weights, [len(layer) for layer in particles])
+    positions, (lower, lengths) = np.concatenate(particles), period(scene)
+    places = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
+    region = scene.container.region(scene.dimension).opened(lengths)
+    return Walls(positions, Surface(positions, flat, lattice, region, lower, lengths).weights(places))

@@ -1,0 +1,92 @@
+"""From a scene to its particles, in float64: fluid and walls."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.discretise.shapes import Points
+from cortado.errors import InputError
+from cortado.scene.bodies import CutBody
+from cortado.scene.emitter import EmitterSample
+from cortado.scene.fluids import RoundFluid
+from cortado.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class FluidSample:
+    """Fluid particles, in the order in which the scene lists their fluids; those of the emitter come last."""
+
+    positions: Points
+    """(n, d) [m]"""
+    velocities: Points
+    """(n, d) [m/s]"""
+    phase: NDArray[np.int64]
+    """(n,) index into the scene's phases"""
+    bodies: tuple[CutBody, ...]
+    """Those whose particles are to be packed, in the order of the particles."""
+    is_packed: NDArray[np.bool_]
+    """(n,) whether a particle is of one of these."""
+    emitter: EmitterSample | None
+    """The last of the particles once more, in the same order, as they are along the emitter; None without one."""
+
+    @property
+    def emitted(self) -> slice:
+        """Which particles are the emitter's."""
+        count = len(self.positions)
+        return slice(count if self.emitter is None else count - len(self.emitter.upstream), count)
+
+
+def fluid_particles(scene: Scene) -> FluidSample:
+    """The fluid of a scene, before particles of round bodies are packed. Raises `InputError` if a file with points is
+    gone since the scene was read, or if walls leave no room for any particle of a fluid."""
+    spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
+    room = scene.container.region(scene.dimension).opened(period(scene)[1])
+    bodies = [CutBody(fluid, room, spacing) if isinstance(fluid, RoundFluid) else None for fluid in scene.fluid]
+    positions = [
+        fluid.particles_in(room, spacing) if body is None else body.particles()
+        for fluid, body in zip(scene.fluid, bodies, strict=True)
+    ]
+    for index, (particles, body) in enumerate(zip(positions, bodies, strict=True)):
+        if not len(particles):
+            raise InputError(f"fluid.{index} has no particle{_why_none(body, spacing)}.")
+    velocities = [np.tile(fluid.velocity, (len(x), 1)) for fluid, x in zip(scene.fluid, positions, strict=True)]
+    phases = [names.index(fluid.phase) for fluid in scene.fluid]
+    emitted = None
+    if scene.emitter is not None:
+        emitted = scene.emitter.sample(spacing)
+        positions.append(emitted.positions)
+        velocities.append(emitted.velocities)
+        phases.append(names.index(scene.emitter.phase))
+        bodies.append(None)
+    sizes = [len(x) for x in positions]
+    return FluidSample(
+        positions=np.concatenate(positions),
+        velocities=np.concatenate(velocities),
+        phase=np.repeat(phases, sizes),
+        bodies=tuple(body for body in bodies if body is not None),
+        is_packed=np.repeat([body is not None for body in bodies], sizes),
+        emitter=emitted,
+    )
+
+
+def _why_none(body: CutBody | None, spacing: float) -> str:
+    """Why a body of fluid has no particles, and what to do, as the end of a sentence."""
+    if body is None:
+        return (
+            f" that is half a spacing, {0.5 * spacing:g} m, or more from all walls: it must be larger, or further "
+            "from them"
+        )
+    cells = body.volume() / spacing ** len(body.room.lower)
+    return f", as the volume that walls leave it is {cells:.2g} of that of a particle: it must be larger"
+
+
+def wall_particles(scene: Scene, depths: Sequence[float]) -> list[Points]:
+    """The wall particles of a scene's container: a layer (b, d) [m] for each depth [m] behind its surface."""
+    return [scene.container.walls(scene.dimension, scene.discretisation.spacing, depth) for depth in depths]
+
+
+def period(scene: Scene) -> tuple[Points, Points]:
+    """Where the period of a scene begins and how long it is, each (d,) [m]; the length is 0 for axes without one."""
+    return scene.container.periods(scene.dimension)
