@@ -59,12 +59,12 @@ class CountedPass:
 
     def __init__(self, forward_pass: ForwardPass, each: int, steps: Steps):
         self._pass, self._each, self._steps = forward_pass, each, steps
-        self.loss, self.rollout, self.derivative = forward_pass.loss, forward_pass.rollout, forward_pass.derivative
+        self.loss = forward_pass.loss
 
-    def back(self, derivative: BackwardStep, observe: Observer | None = None) -> Arrays:
+    def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
         """The gradient."""
         self._steps.backward += self._each
-        return self._pass.back(derivative, observe)
+        return self._pass.back(estimator, observe)
 
 
 class _Counting(AdjointEstimator):

@@ -6,7 +6,7 @@ import warp as wp
 
 from cortado.device.kernels import Kernels
 from cortado.scene.parameters.known import TIME
-from cortado.scene.parameters.registry import Axis, Parameter
+from cortado.scene.parameters.parameter import Axis, Parameter
 
 
 @cache

@@ -9,7 +9,7 @@ import warp as wp
 
 from cortado.device.kernels import Kernels
 from cortado.particles.fields import Entry, StateField
-from cortado.scene.parameters.registry import Axis, Parameter
+from cortado.scene.parameters.parameter import Axis, Parameter
 from cortado.sph.carried import Carried
 from cortado.sph.part import Part, PartAdjoint, PartTangent
 

@@ -7,7 +7,8 @@ import pytest
 
 from cortado import InputError, Problem, Simulation, losses
 from cortado.gradients import Exact
-from cortado.scene.parameters.registry import BY_NAME, PARAMETERS, Role, names
+from cortado.scene.parameters.parameter import Role
+from cortado.scene.parameters.registry import BY_NAME, PARAMETERS, names
 from cortado.scene.parameters.table import markdown
 from cortado.scene.parameters.values import scene_values
 from scenes import plane, plane_of_three, scene
@@ -61,11 +62,9 @@ def test_a_rollout_does_not_go_back_through_states_of_other_parameters():
 
 def test_a_rollout_takes_derivatives_of_its_own_alone():
     simulation = Simulation(plane())
-    one, other = (Problem(simulation, 3, losses.FinalPositions(simulation.positions + k)) for k in (0.1, 0.2))
-    first, second = one.forward_pass({"viscosity": 0.1}), other.forward_pass({"viscosity": 0.1})
+    rollout, other = simulation.rollout(3), simulation.rollout(3)
     with pytest.raises(InputError, match="was made for another rollout"):
-        first.back(second.derivative(Exact()))
-    rollout = simulation.rollout(3)
+        rollout.backward(Exact().derivative(other), {})
     with pytest.raises(InputError, match="cannot go along a tangent"):
         rollout.tangent(simulation.solver.new_state(), simulation.solver.new_parameters(3), lambda step, dot: None)
     rollout.forward()

@@ -7,7 +7,7 @@ import cortado
 from cortado import Problem, Simulation, gradients
 from cortado.errors import InputError, MissingDerivativeError
 from cortado.particles.fields import Entry, StateField
-from cortado.scene.parameters.registry import Axis
+from cortado.scene.parameters.parameter import Axis
 from cortado.sph.carried import Carried
 from cortado.sph.part import Part
 from remembering_force import TAU, Memory, MemoryForce, U

@@ -10,7 +10,7 @@ import pytest
 import cortado
 from cortado import InputError, Problem, Simulation, Trajectory, gradients, losses, reference
 from cortado.cli.commands.run import run_scene
-from cortado.scene.parameters.registry import Axis, Parameter
+from cortado.scene.parameters.parameter import Axis, Parameter
 from cortado.scene.solvers import PackageSolver
 from cortado.solvers.build import particle_system
 from own_forces import Breeze

@@ -195,11 +195,10 @@ class InBlocks:
     """The ways back through a run, with the gradient in blocks."""
 
     def __init__(self, forward_pass: Any, blocks: int):
-        self._passage, self._blocks = forward_pass, blocks
-        self.loss, self.rollout, self.derivative = forward_pass.loss, forward_pass.rollout, forward_pass.derivative
+        self._passage, self._blocks, self.loss = forward_pass, blocks, forward_pass.loss
 
-    def back(self, derivative: Any, observe: Any = None) -> dict[str, np.ndarray]:
-        gradient = self._passage.back(derivative, observe)["gravity"]
+    def back(self, estimator: Any, observe: Any = None) -> dict[str, np.ndarray]:
+        gradient = self._passage.back(estimator, observe)["gravity"]
         return {"gravity": gradient.reshape(self._blocks, -1, 2).sum(axis=1)}
 
 

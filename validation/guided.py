@@ -64,8 +64,8 @@ class InBlocks:
 
     def forward_pass(self, values: Mapping[str, Any]) -> Any:
         run = self._problem.forward_pass(self._parameters(values))
-        back = lambda derivative, observe=None: self._gathered(run.back(derivative, observe))  # noqa: E731
-        return SimpleNamespace(loss=run.loss, rollout=run.rollout, derivative=run.derivative, back=back)
+        back = lambda estimator, observe=None: self._gathered(run.back(estimator, observe))  # noqa: E731
+        return SimpleNamespace(loss=run.loss, back=back)
 
     def together(self, points: Sequence[Mapping[str, Any]], estimator: Any = None) -> list[Any]:
         found = self._problem.together([self._parameters(point) for point in points], estimator)

@@ -41,11 +41,8 @@ class ForwardPass:
         """What a thread holds that uses the rollout."""
         return self.rollout.turn
 
-    @in_turn
-    def derivative(self, estimator: AdjointEstimator) -> BackwardStep:
-        """The estimator's backward step, made once for each problem. Raises `InputError` for an estimator whose
-        settings may change, as its backward step would keep the first ones, and for one that may mix up the scenes of a
-        batch."""
+    def _derivative(self, estimator: AdjointEstimator) -> BackwardStep:
+        """The estimator's backward step, made once for each problem."""
         if self.rollout.solver.layout.batch is not None and not estimator.batches:
             raise InputError(
                 f"{type(estimator).__name__} is given a batch, but has no `batches = True`, which says that it treats "
@@ -63,17 +60,22 @@ class ForwardPass:
         return self._derivatives[estimator]
 
     @in_turn
-    def back(self, derivative: BackwardStep, observe: Observer | None = None) -> Arrays:
-        """The gradient; ``observe`` is given the number and the adjoint of every state, from the last to the first.
+    def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
+        """The gradient by an estimator; ``observe`` is given the number and the adjoint of every state, from the last
+        to the first.
 
-        Other evaluations of the problem may be in between: the bits are the same.
+        Other evaluations of the problem may be in between: the bits are the same. Raises `InputError` for an estimator
+        whose settings may change, as its backward step would keep the first ones, and for one that may mix up the
+        scenes of a batch.
         """
+        derivative = self._derivative(estimator)
         return self._gradient(derivative, self._first_adjoint(derivative, observe))
 
     @in_turn
-    def back_to_state(self, derivative: BackwardStep) -> tuple[Arrays, Arrays]:
-        """The gradient, and the derivatives with respect to the fields of the first state, by name, and to its
+    def back_to_state(self, estimator: AdjointEstimator) -> tuple[Arrays, Arrays]:
+        """As `back`, and the derivatives with respect to the fields of the first state, by name, and to its
         ``time``."""
+        derivative = self._derivative(estimator)
         first = self._first_adjoint(derivative)
         initial_state = self._space.state_adjoint(self.rollout, self._values, first, derivative.parameters())
         return self._gradient(derivative, first), without_lost(self.rollout, initial_state)

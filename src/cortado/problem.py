@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -10,13 +9,14 @@ import numpy as np
 from cortado.arrays import check_steps, require_at_most, require_function, require_methods, whole_number
 from cortado.device.threads import Turn, in_turn
 from cortado.errors import CortadoWarning, DivergedError, InputError, shown
+from cortado.fingerprint import fingerprint_of
 from cortado.fixed import fixed
 from cortado.forward_pass import ForwardPass
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator, estimate
 from cortado.gradients.estimator import checked_reverse
-from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch, batch, fingerprint
-from cortado.losses.checked import as_loss
-from cortado.losses.loss import Adjoint, by_field, moment_of
+from cortado.losses import Frames, Loss, Snapshot, SnapshotBatch
+from cortado.losses.by_step import LossesByStep
+from cortado.losses.loss import moment_of
 from cortado.particles.state import State
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.residual import Residual
@@ -27,7 +27,6 @@ from cortado.runs.trajectory import noted
 from cortado.scene.parameters.values import NAMES, UNITS, Arrays, Values, require_points
 from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation
-from cortado.sph.makers import fingerprint as parts_fingerprint
 from cortado.words import counted
 
 __all__ = ["NAMES", "UNITS", "Problem"]
@@ -78,11 +77,7 @@ class Problem:
         self.simulation, self.steps, self.loss, self.state = simulation, check_steps(steps, least=0), loss, state
         self.memory_budget = whole_number("memory_budget", memory_budget, 0)
         self._states = [one.fixed() for one in one_for_each(state, simulation.batch)]
-        by_step = loss.losses if isinstance(loss, Frames) else {self.steps: loss}
-        for step in by_step:
-            if step not in range(self.steps + 1):
-                raise InputError(f"losses has the frame {step!r}, but must have frames from 0 to {self.steps}.")
-        self._losses: dict[int, Loss] = {step: as_loss(one) for step, one in by_step.items()}
+        self._losses = LossesByStep(loss, self.steps)
         self._space = ParameterSpace(simulation, self.steps)
         self._rollout = Rollout(simulation.solver, self.steps, self.memory_budget)
         self._derivatives: dict[AdjointEstimator, BackwardStep] = {}
@@ -104,7 +99,7 @@ class Problem:
     @in_turn
     def value(self, parameters: Values) -> Any:
         """The loss, forward only: a float, of a batch (batch,), NaN for a scene that was ``lost``."""
-        return self._total(self._ends(self._checked(parameters), self._losses, keep=False))
+        return self._losses.total(self._ends(self._checked(parameters), self._losses, keep=False), self._going)
 
     def end(self, parameters: Values) -> Any:
         """The last state of the rollout under these parameters: a `Snapshot`, of a batch a `SnapshotBatch`."""
@@ -135,8 +130,7 @@ class Problem:
         to the first state: float64, by the names of its fields in their shapes, with ``time`` for its clock; of a batch
         with a first axis for the scenes."""
         forward_pass = self.forward_pass(parameters)
-        derivative = forward_pass.derivative(Exact() if gradient is None else gradient)
-        return forward_pass.loss, *forward_pass.back_to_state(derivative)
+        return forward_pass.loss, *forward_pass.back_to_state(Exact() if gradient is None else gradient)
 
     @in_turn
     def estimate(
@@ -149,7 +143,7 @@ class Problem:
         """
         require_function("observe", observe)
         found = estimate(self, parameters, gradient, observe)
-        kept = self._going if self.simulation.batch else slice(None)
+        kept = slice(None) if self._going is None else self._going
         broken = [name for name, value in found.gradient.items() if not np.isfinite(np.atleast_1d(value)[kept]).all()]
         if broken:
             warnings.warn(
@@ -167,7 +161,7 @@ class Problem:
         values = self._checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself
-        loss, found = self._judged(ends)
+        loss, found = self._losses.total_and_adjoints(ends, self._going)
         bars = {step: bar.through_quantities(ends[step]) for step, bar in found.items()}
         return ForwardPass(loss, residual, values, bars, self._space, self._derivatives)
 
@@ -182,7 +176,7 @@ class Problem:
                 dots[step] = dot.numpy(3)
 
         ends = self.tangents(parameters, directions, observe, self._losses)
-        loss, bars = self._judged(ends)
+        loss, bars = self._losses.total_and_adjoints(ends, self._going)
         leading = np.shape(loss)
 
         def product(bar: np.ndarray, dot: np.ndarray) -> np.ndarray:
@@ -268,20 +262,7 @@ class Problem:
         """Which problem this is, part by part, in words and checksums: steps, precision, scene, first positions (which
         may be in a file), free energy (by its name and curvature), forces and solver of one's own, ``fingerprint`` of
         the loss; for a loss without one only its type is known."""
-        simulation, energy = self.simulation, self.simulation.free_energy
-        parts = {
-            "scene": simulation.scene.computed_json().encode(),
-            "first positions": simulation.positions.tobytes(),
-            "target and loss": fingerprint(self.loss).encode(),
-        }
-        checksums = [f"{name} {sha256(content).hexdigest()[:16]}" for name, content in parts.items()]
-        for state in self._states:
-            fields = b"".join(np.asarray(state[name]).tobytes() for name in sorted(state.fields))
-            checksums.append(f"state {sha256(fields + repr(state.clock).encode()).hexdigest()[:16]}")
-        energies = f"free energy {energy.name} {energy.curvature}"
-        own = {"forces": simulation.forces, "solver": [simulation.own_solver] if simulation.own_solver else []}
-        told = [f"{what} {text}" for what, makers in own.items() if (text := parts_fingerprint(makers, simulation))]
-        return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies, *told])
+        return fingerprint_of(self.simulation, self.steps, self.loss, self._states)
 
     def iterations(self) -> np.ndarray:
         """(steps,) pressure iterations of the last evaluation, of a solver with one loop; see `diagnostics`."""
@@ -331,32 +312,7 @@ class Problem:
         return Moment.of(self._rollout, step, state, self.simulation.evaluator)
 
     @property
-    def _going(self) -> list[int]:
-        """The scenes of a batch that have not lost a particle."""
-        return [b for b in range(self.simulation.batch or 1) if b not in self.lost]
-
-    def _total(self, ends: dict[int, Any]) -> Any:
-        if self.simulation.batch is None:
-            return sum(loss.value(ends[step]) for step, loss in self._losses.items())
-        return sum(batch.values(loss, ends[step], self._going) for step, loss in self._losses.items())
-
-    def _judged(self, ends: dict[int, Any]) -> tuple[Any, dict[int, SnapshotAdjoint]]:
-        """The loss of a run, and its adjoints of states by the number of steps before them."""
-        if self.simulation.batch is None:
-            one = {step: loss.value_and_adjoint(ends[step]) for step, loss in self._losses.items()}
-            bars = {step: self._on_device(bar, ends[step]) for step, (_, bar) in one.items()}
-            return sum(value for value, _ in one.values()), bars
-        going = self._going
-        each = {step: batch.values_and_adjoints(loss, ends[step], going) for step, loss in self._losses.items()}
-        return sum(values for values, _ in each.values()), {step: bar for step, (_, bar) in each.items()}
-
-    def _on_device(self, bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
-        if isinstance(bar, SnapshotAdjoint):
-            return bar
-        no_colours = np.zeros_like(end.colours)
-        if isinstance(bar, State):
-            return SnapshotAdjoint(bar, no_colours)
-        state, arrays = self.simulation.solver.new_state(), by_field(bar, end.dimension)
-        state.set(arrays)
-        of_quantities = {name: array for name, array in arrays.items() if name not in state.names}
-        return SnapshotAdjoint(state, no_colours, of_quantities)
+    def _going(self) -> list[int] | None:
+        """The scenes of a batch that have not lost a particle; None of a single scene."""
+        batch = self.simulation.batch
+        return None if batch is None else [b for b in range(batch) if b not in self.lost]

@@ -7,7 +7,8 @@ import numpy as np
 from cortado.errors import InputError, shown
 from cortado.problem import Problem
 from cortado.rollout.parameter_space import ParameterSpace
-from cortado.scene.parameters.registry import BY_NAME, Axis, Parameter, Range, Role
+from cortado.scene.parameters.parameter import Axis, Parameter, Range, Role
+from cortado.scene.parameters.registry import BY_NAME
 from cortado.scene.parameters.values import Arrays, Values
 
 PERTURBATION = 0.05

@@ -74,16 +74,9 @@ class ForwardPass(Protocol):
     def loss(self) -> float:
         """The loss of the run."""
 
-    @property
-    def rollout(self) -> Rollout:
-        """The run."""
-
-    def derivative(self, estimator: "AdjointEstimator") -> BackwardStep:
-        """The estimator's backward step; it is made once for each problem and estimator."""
-
-    def back(self, derivative: BackwardStep, observe: Observer | None = None) -> Arrays:
-        """The gradient; ``observe`` is called with the number and the adjoint of every state, from the last to the
-        first."""
+    def back(self, estimator: "AdjointEstimator", observe: Observer | None = None) -> Arrays:
+        """The gradient by an estimator; ``observe`` is called with the number and the adjoint of every state, from the
+        last to the first."""
 
 
 class Differentiable(Protocol):
@@ -167,7 +160,7 @@ class AdjointEstimator(ABC):
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         """See `GradientEstimator`."""
         forward_pass = problem.forward_pass(parameters)
-        return Estimate(forward_pass.loss, forward_pass.back(forward_pass.derivative(self), observe))
+        return Estimate(forward_pass.loss, forward_pass.back(self, observe))
 
 
 class Filtered:

@@ -83,10 +83,10 @@ class AdjointViscosity(AdjointEstimator):
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         """``observe`` is called with the adjoints of the smaller coefficient."""
         forward_pass, once = problem.forward_pass(parameters), replace(self, order=1)
-        gradient = forward_pass.back(forward_pass.derivative(once), observe)
+        gradient = forward_pass.back(once, observe)
         if self.order == 2:
             twice = replace(once, coefficient=2.0 * self.coefficient)
-            stronger = forward_pass.back(forward_pass.derivative(twice))
+            stronger = forward_pass.back(twice)
             gradient = {name: 2.0 * weaker - stronger[name] for name, weaker in gradient.items()}
         return Estimate(forward_pass.loss, gradient)
 

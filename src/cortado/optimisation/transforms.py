@@ -17,7 +17,7 @@ from cortado.errors import DivergedError, InputError
 from cortado.fixed import FixedDict, fixed
 from cortado.gradients import AdjointEstimator, Estimate, ForwardPass, GradientEstimator, estimate
 from cortado.problem import Problem
-from cortado.rollout.rollout import BackwardStep, Observer
+from cortado.rollout.rollout import Observer
 from cortado.scene.parameters.values import Arrays, Values, check_known, require_points
 
 SMALLEST = 1e-4
@@ -212,11 +212,11 @@ class TransformedPass:
 
     def __init__(self, forward_pass: ForwardPass, coordinates: Mapping[str, Bijector], u: Mapping[str, Any]):
         self._pass, self._coordinates, self._u = forward_pass, coordinates, u
-        self.loss, self.rollout, self.derivative = forward_pass.loss, forward_pass.rollout, forward_pass.derivative
+        self.loss = forward_pass.loss
 
-    def back(self, derivative: BackwardStep, observe: Observer | None = None) -> Arrays:
+    def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
         """The gradient with respect to the coordinates."""
-        gradient = self._pass.back(derivative, observe)
+        gradient = self._pass.back(estimator, observe)
         return gradient | by_coordinates(self._coordinates, self._u, gradient)
 
 

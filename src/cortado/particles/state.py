@@ -12,7 +12,7 @@ from cortado.device.precision import Precision
 from cortado.particles.arrays import Arrays, padded, zeros
 from cortado.particles.fields import Entry, StateField
 from cortado.scene.parameters.known import REGISTRY, Known
-from cortado.scene.parameters.registry import Axis
+from cortado.scene.parameters.parameter import Axis
 
 
 class State(Arrays):

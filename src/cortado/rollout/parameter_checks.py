@@ -9,7 +9,7 @@ from cortado.device.precision import Precision
 from cortado.discretise.region import TOLERANCE
 from cortado.errors import InputError
 from cortado.scene.parameters.known import Known
-from cortado.scene.parameters.registry import Range
+from cortado.scene.parameters.parameter import Range
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.scene import Scene
 from cortado.scene.stability import broken_limits

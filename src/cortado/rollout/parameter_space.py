@@ -15,7 +15,8 @@ from cortado.rollout.restarts import check_state, origin_of
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
 from cortado.scene.parameters.known import TIME
-from cortado.scene.parameters.registry import Role, names
+from cortado.scene.parameters.parameter import Role
+from cortado.scene.parameters.registry import names
 from cortado.scene.parameters.values import Arrays, Values, check_known, checked_value, scene_values
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.scene.stability import divergence_advice

@@ -13,7 +13,8 @@ from cortado.rollout.stepper import Steppable
 from cortado.runs.quantities.evaluator import Evaluator
 from cortado.runs.quantities.moment import Moment
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.parameters.registry import Role, names
+from cortado.scene.parameters.parameter import Role
+from cortado.scene.parameters.registry import names
 from cortado.scene.parameters.values import OVER_TIME
 from cortado.scene.quantities import check_quantity, sizes
 from cortado.scene.restart import RestartState

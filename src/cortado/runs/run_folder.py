@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
-import os
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -14,19 +12,16 @@ from typing import Any, Self
 
 from cortado.errors import CortadoWarning, InputError, SceneError
 from cortado.files.atomic import UNFINISHED, parsed_json, sentences, write_atomically
-from cortado.files.input_files import content, reason
 from cortado.runs.run_environment import as_json, plain, require_same, session
+from cortado.runs.run_files import asked_for, bytes_of, computed, cut_torn_line, finite, read_json
 from cortado.runs.sensors.log import Readings, as_csv
 from cortado.scene.parameters.values import NAMES
-from cortado.scene.picture import MOST_FRAMES
 from cortado.scene.scene import Scene
 
 _FORMAT = 2
 """Of run folders, in environment.json; of those before it says nothing."""
 _RESUMABLE = "optimise"
 """The command that has --resume."""
-_LARGEST = 2**31
-"""Bytes of a file that is read again when a run goes on."""
 _FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "result.json", "sensors.csv")
 REPLAY_LOG = "replay.log"
 """In which a search notes its evaluations."""
@@ -117,20 +112,20 @@ class RunFolder:
         """
         folder = cls.open(path, TO_RESUME)
         folder.require(scene_json, kind, settings)
-        noted = _read_json(folder.environment)
+        noted = read_json(folder.environment)
         noted.setdefault("resumed", []).append(session(command, device))
         noted["format"] = _FORMAT
         with sentences(folder.path):
             folder.result.unlink(missing_ok=True)
             folder._remove_unfinished()
             folder._complete(noted, scene_json)
-            _cut_torn_line(folder.metrics)
+            cut_torn_line(folder.metrics)
         return folder
 
     def require(self, scene_json: str, kind: str, settings: Mapping[str, Any] | None = None) -> None:
         """Raises `InputError` unless the run in the folder is of this kind, scene and settings; the sentence says what
         differs."""
-        noted = _read_json(self.environment)
+        noted = read_json(self.environment)
         former = noted.get("kind", kind)
         if former != kind:
             raise InputError(
@@ -138,7 +133,7 @@ class RunFolder:
                 f"another --out, or replace it with --overwrite."
             )
         if self.scene.exists():
-            require_same(_computed(_read_json(self.scene)), _computed(json.loads(scene_json)), self.path)
+            require_same(computed(read_json(self.scene)), computed(json.loads(scene_json)), self.path)
         if "settings" in noted:
             require_same(noted["settings"], as_json(settings or {}), self.path)
 
@@ -198,12 +193,12 @@ class RunFolder:
         Raises:
             InputError: the file is damaged; `SceneError` where what it says, or a replacement, does not fit.
         """
-        text = _bytes_of(self.scene).decode(errors="replace")
+        text = bytes_of(self.scene).decode(errors="replace")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CortadoWarning)
             try:
-                if "format" not in _read_json(self.environment):
-                    text = _asked_for(text)
+                if "format" not in read_json(self.environment):
+                    text = asked_for(text)
                 return Scene.from_json(text, overrides)
             except SceneError as error:
                 raise error.in_file(str(self.scene)) from None
@@ -211,11 +206,11 @@ class RunFolder:
     def write_result(self, **values: Any) -> None:
         """Writes result.json, by which a run is known to have ended; takes NumPy values too. A number that is not
         finite is null."""
-        write_atomically(self.result, json.dumps(_finite(as_json(values)), indent=2) + "\n")
+        write_atomically(self.result, json.dumps(finite(as_json(values)), indent=2) + "\n")
 
     def read_result(self) -> dict[str, Any] | None:
         """What result.json holds; None of a run that has not ended. Raises `InputError` for a damaged file."""
-        return _read_json(self.result) if self.result.exists() else None
+        return read_json(self.result) if self.result.exists() else None
 
     def append_metrics(self, **values: Any) -> None:
         """Adds one line to metrics.jsonl, kept even if the process is killed next; takes NumPy values too."""
@@ -232,13 +227,13 @@ class RunFolder:
         if not self.metrics.exists():
             return []
         try:
-            return [parsed_json(line) for line in _bytes_of(self.metrics).split(b"\n")[:-1]]
+            return [parsed_json(line) for line in bytes_of(self.metrics).split(b"\n")[:-1]]
         except ValueError as problem:
             raise InputError(f"{self.metrics} holds a line that is not JSON: {problem}.") from problem
 
     def _holds_run(self) -> bool:
         try:
-            return "cortado" in dict(parsed_json(_bytes_of(self.environment)))
+            return "cortado" in dict(parsed_json(bytes_of(self.environment)))
         except (InputError, ValueError, TypeError):
             return False
 
@@ -255,7 +250,7 @@ class RunFolder:
         elif not self._holds_run():
             raise InputError(f"{self.path} holds {', '.join(present)}, but no run of Cortado; choose another --out.")
         elif not overwrite:
-            resumable = kind == _RESUMABLE == _read_json(self.environment).get("kind")
+            resumable = kind == _RESUMABLE == read_json(self.environment).get("kind")
             advice = ", or go on with it by --resume" if resumable else ""
             raise InputError(
                 f"{self.path} already holds a run; choose another --out, or replace it with --overwrite{advice}."
@@ -291,50 +286,3 @@ class RunFolder:
     def _checkpoints(self) -> list[Path]:
         """The folders with the logs of one search after the other, that of the first one last, as it holds the rest."""
         return [*self.checkpoint.glob("[0-9]*/"), self.checkpoint]
-
-
-def _asked_for(scene_json: str) -> str:
-    """A scene of a folder without a format, whose default of film_frames, 120, was written as if it were asked for."""
-    try:
-        scene = json.loads(scene_json)
-        if scene["picture"]["film_frames"] == MOST_FRAMES:
-            del scene["picture"]["film_frames"]
-    except (ValueError, RecursionError, LookupError, TypeError):
-        return scene_json  # what is wrong is said where it is read
-    return json.dumps(scene)
-
-
-def _computed(scene: Any) -> Any:
-    """A scene without what changes only how it is shown, and what is read of it."""
-    shown = ("picture", "sensor")
-    return {name: table for name, table in scene.items() if name not in shown} if isinstance(scene, dict) else scene
-
-
-def _finite(value: Any) -> Any:
-    """A value without numbers that JSON does not have."""
-    if isinstance(value, dict):
-        return {name: _finite(entry) for name, entry in value.items()}
-    if isinstance(value, list):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _bytes_of(path: Path) -> bytes:
-    """All of a file; raises `InputError` if it is no regular one, or very large."""
-    try:
-        return content(path, _LARGEST)
-    except OSError as problem:
-        raise InputError(f"{path} cannot be read: {reason(problem)}.") from problem
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return parsed_json(_bytes_of(path))
-    except ValueError as problem:
-        raise InputError(f"{path} cannot be read: {reason(problem)}.") from problem
-
-
-def _cut_torn_line(path: Path) -> None:
-    """Removes what a killed run left of a last line, so that the next line begins a line."""
-    if path.exists():
-        os.truncate(path, _bytes_of(path).rfind(b"\n") + 1)

@@ -11,7 +11,7 @@ from cortado.device.kernels import kind_of
 from cortado.device.reduction import type_name
 from cortado.particles.fields import StateField
 from cortado.particles.state import Layout, State
-from cortado.scene.parameters.registry import Axis
+from cortado.scene.parameters.parameter import Axis
 from cortado.sph.order import OrderKernels, order_kernels
 from cortado.sph.parts import StepContext
 

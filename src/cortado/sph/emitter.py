@@ -8,7 +8,7 @@ import warp as wp
 from cortado.particles.arrays import to_device
 from cortado.particles.fields import POSITIONS, VELOCITIES, Entry, StateField
 from cortado.particles.state import Layout, Parameters, State
-from cortado.scene.parameters.registry import Axis
+from cortado.scene.parameters.parameter import Axis
 from cortado.sph.emitter_kernels import emitter_kernels, nozzle_type
 from cortado.sph.part import Part, PartAdjoint, PartTangent
 from cortado.sph.parts import StepContext, Tangents

@@ -8,7 +8,7 @@ import numpy as np
 
 from cortado.errors import InputError, shown
 from cortado.scene.parameters.known import Known
-from cortado.scene.parameters.registry import Parameter, Source
+from cortado.scene.parameters.parameter import Parameter, Source
 from cortado.scene.parameters.values import checked_value
 from cortado.sph.parts import Force, Setting
 

@@ -15,7 +15,7 @@ from cortado.errors import InputError, shown
 from cortado.fixed import fixed
 from cortado.particles.neighbourhood import Discretisation
 from cortado.scene.parameters.known import TIME
-from cortado.scene.parameters.registry import Axis, Parameter, Source
+from cortado.scene.parameters.parameter import Axis, Parameter, Source
 from cortado.scene.schedule import Course
 from cortado.sph.formula import Formula, compiled, formula, keep_source, plain_function, source_of
 from cortado.sph.packed import Packed

@@ -9,7 +9,7 @@ import warp as wp
 
 from cortado.device.precision import Precision
 from cortado.particles.state import Layout, Parameters
-from cortado.scene.parameters.registry import Parameter
+from cortado.scene.parameters.parameter import Parameter
 from cortado.sph.integration import integration_module
 from cortado.sph.parts import Adjoints, StepContext
 

@@ -19,7 +19,7 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout, Parameters
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.parameters.known import argument
-from cortado.scene.parameters.registry import Axis
+from cortado.scene.parameters.parameter import Axis
 from cortado.scene.scene import Scene
 
 

@@ -13,7 +13,7 @@ from cortado.optimisation.optimise import Result
 from cortado.pictures.figures import images, loss_curve, panels, particles
 from cortado.pictures.painter import colours_of
 from cortado.runs.report import Figures
-from cortado.scene.parameters.registry import Axis
+from cortado.scene.parameters.parameter import Axis
 from cortado.scene.parameters.tilt import Tilt
 from cortado.scene.picture import Picture
 

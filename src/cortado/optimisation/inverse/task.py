@@ -13,7 +13,8 @@ from cortado.optimisation.inverse.tables import OptimiseTable, ProblemTable, Tas
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.scene.fields import MISSING
 from cortado.scene.parameters.known import Known
-from cortado.scene.parameters.registry import Axis, Parameter, Range, Role, offered
+from cortado.scene.parameters.parameter import Axis, Parameter, Range, Role
+from cortado.scene.parameters.registry import offered
 from cortado.scene.parameters.values import SUM_TOLERANCE, Arrays, is_too_small
 from cortado.scene.sampling import fluid_particles
 from cortado.scene.scene import Scene, scene_from_dict

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import InputError
-from cortado.scene.parameters.registry import BY_NAME, Axis, Parameter, Role
+from cortado.scene.parameters.parameter import Axis, Parameter, Role
+from cortado.scene.parameters.registry import BY_NAME
 
 
 class Known(Mapping[str, Parameter]):

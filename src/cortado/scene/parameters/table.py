@@ -1,6 +1,7 @@
 """The registry of parameters as a table for people: ``python -m cortado.scene.parameters.table`` prints Markdown."""
 
-from cortado.scene.parameters.registry import PARAMETERS, Axis, Parameter
+from cortado.scene.parameters.parameter import Axis, Parameter
+from cortado.scene.parameters.registry import PARAMETERS
 
 HEAD = "| parameter | shape | unit | | range |\n|---|---|---|---|---|\n"
 

@@ -11,7 +11,8 @@ import numpy as np
 from cortado.arrays import as_numbers, require_table
 from cortado.errors import InputError, shown
 from cortado.scene.parameters.known import REGISTRY, Known
-from cortado.scene.parameters.registry import BY_NAME, Axis, Range, Role, Source, names
+from cortado.scene.parameters.parameter import Axis, Range, Role, Source
+from cortado.scene.parameters.registry import BY_NAME, names
 
 Values = Mapping[str, Any]
 Arrays = dict[str, np.ndarray]
