@@ -17,8 +17,8 @@ from cortado.discretise.calibration import laplacian_rate, pairwise_rate
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.errors import CortadoWarning, DivergedError, InputError, SceneError
 from cortado.scene.fluids import BoxFluid
-from cortado.scene.mixture import Mixture
-from cortado.scene.model import Discretisation
+from cortado.scene.mixture import MixtureTable
+from cortado.scene.model import DiscretisationTable
 from cortado.scene.scene import Scene, load_scene, scene_from_dict
 from cortado.scene.stability import stability_limit, stability_limits
 from cortado.scene.toml import read_toml
@@ -59,13 +59,13 @@ def test_what_is_left_out_has_a_default():
     assert scene.forces.gravity == (0.0, -9.81) and scene.container.shape == "none"
     assert scene.fluid[0].velocity == (0.0, 0.0)
     assert (scene.solver.minimum_iterations, scene.solver.maximum_iterations) == (3, 50)
-    assert scene.emitter is None and scene.render is None and scene.mixture == Mixture()
-    assert scene.discretisation == Discretisation(spacing=0.1, support=2.0, kernel="cubic_spline")
+    assert scene.emitter is None and scene.render is None and scene.mixture == MixtureTable()
+    assert scene.discretisation == DiscretisationTable(spacing=0.1, support=2.0, kernel="cubic_spline")
 
 
 def test_a_scene_can_be_built_from_parts():
     fluid = BoxFluid(lower=np.zeros(2), upper=(np.float32(1.0), 0.5), phase="water")
-    scene = Scene(**plane(fluid=[fluid], discretisation=Discretisation(spacing=0.1)))
+    scene = Scene(**plane(fluid=[fluid], discretisation=DiscretisationTable(spacing=0.1)))
     assert scene == Scene(**plane()) and fluid.velocity == (0.0, 0.0, 0.0)
 
 
@@ -186,7 +186,7 @@ def test_a_misspelt_key_is_told_the_right_one():
     assert str(caught.value) == wanted
 
 
-@pytest.mark.parametrize("fluid", [np.zeros(2), date(2020, 1, 1), 3, Mixture()], ids=str)
+@pytest.mark.parametrize("fluid", [np.zeros(2), date(2020, 1, 1), 3, MixtureTable()], ids=str)
 def test_a_fluid_that_is_no_table_is_a_sentence(fluid):
     with pytest.raises(SceneError, match=r"^fluid\[0\] is .*, but must be a table\.$"):
         Scene(**plane(fluid=[fluid]))
@@ -194,7 +194,7 @@ def test_a_fluid_that_is_no_table_is_a_sentence(fluid):
 
 def test_parts_built_in_python_raise_the_same_error():
     with pytest.raises(SceneError, match=r"^spacing is -1, but must be greater than 0 m\.$"):
-        Discretisation(spacing=-1)
+        DiscretisationTable(spacing=-1)
     with pytest.raises(SceneError, match=r"^discretisation\.spacing is -1, but must be greater than 0 m\.$"):
         Scene(**plane(discretisation={"spacing": -1}))
 

@@ -10,7 +10,7 @@ from bad_scenes import plane
 from cortado import Problem, Simulation, losses
 from cortado.discretise.shapes import across, disc
 from cortado.errors import CortadoWarning, SceneError
-from cortado.scene.emitter import Emitter
+from cortado.scene.emitter import EmitterTable
 from cortado.scene.sampling import fluid_particles
 from cortado.scene.scene import Scene
 from cortado.scene.stability import stability_limit
@@ -33,7 +33,7 @@ def space(**emitter) -> Scene:
     )
 
 
-def emitter_of(scene: Scene) -> Emitter:
+def emitter_of(scene: Scene) -> EmitterTable:
     assert scene.emitter is not None
     return scene.emitter
 

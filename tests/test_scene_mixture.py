@@ -6,7 +6,7 @@ import pytest
 
 from bad_scenes import GOOD_SCENE, MIXTURE, plane
 from cortado.errors import SceneError
-from cortado.scene.mixture import Mixture
+from cortado.scene.mixture import MixtureTable
 from cortado.scene.sampling import fluid_particles
 from cortado.scene.scene import Scene, scene_from_dict
 
@@ -21,7 +21,7 @@ FLUIDS = [
 def test_phases_are_counted_in_the_order_of_the_scene():
     scene = Scene(**plane(phase=PHASES, fluid=FLUIDS))
     assert fluid_particles(scene).phase.tolist() == [2] * 50 + [0] * 50 + [1] * 10
-    assert Scene.from_json(scene.to_json()) == scene and scene.mixture == Mixture()
+    assert Scene.from_json(scene.to_json()) == scene and scene.mixture == MixtureTable()
 
 
 def test_a_mixture_keeps_what_its_file_says():
@@ -39,5 +39,5 @@ def test_an_interface_is_as_wide_as_a_spacing_if_nothing_else_is_said():
 def test_one_phase_has_nothing_to_mix_with():
     wanted = r"^mixture is given, but must be left out, as the scene has only one phase\.$"
     with pytest.raises(SceneError, match=wanted):
-        Scene(**plane(mixture=Mixture(mobility=1e-6)))
-    assert Scene(**plane(mixture=Mixture())) == Scene(**plane())
+        Scene(**plane(mixture=MixtureTable(mobility=1e-6)))
+    assert Scene(**plane(mixture=MixtureTable())) == Scene(**plane())

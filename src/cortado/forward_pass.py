@@ -20,7 +20,7 @@ from cortado.scene.parameters.values import Arrays
 
 
 @dataclass(frozen=True)
-class ForwardPass:
+class ProblemForwardPass:
     """A forward run of a problem with its loss, and the ways back through it."""
 
     loss: Any

@@ -11,7 +11,7 @@ from cortado.device.threads import Turn, in_turn
 from cortado.errors import CortadoWarning, DivergedError, InputError, shown
 from cortado.fingerprint import fingerprint_of
 from cortado.fixed import fixed
-from cortado.forward_pass import ForwardPass
+from cortado.forward_pass import ProblemForwardPass
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator, estimate
 from cortado.gradients.estimator import checked_reverse
 from cortado.losses import Frames, Loss, Snapshot, SnapshotBatch
@@ -155,7 +155,7 @@ class Problem:
         return found
 
     @in_turn
-    def forward_pass(self, parameters: Values) -> ForwardPass:
+    def forward_pass(self, parameters: Values) -> ProblemForwardPass:
         """A forward run that can be gone back through, also after other evaluations: what estimators work with. Its
         states are kept for as long as it is held."""
         values = self._checked(parameters)
@@ -163,7 +163,7 @@ class Problem:
         residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself
         loss, found = self._losses.total_and_adjoints(ends, self._going)
         bars = {step: bar.through_quantities(ends[step]) for step, bar in found.items()}
-        return ForwardPass(loss, residual, values, bars, self._space, self._derivatives)
+        return ProblemForwardPass(loss, residual, values, bars, self._space, self._derivatives)
 
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> Any:

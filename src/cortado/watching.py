@@ -10,7 +10,7 @@ from cortado.losses.loss import Snapshot
 from cortado.particles.state import State
 from cortado.rollout.rollout import Rollout
 from cortado.runs.measuring import Measured
-from cortado.runs.quantities.evaluator import Evaluator
+from cortado.runs.quantities.evaluator import QuantityEvaluator
 from cortado.runs.quantities.moment import Moment
 from cortado.runs.quantities.recorder import Recorder
 from cortado.runs.sensors.log import Readings, SensorLog
@@ -36,7 +36,7 @@ class Watch:
             raise InputError("sensors is given, but must be left out, as a batch reads none: read one scene's.")
 
         @cache
-        def evaluator() -> Evaluator:
+        def evaluator() -> QuantityEvaluator:
             own, batch = simulation, simulation.batch
             return (own.in_precision(own.precision.name) if batch is None else own.batch_of(batch)).evaluator()
 

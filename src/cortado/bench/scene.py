@@ -3,7 +3,7 @@
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.scene.containers import BoxContainer
 from cortado.scene.fluids import BoxFluid
-from cortado.scene.model import Discretisation, Forces, Phase
+from cortado.scene.model import DiscretisationTable, Forces, Phase
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import PcisphSolver
 from cortado.simulation import Simulation
@@ -20,7 +20,7 @@ def dam_break(particles: int) -> Scene:
     return Scene(
         name="dam break",
         dimension=3,
-        discretisation=Discretisation(spacing=spacing),
+        discretisation=DiscretisationTable(spacing=spacing),
         phase=(Phase(name="water", rest_density=1000.0, viscosity=0.05),),
         fluid=(BoxFluid(lower=(0.0, 0.0, 0.0), upper=(1.0, 1.0, 1.0), phase="water"),),
         container=BoxContainer(lower=(0.0, 0.0, 0.0), upper=(2.0, 1.5, 1.0)),

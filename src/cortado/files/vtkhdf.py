@@ -1,6 +1,6 @@
 """Frames of particles in one temporal VTKHDF file, which ParaView opens and a killed run leaves readable.
 
-A frame is written at the places of its datasets (`Layout`) without HDF5, which a full disk can kill.
+A frame is written at the places of its datasets (`FileLayout`) without HDF5, which a full disk can kill.
 Then one number of eight bytes counts it, and carries the CRC-32 of all frames so far: a SIGKILL comes before or
 after it. The checksums are not those of HDF5, which need datasets in chunks, whose index a killed process
 leaves half written.
@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from cortado.errors import ComputationError, InputError
 from cortado.files.atomic import sentences, unfinished, write_fully
-from cortado.files.vtkhdf_layout import FORMAT, WRITTEN, Layout, frames_seed, steps_seed
+from cortado.files.vtkhdf_layout import FORMAT, WRITTEN, FileLayout, frames_seed, steps_seed
 
 
 class TrajectoryWriter:
@@ -76,7 +76,7 @@ class TrajectoryWriter:
         self.path = Path(path)
         self.frames_written = 0
         self.steps_written = 0
-        self._layout = Layout(
+        self._layout = FileLayout(
             moments,
             (particles, dimension),
             np.dtype(precision),
@@ -300,7 +300,7 @@ def _records(columns: Mapping[str, ArrayLike], record: np.dtype[Any]) -> NDArray
     return records
 
 
-def _require_room(layout: Layout, path: Path) -> None:
+def _require_room(layout: FileLayout, path: Path) -> None:
     """Raise ComputationError if the disk has no room for all the frames."""
     free = shutil.disk_usage(path.absolute().parent).free
     if layout.size > free:

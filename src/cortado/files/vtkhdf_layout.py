@@ -34,7 +34,7 @@ _PAGE = 4096
 
 
 @dataclass(frozen=True)
-class Layout:
+class FileLayout:
     """What a file has room for."""
 
     times: NDArray[np.float64]

@@ -10,7 +10,7 @@ LossFunction = Callable[[dict[str, Any]], tuple[Any, Mapping[str, Any]]]
 """Parameters by name -> the loss, and its gradient by the same names."""
 
 
-class Differentiable(Protocol):
+class Optimisable(Protocol):
     """A problem that can be optimised. It may have an attribute `fingerprint`, a text that identifies it.
 
     The fingerprint is kept in the checkpoint, so that the run of one problem is not resumed with another.
@@ -22,7 +22,7 @@ class Differentiable(Protocol):
 
 @dataclass(frozen=True)
 class Function:
-    """A function of the parameters, which returns its own gradient, as a `Differentiable`."""
+    """A function of the parameters, which returns its own gradient, as a `Optimisable`."""
 
     function: LossFunction
 
@@ -40,7 +40,7 @@ class Function:
         return self.function(parameters)
 
 
-def as_differentiable(problem: Any) -> Differentiable:
+def as_differentiable(problem: Any) -> Optimisable:
     """The problem itself, or a function made into one; raises `InputError` for anything else."""
     if isinstance(problem, type):
         raise InputError(f"What is optimised is the class {problem.__name__}, but must be an object made of it.")

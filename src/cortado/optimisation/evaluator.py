@@ -11,8 +11,8 @@ from cortado.arrays import as_numbers, as_one_number
 from cortado.device.executors.executor import InProcess
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.gradients.points import Daring, evaluated
-from cortado.optimisation.differentiable import Differentiable, loss_and_gradient
-from cortado.optimisation.replay_log import Evaluation, Log, ParameterLayout, Vector
+from cortado.optimisation.differentiable import Optimisable, loss_and_gradient
+from cortado.optimisation.replay_log import Log, LoggedEvaluation, ParameterLayout, Vector
 from cortado.optimisation.result import Parameters, Record
 
 GREATEST_GRADIENT = 1e150
@@ -27,7 +27,7 @@ REFUSED = (DivergedError, InputError)
 class Evaluator:
     """The function of one vector that the optimiser sees; replays the log, then computes and adds to it."""
 
-    problem: Differentiable
+    problem: Optimisable
     estimator: Any
     layout: ParameterLayout
     start: Mapping[str, Any]
@@ -60,19 +60,19 @@ class Evaluator:
             try:
                 evaluation = self._kept(self._compute(vector))
             except DivergedError:
-                evaluation = self._kept(Evaluation(vector.copy(), math.inf, np.zeros_like(vector)))
+                evaluation = self._kept(LoggedEvaluation(vector.copy(), math.inf, np.zeros_like(vector)))
         if math.isfinite(evaluation.loss):
             return self._noted(evaluation, replayed)
         self.logged += 1
         self.refused += 1
         return None
 
-    def _kept(self, evaluation: Evaluation) -> Evaluation:
+    def _kept(self, evaluation: LoggedEvaluation) -> LoggedEvaluation:
         """The evaluation, which is in the log from now on."""
         self.log.append(evaluation)
         return evaluation
 
-    def _noted(self, evaluation: Evaluation, replayed: bool) -> tuple[float, Vector]:
+    def _noted(self, evaluation: LoggedEvaluation, replayed: bool) -> tuple[float, Vector]:
         """The loss and its gradient (size,), which are in the history from now on."""
         self.logged += 1
         record = Record(
@@ -98,7 +98,7 @@ class Evaluator:
 
         def keep(loss: Any) -> None:
             number = as_one_number("The problem's loss", loss)
-            self.log.append(Evaluation(left[len(found)].copy(), number, np.zeros_like(left[0])))
+            self.log.append(LoggedEvaluation(left[len(found)].copy(), number, np.zeros_like(left[0])))
             found.append(number)
 
         points, problem = [self.layout.unravel(vector) for vector in left], self.problem
@@ -123,7 +123,7 @@ class Evaluator:
         """The loss and its gradient, as the problem returns them."""
         return loss_and_gradient(self.problem.value_and_gradient(parameters, gradient=self.estimator))
 
-    def _replay(self, vector: Vector, ahead: int = 0) -> Evaluation:
+    def _replay(self, vector: Vector, ahead: int = 0) -> LoggedEvaluation:
         """The logged evaluation, or the one so many ahead of it, if it is the one asked for."""
         evaluation = self.log.read(self.logged + ahead)
         changed = vector.view(np.uint64) != evaluation.parameters.view(np.uint64)
@@ -136,7 +136,7 @@ class Evaluator:
             )
         return evaluation
 
-    def _compute(self, vector: Vector) -> Evaluation:
+    def _compute(self, vector: Vector) -> LoggedEvaluation:
         """Evaluate the problem, and return the evaluation if it is finite.
 
         A first evaluation that is refused has a wrong start; later ones, parameters to which the search has come.
@@ -155,7 +155,9 @@ class Evaluator:
             if not self.history:
                 raise
             raise error.with_advice(self._shorter(error.advice, vector)) from error
-        evaluation = Evaluation(vector.copy(), as_one_number("The problem's loss", loss), self._ravelled(gradients))
+        evaluation = LoggedEvaluation(
+            vector.copy(), as_one_number("The problem's loss", loss), self._ravelled(gradients)
+        )
         self._require_finite(evaluation)
         return evaluation
 
@@ -180,7 +182,7 @@ class Evaluator:
             )
         return self.layout.ravel({name: as_numbers(f"The gradient of '{name}'", gradients[name]) for name in wanted})
 
-    def _require_finite(self, evaluation: Evaluation) -> None:
+    def _require_finite(self, evaluation: LoggedEvaluation) -> None:
         """Raise ComputationError, with advice, if an evaluation cannot be used."""
         broken = ~(np.abs(evaluation.gradient) <= GREATEST_GRADIENT)
         if math.isfinite(evaluation.loss) and not broken.any():

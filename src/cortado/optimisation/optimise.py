@@ -15,7 +15,7 @@ import numpy as np
 from cortado.arrays import require_function, require_truth
 from cortado.errors import InputError
 from cortado.files.input_files import as_path
-from cortado.optimisation.differentiable import Differentiable, LossFunction, as_differentiable
+from cortado.optimisation.differentiable import LossFunction, Optimisable, as_differentiable
 from cortado.optimisation.evaluator import Evaluator, as_given
 from cortado.optimisation.named_optimisers import as_optimiser
 from cortado.optimisation.replay_log import Log, MemoryLog, ParameterLayout, ReplayLog
@@ -26,7 +26,7 @@ from cortado.words import counted
 
 
 def optimise(
-    problem: Differentiable | LossFunction,
+    problem: Optimisable | LossFunction,
     start: Mapping[str, Any],
     optimiser: Optimiser | str,
     iterations: int,

@@ -71,7 +71,7 @@ class ParameterLayout:
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation:
+class LoggedEvaluation:
     """One evaluation of the loss and its gradient."""
 
     parameters: Vector
@@ -90,10 +90,10 @@ class Log(Protocol):
 
     def __len__(self) -> int: ...
 
-    def read(self, index: int) -> Evaluation:
+    def read(self, index: int) -> LoggedEvaluation:
         """The evaluation of that index, bit for bit as it was appended."""
 
-    def append(self, evaluation: Evaluation) -> None:
+    def append(self, evaluation: LoggedEvaluation) -> None:
         """Keep one more evaluation."""
 
     def close(self) -> None:
@@ -106,16 +106,16 @@ class MemoryLog:
     fate = "were not kept, as there is no checkpoint"
 
     def __init__(self) -> None:
-        self._evaluations: list[Evaluation] = []
+        self._evaluations: list[LoggedEvaluation] = []
 
     def __len__(self) -> int:
         return len(self._evaluations)
 
-    def read(self, index: int) -> Evaluation:
+    def read(self, index: int) -> LoggedEvaluation:
         """The evaluation of that index."""
         return self._evaluations[index]
 
-    def append(self, evaluation: Evaluation) -> None:
+    def append(self, evaluation: LoggedEvaluation) -> None:
         """Keep one more evaluation."""
         self._evaluations.append(evaluation)
 
@@ -174,14 +174,14 @@ class ReplayLog:
     def __len__(self) -> int:
         return self._count
 
-    def read(self, index: int) -> Evaluation:
+    def read(self, index: int) -> LoggedEvaluation:
         """The evaluation of that index, 0 <= index < len(self), bit for bit as it was appended."""
         self._file.seek(self._first_record + index * self._record_size)
         values = np.frombuffer(self._file.read(self._record_size)[8:-4], dtype="<f8").astype(np.float64)
         size = self._layout.size
-        return Evaluation(values[1 : 1 + size], float(values[0]), values[1 + size :])
+        return LoggedEvaluation(values[1 : 1 + size], float(values[0]), values[1 + size :])
 
-    def append(self, evaluation: Evaluation) -> None:
+    def append(self, evaluation: LoggedEvaluation) -> None:
         """Write one more evaluation; it is on the disk on return. Raises ComputationError if the disk refuses."""
         values = np.concatenate([[evaluation.loss], evaluation.parameters, evaluation.gradient])
         content = struct.pack("<Q", self._count) + values.astype("<f8").tobytes()

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from cortado.pictures.surroundings import FAR, Surroundings, mirrored, open_background, schlick, sky, smooth_step
+from cortado.pictures.surroundings import FAR, Environment, mirrored, open_background, schlick, sky, smooth_step
 
 
 @wp.struct
@@ -45,7 +45,7 @@ def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
 
 
 @wp.func
-def pane(s: Surroundings, d: wp.vec3, normal: wp.vec3, rim: wp.float32, is_pane: wp.float32, behind: Passed):
+def pane(s: Environment, d: wp.vec3, normal: wp.vec3, rim: wp.float32, is_pane: wp.float32, behind: Passed):
     """One more sheet of glass, behind what is passed already; ``rim``: how much of its edge is seen, 0 to 1."""
     cosine = wp.abs(wp.dot(d, normal))
     f = schlick(0.04, cosine)
@@ -68,7 +68,7 @@ def rim_of(off: wp.float32, width: wp.float32):
 
 
 @wp.func
-def box_pane(s: Surroundings, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float32, width: wp.float32, before: Passed):
+def box_pane(s: Environment, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float32, width: wp.float32, before: Passed):
     """The side of the box where a ray, o and d in its own frame, passes at t."""
     q = o + t * d
     axis = wp.int32(0)
@@ -96,7 +96,7 @@ def box_pane(s: Surroundings, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.floa
 
 @wp.func
 def box_glass(
-    s: Surroundings,
+    s: Environment,
     o: wp.vec3,
     d: wp.vec3,
     world: wp.vec3,
@@ -120,7 +120,7 @@ def box_glass(
 
 
 @wp.func
-def tube(s: Surroundings, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float32, width: wp.float32, before: Passed):
+def tube(s: Environment, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float32, width: wp.float32, before: Passed):
     """The side of the cylinder where a ray passes at t; nothing above and below it."""
     q = o + t * d
     if q[1] < s.glass_lower[1] or q[1] > s.glass_upper[1]:
@@ -134,7 +134,7 @@ def tube(s: Surroundings, o: wp.vec3, d: wp.vec3, world: wp.vec3, t: wp.float32,
 
 @wp.func
 def cylinder_glass(
-    s: Surroundings,
+    s: Environment,
     o: wp.vec3,
     d: wp.vec3,
     world: wp.vec3,
@@ -155,7 +155,7 @@ def cylinder_glass(
 
 
 @wp.func
-def glass(s: Surroundings, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32):
+def glass(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32):
     """The glass that a ray passes up to the distance ``most`` [m]."""
     nothing = Passed()
     nothing.light = wp.vec3(0.0)
@@ -170,7 +170,7 @@ def glass(s: Surroundings, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.
 
 
 @wp.func
-def background(s: Surroundings, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d: wp.vec3, spread: wp.float32):
+def background(s: Environment, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d: wp.vec3, spread: wp.float32):
     """What a ray sees that meets no fluid."""
     most = FAR
     if s.has_floor > 0 and d[1] < -1.0e-4:
@@ -180,7 +180,7 @@ def background(s: Surroundings, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d
 
 
 @wp.func
-def room(s: Surroundings, o: wp.vec3, d: wp.vec3):
+def room(s: Environment, o: wp.vec3, d: wp.vec3):
     """From where to where on a ray fluid is shown; from FAR to -FAR where it is not."""
     if s.has_room == 0:
         return wp.vec2(-FAR, FAR)
@@ -198,7 +198,7 @@ def room(s: Surroundings, o: wp.vec3, d: wp.vec3):
 
 
 @wp.func
-def wall_normal(s: Surroundings, p: wp.vec3):
+def wall_normal(s: Environment, p: wp.vec3):
     """Outwards, of the wall that a point is on."""
     q = s.glass_frame * p
     n = wp.vec3(0.0)

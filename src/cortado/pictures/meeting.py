@@ -3,7 +3,7 @@
 import warp as wp
 
 from cortado.pictures.glass import room, wall_normal
-from cortado.pictures.surroundings import FAR, Surroundings
+from cortado.pictures.surroundings import FAR, Environment
 
 
 @wp.struct
@@ -79,7 +79,7 @@ def at_surface(surface: FluidSurface, t: wp.float32, d: wp.vec3, face: wp.int32,
 
 
 @wp.func
-def at_wall(s: Surroundings, surface: FluidSurface, o: wp.vec3, d: wp.vec3, t: wp.float32):
+def at_wall(s: Environment, surface: FluidSurface, o: wp.vec3, d: wp.vec3, t: wp.float32):
     """A meeting with the wall that fluid touches, beyond which its triangles go on: they are near."""
     p = o + t * d
     near = wp.mesh_query_point_no_sign(surface.mesh, p, surface.reach)
@@ -92,7 +92,7 @@ def at_wall(s: Surroundings, surface: FluidSurface, o: wp.vec3, d: wp.vec3, t: w
 
 
 @wp.func
-def meet(s: Surroundings, surface: FluidSurface, o: wp.vec3, d: wp.vec3):
+def meet(s: Environment, surface: FluidSurface, o: wp.vec3, d: wp.vec3):
     """Where a ray from outside of the fluid comes into it."""
     none = Meeting()
     none.found = False
@@ -112,7 +112,7 @@ def meet(s: Surroundings, surface: FluidSurface, o: wp.vec3, d: wp.vec3):
 
 
 @wp.func
-def leave(s: Surroundings, surface: FluidSurface, o: wp.vec3, d: wp.vec3):
+def leave(s: Environment, surface: FluidSurface, o: wp.vec3, d: wp.vec3):
     """Where a ray within the fluid comes out of it."""
     part = room(s, o, d)
     hit = wp.mesh_query_ray(surface.mesh, o, d, FAR)

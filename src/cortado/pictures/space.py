@@ -16,7 +16,7 @@ from cortado.pictures.meeting import FluidSurface
 from cortado.pictures.scenery import Scenery, State, processes_for, sceneries, scenery
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.surface import Surface
-from cortado.pictures.surroundings import GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Surroundings
+from cortado.pictures.surroundings import GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Environment
 from cortado.pictures.trace import Eye, find_contrast, illuminate, trace
 
 ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
@@ -139,7 +139,7 @@ def _directions(count: int) -> Points:
 
 
 def _surroundings(stage: Stage) -> Any:
-    picture, s = stage.picture, Surroundings()
+    picture, s = stage.picture, Environment()
     horizon = np.asarray(picture.background)
     s.size, s.nearest = stage.size, 1e-4 * stage.size
     s.sun, s.fill = wp.vec3(*stage.sun), wp.vec3(*stage.fill)

@@ -10,7 +10,7 @@ FAR = wp.constant(wp.float32(1.0e9))
 
 
 @wp.struct
-class Surroundings:
+class Environment:
     """Everything around the fluid."""
 
     size: wp.float32
@@ -73,7 +73,7 @@ def mirrored(direction: wp.vec3, normal: wp.vec3):
 
 
 @wp.func
-def sky(s: Surroundings, d: wp.vec3):
+def sky(s: Environment, d: wp.vec3):
     """Light from a direction above the floor: a gradient, a soft lamp, and a strip of light on the other side."""
     base = wp.lerp(s.horizon, s.zenith, smooth_step(0.0, 0.9, d[1]))
     lamp = smooth_step(0.945, 0.985, wp.dot(d, s.sun))
@@ -82,7 +82,7 @@ def sky(s: Surroundings, d: wp.vec3):
 
 
 @wp.func
-def shadow_at(s: Surroundings, shadow: wp.array2d(dtype=wp.vec3), x: wp.float32, z: wp.float32):
+def shadow_at(s: Environment, shadow: wp.array2d(dtype=wp.vec3), x: wp.float32, z: wp.float32):
     """The part of the light that reaches a place of the floor, interpolated between nodes; all of it elsewhere."""
     u = (x - s.shadow_corner[0]) / s.shadow_cell
     v = (z - s.shadow_corner[2]) / s.shadow_cell
@@ -105,7 +105,7 @@ def line(x: wp.float32, grid: wp.float32, width: wp.float32):
 
 
 @wp.func
-def floor(s: Surroundings, shadow: wp.array2d(dtype=wp.vec3), p: wp.vec3, footprint: wp.float32):
+def floor(s: Environment, shadow: wp.array2d(dtype=wp.vec3), p: wp.vec3, footprint: wp.float32):
     """The floor at p, which becomes the horizon further out; ``footprint``: the width of a pixel there [m]."""
     colour = s.floor_colour
     if s.grid > 0.0:
@@ -119,7 +119,7 @@ def floor(s: Surroundings, shadow: wp.array2d(dtype=wp.vec3), p: wp.vec3, footpr
 
 
 @wp.func
-def open_background(s: Surroundings, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d: wp.vec3, spread: wp.float32):
+def open_background(s: Environment, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d: wp.vec3, spread: wp.float32):
     """What a ray sees that meets neither fluid nor glass; ``spread``: the width of a pixel at 1 m [m]."""
     if s.has_floor > 0 and d[1] < -1.0e-4:
         t = (s.floor_height - o[1]) / d[1]

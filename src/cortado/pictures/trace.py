@@ -10,7 +10,7 @@ import warp as wp
 
 from cortado.pictures.glass import background, glass
 from cortado.pictures.meeting import FluidSurface, leave, meet
-from cortado.pictures.surroundings import FAR, Surroundings, mirrored, schlick, sky
+from cortado.pictures.surroundings import FAR, Environment, mirrored, schlick, sky
 
 SEGMENTS = 4
 INDEX = wp.constant(wp.float32(1.33))
@@ -45,7 +45,7 @@ def toned(colour: wp.vec3):
 
 @wp.func
 def within(
-    s: Surroundings,
+    s: Environment,
     shadow: wp.array2d(dtype=wp.vec3),
     surface: FluidSurface,
     start: wp.vec3,
@@ -110,7 +110,7 @@ def within(
 
 @wp.func
 def seen(
-    s: Surroundings,
+    s: Environment,
     shadow: wp.array2d(dtype=wp.vec3),
     surface: FluidSurface,
     o: wp.vec3,
@@ -152,7 +152,7 @@ def seen(
 def trace(
     first: wp.int32,
     eye: Eye,
-    s: Surroundings,
+    s: Environment,
     surface: FluidSurface,
     shadow: wp.array2d(dtype=wp.vec3),
     pixels: wp.array(dtype=wp.int32),
@@ -195,7 +195,7 @@ def find_contrast(
 @wp.kernel(module=wp.get_module("cortado_shading"), enable_backward=False)
 def illuminate(
     first: wp.int32,
-    s: Surroundings,
+    s: Environment,
     surface: FluidSurface,
     points: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),

@@ -10,7 +10,7 @@ from cortado.device.threads import Turn, in_turn
 from cortado.discretise.calibration import circulation_factor
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.stepper import Steppable
-from cortado.runs.quantities.evaluator import Evaluator
+from cortado.runs.quantities.evaluator import QuantityEvaluator
 from cortado.runs.quantities.moment import Moment
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.parameters.parameter import Role
@@ -46,7 +46,7 @@ class Measuring:
         raise NotImplementedError
 
     @in_turn
-    def evaluator(self) -> Evaluator:
+    def evaluator(self) -> QuantityEvaluator:
         """What computes quantities of states on the device, made once."""
         made = self.__dict__.get("_evaluator")
         if made is None:
@@ -54,7 +54,7 @@ class Measuring:
             scene, lattice = own.scene, own.lattice
             spacing, dimension = scene.discretisation.spacing, scene.dimension
             factor = circulation_factor(own.smoothing, spacing, lattice.support, dimension)
-            made = self.__dict__["_evaluator"] = Evaluator(own.solver, dimension, factor)
+            made = self.__dict__["_evaluator"] = QuantityEvaluator(own.solver, dimension, factor)
         return made
 
     def quantity(

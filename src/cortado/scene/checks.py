@@ -7,10 +7,10 @@ from cortado.device.memory import sampling_parts, shortage
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError, Words, shown
 from cortado.scene.containers import check_length
-from cortado.scene.emitter import Emitter
+from cortado.scene.emitter import EmitterTable
 from cortado.scene.fields import MISSING, FieldPath, field_error
-from cortado.scene.fluids import Body, Fluid, PointsFluid
-from cortado.scene.mixture import Mixture
+from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
+from cortado.scene.mixture import MixtureTable
 from cortado.scene.model import SceneTables
 from cortado.scene.overlaps import check_distinct, check_overlaps
 from cortado.scene.parameters.registry import BY_NAME
@@ -47,9 +47,9 @@ def check_scene(scene: SceneTables) -> None:
     _check_schedule(scene)
 
 
-def _bodies(scene: SceneTables) -> list[tuple[FieldPath, Body]]:
+def _bodies(scene: SceneTables) -> list[tuple[FieldPath, FluidBody]]:
     """All that has particles, in their order, each with its path in the scene."""
-    fluids: list[tuple[FieldPath, Body]] = [(("fluid", index), fluid) for index, fluid in enumerate(scene.fluid)]
+    fluids: list[tuple[FieldPath, FluidBody]] = [(("fluid", index), fluid) for index, fluid in enumerate(scene.fluid)]
     return fluids if scene.emitter is None else [*fluids, (("emitter",), scene.emitter)]
 
 
@@ -61,7 +61,7 @@ def _check_phases(scene: SceneTables) -> None:
     for path, body in _bodies(scene):
         if body.phase not in names:
             raise field_error((*path, "phase"), body.phase, f"the name of a phase, of {shown(names)}")
-    if len(names) == 1 and scene.mixture != Mixture():
+    if len(names) == 1 and scene.mixture != MixtureTable():
         raise field_error(("mixture",), Words("given"), "left out, as the scene has only one phase")
 
 
@@ -101,13 +101,13 @@ def _check_size(index: int, fluid: Fluid, spacing: float) -> None:
         raise field_error(("fluid", index), Words("too thin to hold a particle"), wanted)
 
 
-def _check_length(emitter: Emitter, spacing: float) -> None:
+def _check_length(emitter: EmitterTable, spacing: float) -> None:
     if emitter.layers(spacing) == 0.0:
         wanted = f"greater than half a spacing, {0.5 * spacing:g} m, for the column to hold a layer of particles"
         raise field_error(("emitter", "length"), emitter.length, wanted)
 
 
-def _check_distance(path: FieldPath, body: Body, spacing: float) -> None:
+def _check_distance(path: FieldPath, body: FluidBody, spacing: float) -> None:
     furthest = np.abs(body.extent(spacing)).max()
     if furthest > FURTHEST * spacing:
         raise field_error(path, Words(f"{furthest:g} m from the origin"), _nearer(spacing))
@@ -137,7 +137,7 @@ def _outside(index: int, place: Points) -> PydanticCustomError:
     return field_error(("fluid", index), found, "inside the container")
 
 
-def _check_outlet(scene: SceneTables, emitter: Emitter) -> None:
+def _check_outlet(scene: SceneTables, emitter: EmitterTable) -> None:
     """The opening is inside, and fluid comes in through it; upstream of it the column may be outside.
 
     Along a periodic axis it may not: what is outside there comes in again on the other side.

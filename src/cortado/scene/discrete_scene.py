@@ -21,7 +21,7 @@ from cortado.discretise.region import Region
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
 from cortado.discretise.walls.layers import WallLayers, wall_layers
-from cortado.discretise.walls.weights import RestLattice, Surface
+from cortado.discretise.walls.weights import RestLattice, WallSurface
 from cortado.errors import CortadoWarning
 from cortado.scene.bodies import Surroundings
 from cortado.scene.fluids import PointsFluid
@@ -131,4 +131,4 @@ def _walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     positions, (lower, lengths) = np.concatenate(particles), period(scene)
     places = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
     region = scene.container.region(scene.dimension).opened(lengths)
-    return Walls(positions, Surface(positions, flat, lattice, region, lower, lengths).weights(places))
+    return Walls(positions, WallSurface(positions, flat, lattice, region, lower, lengths).weights(places))

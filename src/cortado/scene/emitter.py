@@ -9,7 +9,7 @@ from pydantic import field_validator
 
 from cortado.discretise.shapes import ROUND_OFF, Points, across, disc, disc_cells
 from cortado.scene.fields import GREATEST, Length, Vector, field_error, quantity
-from cortado.scene.fluids import Body
+from cortado.scene.fluids import FluidBody
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class EmitterSample:
     """Particles in a layer; m is a multiple of it."""
 
 
-class Emitter(Body):
+class EmitterTable(FluidBody):
     """An opening, a disc or in 2-D a line, out of which a column of fluid comes with one speed."""
 
     outlet: Vector[Length]

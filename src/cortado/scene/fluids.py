@@ -16,7 +16,7 @@ from cortado.scene.tables import Table
 INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
 
 
-class Body(Table):
+class FluidBody(Table):
     """Particles of one phase: a body of fluid, or what an emitter holds."""
 
     phase: Text
@@ -35,7 +35,7 @@ class Body(Table):
         """(n, d) [m]"""
 
 
-class Fluid(Body):
+class Fluid(FluidBody):
     """A body of fluid."""
 
     velocity: Vector[Annotated[float, quantity("m/s")]] = (0.0, 0.0, 0.0)

@@ -6,7 +6,7 @@ from cortado.scene.fields import quantity
 from cortado.scene.tables import Table
 
 
-class Mixture(Table):
+class MixtureTable(Table):
     """The Cahn-Hilliard equation that the mass fractions follow (Yang et al. 2015); the scene's phases, in order."""
 
     free_energy: Literal["double_well", "miscible"] = "double_well"

@@ -8,10 +8,10 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, ValidationInfo, create_model, field_validator
 
 from cortado.scene.containers import AnyContainer, NoContainer
-from cortado.scene.emitter import Emitter
+from cortado.scene.emitter import EmitterTable
 from cortado.scene.fields import Colour, Flag, Several, Text, Vector, count, field_error, quantity
 from cortado.scene.fluids import AnyFluid
-from cortado.scene.mixture import Mixture
+from cortado.scene.mixture import MixtureTable
 from cortado.scene.package_tables import AnyForces
 from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.picture import Picture
@@ -25,7 +25,7 @@ OTHER_TABLES = ("problem", "optimise")
 """Tables that a scene file may hold for other modules."""
 
 
-class Discretisation(Table):
+class DiscretisationTable(Table):
     """How the fluid is cut into particles."""
 
     spacing: Annotated[float, quantity("m", gt=0.0)]
@@ -82,17 +82,17 @@ class SceneTables(Table):
     """Shown in titles."""
     dimension: Annotated[int, count(2, 3)]
     """2 for a plane, 3 for space: d, the number of components of vectors."""
-    discretisation: Discretisation
+    discretisation: DiscretisationTable
     """How the fluid is cut into particles."""
     phase: Several[Phase]
     """The materials: in this order the components of mass fractions."""
     fluid: tuple[AnyFluid, ...] = ()
     """The bodies of fluid; particles come in this order. With an emitter there may be none."""
-    emitter: Emitter | None = None
+    emitter: EmitterTable | None = None
     """An emitter, out of which fluid comes; its particles come after those of all fluids."""
     container: AnyContainer = Field(default=NoContainer(), validate_default=True)
     """What holds the fluid."""
-    mixture: Mixture = Mixture()
+    mixture: MixtureTable = MixtureTable()
     """How phases mix; the default if there is only one."""
     forces: Forces = Field(default=Forces(), validate_default=True)
     """Which forces act."""

@@ -9,7 +9,7 @@ from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.errors import Words
 from cortado.scene.fields import FieldPath, field_error
-from cortado.scene.fluids import Body, Fluid, PointsFluid
+from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
 from cortado.scene.sentences import field_name, point_in_words
 
 NEAREST = 0.5
@@ -36,7 +36,7 @@ def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
         raise field_error(path, *_overlap("itself", points[np.argmin(distances)], spacing))
 
 
-def check_overlaps(placed: list[tuple[FieldPath, Body]], lengths: Points, spacing: float) -> None:
+def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, spacing: float) -> None:
     """Between different bodies, and between a body and the periodic images of all; ``lengths`` (d,) of a period [m]."""
     paths, bodies = zip(*placed, strict=True)
     lower, upper = np.swapaxes([body.extent(spacing) for body in bodies], 0, 1)
@@ -50,7 +50,7 @@ def check_overlaps(placed: list[tuple[FieldPath, Body]], lengths: Points, spacin
                 raise field_error(paths[second], *_overlap(field_name(paths[first]), place, spacing))
 
 
-def _meeting(first: Body, second: Body, shift: Points, spacing: float) -> Points | None:
+def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float) -> Points | None:
     """(d,) where a particle of one body is too near to those of the other, the second one shifted; None if nowhere."""
     from scipy.spatial import cKDTree
 

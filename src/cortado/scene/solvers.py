@@ -13,7 +13,7 @@ OWN = ("pcisph",)
 """The kinds that are Cortado's own."""
 
 
-class Solver(Table):
+class SolverTable(Table):
     """How a step is solved."""
 
     kind: str
@@ -22,7 +22,7 @@ class Solver(Table):
     """Length of a step [s]."""
 
 
-class PcisphSolver(Solver):
+class PcisphSolver(SolverTable):
     """How a step is solved by PCISPH."""
 
     kind: Literal["pcisph"] = "pcisph"
@@ -44,7 +44,7 @@ class PcisphSolver(Solver):
         return self
 
 
-class PackageSolver(Solver, PackageTable):
+class PackageSolver(SolverTable, PackageTable):
     """How a step is solved by a solver that an installed package registers."""
 
     group = "cortado.solvers"

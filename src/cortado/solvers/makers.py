@@ -9,7 +9,7 @@ from cortado.errors import InputError, shown
 from cortado.scene.discrete_scene import DiscreteScene
 from cortado.scene.parameters.known import Known
 from cortado.scene.scene import Scene
-from cortado.scene.solvers import Solver as SolverTable
+from cortado.scene.solvers import SolverTable
 from cortado.solvers.solver import Solver
 from cortado.sph.free_energy import FreeEnergy
 from cortado.sph.makers import ForceMaker, checked_parameters

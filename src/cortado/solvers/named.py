@@ -4,7 +4,7 @@ from importlib import import_module
 
 from cortado.scene.parameters.known import REGISTRY, Known
 from cortado.scene.scene import Scene
-from cortado.scene.solvers import PackageSolver, Solver
+from cortado.scene.solvers import PackageSolver, SolverTable
 from cortado.solvers.makers import SolverMaker, checked_solver
 from cortado.sph.makers import ForceMaker, checked_makers, known_of
 
@@ -12,7 +12,7 @@ MODULES = {"pcisph": "cortado.solvers.pcisph.build"}
 """By the kind of Cortado's own, the module whose ``maker`` takes the table."""
 
 
-def solver_named(table: Solver) -> SolverMaker:
+def solver_named(table: SolverTable) -> SolverMaker:
     """What builds the solver of a scene with this table."""
     if isinstance(table, PackageSolver):
         return checked_solver(table.make())

@@ -14,7 +14,7 @@ import warp as wp
 
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
-from cortado.sph.function_text import REAL, VECTOR, Differentiable, InPrecision, check_names, check_returns
+from cortado.sph.function_text import REAL, VECTOR, DerivativeCheck, InPrecision, check_names, check_returns
 
 _SENT: WeakKeyDictionary[FunctionType, str] = WeakKeyDictionary()
 """Texts of functions that came from other processes."""
@@ -84,7 +84,7 @@ def formula(
     tree = ast.Module([definition], [])
     helpers = _called(scope)
     for one in (tree, *(helper.adj.tree for helper in helpers)):
-        Differentiable(what).visit(one)
+        DerivativeCheck(what).visit(one)
     scopes = scope, *(_scope(helper.func) for helper in helpers)
     outside = (*(helper.adj.source for helper in helpers), *map(_values, scopes))
     local = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}

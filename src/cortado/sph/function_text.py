@@ -15,7 +15,7 @@ REAL, VECTOR = "cortado_real", "cortado_vector"
 _TYPES = {float: REAL, wp.float32: REAL, wp.float64: REAL, wp.vec3f: VECTOR, wp.vec3d: VECTOR}
 
 
-class Differentiable(ast.NodeVisitor):
+class DerivativeCheck(ast.NodeVisitor):
     """Refuses what Warp would differentiate wrongly without a word: loops that it does not unroll, and vectors that are
     changed in part."""
 

@@ -33,7 +33,7 @@ FIRST, MOST, ENOUGH = 4, 100, 0.5
 
 
 @dataclass(frozen=True)
-class Speed:
+class MeasuredSpeed:
     """How long the first steps of a scene take."""
 
     steps: int
@@ -42,7 +42,7 @@ class Speed:
     """Of one of them."""
 
     @classmethod
-    def measured(cls, simulation: Simulation) -> "Speed":
+    def measured(cls, simulation: Simulation) -> "MeasuredSpeed":
         """Raises `DivergedError` of a scene that does not even bear these steps."""
         steps = FIRST
         while True:
@@ -117,7 +117,7 @@ def _masses(simulation: Simulation) -> dict[str, float]:
 def _expected(simulation: Simulation, steps: int) -> dict[str, Any]:
     """How long so many steps will take; of a scene that does not bear the first ones, what happened."""
     try:
-        speed = Speed.measured(simulation)
+        speed = MeasuredSpeed.measured(simulation)
     except DivergedError as error:
         return {"diverged": str(error)}
     return {

@@ -22,7 +22,7 @@ Controls = Callable[[str], Any]
 """A control by its id; None where there is none."""
 
 
-class Camera(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", forbid_unknown_fields=True):
+class CameraMessage(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", forbid_unknown_fields=True):
     """Where the camera of a page is; viser calls a page connected from the first one on."""
 
     wxyz: tuple[Number, Number, Number, Number]
@@ -43,7 +43,7 @@ class Update(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", forbid_un
     updates: dict[str, Any]
 
 
-_decoder = msgspec.msgpack.Decoder(Camera | Update)
+_decoder = msgspec.msgpack.Decoder(CameraMessage | Update)
 _encoder = msgspec.msgpack.Encoder()
 
 
@@ -51,7 +51,7 @@ def judged(message: bytes | str, controls: Controls) -> bytes | None:
     """A message as viser may read it, written again so that both read the same; None for one to be left aside."""
     with suppress(msgspec.MsgspecError, RecursionError, TypeError):
         said = _decoder.decode(message)  # type: ignore[arg-type]  # a text is refused
-        if isinstance(said, Camera) or (said.updates.keys() == {"value"} and _can_be(said, controls)):
+        if isinstance(said, CameraMessage) or (said.updates.keys() == {"value"} and _can_be(said, controls)):
             return _encoder.encode(said)
     return None
 

@@ -61,7 +61,7 @@ class RestLattice:
 
 
 @dataclass(frozen=True)
-class Surface:
+class WallSurface:
     """The walls of a container, whose weights are sought."""
 
     walls: Points

@@ -26,7 +26,7 @@ OF_PRESSURE = {"pressure", "wall_force"}
 """Quantities that need the step after the state to be solved; others need its neighbours alone."""
 
 
-class Evaluator:
+class QuantityEvaluator:
     """Computes quantities of states, their tangents and adjoints, in the arrays of one solver, which no run may use
     meanwhile. What it is given and returns is in the scene's order, of a batch with a first axis for the scenes."""
 

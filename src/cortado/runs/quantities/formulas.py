@@ -78,7 +78,7 @@ class Sums:
         return wp.array(values, dtype=self._solver.discretisation.precision.vector, device=self._solver.device)
 
 
-class Formula(Protocol):
+class QuantityFormula(Protocol):
     """A quantity of the sorted particles of a step."""
 
     def value(self, at: Particles, sums: Sums) -> NDArray:
@@ -118,7 +118,7 @@ class Pressure:
         bar.p[:] += own
 
 
-class Speed:
+class SpeedQuantity:
     """|v_i|; of a particle at rest, where it has a kink, the derivative is taken as 0."""
 
     def value(self, at: Particles, sums: Sums) -> NDArray:
@@ -165,7 +165,7 @@ class Vorticity:
 
 
 @dataclass(frozen=True)
-class WallForce:
+class WallForceQuantity:
     """V^2 p_i / n_i^2 g_i: see `cortado.sph.wall_slope`."""
 
     volume: float
@@ -190,12 +190,12 @@ class WallForce:
         return self.volume**2 * at.p / at["n"] ** 2
 
 
-def formulas(solver: ParticleSolver, dimension: int, circulation_factor: float) -> dict[str, Formula]:
+def formulas(solver: ParticleSolver, dimension: int, circulation_factor: float) -> dict[str, QuantityFormula]:
     """Those of a solver's particles, by their names."""
     return {
         "density": Density(),
         "pressure": Pressure(),
-        "speed": Speed(),
+        "speed": SpeedQuantity(),
         "vorticity": Vorticity(circulation_factor, dimension),
-        "wall_force": WallForce(solver.lattice.volume, dimension),
+        "wall_force": WallForceQuantity(solver.lattice.volume, dimension),
     }

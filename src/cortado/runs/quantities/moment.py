@@ -14,7 +14,7 @@ from cortado.scene.parameters.values import Arrays
 
 
 class Evaluates(Protocol):
-    """What computes quantities: see `cortado.runs.quantities.evaluator.Evaluator`."""
+    """What computes quantities: see `cortado.runs.quantities.evaluator.QuantityEvaluator`."""
 
     lattice: Lattice
 
