@@ -1,4 +1,7 @@
-"""A command line that cannot be understood, in one sentence instead of the box that tyro draws around several."""
+"""A command line that cannot be understood, in one sentence instead of the box that tyro draws around several.
+
+Where tyro's words are none of those below, such as those of another release, they come as they are.
+"""
 
 import re
 from collections.abc import Callable, Sequence

@@ -5,11 +5,12 @@ a report reads back, and in a renderer nodes, pixels and samples. The bytes of e
 of about 1.5. Checkpoints are not counted, as a rollout keeps no more of them than there is room for.
 """
 
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from cortado.errors import InputError
 
@@ -102,12 +103,7 @@ def available(device: Any = None) -> float:
 
 
 def _of_machine() -> float:
-    with suppress(OSError, ValueError, IndexError):
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
-    with suppress(OSError, ValueError, AttributeError):
-        return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
-    return float("inf")
+    return float(psutil.virtual_memory().available)
 
 
 def _of_container() -> float:
@@ -127,7 +123,7 @@ def _of_process() -> float:
 
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit != resource.RLIM_INFINITY:
-            return float(limit - int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize())
+            return float(limit - psutil.Process().memory_info().vms)
     return float("inf")
 
 

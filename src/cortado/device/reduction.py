@@ -2,6 +2,7 @@
 
 Each scene of a batch has ``count`` values, one scene behind the other, which come down to ``stride`` partial ones. On a
 CPU each of these is the work of one thread, on a GPU of a block of threads, which add up in a tree in shared memory.
+`wp.tile_sum` adds up in another order, so with other bits, and has no sum and maximum of pairs in one pass.
 """
 
 from dataclasses import dataclass

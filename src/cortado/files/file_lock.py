@@ -1,4 +1,7 @@
-"""The lock of an open file, which the system takes from a process that dies."""
+"""The lock of an open file, which the system takes from a process that dies.
+
+The package filelock does not tell who has a lock, which `cortado.files.folder_lock` reads in the file.
+"""
 
 import os
 import sys

@@ -2,7 +2,8 @@
 
 An optimiser is deterministic: given the losses and gradients of a former run, it takes the same steps. The replay log
 keeps every evaluation of the loss and its gradient, and so it is a complete checkpoint of any optimiser: a run is
-resumed by replaying the optimiser against the log.
+resumed by replaying the optimiser against the log. It is a file that only grows, as a database of sqlite3 needs locks,
+which file systems of clusters may lack.
 """
 
 import json

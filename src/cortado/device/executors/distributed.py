@@ -1,4 +1,7 @@
-"""Workers of Dask's distributed, on this machine or on others."""
+"""Workers of Dask's distributed, on this machine or on others.
+
+Its own executor, `Client.get_executor`, takes all items at once, and waits for ever where no worker is left.
+"""
 
 import asyncio
 import queue
