@@ -3,13 +3,13 @@
 FROM python:3.12-slim AS wheel
 RUN apt-get update && apt-get install --yes --no-install-recommends g++ && rm -rf /var/lib/apt/lists/*
 COPY . /source
-RUN CORTADO_REQUIRE_ENGINE=1 pip wheel --no-cache-dir --no-deps --wheel-dir /wheels /source
+RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels /source /source/reference
 
 FROM python:3.12-slim AS cpu
 # The reference engine needs libgomp and libquadmath.
 RUN apt-get update && apt-get install --yes --no-install-recommends libgomp1 libquadmath0 && rm -rf /var/lib/apt/lists/*
 COPY --from=wheel /wheels /wheels
-RUN pip install --no-cache-dir "$(echo /wheels/*.whl)[video]" && rm -rf /wheels
+RUN pip install --no-cache-dir "$(echo /wheels/cortado_sph-*.whl)[video]" /wheels/cortado_reference-*.whl && rm -rf /wheels
 WORKDIR /work
 ENTRYPOINT ["cortado"]
 

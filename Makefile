@@ -3,73 +3,17 @@
 # make docs: build the site, build/docs/index.html; make docs-links: ask whether what it links to elsewhere is there;
 # make docs-browser: look at every page of it with Chromium;
 # make sanitize: check the C++ engine with sanitizers; make fuzz: an hour of hostile input, MINUTES=10 for a part of it.
+# All of it is in tasks.py, which runs without make too: python -m tasks test.
 PYTHON ?= python3
-VENV := .venv
-BIN := $(VENV)/bin
+TASKS := setup demo test lint types tests unit validation slow docs docs-links docs-browser sanitize
 
-.PHONY: setup demo test lint types tests unit validation slow docs docs-links docs-browser sanitize fuzz clean
+.PHONY: $(TASKS) fuzz clean
 
-setup: $(VENV)/.ready
+$(TASKS):
+	@$(PYTHON) -m tasks $@
 
-$(VENV)/.ready: pyproject.toml $(shell find cpp -type f)
-	@echo 'Installing Cortado and what its tests need in $(VENV), once: some minutes.'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
-	@$(BIN)/python -c 'import cortado.reference._engine' 2>/dev/null || \
-		echo 'Installed without the reference engine (C++): CONTRIBUTING.md says how to see why.'
-	touch $@
-
-$(VENV)/.demo: pyproject.toml $(shell find cpp -type f)
-	@test -e $(VENV)/.ready || echo 'Installing Cortado, its pictures and its viewer in $(VENV), once: a minute or two.'
-	@test -e $(VENV)/.ready || $(PYTHON) -m venv $(VENV)
-	@test -e $(VENV)/.ready || $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[pictures,view]'
-	touch $@
-
-demo: $(VENV)/.demo
-	$(BIN)/cortado optimise examples/latte_art_small.toml --out runs/demo --overwrite
-
-test: lint types tests
-
-lint: setup
-	$(BIN)/ruff check .
-
-types: setup
-	$(BIN)/mypy
-
-tests: setup
-	$(BIN)/pytest
-
-unit: setup
-	$(BIN)/pytest -m 'not slow and not validation'
-
-validation: setup
-	$(BIN)/pytest -m validation
-
-slow: setup
-	$(BIN)/pytest -m slow
-
-$(VENV)/.docs: $(VENV)/.ready
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
-	touch $@
-
-docs: $(VENV)/.docs
-	$(BIN)/sphinx-build --fresh-env --write-all --fail-on-warning --keep-going --quiet docs build/docs
-	@echo 'build/docs/index.html'
-
-docs-links: $(VENV)/.docs
-	$(BIN)/sphinx-build --builder linkcheck --quiet docs build/docs-links
-
-docs-browser: docs
-	$(BIN)/python docs/site/look.py build/docs
-
-sanitize: setup
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check cmeel-eigen
-	cmake -S cpp -B build/sanitize -DCORTADO_SANITIZE=ON -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python
-	cmake --build build/sanitize --parallel
-	build/sanitize/check_engine
-
-fuzz: setup
-	$(BIN)/python -m fuzz $(if $(MINUTES),--minutes $(MINUTES)) $(ARGS)
+fuzz:
+	@$(PYTHON) -m tasks fuzz $(if $(MINUTES),--minutes $(MINUTES)) $(ARGS)
 
 clean:
-	rm -rf $(VENV) runs build dist
+	rm -rf .venv runs build dist

@@ -1,8 +1,9 @@
-"""What ``make`` does, for machines without it, such as Windows: ``python -m tasks test``.
+"""What ``make`` does: ``python -m tasks test`` is the same where there is no make, such as on Windows.
 
-``make sanitize`` needs GCC or Clang, and ``make clean`` removes folders; they have no part in it.
+``sanitize`` needs GCC or Clang, and CMake.
 """
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,9 +15,12 @@ STAMPS = {"test": VENV / ".ready", "pictures,view": VENV / ".demo", "docs": VENV
 BIN = VENV / ("Scripts" if sys.platform == "win32" else "bin")
 INSTALL = ("python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--editable")
 DOCS = "--fresh-env --write-all --fail-on-warning --keep-going"
+ENGINE = (*INSTALL, "./reference")
+"""Needs a C++ compiler."""
 COMMANDS: dict[str, tuple[str, ...]] = {
     "demo": ("cortado", "optimise", "examples/latte_art_small.toml", "--out", "runs/demo", "--overwrite"),
     "lint": ("ruff", "check", "."),
+    "format": ("ruff", "format", "--check", "."),
     "types": ("mypy",),
     "tests": ("pytest",),
     "unit": ("pytest", "-m", "not slow and not validation"),
@@ -27,15 +31,15 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "docs-links": ("sphinx-build", "--builder", "linkcheck", "--quiet", "docs", "build/docs-links"),
     "docs-browser": ("python", "docs/site/look.py", "build/docs"),
 }
-"""By name, as the Makefile has them."""
 SEVERAL = {
     "setup": (),
-    "test": ("lint", "types", "tests"),
+    "test": ("lint", "format", "types", "tests"),
     **{name: (name,) for name in COMMANDS},
     "docs-browser": ("docs", "docs-browser"),
 }
 EXTRAS = {"demo": ("pictures,view",), **{name: ("test", "docs") for name in COMMANDS if name.startswith("docs")}}
 """What a task needs; all others need what tests do."""
+SANITIZED = "build/sanitize"
 MADE = {"docs": "build/docs/index.html"}
 """What a task says at its end."""
 
@@ -43,11 +47,13 @@ MADE = {"docs": "build/docs/index.html"}
 def main(arguments: list[str]) -> int:
     """Runs a task, with what else is given as options of its last command."""
     name, *options = arguments or [""]
-    if name not in SEVERAL:
-        print(f"python -m tasks TASK, one of: {', '.join(SEVERAL)}", file=sys.stderr)
+    if name not in SEVERAL and name != "sanitize":
+        print(f"python -m tasks TASK, one of: {', '.join((*SEVERAL, 'sanitize'))}", file=sys.stderr)
         return 2
     for extra in EXTRAS.get(name, ("test",)):
         set_up(extra)
+    if name == "sanitize":
+        return sanitize()
     for part in SEVERAL[name]:
         code = run((*COMMANDS[part], *(options if part == SEVERAL[name][-1] else ())))
         if code:
@@ -60,7 +66,8 @@ def main(arguments: list[str]) -> int:
 def set_up(extra: str) -> None:
     """Make the virtual environment, and install Cortado in it with what extras have, unless nothing has changed since
     that, or since all that tests need was installed, which is more than a demo does."""
-    sources = [ROOT / "pyproject.toml", *(path for path in (ROOT / "cpp").rglob("*") if path.is_file())]
+    build = ROOT / "reference" / "pyproject.toml", *(ROOT / "reference" / "cpp").rglob("*")
+    sources = [ROOT / "pyproject.toml", *(path for path in build if path.is_file() and extra == "test")]
     changed, stamp = max(path.stat().st_mtime for path in sources), STAMPS[extra]
     enough = {stamp} if extra == "docs" else {stamp, STAMPS["test"]}
     if any(done.exists() and done.stat().st_mtime >= changed for done in enough):
@@ -70,14 +77,40 @@ def set_up(extra: str) -> None:
         subprocess.run([sys.executable, "-m", "venv", str(VENV)], check=True)
     if run((*INSTALL, f".[{extra}]")):
         sys.exit(1)
-    if run(("python", "-c", "import cortado.reference._engine")):
+    if extra == "test" and not engine_built():
         print("Installed without the reference engine (C++): CONTRIBUTING.md says how to see why.", file=sys.stderr)
     stamp.touch()
 
 
-def run(command: tuple[str, ...]) -> int:
+def engine_built() -> bool:
+    """Compile the reference engine and install it; ends where it has to be there and cannot."""
+    required = os.environ.get("CORTADO_REQUIRE_ENGINE", "") not in ("", "0")
+    if run(ENGINE, quiet=not required) == 0:
+        return True
+    if required:
+        sys.exit(1)
+    return False
+
+
+def sanitize() -> int:
+    """Build and run the engine's own check with the sanitizers of the compiler."""
+    python = BIN / "python"
+    for command in (
+        (str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "cmeel-eigen"),
+        ("cmake", "-S", "reference/cpp", "-B", SANITIZED, "-DCORTADO_SANITIZE=ON", f"-DPython_EXECUTABLE={python}"),
+        ("cmake", "--build", SANITIZED, "--parallel"),
+        (f"{SANITIZED}/check_engine",),
+    ):
+        code = subprocess.run(command, cwd=ROOT).returncode
+        if code:
+            return code
+    return 0
+
+
+def run(command: tuple[str, ...], quiet: bool = False) -> int:
     """Its exit code; the program is that of the virtual environment."""
-    return subprocess.run([str(BIN / command[0]), *command[1:]], cwd=ROOT).returncode
+    out = subprocess.DEVNULL if quiet else None
+    return subprocess.run([str(BIN / command[0]), *command[1:]], cwd=ROOT, stdout=out, stderr=out).returncode
 
 
 if __name__ == "__main__":

@@ -19,9 +19,9 @@ import numpy as np
 import warp as wp
 
 import cortado
+from benchmarks.bench.scene import dam_break
+from benchmarks.bench.timing import median_seconds
 from cortado import Simulation
-from cortado.bench.scene import dam_break
-from cortado.bench.timing import median_seconds
 from cortado.device.lanes import lane_functions
 from cortado.particles.by_hand import BY_HAND, ByHand
 from cortado.particles.made_derivatives import made_adjoint, made_tangent

@@ -199,7 +199,7 @@ def main() -> None:
                     for state in ("cold", "warm")[: 2 if given.warm else 1]:
                         run = measured(name, words, folder, sources)
                         found.setdefault(f"{name}, {version}, {state}", []).append(run)
-    from cortado.bench.environment import environment
+    from benchmarks.bench.environment import environment
 
     around = environment()
     settings = {"device": given.device, "precision": given.precision, "rounds": given.rounds}

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from programs import PEERS
 
+from benchmarks.bench.scene import dam_break
 from cortado import Simulation
-from cortado.bench.scene import dam_break
 from cortado.scene.containers import NoContainer
 
 

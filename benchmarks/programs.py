@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cortado.bench.environment import OtherProcesses
+from benchmarks.bench.environment import OtherProcesses
 
 PEERS = Path(__file__).parent / "peers"
 
@@ -65,8 +65,8 @@ def last_json(command: Sequence[str], timeout: float, environment: dict[str, str
 
 
 def cortado(device: str, precision: str) -> Program:
-    """``cortado bench``."""
-    words = ("-m", "cortado", "bench", "--device", device, "--precision", precision)
+    """``python -m benchmarks bench``."""
+    words = ("-m", "benchmarks", "bench", "--device", device, "--precision", precision)
     return Program("Cortado", sys.executable, words, "cortado")
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from programs import Program, ProgramError, cortado, peers
 
-from cortado.bench.environment import OtherProcesses
+from benchmarks.bench.environment import OtherProcesses
 
 QUIET, LOOK = 0.2, 3.0
 """Cores that others keep busy at most on a quiet machine, and the seconds for which they are watched."""
@@ -78,7 +78,7 @@ def wait_for_quiet(patience: float) -> None:
 
 
 def flat(found: Row) -> Row:
-    """What `cortado bench` says of its only size, with what it says of the machine; what a peer says, as it is."""
+    """What `python -m benchmarks bench` says of its only size and of the machine; what a peer says, as it is."""
     if "sizes" not in found:
         return found
     machine = {name: value for name, value in found.items() if name != "sizes"}

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from cortado.runs.trajectory import Trajectory
-from cortado.study.experiment_files import load_experiment
+from experiments.experiment_files import load_experiment
 from fuzz import bases
 from fuzz.answers import run_complaints, same_frames, search_complaints
 from fuzz.cases import Case

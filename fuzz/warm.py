@@ -14,7 +14,7 @@ MODULES = (
     "cortado.cli",
     "cortado.cli.commands.optimise",
     "cortado.cli.commands.run",
-    "cortado.study.experiment_files",
+    "experiments.experiment_files",
 )
 
 

@@ -5,11 +5,23 @@ where a core was shared by about three processes; a few are left in the unit tie
 """
 
 import math
+import shutil
+from importlib.util import find_spec
 
 import pytest
 
 from compiling_notice import without_compiling
 from cortado.cli import main
+from cortado.cli.subcommands import CORTADO
+
+WITHOUT_ENGINE = find_spec("cortado_reference") is None and shutil.which("c++") is None
+collect_ignore = ["test_reference.py", "test_study.py", "test_study_figures.py", "test_study_growth.py"]
+collect_ignore = collect_ignore if WITHOUT_ENGINE else []
+
+
+def pytest_report_header():
+    return "There is no C++ compiler: nothing of the reference engine is tested." if WITHOUT_ENGINE else None
+
 
 VALIDATION = {
     "test_containment",
@@ -202,10 +214,10 @@ def cortado_command(capfd, monkeypatch):
     progress, however slow the machine is."""
     monkeypatch.setattr("cortado.files.progress.LINE_INTERVAL", math.inf)
 
-    def run(*arguments):
+    def run(*arguments, program=CORTADO):
         capfd.readouterr()
         try:
-            main([str(argument) for argument in arguments])
+            main([str(argument) for argument in arguments], program)
             code = 0
         except SystemExit as end:
             code = end.code or 0

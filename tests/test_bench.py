@@ -1,23 +1,25 @@
-"""`cortado bench` and what it is made of: what it says adds up. How fast Cortado is, it says on the day."""
+"""`python -m benchmarks bench` and what it is made of: its numbers add up."""
 
 import json
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.__main__ import BENCH
+from benchmarks.bench.dam_break import measure_dam_break, with_floors
+from benchmarks.bench.environment import OtherProcesses
+from benchmarks.bench.floor import copy_bandwidth, least_bytes, sums_over_neighbours
+from benchmarks.bench.passes import AGAIN, PassTimer
+from benchmarks.bench.run import bench_dam_break
+from benchmarks.bench.scene import ITERATIONS, dam_break
+from benchmarks.bench.text import as_text
+from benchmarks.bench.timing import LaunchTimer, median_seconds
 from cortado import Simulation
-from cortado.bench.dam_break import measure_dam_break, with_floors
-from cortado.bench.environment import OtherProcesses
-from cortado.bench.floor import copy_bandwidth, least_bytes, sums_over_neighbours
-from cortado.bench.memory import ESTIMATED
-from cortado.bench.passes import AGAIN, PassTimer
-from cortado.bench.scene import ITERATIONS, dam_break
-from cortado.bench.text import as_text
-from cortado.bench.timing import LaunchTimer, median_seconds
-from cortado.cli.commands.bench import bench_dam_break
+from cortado.cli.commands.memory_use import ESTIMATED
 from cortado.device.launching import KernelLauncher, watched
 
 STEP = [
@@ -176,3 +178,38 @@ def test_the_bandwidth_is_that_of_memory():
 def test_float64_moves_more_bytes():
     single, double = (with_floors(measure_dam_break(8, 1, "cpu", p, 1), 1e9) for p in ("float32", "float64"))
     assert single["step"]["floor_ms"] < double["step"]["floor_ms"]
+
+
+@pytest.fixture
+def benchmarks_command(cortado_command):
+    return partial(cortado_command, program=BENCH)
+
+
+def test_bench_speaks_json_and_words(benchmarks_command):
+    code, out, err = benchmarks_command("bench", "--particles", 8, 100, "--steps", 2, "--repeats", 5, "--json")
+    found = json.loads(out)
+    assert (code, err) == (0, "") and [row["particles"] for row in found["sizes"]] == [8, 125]
+    assert all(row["steps"] == 2 and row["gradient"]["ms"] > 0.0 < row["rollout"]["ms"] for row in found["sizes"])
+    code, out, _ = benchmarks_command("bench", "--particles", 100, "--steps", 2, "--repeats", 1)
+    assert code == 0 and "125 particles" in out and "\npressure force adjoint" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["bench", "--engine", "steam"], "--engine is 'steam', but must be one of 'warp', 'reference'"),
+        (["bench", "--particles", "-5"], "--particles is -5"),
+        (["bench", "--particles", "8", "--steps", "0"], "steps is 0"),
+        (["bench", "--particles", "8", "0"], "--particles is 0"),
+        (["bench", "--particles"], "--particles"),
+        (["bench", "--particles", "8", "--repeats", "0"], "--repeats is 0"),
+        (["bench", "--particles", "8", "--repeats", "1e12"], "--repeats"),
+        (["bench", "--particles", "8", "--repeats", "1000000000000"], "but must be at most 100,000"),
+        (["bench", "--engine", "reference", "--repeats", "10000000"], "but must be at most 100,000"),
+        (["bench", "--particles", "8", "--device", "tpu"], "device is 'tpu'"),
+        (["bench", "--particles", "8", "--precision", "float16"], "precision is 'float16'"),
+    ],
+)
+def test_wrong_arguments_are_refused(benchmarks_command, arguments, words):
+    code, out, err = benchmarks_command(*arguments)
+    assert (code, out) == (2, "") and words in err and err.count("\n") == 1

@@ -240,7 +240,9 @@ def test_wrong_arguments_of_run_are_refused(cortado_command, folder, arguments, 
         (["rnu", "scene.toml"], "rnu is unknown; run may be meant"),
         (["run", "scene"], "scene: the scene cannot be read: No such file or directory; did you mean scene.toml?"),
         (["run"], "SCENE.toml is missing; see cortado run --help."),
-        (["gradients"], "a command is missing, one of check, figure, study; see cortado gradients --help."),
+        (["gradients"], "a command is missing, one of check; see cortado gradients --help."),
+        (["bench"], "cortado bench is now python -m benchmarks bench, in a clone of the repository."),
+        (["gradients", "study", "--reduced"], "cortado gradients study is now python -m experiments study"),
         (["run", "scene.toml", "--steps", "many"], "--steps is 'many', but must be a whole number; see cortado run "),
         (["run", "scene.toml", "--steps"], "--steps is given without a value"),
         (["run", "scene.toml", "--stesp", "3"], "--stesp is unknown; --steps may be meant"),
@@ -248,7 +250,6 @@ def test_wrong_arguments_of_run_are_refused(cortado_command, folder, arguments, 
         (["run", "scene.toml", "other.toml"], "other.toml is unknown, or one too many"),
         (["run", "scene.toml", "--seed", "3"], "--seed is no option here; see cortado run --help."),
         (["gradients", "check", "scene.toml", "--perturbation", "x"], "--perturbation is 'x', but must be a number"),
-        (["bench", "--engine", "steam"], "--engine is 'steam', but must be one of 'warp', 'reference'"),
         (["run", "scene.toml", "--set", "name=\udcff"], "must be text in UTF-8"),
     ],
 )
@@ -257,9 +258,7 @@ def test_wrong_usage_is_refused(cortado_command, folder, arguments, words):
     assert_nothing_made(folder)
 
 
-@pytest.mark.parametrize(
-    "command", [[], ["run"], ["optimise"], ["gradients"], ["gradients", "check"], ["bench"], ["sweep"]]
-)
+@pytest.mark.parametrize("command", [[], ["run"], ["optimise"], ["gradients"], ["gradients", "check"], ["sweep"]])
 def test_every_command_has_help(cortado_command, command):
     code, out, err = cortado_command(*command, "--help")
     assert (code, err) == (0, "") and out.startswith(" ".join(["usage: cortado", *command]))
@@ -785,15 +784,6 @@ def test_a_planted_error_fails_the_check(cortado_command, monkeypatch, json_opti
     assert json.loads(out)["right"] is False if json_option else out.count("WRONG") == 2
 
 
-def test_bench_speaks_json_and_words(cortado_command):
-    code, out, err = cortado_command("bench", "--particles", 8, 100, "--steps", 2, "--repeats", 5, "--json")
-    found = json.loads(out)
-    assert (code, err) == (0, "") and [row["particles"] for row in found["sizes"]] == [8, 125]
-    assert all(row["steps"] == 2 and row["gradient"]["ms"] > 0.0 < row["rollout"]["ms"] for row in found["sizes"])
-    code, out, _ = cortado_command("bench", "--particles", 100, "--steps", 2, "--repeats", 1)
-    assert code == 0 and "125 particles" in out and "\npressure force adjoint" in out
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -804,16 +794,6 @@ def test_bench_speaks_json_and_words(cortado_command):
         (["gradients", "check", "scene.toml", "--perturbation", "-1"], "perturbation is -1.0, but must be greater"),
         (["gradients", "check", "scene.toml", "--out", "scene.toml"], "The folder scene.toml cannot be made"),
         (["gradients", "check", "absent.toml"], "cannot be read"),
-        (["bench", "--particles", "-5"], "--particles is -5"),
-        (["bench", "--particles", "8", "--steps", "0"], "steps is 0"),
-        (["bench", "--particles", "8", "0"], "--particles is 0"),
-        (["bench", "--particles"], "--particles"),
-        (["bench", "--particles", "8", "--repeats", "0"], "--repeats is 0"),
-        (["bench", "--particles", "8", "--repeats", "1e12"], "--repeats"),
-        (["bench", "--particles", "8", "--repeats", "1000000000000"], "but must be at most 100,000"),
-        (["bench", "--engine", "reference", "--repeats", "10000000"], "but must be at most 100,000"),
-        (["bench", "--particles", "8", "--device", "tpu"], "device is 'tpu'"),
-        (["bench", "--particles", "8", "--precision", "float16"], "precision is 'float16'"),
     ],
 )
 def test_other_wrong_arguments_are_refused(cortado_command, folder, arguments, words):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.bench.scene import dam_break
 from cortado import CortadoWarning, DivergedError, InputError, Problem, Scene, Simulation, Trajectory, losses
-from cortado.bench.scene import dam_break
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import precision_named
 from cortado.discretise.region import Region
@@ -24,7 +24,7 @@ SUPPORTS = {"cubic_spline": 2.0, "wendland_c2": 2.6, "wendland_c4": 3.0}
 
 
 def box(particles: int = 1000, kernel: str = "cubic_spline") -> Scene:
-    """The dam break of `cortado bench`."""
+    """The dam break of `python -m benchmarks bench`."""
     return _with_kernel(dam_break(particles).model_dump(mode="json"), kernel)
 
 

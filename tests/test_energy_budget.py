@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from cortado import Simulation, reference
+from cortado import Simulation
 from cortado.particles.arrays import to_device
 from cortado.particles.neighbourhood import neighbourhood_type
 from scenes import plane, plane_of_three, scene, two_layers
@@ -121,10 +121,10 @@ def test_the_work_of_pressure_is_that_of_compression(make, kernel, precision):
     assert step.gap(forces - inner_forces, compressions - inner_compressions) < ROUND_OFF[precision]
 
 
-@pytest.mark.skipif(not reference.available(), reason="the reference engine is not built")
 @pytest.mark.parametrize("make", [scene, plane])
 @kernels
 def test_so_it_is_in_the_reference_engine(make, kernel):
+    reference = pytest.importorskip("cortado.reference", exc_type=ImportError)
     """A step of the reference engine against pressures and compressions of the Warp engine."""
     step = step_of(make, kernel, "float64")
     history = reference.Simulation(step.simulation.scene).run(1, step.point)

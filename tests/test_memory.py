@@ -18,7 +18,7 @@ import sys
 import numpy as np
 from cortado import Problem, Simulation, losses
 from cortado.device import memory
-from cortado.bench.scene import dam_break
+from benchmarks.bench.scene import dam_break
 
 def run(particles):
     simulation = Simulation(dam_break(particles), precision=sys.argv[1])

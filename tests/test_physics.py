@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from benchmarks.bench.scene import dam_break
 from cortado import DivergedError, Problem, Scene, Simulation, losses
-from cortado.bench.scene import dam_break
 from cortado.device import launching
 from cortado.errors import CortadoWarning
 from scenes import plane, scene, splash

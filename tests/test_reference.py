@@ -1,22 +1,20 @@
 """The reference engine: the Warp engine's numbers from independent code, and derivatives that agree."""
 
 import json
-import shutil
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 
+import cortado
+import cortado_reference
 import reference as twins
+from benchmarks.bench.run import bench_reference
 from cortado import DivergedError, InputError, Problem, Simulation, losses, reference
-from cortado.cli.commands.bench import bench_reference
 from cortado.reference import Digits, Terms
 from scenes import plane, scene, splash, two_layers
 
-pytestmark = pytest.mark.skipif(
-    not reference.available() and shutil.which("c++") is None, reason="there is no C++ compiler here"
-)
 WALLS = {"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"}
 SCENES = {
     "splash": splash(),
@@ -367,16 +365,19 @@ def test_a_lost_particle_is_named():
         reference.Simulation(splash()).run(5, down)
 
 
-def test_without_the_extension_module_there_is_one_sentence():
+def test_where_it_is_not_installed_there_is_one_sentence():
     program = (
-        "import sys; sys.modules['cortado.reference._engine'] = None\n"
-        "from cortado import reference\n"
-        "assert not reference.available()\n"
-        "try: reference.precisions()\n"
-        "except reference.EngineMissingError as error: print(error)"
+        "import sys; sys.modules['cortado_reference'] = None\n"
+        "import cortado\n"
+        "try: cortado.reference\n"
+        "except (cortado.CortadoError, ImportError) as error: print(error)"
     )
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert "install a C++17 compiler" in found and found.count("\n") == 1
+    assert "pip install cortado-reference" in found and found.count("\n") == 1
+
+
+def test_both_distributions_have_one_version():
+    assert cortado_reference.__version__ == cortado.__version__
 
 
 def test_bench_times_it():

@@ -15,6 +15,7 @@ import tasks
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+ENGINE = tomllib.loads((ROOT / "reference/pyproject.toml").read_text("utf-8"))
 
 
 def test_the_version_stands_in_one_place():
@@ -25,23 +26,21 @@ def test_the_version_stands_in_one_place():
 
 def test_wheels_are_for_the_pythons_that_are_promised():
     promised = {line.rpartition(" ")[2] for line in PROJECT["project"]["classifiers"] if ":: 3." in line}
-    built = {f"3.{one[3:-2]}" for one in PROJECT["tool"]["cibuildwheel"]["build"].split()}
+    built = {f"3.{one[3:-2]}" for one in ENGINE["tool"]["cibuildwheel"]["build"].split()}
     assert built == promised == {"3.11", "3.12", "3.13", "3.14"}
-    assert PROJECT["project"]["requires-python"] == ">=3.11"
+    assert PROJECT["project"]["requires-python"] == ENGINE["project"]["requires-python"] == ">=3.11"
 
 
 def test_only_an_editable_install_is_for_its_own_processor():
-    build = PROJECT["tool"]["scikit-build"]
+    build = ENGINE["tool"]["scikit-build"]
     assert build["cmake"]["define"]["CORTADO_NATIVE"] == "OFF"
     states = [one["if"] for one in build["overrides"] if "CORTADO_NATIVE" in one.get("cmake", {}).get("define", {})]
     assert states == [{"state": "editable"}]
 
 
 def test_the_examples_go_into_the_wheel():
-    assert PROJECT["tool"]["scikit-build"]["wheel"]["packages"] == {
-        "cortado": "src/cortado",
-        "cortado/examples": "examples",
-    }
+    wheel = PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert wheel == {"packages": ["src/cortado"], "force-include": {"examples": "cortado/examples"}}
 
 
 def test_what_was_tested_is_pinned():
@@ -55,27 +54,18 @@ def test_what_was_tested_is_pinned():
 # ---- python -m tasks ---------------------------------------------------------------------------------------------
 
 
-def test_tasks_are_those_of_make():
+def test_make_has_all_tasks():
     makefile = (ROOT / "Makefile").read_text("utf-8")
-    recipes = dict(re.findall(r"^([\w-]+): (?:setup|docs|\$\(VENV\)/\.\w+)\n\t\$\(BIN\)/(.*)$", makefile, re.MULTILINE))
-    recipes["fuzz"] = recipes["fuzz"].partition(" $(if")[0]
-    recipes.pop("sanitize")  # takes GCC or Clang
-    assert recipes == {
-        name: " ".join(f"'{word}'" if " " in word else word for word in words) for name, words in tasks.COMMANDS.items()
-    }
-    (test,) = re.findall(r"^test: (.*)$", makefile, re.MULTILINE)
-    assert tuple(test.split()) == tasks.SEVERAL["test"]
+    (names,) = re.findall(r"^TASKS := (.*)$", makefile, re.MULTILINE)
+    assert {*names.split(), "fuzz", "format"} == {*tasks.SEVERAL, "sanitize"}
     assert {name for name, parts in tasks.SEVERAL.items() if "docs" in parts} == {"docs", "docs-browser"}
-    targets = set(re.search(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)[1].split())
-    assert targets - tasks.SEVERAL.keys() == {"sanitize", "clean"}
-    assert all(f"{' '.join(tasks.INSTALL)} '.[{extra}]'" in makefile for extra in tasks.STAMPS)
 
 
 def test_a_task_ends_with_the_first_failure(monkeypatch):
     ran = []
     monkeypatch.setattr(tasks, "set_up", lambda extra: None)
     monkeypatch.setattr(tasks, "run", lambda command: ran.append(command[0]) or (3 if command[0] == "mypy" else 0))
-    assert tasks.main(["test"]) == 3 and ran == ["ruff", "mypy"]
+    assert tasks.main(["test"]) == 3 and ran == ["ruff", "ruff", "mypy"]
     assert tasks.main(["lint", "--fix"]) == 0
 
 
@@ -93,20 +83,40 @@ def test_an_unknown_task_is_told(arguments):
     assert (done.returncode, done.stdout) == (2, "") and "one of: setup, test, demo, lint" in done.stderr
 
 
-@pytest.mark.parametrize("newer", ["pyproject.toml", "cpp/CMakeLists.txt"])
+@pytest.mark.parametrize("newer", ["pyproject.toml", "reference/pyproject.toml", "reference/cpp/CMakeLists.txt"])
 def test_what_changed_is_installed_again(tmp_path, monkeypatch, newer):
-    (tmp_path / "cpp").mkdir()
-    for name in ("pyproject.toml", "cpp/CMakeLists.txt"):
+    (tmp_path / "reference/cpp").mkdir(parents=True)
+    for name in ("pyproject.toml", "reference/pyproject.toml", "reference/cpp/CMakeLists.txt"):
         (tmp_path / name).touch()
     ready, ran = tmp_path / "ready", []
     monkeypatch.setattr(tasks, "ROOT", tmp_path)
     monkeypatch.setattr(tasks, "STAMPS", {"test": ready, "pictures": tmp_path / "demo"})
     monkeypatch.setattr(tasks, "BIN", tmp_path)
-    monkeypatch.setattr(tasks, "run", lambda command: ran.append(command) or 0)
+    monkeypatch.setattr(tasks, "run", lambda command, quiet=False: ran.append(command) or 0)
     tasks.set_up("test")
     tasks.set_up("test")
-    assert len(ran) == 2 and ran[0] == (*tasks.INSTALL, ".[test]") and ready.exists()
+    assert ran == [(*tasks.INSTALL, ".[test]"), tasks.ENGINE] and ready.exists()
     later = ready.stat().st_mtime + 10
     os.utime(tmp_path / newer, (later, later))
     tasks.set_up("test")
     assert len(ran) == 4
+
+
+@pytest.mark.parametrize("required", ["", "1"])
+def test_without_a_compiler_all_but_the_engine_is_installed(tmp_path, monkeypatch, capsys, required):
+    (tmp_path / "pyproject.toml").touch()
+    (tmp_path / "reference").mkdir()
+    (tmp_path / "reference/pyproject.toml").touch()
+    ready = tmp_path / "ready"
+    monkeypatch.setattr(tasks, "ROOT", tmp_path)
+    monkeypatch.setattr(tasks, "STAMPS", {"test": ready})
+    monkeypatch.setattr(tasks, "BIN", tmp_path)
+    monkeypatch.setenv("CORTADO_REQUIRE_ENGINE", required)
+    monkeypatch.setattr(tasks, "run", lambda command, quiet=False: int(command == tasks.ENGINE))
+    if required:
+        with pytest.raises(SystemExit):
+            tasks.set_up("test")
+    else:
+        tasks.set_up("test")
+        assert "Installed without the reference engine" in capsys.readouterr().err
+    assert ready.exists() != bool(required)

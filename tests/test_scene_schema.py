@@ -9,7 +9,7 @@ from unicodedata import normalize
 import pytest
 from pydantic import ValidationError
 
-import cortado.study.registry  # noqa: F401  so that the tables of all experiments are there
+import experiments.registry  # noqa: F401  so that the tables of all experiments are there
 from cortado.optimisation.inverse.tables import TaskTables
 from cortado.scene.scene import Scene
 from cortado.scene.tables import Table
@@ -85,9 +85,9 @@ def test_an_editor_is_told_what_fields_mean_and_what_they_are_if_left_out(model)
 
 def test_what_the_schema_of_a_scene_says():
     schema = Scene.model_json_schema()["$defs"]
-    spacing, gravity = schema["Discretisation"]["properties"]["spacing"], schema["Forces"]["properties"]["gravity"]
+    spacing, gravity = schema["DiscretisationTable"]["properties"]["spacing"], schema["Forces"]["properties"]["gravity"]
     assert (spacing["unit"], spacing["exclusiveMinimum"], spacing["maximum"]) == ("m", 0.0, 1e50)
     assert (gravity["items"]["unit"], gravity["default"]) == ("m/s2", [0.0, -9.81, 0.0])
     assert schema["Forces"]["properties"]["surface_tension"]["description"] == "tension of the free surface"
-    assert schema["Mixture"]["properties"]["free_energy"]["enum"] == ["double_well", "miscible"]
+    assert schema["MixtureTable"]["properties"]["free_energy"]["enum"] == ["double_well", "miscible"]
     assert schema["PcisphSolver"]["properties"]["time_step"]["description"] == "Length of a step [s]."

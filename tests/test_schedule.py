@@ -15,7 +15,7 @@ from cortado.scene.in_words import scene_in_words
 from cortado.scene.parameters.tilt import Tilt
 from cortado.scene.schedule import Course
 from cortado.scene.stability import stability_limit
-from cortado.study.experiment_files import load_experiment
+from experiments.experiment_files import load_experiment
 from finite_differences import central_difference
 from scenes import jet, plane, scene
 

@@ -8,9 +8,9 @@ import pytest
 from cortado import Problem, SceneError, Simulation, gradients, losses
 from cortado.errors import InputError
 from cortado.reference import Terms
-from cortado.study.comparison import compare, growth
-from cortado.study.scenes import varied
-from cortado.study.sources import (
+from experiments.comparison import compare, growth
+from experiments.scenes import varied
+from experiments.sources import (
     ByEstimator,
     FiniteDifference,
     Reference,
@@ -19,7 +19,7 @@ from cortado.study.sources import (
     Warp,
     WarpTangent,
 )
-from cortado.study.tables import Table
+from experiments.tables import Table
 from scenes import plane, splash
 
 STEPS = 12

@@ -19,15 +19,16 @@ from cortado.optimisation.inverse.task import load_task
 from cortado.optimisation.optimise import optimise
 from cortado.optimisation.optimisers import Adam
 from cortado.reference import Simulation, Terms
-from cortado.study.experiment_files import load_experiment
-from cortado.study.forces import ABLATIONS, FULL
-from cortado.study.gravity_and_precision import ANALYTIC, DIFFERENCES
-from cortado.study.image_horizon import ADJOINT, TAPE
-from cortado.study.pressure_terms import ONE_STEP, PROPAGATED
-from cortado.study.scenes import varied
-from cortado.study.tables import Table
-from cortado.study.task import TASK, TaskSettings
-from cortado.study.term_sizes import term_sizes
+from experiments.__main__ import EXPERIMENTS as EXPERIMENTS_PROGRAM
+from experiments.experiment_files import load_experiment
+from experiments.forces import ABLATIONS, FULL
+from experiments.gravity_and_precision import ANALYTIC, DIFFERENCES
+from experiments.image_horizon import ADJOINT, TAPE
+from experiments.pressure_terms import ONE_STEP, PROPAGATED
+from experiments.scenes import varied
+from experiments.tables import Table
+from experiments.task import TASK, TaskSettings
+from experiments.term_sizes import term_sizes
 from scenes import scene
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -37,7 +38,7 @@ FIGURES = ["figure_1", "figure_2_small", "figure_3_small", "figure_4", "figure_5
 @pytest.fixture
 def gradients(cortado_command):
     """Runs ``cortado gradients ...`` in this process: (exit code, stdout, stderr)."""
-    return partial(cortado_command, "gradients")
+    return partial(cortado_command, program=EXPERIMENTS_PROGRAM)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,7 @@ def measured(tmp_path_factory):
     def figure(name):
         out = folder / name
         if not out.exists():
-            main(["gradients", "figure", str(EXPERIMENTS / f"{name}.toml"), "--reduced", "--out", str(out)])
+            main(["figure", str(EXPERIMENTS / f"{name}.toml"), "--reduced", "--out", str(out)], EXPERIMENTS_PROGRAM)
         return Table.read_csv(out / "data.csv"), out
 
     return figure
@@ -230,7 +231,7 @@ def folder(tmp_path):
 
 
 def test_a_study_resumes_and_leaves_out_what_needs_a_gpu(folder, tmp_path, gradients, monkeypatch):
-    monkeypatch.setattr("cortado.cli.commands.study._has_gpu", lambda: False)
+    monkeypatch.setattr("experiments.run_study._has_gpu", lambda: False)
     out = tmp_path / "study"
     code, printed, err = gradients("study", folder, "--out", out)
     assert code == 0 and err == "quick ...\n"
@@ -245,7 +246,7 @@ def test_a_study_resumes_and_leaves_out_what_needs_a_gpu(folder, tmp_path, gradi
 
 
 def test_an_experiment_that_fails_does_not_stop_the_study(folder, tmp_path, gradients, monkeypatch):
-    monkeypatch.setattr("cortado.cli.commands.study._has_gpu", lambda: True)
+    monkeypatch.setattr("experiments.run_study._has_gpu", lambda: True)
     code, printed, err = gradients("study", folder, "--out", tmp_path / "study")
     assert code == 1 and "These experiments failed: remote." in err
     assert "Failed: device is 'cuda:99'" in printed and "Analytic, all forces" in printed

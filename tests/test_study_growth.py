@@ -12,13 +12,13 @@ import pytest
 from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.reference import Simulation
 from cortado.scene.scene import scene_from_dict
-from cortado.study import spatial_scales
-from cortado.study.ensembles import perturbed, side_by_side
-from cortado.study.estimates import Estimate, Line, growth_rate, norms
-from cortado.study.experiment_files import load_experiment
-from cortado.study.lyapunov_spectrum import growth_by_segment
-from cortado.study.results import Results
-from cortado.study.wrong_adjoints import CLAMP, LINEAR, RIGHT, WALLS, WRONG_ADJOINTS
+from experiments import spatial_scales
+from experiments.ensembles import perturbed, side_by_side
+from experiments.estimates import Estimate, Line, growth_rate, norms
+from experiments.experiment_files import load_experiment
+from experiments.lyapunov_spectrum import growth_by_segment
+from experiments.results import Results
+from experiments.wrong_adjoints import CLAMP, LINEAR, RIGHT, WALLS, WRONG_ADJOINTS
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 

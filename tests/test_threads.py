@@ -149,7 +149,7 @@ FORKS = """
 import multiprocessing, sys, threading
 import numpy as np
 from cortado import Problem, Simulation, losses
-from cortado.bench.scene import dam_break
+from benchmarks.bench.scene import dam_break
 
 def gradient(x):
     return problem.value_and_gradient({"gravity": np.array([x, -9.81, 0.0])})[1]["gravity"].tobytes()

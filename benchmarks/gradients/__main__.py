@@ -8,8 +8,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from benchmarks.bench.environment import environment
 from cortado import CortadoError, InputError, __version__
-from cortado.bench.environment import environment
 from cortado.executors import InProcess, local_workers
 from cortado.files.progress import track
 

@@ -2,7 +2,7 @@
 
     python benchmarks/peers/jax_pcisph.py --particles 8000 --json
 
-The dam break of `cortado.bench.scene` with the same particles, time step, smoothing kernel, viscosity and number of
+The dam break of `benchmarks.bench.scene` with the same particles, time step, smoothing kernel, viscosity and number of
 pressure iterations (Solenthaler and Pajarola 2009), on whatever device JAX finds. Every step sorts the particles by
 cell and lists their neighbours anew, in lists of a fixed length. A rollout is a scan whose steps are checkpointed, so
 that the way back keeps the states and computes the rest again, as Cortado does.

@@ -1,4 +1,4 @@
-"""SPlisHSPlasH on the dam break of `cortado.bench.scene`, on the CPU, forward alone: it has no gradients.
+"""SPlisHSPlasH on the dam break of `benchmarks.bench.scene`, on the CPU, forward alone: it has no gradients.
 
     python benchmarks/peers/splishsplash.py --particles 8000 --method PCISPH --json
 

@@ -103,3 +103,13 @@ def shown(value: Any) -> str:
         return "too long to print"
     text = " ".join(text.split())
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+
+
+class EngineMissingError(CortadoError, ImportError):
+    """The reference engine is not installed."""
+
+    def __str__(self) -> str:
+        return (
+            "The reference engine is not installed: pip install cortado-reference, or from a clone of the repository "
+            "pip install ./reference, which needs a C++17 compiler (g++, for all precisions)."
+        )

@@ -2,9 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
 from cortado.cli.arguments import Flag, Overrides, Scene, as_text, require_at_least
@@ -45,45 +43,3 @@ def check(
 
     words = as_text(overrides)
     return partial(check_scene, scene, steps, parameters, loss, perturbation, out, words, device, json, seed)
-
-
-@command(gradients)
-def figure(
-    experiment: Annotated[Positional[Path], arg(metavar="EXPERIMENT.toml")],
-    out: Path | None = None,
-    overrides: Overrides = (),
-    reduced: Flag = False,
-    redraw: Flag = False,
-) -> Work:
-    """Measure and draw one experiment of the gradient study.
-
-    Args:
-        experiment: The experiment's file, such as experiments/figure_7.toml.
-        out: Folder for its numbers, its picture and its verdict; runs/NAME if left out.
-        overrides: Replace a setting, such as steps=100; may be given again.
-        reduced: The quick form, with the settings that the file has in [reduced].
-        redraw: Draw and judge the numbers that are there again.
-    """
-    from cortado.cli.commands.figure import measure_figure
-
-    return partial(measure_figure, experiment, out, as_text(overrides), reduced, redraw)
-
-
-@command(gradients)
-def study(
-    folder: Annotated[Positional[Path], arg(metavar="FOLDER")] = Path("experiments"),
-    out: Path = Path("runs/study"),
-    only: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (),
-    reduced: Flag = False,
-) -> Work:
-    """Measure and draw all experiments; those that are there already, with the same settings, are not repeated.
-
-    Args:
-        folder: Where the experiments are.
-        out: Folder of the results, with a folder for each experiment.
-        only: The name of an experiment, such as figure_4; may be given again.
-        reduced: The quick form of each.
-    """
-    from cortado.cli.commands.study import run_study
-
-    return partial(run_study, folder, out, reduced, as_text(only))

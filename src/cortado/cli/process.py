@@ -10,9 +10,9 @@ from contextlib import redirect_stderr
 from signal import SIGINT
 
 from cortado.cli.command import Work
-from cortado.cli.parsing import parsed
+from cortado.cli.parsing import Program, parsed
 from cortado.cli.shortage import shortage
-from cortado.cli.subcommands import app
+from cortado.cli.subcommands import CORTADO
 from cortado.cli.usage import usage_sentence
 from cortado.device.kernel_cache import complaint, start_warp
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
@@ -24,14 +24,14 @@ BROKEN_PIPE = 141
 """Exit code where nobody reads the result: that of a process which the signal SIGPIPE ended."""
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command; exits with its code unless that is 0."""
+def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> None:
+    """Run a command of a program; exits with its code unless that is 0."""
     arguments = sys.argv[1:] if arguments is None else arguments
     os.environ["MPLBACKEND"] = "agg"  # pictures go to files, whatever the user has chosen for windows
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # type: ignore[assignment]
-            work = _understood(arguments)
+            work = _understood(program, arguments)
             logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where its folder cannot be written it goes on
             start_warp()
             text = work()
@@ -53,24 +53,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(_say(sentence, 1))
 
 
-def _understood(arguments: Sequence[str]) -> Work:
+def _understood(program: Program, arguments: Sequence[str]) -> Work:
     """The command that the arguments name; prints help or the version and exits where they ask for it."""
     box = io.StringIO()
     try:
         with redirect_stderr(box), to_stdout():
-            if not arguments:
-                from cortado.cli.commands.overview import overview
-
-                print(overview())
+            if not arguments and program.overview:
+                print(program.overview())
                 sys.exit(0)
             if list(arguments) == ["--version"]:
                 print(f"cortado {__version__}")
                 sys.exit(0)
-            return parsed(app, arguments)
+            return parsed(program, arguments)
     except SystemExit as end:
         if not end.code:
             raise
-        raise InputError(usage_sentence(box.getvalue(), arguments)) from None
+        raise InputError(usage_sentence(box.getvalue(), arguments, program.name)) from None
 
 
 def _say(error: BaseException | str, code: int) -> int:

@@ -10,7 +10,7 @@ from tyro.extras import SubcommandApp
 from cortado.cli.arguments import Flag, Overrides, Scene, as_text, command_line, require_at_least
 from cortado.cli.command import Work, command
 from cortado.cli.gradient_commands import gradients
-from cortado.cli.parsing import completion_script
+from cortado.cli.parsing import Program, completion_script
 from cortado.errors import InputError
 
 app = SubcommandApp()
@@ -246,42 +246,6 @@ def sweep(
 
 
 @command(app, answers=True)
-def bench(
-    particles: tuple[int, ...] = (8000,),
-    steps: int = 20,
-    repeats: int = 5,
-    device: str = "cpu",
-    precision: str = "float32",
-    engine: Literal["warp", "reference"] = "warp",
-    json: Flag = False,
-) -> Work:
-    """Time a dam break: each pass of a step, the step, a rollout and its gradient, beside what the hardware allows.
-
-    Args:
-        particles: Numbers of fluid particles, about; one measurement for each.
-        steps: Number of time steps.
-        repeats: The median of so many repeats counts.
-        device: "cpu", or "cuda:0" for the first GPU.
-        precision: "float32" or "float64"; of the reference engine also "float80" and "float128".
-        engine: The one in Warp, or the reference engine in C++.
-        json: Print JSON for machines, with more numbers, instead of tables.
-    """
-    require_at_least(1, len(particles), "the number of --particles")
-    require_at_least(1, min(particles), "--particles")
-    require_at_least(1, repeats, "--repeats")
-    from cortado.arrays import require_at_most
-    from cortado.bench.timing import MOST_REPEATS
-
-    require_at_most("--repeats", repeats, MOST_REPEATS)
-    from cortado.cli.commands.bench import bench_dam_break, bench_reference
-
-    if engine == "reference":
-        return partial(bench_reference, particles, steps, repeats, precision, json)
-    else:
-        return partial(bench_dam_break, particles, steps, repeats, device, precision, json)
-
-
-@command(app, answers=True)
 def schema() -> Work:
     """Print the JSON schema of scenes and tasks, with which editors complete and check them."""
     from cortado.cli.commands.schema import print_schema
@@ -296,4 +260,18 @@ def completion(shell: Annotated[Positional[Literal["bash", "zsh"]], arg(metavar=
     Args:
         shell: bash or zsh.
     """
-    return partial(completion_script, app, shell)
+    return partial(completion_script, CORTADO, shell)
+
+
+def _overview() -> str:
+    from cortado.cli.commands.overview import overview
+
+    return overview()
+
+
+CORTADO = Program(
+    "cortado",
+    app,
+    "A differentiable SPH fluid simulator. --version prints which one; cortado alone gives examples.",
+    _overview,
+)

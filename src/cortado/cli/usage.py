@@ -10,8 +10,8 @@ from difflib import get_close_matches
 from cortado.errors import LONGEST
 
 _COMMAND = re.compile(
-    r"(new|examples|describe|run|compare|optimise|picture|view|sweep|bench|schema|completion"
-    r"|gradients( (check|figure|study))?)(?= |$)"
+    r"(new|examples|describe|run|compare|optimise|picture|view|sweep|schema|completion|gradients( check)?"
+    r"|figure|study)(?= |$)"
 )
 _EDGES = "│|╭╮╰╯─-+ "
 
@@ -41,13 +41,25 @@ _SENTENCES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
 """What tyro says, and what we say."""
 
 
-def usage_sentence(box: str, arguments: Sequence[str]) -> str:
-    """What tyro says in its box, as a sentence of ours."""
+MOVED = {
+    "bench": "python -m benchmarks bench",
+    "gradients figure": "python -m experiments figure",
+    "gradients study": "python -m experiments study",
+}
+"""Commands of before, and what one types in a clone of the repository in their place."""
+
+
+def usage_sentence(box: str, arguments: Sequence[str], program: str = "cortado") -> str:
+    """What tyro says in its box about the arguments of a program, as a sentence of ours."""
+    words = " ".join(arguments)
+    for before, now in MOVED.items():
+        if program == "cortado" and f"{words} ".startswith(f"{before} "):
+            return f"cortado {before} is now {now}, in a clone of the repository."
     lines = ["" if set(line) <= set(_EDGES) else line.strip("│| ") for line in box.splitlines()[1:]]
     text = " ".join(line for line in lines if line)
     text = re.split(r" (?:Argument helptext:|For full helptext,)", text)[0].rstrip(". ")
     found = ((re.fullmatch(theirs, text), ours) for theirs, ours in _SENTENCES)
     said = next((ours(match) if callable(ours) else match.expand(ours) for match, ours in found if match), text)
     said = said if len(said) <= 2 * LONGEST else f"{said[: 2 * LONGEST]}..."
-    command = _COMMAND.match(" ".join(arguments))
-    return f"{said}; see cortado {f'{command[0]} ' if command else ''}--help."
+    command = _COMMAND.match(words)
+    return f"{said}; see {program} {f'{command[0]} ' if command else ''}--help."

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from cortado.arrays import check_steps
-from cortado.bench.memory import estimated_bytes
+from cortado.cli.commands.memory_use import estimated_bytes
 from cortado.device.memory import frame_parts, step_parts
 from cortado.errors import DivergedError, InputError
 from cortado.files.atomic import sentences

@@ -17,11 +17,8 @@ _GROUPS = {
         ("cortado optimise task.toml --out runs/found", "find what a task file asks for; --resume goes on"),
         ("cortado sweep dam.toml --set phase.0.viscosity=0.05,0.1", "every combination of some values"),
         ("cortado gradients check dam.toml --steps 20", "are gradients right, and for how long?"),
-        ("cortado gradients figure experiments/step_size.toml", "one experiment of the gradient study"),
-        ("cortado gradients study experiments", "all of them"),
     ),
     "Set up": (
-        ("cortado bench --particles 1000 8000", "how fast this machine is"),
         ("cortado schema", "the JSON schema of scenes, for editors"),
         ("cortado completion bash", "completion of commands and options by the shell"),
     ),

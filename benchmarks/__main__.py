@@ -1,0 +1,53 @@
+"""``python -m benchmarks bench``: a dam break, timed."""
+
+from functools import partial
+from typing import Literal
+
+from tyro.extras import SubcommandApp
+
+from benchmarks.bench.timing import MOST_REPEATS
+from cortado.arrays import require_at_most
+from cortado.cli.arguments import Flag, require_at_least
+from cortado.cli.command import Work, command
+from cortado.cli.parsing import Program
+from cortado.cli.process import main
+
+app = SubcommandApp()
+BENCH = Program("python -m benchmarks", app, "Times Cortado on this machine.")
+
+
+@command(app, answers=True)
+def bench(
+    particles: tuple[int, ...] = (8000,),
+    steps: int = 20,
+    repeats: int = 5,
+    device: str = "cpu",
+    precision: str = "float32",
+    engine: Literal["warp", "reference"] = "warp",
+    json: Flag = False,
+) -> Work:
+    """Time a dam break: each pass of a step, the step, a rollout and its gradient, beside what the hardware allows.
+
+    Args:
+        particles: Numbers of fluid particles, about; one measurement for each.
+        steps: Number of time steps.
+        repeats: The median of so many repeats counts.
+        device: "cpu", or "cuda:0" for the first GPU.
+        precision: "float32" or "float64"; of the reference engine also "float80" and "float128".
+        engine: The one in Warp, or the reference engine in C++.
+        json: Print JSON for machines, with more numbers, instead of tables.
+    """
+    require_at_least(1, len(particles), "the number of --particles")
+    require_at_least(1, min(particles), "--particles")
+    require_at_least(1, repeats, "--repeats")
+    require_at_most("--repeats", repeats, MOST_REPEATS)
+    from benchmarks.bench.run import bench_dam_break, bench_reference
+
+    if engine == "reference":
+        return partial(bench_reference, particles, steps, repeats, precision, json)
+    else:
+        return partial(bench_dam_break, particles, steps, repeats, device, precision, json)
+
+
+if __name__ == "__main__":
+    main(program=BENCH)

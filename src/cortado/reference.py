@@ -1,0 +1,15 @@
+"""The reference engine in C++, to judge gradients by: a distribution of its own, ``cortado-reference``."""
+
+from cortado.errors import EngineMissingError
+
+try:
+    from cortado_reference import *  # noqa: F403
+    from cortado_reference import __all__ as __all__
+except ModuleNotFoundError as error:
+    if error.name != "cortado_reference":
+        raise
+    raise EngineMissingError from None
+
+
+def __dir__() -> list[str]:
+    return __all__
