@@ -16,7 +16,7 @@ from cortado.certificate.alignment import Alignment, Judged
 from cortado.certificate.growth import growth
 from cortado.certificate.horizon import Horizon
 from cortado.certificate.twin import in_float64
-from cortado.problem import ForwardPass
+from cortado.forward_pass import ProblemForwardPass
 from cortado.render.scene_renderer import scene_renderer
 from cortado.scene.scene import load_scene
 from cortado.sph.free_energy import FREE_ENERGIES
@@ -204,13 +204,13 @@ def test_right_gradients_are_found_right_in_float32(name):
 @pytest.mark.parametrize("name", ["3-D, two fluids, a picture", "2-D, three fluids, a loss of one's own"])
 def test_a_sign_flipped_is_found_in_float32(name, monkeypatch):
     """In the gradient with respect to one parameter, as a wrong adjoint would."""
-    back = ForwardPass.back
+    back = ProblemForwardPass.back
 
     def wrong(*arguments):
         gradient = back(*arguments)
         return {**gradient, "viscosity": -gradient["viscosity"]}
 
-    monkeypatch.setattr(ForwardPass, "back", wrong)
+    monkeypatch.setattr(ProblemForwardPass, "back", wrong)
     assert certified_in_single(name).wrong == ("viscosity",)
 
 

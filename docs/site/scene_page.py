@@ -88,7 +88,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         "## Particles: `[discretisation]`",
         "Fluid is cut into particles that start on a regular lattice. A smaller spacing shows smaller waves and takes "
         "more time: half of it means eight times as many particles in 3-D, and time steps about half as long.",
-        (("Discretisation", "", '[discretisation]\nspacing = 0.05\nsupport = 2.6\nkernel = "wendland_c2"'),),
+        (("DiscretisationTable", "", '[discretisation]\nspacing = 0.05\nsupport = 2.6\nkernel = "wendland_c2"'),),
     ),
     (
         "## Materials: `[[phase]]`",
@@ -136,7 +136,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         "change over time: the parameter `nozzle_path`.",
         (
             (
-                "Emitter",
+                "EmitterTable",
                 "",
                 '[emitter]\nphase = "water"\noutlet = [0.75, 0.7, 0.25]\ndirection = [0.0, -1.0, 0.0]\nradius = 0.1\n'
                 "length = 0.2\nflow_rate = 0.02",
@@ -168,7 +168,7 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         "([the equation](discretisation.md#diffusion-between-phases)).",
         (
             (
-                "Mixture",
+                "MixtureTable",
                 "",
                 '[[phase]]\nname = "water"\nrest_density = 1000.0\nviscosity = 0.01\n\n[[phase]]\nname = "ink"\n'
                 'rest_density = 900.0\nviscosity = 0.02\n\n[mixture]\nfree_energy = "miscible"\nmobility = 1e-4\n'
