@@ -9,6 +9,7 @@ from cortado.errors import InputError, MissingDerivativeError
 from cortado.particles.fields import Entry, StateField
 from cortado.scene.parameters.parameter import Axis
 from cortado.sph.carried import Carried
+from cortado.sph.gravity import Gravity
 from cortado.sph.part import Part
 from remembering_force import TAU, Memory, MemoryForce, U
 from scenes import jet, plane, two_layers
@@ -131,10 +132,17 @@ def test_fields_of_a_scene_are_not_sorted():
         Carried([StateField("u", "", Entry.NUMBER, Axis.SCALAR)], layout)
 
 
+def test_what_lacks_something_of_a_force_is_refused():
+    with pytest.raises(
+        InputError, match="the force object has no shares, but must have shares, accelerate, tangent, adj"
+    ):
+        Simulation(plane(), forces=[Made(lambda setting: object())])
+
+
 def test_what_works_as_a_part_must_be_one():
-    class Duck:
+    class Duck(Gravity):
         def __init__(self, setting):
-            self.shares = ()
+            super().__init__(setting.layout, False)
 
         def settle(self, step):
             """Never called."""

@@ -29,6 +29,8 @@ from cortado.sph.mixture import Phases
 from cortado.sph.part import Part, PartMaker
 from cortado.sph.parts import Force, Setting
 
+FORCE_ATTRIBUTES = ("shares", "accelerate", "tangent", "adjoint")
+"""Of a `Force`."""
 PART_METHODS = ("begin", "sort", "settle", "target", "end", "new_tangent", "new_adjoint")
 """Of a `Part`, which no `Force` has."""
 
@@ -88,7 +90,7 @@ def _forces(
     found = [maker.force(setting) for maker in (*map(import_module, modules), *makers)]
     forces = [force for force in found if force is not None]
     for force in forces:
-        _check_part(force)
+        _check_force(force)
         if layout.batch is not None and not getattr(force, "batches", False):
             raise InputError(
                 f"batch is {layout.batch}, but must be left out, as the force {type(force).__name__} has no "
@@ -97,10 +99,12 @@ def _forces(
     return forces
 
 
-def _check_part(force: Force) -> None:
-    """Raises `InputError` for a force that has methods of a part and is none, as no step would call them, and for a
-    part that would leave its fields unwritten."""
+def _check_force(force: Force) -> None:
+    """Raises `InputError` for what lacks something of a `Force`, for a force that has methods of a part and is none, as
+    no step would call them, and for a part that would leave its fields unwritten."""
     name = type(force).__name__
+    if missing := [one for one in FORCE_ATTRIBUTES if not hasattr(force, one)]:
+        raise InputError(f"the force {name} has no {missing[0]}, but must have {', '.join(FORCE_ATTRIBUTES)}.")
     if not isinstance(force, Part):
         found = [method for method in PART_METHODS if hasattr(force, method)]
         if found:
