@@ -77,15 +77,15 @@ def test_paths_in_backticks_are_there():
     found = {
         path
         for text in texts
-        for path in re.findall(r"`((?:src|tests|docs|examples|cpp|fuzz|validation)/[^` *]*)`", text)
+        for path in re.findall(r"`((?:src|tests|docs|examples|reference|fuzz|validation)/[^` *]*)`", text)
     }
     assert len(found) > 50
     assert not {path for path in found if not (ROOT / path).exists()}
 
 
 def test_names_in_files_are_there():
-    """Of "`NAME` of `path`" and the like in CONTRIBUTING.md."""
-    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    """Of "`NAME` of `path`" and the like, in what contributors read."""
+    text = "".join((ROOT / name).read_text(encoding="utf-8") for name in ("CONTRIBUTING.md", "docs/adding_parts.md"))
     found = re.findall(r"`(\w+)`\s+(?:of|in|there in)\s+`((?:src|tests)/\S+\.py)`", text)
     assert len(found) > 15
     assert not [(name, path) for name, path in found if not re.search(rf"\b{name}\b", (ROOT / path).read_text("utf-8"))]
