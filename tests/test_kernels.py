@@ -165,7 +165,18 @@ def cloud(name: str) -> Cloud:
     return Cloud(x, s, search, dimension)
 
 
-VECTORS = ("x", "v", "acceleration", "acceleration_in", "gravity", "x_star")
+VECTORS = (
+    "x",
+    "v",
+    "acceleration",
+    "acceleration_in",
+    "gravity",
+    "x_star",
+    "x_free",
+    "v_free",
+    "outlet_in",
+    "nozzle_path",
+)
 
 
 class Operation:

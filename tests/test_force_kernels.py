@@ -1,0 +1,272 @@
+"""The checks of `tests/test_kernels.py` for kernels of forces and parts that not every scene has: surface tension,
+forces of one function, the emitter; and of what is read of states: vorticity and the push of walls."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp as wp
+
+import cortado
+import test_kernels
+from cortado.forces import Body, Pair
+from cortado.particles.state import Layout
+from cortado.runs.quantities.formulas import circulation_kernels
+from cortado.sph.emitter import Nozzle
+from cortado.sph.emitter_kernels import emitter_kernels, nozzle_type
+from cortado.sph.surface_normals import normal_kernels
+from cortado.sph.surface_stress import surface_tension_kernels
+from cortado.sph.wall_slope import wall_slope_kernels
+from test_kernels import CPU, DISCRETISATION, FLOAT64, N, Operation, by_input, cloud, clouds, dotted, launch, zeros
+
+VECTORS = np.zeros((N, 3))
+
+
+class SurfaceTension(Operation):
+    """Normals and then the force."""
+
+    inputs, outputs = ("x", "m", "surface_tension", "acceleration_in"), ("acceleration",)
+    passed = ("acceleration_in",)
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.normal, self.force = normal_kernels(DISCRETISATION), surface_tension_kernels(DISCRETISATION)
+        self.start["acceleration_in"] = self.start.pop("acceleration")
+        self.start["surface_tension"] = np.array([1.4])
+        self.given = {"s": self.s, "inverse": 0.4, "scale": 0.7}
+
+    def normals(self, values):
+        return launch(self.normal.forward, **self.given, **values, normals=VECTORS)["normals"]
+
+    def forward(self, values):
+        return launch(self.force.forward, **self.given, **values, normals=self.normals(values), acceleration=VECTORS)
+
+    def tangent(self, values, dots):
+        given = {**self.given, **values, **dotted(dots)}
+        change = launch(self.normal.tangent, **given, normals_dot=VECTORS)["normals_dot"]
+        given |= {"normals": self.normals(values), "normals_dot": change}
+        return {"acceleration": launch(self.force.tangent, **given, acceleration_dot=VECTORS)["acceleration_dot"]}
+
+    def adjoint(self, values, bars):
+        given = {**self.given, **values, "normals": self.normals(values), "acceleration_bar": bars["acceleration"]}
+        bar = zeros("x_bar", "m_bar", "surface_tension_bar")
+        bar |= launch(self.force.adjoint, **given, **bar, normals_bar=VECTORS)
+        found = launch(self.normal.adjoint, **{**given, **bar})
+        return {
+            "x": found["x_bar"],
+            "m": bar["m_bar"],
+            "surface_tension": bar["surface_tension_bar"].sum(keepdims=True),
+            "acceleration_in": bars["acceleration"],
+        }
+
+
+class Circulation(Operation):
+    inputs, outputs = ("x", "v"), ("circulation",)
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.kernels = circulation_kernels(DISCRETISATION)
+
+    def forward(self, values):
+        return launch(self.kernels.forward, s=self.s, **values, circulation=VECTORS)
+
+    def tangent(self, values, dots):
+        found = launch(self.kernels.tangent, s=self.s, **values, **dotted(dots), circulation_dot=VECTORS)
+        return {"circulation": found["circulation_dot"]}
+
+    def adjoint(self, values, bars):
+        bar = {"circulation_bar": bars["circulation"], **zeros("x_bar", "v_bar")}
+        found = launch(self.kernels.adjoint, s=self.s, **values, **bar)
+        return {"x": found["x_bar"], "v": found["v_bar"]}
+
+
+class WallSlope(Operation):
+    """The sum of forward mode is that of reverse mode too."""
+
+    inputs, outputs = ("x",), ("wall_slope",)
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.kernels = wall_slope_kernels(DISCRETISATION)
+
+    def forward(self, values):
+        return launch(self.kernels.slope, s=self.s, **values, wall_slope=VECTORS)
+
+    def change(self, values, along):
+        found = launch(self.kernels.change, s=self.s, **values, along=along, wall_slope_change=VECTORS)
+        return found["wall_slope_change"]
+
+    def tangent(self, values, dots):
+        return {"wall_slope": self.change(values, dots["x"])}
+
+    def adjoint(self, values, bars):
+        return {"x": self.change(values, bars["wall_slope"])}
+
+
+def swirl(x, v, t, rate, centre):
+    r = x - centre
+    return rate * wp.cos(t) * wp.vec3(-r[1], r[0], 0.0) - wp.length(v) * v
+
+
+def spring(x_ij, v_ij, t, k, rest):
+    r = wp.length(x_ij)
+    return (k * (r - rest) * wp.cos(t)) * x_ij - v_ij
+
+
+class OfOneFunction(Operation):
+    """theta is the time, a number, and one more parameter."""
+
+    inputs, outputs = ("x", "v", "theta", "acceleration_in"), ("acceleration",)
+    passed = ("acceleration_in",)
+    force = Body(swirl, rate=1.3, centre=[0.2, 0.4, 0.1])
+    theta = (0.3, 1.3, 0.2, 0.4, 0.1)
+    own = ("x", "v")
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.kernels = self.force.kernels(DISCRETISATION, 3)
+        self.start["acceleration_in"] = self.start.pop("acceleration")
+        self.start["theta"] = np.array([self.theta])
+
+    def forward(self, values):
+        return launch(self.kernels.forward, s=self.s, **values, acceleration=VECTORS)
+
+    def tangent(self, values, dots):
+        found = launch(self.kernels.tangent, s=self.s, **values, **dotted(dots), acceleration_dot=VECTORS)
+        return {"acceleration": found["acceleration_dot"]}
+
+    def adjoint(self, values, bars):
+        bar = {"acceleration_bar": bars["acceleration"], "theta_bar": np.zeros((N, len(self.theta)))}
+        found = launch(self.kernels.adjoint, s=self.s, **values, **bar, **zeros(*(f"{name}_bar" for name in self.own)))
+        return {
+            **{name: found[f"{name}_bar"] for name in self.own},
+            "theta": found["theta_bar"].sum(axis=0, keepdims=True),
+            "acceleration_in": bars["acceleration"],
+        }
+
+
+class PairOfOneFunction(OfOneFunction):
+    inputs = ("x", "v", "m", "theta", "acceleration_in")
+    force, theta, own = Pair(spring, k=2.0, rest=0.3), (0.3, 2.0, 0.3), ("x", "v", "m")
+
+
+class Emitter(Operation):
+    """The last third of the particles wait in a nozzle, and some of them have left it."""
+
+    inputs = ("x_free", "v_free", "outlet_in", "emitted_in", "nozzle_path", "flow_rate", "time_step")
+    outputs = ("x", "v", "outlet_out", "emitted_out")
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        random, first, self.kernels = np.random.default_rng(23), 2 * N // 3, emitter_kernels(FLOAT64, False)
+        direction = np.array([0.6, 0.8, 0.0])
+        offsets = cloud.vectors(24, N - first)[:, : cloud.dimension]
+        nozzle = Nozzle(first, np.linspace(0.1, 1.0, N - first), offsets, direction[: cloud.dimension], 0.3)
+        made = nozzle_type(FLOAT64)()
+        made.first, made.area, made.direction = first, nozzle.area, FLOAT64.vector(*direction)
+        made.upstream = wp.array(nozzle.upstream, dtype=wp.float64, device=CPU)
+        made.offsets = test_kernels.array(np.pad(offsets, ((0, 0), (0, 3 - cloud.dimension))))
+        self.known = {"nozzle": made, "step": np.array([2], dtype=np.int32)}
+        self.layout = Layout(N, 1, FLOAT64, CPU)
+        self.start |= {
+            "x_free": cloud.vectors(25),
+            "v_free": cloud.vectors(26),
+            "outlet_in": cloud.vectors(27, 1),
+            "emitted_in": np.array([0.4]),
+            "nozzle_path": cloud.vectors(28, 4),
+            "flow_rate": random.uniform(0.2, 0.4, 1),
+        }
+
+    def begun(self, values):
+        found = launch(self.kernels.begin, 1, **self.known, **values, outlet=np.zeros((1, 3)), emitted=np.zeros(1))
+        return {name: found[name] for name in ("outlet", "emitted")}
+
+    def forward(self, values):
+        given = {name: value for name, value in values.items() if name not in ("x", "v")}
+        out = {"x": VECTORS, "v": VECTORS, "outlet_out": np.zeros((1, 3)), "emitted_out": np.zeros(1)}
+        return launch(self.kernels.forward, **self.known, **given, **self.begun(values), **out)
+
+    def tangent(self, values, dots):
+        given = {**self.known, **values, **dotted(dots)}
+        out = {"outlet_dot": np.zeros((1, 3)), "emitted_dot": np.zeros(1)}
+        begun = launch(self.kernels.begin_tangent, 1, **given, **out)
+        given |= {**self.begun(values), **{name: begun[name] for name in out}}
+        moved = {"x_dot": dots["x_free"], "v_dot": dots["v_free"]}
+        ends = {"outlet_out_dot": np.zeros((1, 3)), "emitted_out_dot": np.zeros(1)}
+        found = launch(self.kernels.tangent, **{**given, **moved, **ends})
+        return {name: found[f"{name}_dot"] for name in self.outputs}
+
+    def adjoint(self, values, bars):
+        given = {**self.known, **values, **self.begun(values)}
+        moved = {f"{name}_{kind}_bar": VECTORS for name in "xv" for kind in ("free", "prescribed")}
+        found = launch(self.kernels.adjoint, **given, x_bar=bars["x"], v_bar=bars["v"], **moved)
+        totals = {f"{name}_total": found[f"{name}_prescribed_bar"].sum(axis=0, keepdims=True) for name in "xv"}
+        bar = {
+            "outlet_bar": bars["outlet_out"],
+            "emitted_bar": bars["emitted_out"],
+            "nozzle_path_bar": np.zeros((4, 3)),
+        }
+        bar |= {"flow_rate_bar": np.zeros(1), "time_step_bar": np.zeros(1)}
+        last = launch(self.kernels.collect, 1, **given, **totals, **bar)
+        return {
+            **{f"{name}_free": found[f"{name}_free_bar"] for name in "xv"},
+            **{f"{name}_in": last[f"{name}_bar"] for name in ("outlet", "emitted")},
+            **{name: last[f"{name}_bar"] for name in ("nozzle_path", "flow_rate", "time_step")},
+        }
+
+
+OPERATIONS = [SurfaceTension, Circulation, WallSlope, OfOneFunction, PairOfOneFunction, Emitter]
+check_transpose = test_kernels.test_adjoint_is_the_transpose_of_the_tangent
+check_differences = test_kernels.test_tangent_is_the_limit_of_central_differences
+check_bits = test_kernels.test_same_bits_twice
+
+
+@clouds
+@by_input(OPERATIONS)
+def test_adjoints_are_transposes_and_tangents_limits_of_differences(operation, name, where):
+    if (operation, where) == (OfOneFunction, "2-D"):
+        pytest.skip("its kernels here are those of space")
+    check_transpose(operation, name, where)
+    check_differences(operation, name, where)
+
+
+@clouds
+@pytest.mark.parametrize("operation", OPERATIONS)
+def test_the_same_bits_twice(operation, where):
+    check_bits(operation, where)
+
+
+def test_some_particles_have_left_the_nozzle_and_some_have_not():
+    op = Emitter(cloud("3-D"))
+    moved = op.forward(op.start)["x"][2 * N // 3 :] != op.start["x_free"][2 * N // 3 :]
+    assert 0.1 < moved.all(axis=1).mean() < 0.9
+
+
+ELSEWHERE = {
+    "frozen_force_adjoint": "an estimator that is not exact: tests/test_estimators.py",
+    "phase_colour_kernels": "of pictures, by differences: tests/test_render.py",
+    "colour_field_kernels": "the same",
+    "absorption_kernels": "the same",
+}
+"""Factories of kernels of adjoints that are checked in other places."""
+
+
+def test_every_family_with_an_adjoint_is_checked():
+    checked = "".join(Path(module).read_text() for module in (__file__, test_kernels.__file__))
+    found = set()
+    for path in Path(cortado.__file__).parent.rglob("*.py"):
+        for factory in ast.parse(path.read_text()).body:
+            kernels = [one for one in ast.walk(factory) if isinstance(one, ast.FunctionDef) and of_an_adjoint(one)]
+            found |= {factory.name} if isinstance(factory, ast.FunctionDef) and kernels else set()
+    used = {name for name in found if f"{name}(" in checked or name in OF_FORCES}
+    assert len(found) > 15 and found - used == ELSEWHERE.keys()
+
+
+def of_an_adjoint(function):
+    is_kernel = any("wp.kernel" in ast.unparse(one) for one in function.decorator_list)
+    return is_kernel and "adjoint" in function.name.split("_")
+
+
+OF_FORCES = {"body_kernels", "pair_kernels"}
+"""Made by `OfOneFunction.force`."""
