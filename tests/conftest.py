@@ -134,7 +134,7 @@ SLOW_TESTS = {
         "test_rosenbrock_converges",
     },
     "test_packaging": {
-        "test_without_a_compiler_the_wheel_is_pure_python",
+        "test_whoever_wants_the_engine_without_a_compiler_is_told",
     },
     "test_packages": {
         "test_a_key_of_one_is_swept",
@@ -159,7 +159,7 @@ SLOW_TESTS = {
         "test_same_bits_with_any_number_of_threads",
         "test_the_adjoint_is_the_transpose_of_the_tangent",
         "test_the_tangent_is_the_limit_of_differences_in_float128",
-        "test_without_the_extension_module_there_is_one_sentence",
+        "test_where_it_is_not_installed_there_is_one_sentence",
     },
     "test_restart": {
         "test_a_restart_has_the_bits_of_a_run_that_did_not_stop",
