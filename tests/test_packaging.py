@@ -38,7 +38,7 @@ def build(hook: str, source: Path, out: Path, **environment: str) -> subprocess.
 def small(tmp_path):
     """A project of one module, with a marker that it has types, a schema and an example, built as Cortado is."""
     source = tmp_path / "source"
-    (source / "src/cortado/io").mkdir(parents=True)
+    (source / "src/cortado/pictures").mkdir(parents=True)
     (source / "cpp").mkdir()
     (source / "examples").mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE", "cpp/CMakeLists.txt", *PACKAGE, EXAMPLE):
