@@ -18,6 +18,7 @@ ROOT = Path(__file__).parent.parent
 
 PACKAGE = (
     "src/cortado/__init__.py",
+    "src/cortado/version.py",
     "src/cortado/py.typed",
     "src/cortado/scene.schema.json",
     "src/cortado/pictures/particle_view.js",
