@@ -131,9 +131,8 @@ def test_an_error_that_cannot_travel_is_told_in_words():
         raise Odd(1, 2)
 
     answer = calls.call(calls.Payload.of(fail), calls.pickled(0, "The item"))
-    assert (
-        type(answer.error) is RuntimeError and str(answer.error) == "Odd: 1 and 2" and "raise Odd" in answer.traceback
-    )
+    assert type(answer.error) is RuntimeError and str(answer.error) == "Odd: 1 and 2"
+    assert "in fail" in answer.traceback and "Odd: 1 and 2" in answer.traceback
 
 
 def test_what_cannot_be_sent_is_a_sentence():
