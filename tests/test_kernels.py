@@ -40,6 +40,7 @@ from cortado.sph.gravity import gravity_kernels
 from cortado.sph.integration import integration_kernels
 from cortado.sph.materials import mixture_kernels
 from cortado.sph.pair_forces import laminar, pairwise
+from cortado.sph.stress_kernels import stress_kernels
 from cortado.sph.viscosity import viscosity_kernels
 from finite_differences import central_difference, decades, plateau
 
@@ -144,12 +145,13 @@ def cloud(name: str) -> Cloud:
     period = np.array([side, 0.0, 0.0]) * (name == "periodic")
     grid = Grid.around(np.full(3, -0.4)[:dimension], np.full(3, side)[:dimension], period, 1.03 * SUPPORT, 512)
     weights, layout = random.uniform(0.5, 1.5, WALLS), Layout(N, 1, FLOAT64, CPU)
-    search = NeighbourSearch(DISCRETISATION, grid, walls, weights, layout, 100)
+    feet = np.stack([0.0 * walls[:, 0], -walls[:, 1], 0.0 * walls[:, 2]], axis=1)
+    search = NeighbourSearch(DISCRETISATION, grid, walls, weights, feet, layout, 100)
     s = neighbourhood_type(FLOAT64)()
     s.particles = N
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count
-    s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
+    s.wall_positions, s.wall_weights, s.wall_feet = search.wall_positions, search.wall_weights, search.wall_feet
     s.support, s.per_support, s.reach = SUPPORT, 1.0 / SUPPORT, 1.03 * SUPPORT
     s.normalisation = CUBIC_SPLINE.normalisation(dimension, SUPPORT)
     s.self_weight = float(CUBIC_SPLINE.weight(np.zeros(1), dimension, SUPPORT)[0])
@@ -344,6 +346,47 @@ class Laminar(Viscosity):
 
 class LaminarWithFriction(Viscosity):
     kernels, friction = Kernels.laminar_no_slip, 0.7
+
+
+class Stress(Viscosity):
+    """Viscosity as a stress: sums over neighbours, and then the force."""
+
+    inputs = ("x", "v", "m", "mu", "acceleration_in")
+    sticks = False
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        self.stress, self.force = stress_kernels(DISCRETISATION, cloud.dimension, 1.3, self.sticks)
+        self.given = {"s": self.s, "least": 0.05}
+        self.room = {name: np.zeros((N, 3, 3)) for name in "MAT"} | {name: np.zeros(N) for name in ("R", "eta")}
+
+    def known(self, values):
+        """Arguments of all kernels after the first."""
+        found = launch(self.stress.forward, **self.given, **values, **self.room)
+        return {**self.given, **values, **{name: found[name] for name in self.room}}
+
+    def forward(self, values):
+        return launch(self.force.forward, **self.known(values), acceleration=np.zeros((N, 3)))
+
+    def tangent(self, values, dots):
+        known = {**self.known(values), **dotted(dots)}
+        change = {"T_dot": np.zeros((N, 3, 3)), "eta_dot": np.zeros(N)}
+        found = launch(self.stress.tangent, **known, **change)
+        known |= {name: found[name] for name in change} | {"acceleration_dot": np.zeros((N, 3))}
+        return {"acceleration": launch(self.force.tangent, **known)["acceleration_dot"]}
+
+    def adjoint(self, values, bars):
+        known = {**self.known(values), "acceleration_bar": bars["acceleration"]}
+        change = {"M_bar": np.zeros((N, 3, 3)), "A_bar": np.zeros((N, 3, 3)), "R_bar": np.zeros(N)}
+        names = ("x", "v", "m", "mu")
+        found = launch(self.stress.adjoint, **known, **change, **zeros("mu_bar"))
+        known |= {name: found[name] for name in (*change, "mu_bar")} | zeros("x_bar", "v_bar", "m_bar")
+        found = launch(self.force.adjoint, **known)
+        return {**{name: found[f"{name}_bar"] for name in names}, "acceleration_in": bars["acceleration"]}
+
+
+class StressWithoutSlip(Stress):
+    sticks = True
 
 
 class GravityTable(Operation):
@@ -655,6 +698,8 @@ ADJOINT = [
     PairwiseWithFriction,
     Laminar,
     LaminarWithFriction,
+    Stress,
+    StressWithoutSlip,
     GravityTable,
     Iterations,
     TwoIterations,
@@ -728,7 +773,7 @@ def test_some_pressures_are_active_and_some_are_not(where):
 
 
 @clouds
-@pytest.mark.parametrize("operation", [Density, WallYield, PairwiseWithFriction, LaminarWithFriction, Blend, Substep])
+@pytest.mark.parametrize("operation", [Density, WallYield, PairwiseWithFriction, StressWithoutSlip, Blend, Substep])
 def test_adjoints_are_added(operation, where, monkeypatch):
     """What other terms left in the adjoints of particles and of scalars stays."""
     op = operation(cloud(where))

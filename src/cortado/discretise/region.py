@@ -61,6 +61,15 @@ class Region:
         from_faces = np.maximum(self.lower - points, points - self.upper).max(axis=1)
         return np.asarray(np.maximum(from_faces, from_axis - self.radius))
 
+    def nearest(self, points: Points) -> Points:
+        """(n, d) the points of the region that are nearest to points (n, d) [m] beside its faces or its side, and those
+        themselves that are within."""
+        boxed = np.clip(points, self.lower, self.upper)
+        across = (boxed - self.base) * self.across
+        from_axis = np.linalg.norm(across, axis=1, keepdims=True)
+        inwards = np.maximum(1.0 - self.radius / np.maximum(from_axis, 1e-300), 0.0)
+        return np.asarray(boxed - inwards * across)
+
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
         """(n,) whether points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
         from_axis = np.linalg.norm((points - self.base) * self.across, axis=1)

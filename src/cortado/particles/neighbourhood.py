@@ -74,6 +74,8 @@ def neighbourhood_type(precision: Precision) -> Any:
         """[m]"""
         wall_weights: wp.array(dtype=real)
         """w_b [-]: what a wall particle counts for in the density, a fluid particle being 1."""
+        wall_feet: wp.array(dtype=vector)
+        """From a wall particle to the nearest point of the container's surface [m]."""
         support: real
         """Support radius h [m]."""
         per_support: real
@@ -108,6 +110,7 @@ class PairFunctions:
     weight: Any
     slope: Any
     slope_change: Any
+    slope_gradient: Any
     gradient: Any
     hessian_product: Any
     per_size: Any
@@ -116,6 +119,7 @@ class PairFunctions:
     neighbour: Any
     wall_position: Any
     wall_weight: Any
+    wall_foot: Any
     vectors: Any
     numbers: Any
 
@@ -125,16 +129,17 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
     """Warp functions of a separation in given neighbourhood.
 
     ``separation`` (x_i - x_j, of the nearest image), ``weight``, ``slope`` (a of G = a x), ``slope_change``
-    (grad a . u), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x); ``per_size``
+    (grad a . u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x); ``per_size``
     (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction per_size x . G, of
     second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the list of i),
-    ``wall_position`` and ``wall_weight``; and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have
+    ``wall_position``, ``wall_weight`` and ``wall_foot``; and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have
     before any of it is used, so that the loads do not wait for one another (on a GPU a tenth of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     smooth = smoothing_functions(discretisation.smoothing, discretisation.precision, discretisation.taped)
     smooth_weight, smooth_slope, smooth_slope_change = smooth.weight, smooth.slope, smooth.slope_change
+    smooth_slope_gradient = smooth.slope_gradient
     reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
     load = loads(discretisation.precision, discretisation.taped)
     load_neighbour, load_vector, load_number = load.neighbour, load.vector, load.number
@@ -166,6 +171,10 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
     @wp.func
     def slope_change(x: vector, u: vector, s: neighbourhood) -> real:
         return smooth_slope_change(x, u, s.per_support, s.normalisation)
+
+    @wp.func
+    def slope_gradient(x: vector, s: neighbourhood) -> vector:
+        return smooth_slope_gradient(x, s.per_support, s.normalisation)
 
     @wp.func
     def gradient(x: vector, s: neighbourhood) -> vector:
@@ -203,6 +212,10 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         return load_number(s.wall_weights, b)
 
     @wp.func
+    def wall_foot(b: int, s: neighbourhood) -> vector:
+        return load_vector(s.wall_feet, b)
+
+    @wp.func
     def vectors(a: wp.array(dtype=vector), k: int, i: int, s: neighbourhood) -> rows:
         return wp.matrix_from_rows(
             load_vector(a, neighbour(k, i, s)),
@@ -225,6 +238,7 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         weight=weight,
         slope=slope,
         slope_change=slope_change,
+        slope_gradient=slope_gradient,
         gradient=gradient,
         hessian_product=hessian_product,
         per_size=per_size,
@@ -233,6 +247,7 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         neighbour=neighbour,
         wall_position=wall_position,
         wall_weight=wall_weight,
+        wall_foot=wall_foot,
         vectors=vectors,
         numbers=numbers,
     )

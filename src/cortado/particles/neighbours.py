@@ -102,10 +102,12 @@ class NeighbourSearch:
         grid: Grid,
         walls: np.ndarray,
         wall_weights: np.ndarray,
+        wall_feet: np.ndarray,
         layout: Layout,
         capacity: int,
     ):
-        """``walls`` (b, 3) [m], ``wall_weights`` (b,) [-], the same ones for all scenes of a batch."""
+        """``walls`` (b, 3) [m], ``wall_weights`` (b,) [-] and ``wall_feet`` (b, 3) [m], from wall particles to the
+        surface, the same ones for all scenes of a batch."""
         precision, device, particles = discretisation.precision, layout.device, layout.all_particles
         self.particles, self.device = particles, device
         self._fill = fill_kernel(discretisation)
@@ -119,8 +121,9 @@ class NeighbourSearch:
         self._seen = HostCopy(self._needed)
         self.wall_positions = wp.array(walls, dtype=precision.vector, device=device)
         self.wall_weights = wp.array(wall_weights, dtype=precision.real, device=device)
+        self.wall_feet = wp.array(wall_feet, dtype=precision.vector, device=device)
         self._wall_sort = CellSort(grid, len(walls), precision, device)
-        self._unsorted_walls: tuple[np.ndarray, np.ndarray] | None = (walls, wall_weights)
+        self._unsorted_walls: tuple[np.ndarray, ...] | None = (walls, wall_weights, wall_feet)
         self._grid, self._near_walls = grid, wp.zeros(grid.cells, dtype=wp.bool, device=device)
         self.allocate(capacity)
 
@@ -141,11 +144,12 @@ class NeighbourSearch:
             self._unsorted_walls = None
         self._sort(positions)
 
-    def _sort_walls(self, walls: np.ndarray, wall_weights: np.ndarray) -> None:
+    def _sort_walls(self, walls: np.ndarray, wall_weights: np.ndarray, wall_feet: np.ndarray) -> None:
         self._wall_sort(self.wall_positions)
         sorted_to_given = self._wall_sort.order.numpy()
         self.wall_positions.assign(walls[sorted_to_given])
         self.wall_weights.assign(wall_weights[sorted_to_given])
+        self.wall_feet.assign(wall_feet[sorted_to_given])
         self._near_walls.assign(_near_walls(self._grid, self._wall_sort.grid.starts.numpy()))
 
     def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:

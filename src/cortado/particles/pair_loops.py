@@ -32,6 +32,7 @@ OVER_WALLS = """\
         _b = _neighbour(_place, i, s)
         _w_b = _wall_weight(_b, s)
         _x_ij = _separation(_x_i, _wall_position(_b, s), s)
+        {foot}
         {body}
 """
 
@@ -60,10 +61,12 @@ def over_fluid(
     )
 
 
-def over_walls(d: Discretisation, arrays: Types, body: Body) -> str:
-    """A loop over the walls, whose particles have nothing but a place and a weight _w_b."""
+def over_walls(d: Discretisation, arrays: Types, body: Body, footed: bool) -> str:
+    """A loop over the walls, whose particles have nothing but a place, a weight _w_b and a way to the surface, which
+    ``footed`` loops know as _foot."""
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
-    return OVER_WALLS.format(body=_lines(8, body({**of_b, "x": "_wall_position(_b, s)"})))
+    foot = "_foot = _wall_foot(_b, s)" if footed else ""
+    return OVER_WALLS.format(foot=foot, body=_lines(8, body({**of_b, "x": "_wall_position(_b, s)"})))
 
 
 def summed(
@@ -111,7 +114,7 @@ def _is_vector_of(real: Any, kind: Any) -> bool:
 
 def _known(d: Discretisation) -> dict[str, Any]:
     pair = pair_functions(d)
-    used = ("separation", "neighbour", "vectors", "numbers", "wall_position", "wall_weight")
+    used = ("separation", "neighbour", "vectors", "numbers", "wall_position", "wall_weight", "wall_foot")
     return {
         **{f"_{name}": getattr(pair, name) for name in used},
         **{"_real": d.precision.real, "_vector": d.precision.vector, "_neighbourhood": neighbourhood_type(d.precision)},

@@ -115,12 +115,15 @@ class SmoothingFunctions:
     """a of grad W = a x."""
     slope_change: Any
     """The derivative of a along a vector u, grad a . u; with it H u = a u + (grad a . u) x."""
+    slope_gradient: Any
+    """grad a."""
     gradient: Any
 
 
 @cache
 def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bool = False) -> SmoothingFunctions:
-    """Warp functions of a separation x [m]: ``weight``, ``slope``, ``slope_change`` and ``gradient``.
+    """Warp functions of a separation x [m]: ``weight``, ``slope``, ``slope_change``, ``slope_gradient`` and
+    ``gradient``.
 
     Each takes 1 / h, h being the support radius [m], and the normalisation sigma [1 / m^d]. A tape can differentiate
     ``taped`` ones.
@@ -156,7 +159,13 @@ def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bo
         return sigma * (per_h * per_h) * hessian_factor(q_2 * per_q, per_q) * (per_h * per_h * wp.dot(x, u))
 
     @wp.func
+    def slope_gradient(x: vector, per_h: real, sigma: real) -> vector:
+        q_2 = square(x, per_h)
+        per_q = inverse_root(q_2)
+        return (sigma * (per_h * per_h) * hessian_factor(q_2 * per_q, per_q) * (per_h * per_h)) * x
+
+    @wp.func
     def gradient(x: vector, per_h: real, sigma: real) -> vector:
         return slope(x, per_h, sigma) * x
 
-    return SmoothingFunctions(weight, slope, slope_change, gradient)
+    return SmoothingFunctions(weight, slope, slope_change, slope_gradient, gradient)

@@ -3,6 +3,7 @@
 x_ij               the separation x_i - x_j, of the nearest image
 c_i, c_j, v_ij     an array's entry of the particle, that of its neighbour, and v_i - v_j
 i, j               their numbers; j is -1 for a particle of a wall
+foot               of a particle of a wall, from it to the surface of the container; in terms of walls alone
 s                  the neighbourhood
 any other          what is the same for all neighbours of a particle
 """
@@ -58,7 +59,7 @@ class Term:
     @property
     def others(self) -> dict[str, Any]:
         """Types of what is the same for all neighbours, by name."""
-        known = (*NUMBERS, "s")
+        known = (*NUMBERS, "foot", "s")
         return {name: kind for name, kind in self.parameters.items() if not array_of(name) and name not in known}
 
     def seen_from_i(self, of_j: Mapping[str, str], j: str = "_j") -> str:
@@ -76,6 +77,8 @@ class Term:
             array = array_of(name)
             if name == "x_ij":
                 return separation
+            if name == "foot":
+                return "_foot"
             if not array:
                 return numbers.get(name, name)
             if name.endswith("_ij"):

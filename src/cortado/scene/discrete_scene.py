@@ -70,6 +70,8 @@ class Walls:
     """(b, d) [m]"""
     weights: Points
     """(b,) w_b [-]: what each counts for in the density, a fluid particle being 1."""
+    feet: Points
+    """(b, d) from each to the nearest point of the container's surface [m]."""
 
 
 @dataclass(frozen=True)
@@ -131,4 +133,5 @@ def _walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     positions, (lower, lengths) = np.concatenate(particles), period(scene)
     places = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
     region = scene.container.region(scene.dimension).opened(lengths)
-    return Walls(positions, WallSurface(positions, flat, lattice, region, lower, lengths).weights(places))
+    weights = WallSurface(positions, flat, lattice, region, lower, lengths).weights(places)
+    return Walls(positions, weights, region.nearest(positions) - positions)

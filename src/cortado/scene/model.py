@@ -59,7 +59,7 @@ class FixedForces(Table):
 
     gravity: Vector[Annotated[float, quantity("m/s2")]] = (0.0, -9.81, 0.0)
     """(d,) Acceleration that acts on all fluid [m/s2]."""
-    viscosity: Literal["pairwise", "laminar", "none"] = "pairwise"
+    viscosity: Literal["stress", "pairwise", "laminar", "none"] = "stress"
     """Form of the viscous force. "pairwise": that of Monaghan (2005); "laminar": Morris et al. (1997)."""
     pressure: Flag = True
     """Whether the fluid resists compression."""

@@ -78,7 +78,8 @@ def _search(scene: Scene, discrete: DiscreteScene, discretisation: Discretisatio
     )
     room = first_capacity(support / scene.discretisation.spacing, scene.dimension)
     walls = discrete.walls
-    return NeighbourSearch(discretisation, grid, padded(walls.positions), walls.weights, layout, room)
+    around = (padded(walls.positions), walls.weights, padded(walls.feet))
+    return NeighbourSearch(discretisation, grid, *around, layout, room)
 
 
 def _forces(

@@ -25,6 +25,7 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import fluid_sum, pair_sum
 from cortado.sph.pair_forces import PairForm, laminar, pairwise
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
+from cortado.sph.viscous_stress import ViscousStress, viscous_stress
 
 
 @cache
@@ -275,11 +276,13 @@ class Viscosity:
         step.launch(self._kernels.adjoint, *bar.named, **self._constants, acceleration_bar=acceleration_bar)
 
 
-def force(setting: Setting) -> Viscosity | None:
+def force(setting: Setting) -> Viscosity | ViscousStress | None:
     """The form that a scene names: that of Monaghan (2005), which keeps linear and angular momentum, or that of Morris,
     Fox and Zhu (1997), which carries shear to a wall. None for a scene without."""
     scene, walls = setting.scene, setting.walls
     sticks = getattr(scene.container, "slip", "free") == "no"
+    if scene.forces.viscosity == "stress":
+        return viscous_stress(setting)
     if scene.forces.viscosity == "pairwise":
         return Viscosity(setting.discretisation, pairwise, 2.0 * (scene.dimension + 2), friction=float(sticks))
     if scene.forces.viscosity == "laminar":

@@ -1,0 +1,128 @@
+"""The viscous stress of one particle from the sums over its neighbours (`cortado.sph.viscous_stress`):
+
+    G = A M^-1,   D = (G + G^T) / 2,   mu = S / (1 / (2 mu_i) + R / (2 tr M)),
+    T = 2 mu D M^-1 - C mu G
+
+S(M) is 1 where neighbours lie on all sides or on one side, and falls smoothly to 0 where they lie on a line or are
+missing: M has no inverse there, and the particle takes no part in the stress. With the invariants of M, I_2 and I_3,
+
+    H = 3 I_3 / I_2 (in the plane 2 det M / tr M),   S = smoothstep((H - 0.2) / 0.3).
+
+H is 1 inside, about 0.6 at a flat surface and 0 on a line. Where S is not 0, det M is at least 0.008, so that the
+inverse needs no guard of its own.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.precision import Precision
+
+LEAST_VISCOSITY = 1e-12
+"""What is added to viscosities [Pa s]: the mean of their reciprocals is finite where there is none."""
+EMPTY, FULL = 0.2, 0.5
+"""H below which a particle takes no part in the stress, and above which it takes part in all of it."""
+
+
+@dataclass(frozen=True)
+class StressFunctions:
+    """Warp functions of one particle."""
+
+    matrix: Any
+    """The Warp type of 3 x 3 matrices."""
+    moment: Any
+    """M, invertible in the plane too, from its diagonal and its entries yz, xz and xy."""
+    moment_change: Any
+    """The same of a tangent of M."""
+    fluidity: Any
+    """1 / mu."""
+    velocity_gradient: Any
+    """G of M and A, 0 where S is."""
+    viscosity: Any
+    """mu of M, R and mu_i."""
+    traction: Any
+    """T of M, A and mu."""
+    work: Any
+    """T . T_bar + mu mu_bar of M, A, R and mu_i, whose gradient is the adjoint of T and mu."""
+
+
+@cache
+def stress_functions(precision: Precision, dimension: int, control: float) -> StressFunctions:
+    """Of a precision in 2 or 3 dimensions; ``control`` is C."""
+    real, vector = precision.real, precision.vector
+    matrix = wp.types.matrix(shape=(3, 3), dtype=real)
+    plane = wp.constant(real(float(dimension == 2)))
+    C = wp.constant(real(control))
+    empty, width = wp.constant(real(EMPTY)), wp.constant(real(FULL - EMPTY))
+    least, tiny = wp.constant(real(LEAST_VISCOSITY)), wp.constant(real(1e-12))
+
+    @wp.func
+    def moment_change(diagonal: vector, others: vector) -> matrix:
+        x, y, z = others[0], others[1], others[2]
+        return matrix(diagonal[0], z, y, z, diagonal[1], x, y, x, diagonal[2])
+
+    @wp.func
+    def moment(diagonal: vector, others: vector) -> matrix:
+        """In the plane M_zz is 1, which changes none of what lies in it."""
+        return moment_change(diagonal + vector(real(0.0), real(0.0), plane), others)
+
+    @wp.func
+    def fluidity(mu: real) -> real:
+        return real(1.0) / (mu + least)
+
+    @wp.func
+    def fullness(M: matrix) -> real:
+        """S; tiny covers particles without neighbours, where H is 0."""
+        product = M[0, 0] * M[1, 1] + M[1, 1] * M[2, 2] + M[2, 2] * M[0, 0]
+        I_2 = product - M[0, 1] * M[0, 1] - M[1, 2] * M[1, 2] - M[0, 2] * M[0, 2]
+        I_3 = wp.determinant(M)
+        H = (real(3.0) - plane) * I_3 / (I_2 - plane * I_3 + tiny)
+        t = wp.clamp((H - empty) / width, real(0.0), real(1.0))
+        return t * t * (real(3.0) - real(2.0) * t)
+
+    @wp.func
+    def inverse(M: matrix) -> matrix:
+        """M^-1, by cofactors: the derivative of a determinant that is not 0."""
+        a = M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1]
+        b = M[0, 2] * M[2, 1] - M[0, 1] * M[2, 2]
+        c = M[0, 1] * M[1, 2] - M[0, 2] * M[1, 1]
+        e = M[0, 0] * M[2, 2] - M[0, 2] * M[2, 0]
+        f = M[0, 2] * M[1, 0] - M[0, 0] * M[1, 2]
+        h = M[0, 0] * M[1, 1] - M[0, 1] * M[1, 0]
+        per = real(1.0) / (M[0, 0] * a + M[1, 0] * b + M[2, 0] * c)
+        return per * matrix(a, b, c, b, e, f, c, f, h)
+
+    @wp.func
+    def regular(M: matrix) -> matrix:
+        """M, or the unit matrix where S is 0 and nothing depends on it."""
+        result = M
+        if fullness(M) == real(0.0):
+            result = matrix(
+                real(1.0), real(0.0), real(0.0), real(0.0), real(1.0), real(0.0), real(0.0), real(0.0), real(1.0)
+            )
+        return result
+
+    @wp.func
+    def viscosity(M: matrix, R: real, mu: real) -> real:
+        trace = M[0, 0] + M[1, 1] + M[2, 2] - plane
+        mean = real(0.5) * fluidity(mu) + real(0.5) * R / (trace + tiny)
+        return fullness(M) / mean
+
+    @wp.func
+    def velocity_gradient(M: matrix, A: matrix) -> matrix:
+        return A * inverse(regular(M))
+
+    @wp.func
+    def traction(M: matrix, A: matrix, mu: real) -> matrix:
+        K = inverse(regular(M))
+        G = A * K
+        return mu * ((G + wp.transpose(G)) * K - C * G)
+
+    @wp.func
+    def work(M: matrix, A: matrix, R: real, mu_i: real, T_bar: matrix, mu_bar: real) -> real:
+        mu = viscosity(M, R, mu_i)
+        return wp.ddot(traction(M, A, mu), T_bar) + mu * mu_bar
+
+    return StressFunctions(matrix, moment, moment_change, fluidity, velocity_gradient, viscosity, traction, work)
