@@ -356,8 +356,8 @@ class Stress(Viscosity):
 
     def __init__(self, cloud):
         super().__init__(cloud)
-        self.stress, self.force = stress_kernels(DISCRETISATION, cloud.dimension, 1.3, self.sticks)
-        self.given = {"s": self.s, "least": 0.05}
+        self.stress, self.force = stress_kernels(DISCRETISATION, cloud.dimension, self.sticks)
+        self.given = {"s": self.s, "control": 1.3, "least": 0.05}
         self.room = {name: np.zeros((N, 3, 3)) for name in "MAT"} | {name: np.zeros(N) for name in ("R", "eta")}
 
     def known(self, values):

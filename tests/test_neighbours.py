@@ -84,7 +84,9 @@ def lists(
     grid = Grid.around(lower, upper, period, REACH, most)
     discretisation = kind(CUBIC_SPLINE, precision, lanes, periodic=any(period))
     names = np.arange(len(walls), dtype=np.float64)  # as weights, so that sorted walls tell who they were
-    search = NeighbourSearch(discretisation, grid, padded(walls), names, 0.0 * padded(walls), Layout(n, 1, precision, device), capacity)
+    search = NeighbourSearch(
+        discretisation, grid, padded(walls), names, 0.0 * padded(walls), Layout(n, 1, precision, device), capacity
+    )
     memory = wp.full((n, capacity + 8) if device.is_cpu else (capacity + 8, n), GUARD, dtype=wp.int32, device=device)
     search.neighbours = memory[:, :capacity].transpose((1, 0)) if device.is_cpu else memory[:capacity]
     neighbourhood = around(search, period, precision)
@@ -357,7 +359,9 @@ def test_lists_that_are_too_short_say_how_long_they_must_be(capacity, precision)
 def test_room_can_be_made():
     discretisation = Discretisation(CUBIC_SPLINE, FLOAT64)
     grid = Grid.around(np.zeros(3), np.ones(3), np.zeros(3), REACH, 1000)
-    search = NeighbourSearch(discretisation, grid, np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), Layout(10, 1, FLOAT64, CPU), 4)
+    search = NeighbourSearch(
+        discretisation, grid, np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), Layout(10, 1, FLOAT64, CPU), 4
+    )
     search.allocate(9)
     assert search.capacity == 12  # the next multiple of UNROLL
     assert search.neighbours.shape == (12, 10)

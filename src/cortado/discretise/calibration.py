@@ -127,6 +127,29 @@ def pairwise_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
     return float(np.linalg.eigvalsh(answers.reshape(-1, dimension, dimension)).max())
 
 
+@cache
+def stress_control(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """C = 4 / (3 m_2) of `cortado.sph.stress_kernels` [-], with the second moment m_2 = V sum_j (-a_j) x_j^2 along an
+    axis of the lattice, grad W = a x."""
+    return 4.0 / (3.0 * circulation_factor(kernel, spacing, support, dimension))
+
+
+@cache
+def stress_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
+    """The same [1 / m2] of viscosity as a stress (`cortado.sph.stress_kernels`): in a wave of compression, the greatest
+    of 2 |g|^2 + C (sum_j 2 s_j (1 - cos k . x_j) - m_2 |g|^2) with g = sum_j s_j x_j sin(k . x_j) / m_2."""
+    offsets = lattice_offsets(spacing, support, dimension)
+    offsets = offsets[np.any(offsets != 0.0, axis=1)]
+    volume = rest_volume(kernel, spacing, support, dimension) / (1.0 - SLACK)
+    slopes = (offsets * kernel.gradient(offsets, support)).sum(axis=1) / (offsets**2).sum(axis=1)
+    second = circulation_factor(kernel, spacing, support, dimension)
+    control = stress_control(kernel, spacing, support, dimension)
+    phases = np.array(list(itertools.product(np.linspace(0.0, np.pi / spacing, 25), repeat=dimension))) @ offsets.T
+    squares = ((np.sin(phases) @ (-volume * slopes[:, None] * offsets) / second) ** 2).sum(axis=1)
+    remainders = (1.0 - np.cos(phases)) @ (-2.0 * volume * slopes) - second * squares
+    return float((2.0 * squares + control * remainders).max())
+
+
 def _products(vectors: np.ndarray) -> np.ndarray:
     """x x^T of vectors (m, d), (m, d^2)."""
     return (vectors[:, :, None] * vectors[:, None, :]).reshape(len(vectors), -1)

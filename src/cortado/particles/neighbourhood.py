@@ -129,11 +129,12 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
     """Warp functions of a separation in given neighbourhood.
 
     ``separation`` (x_i - x_j, of the nearest image), ``weight``, ``slope`` (a of G = a x), ``slope_change``
-    (grad a . u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x); ``per_size``
-    (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction per_size x . G, of
-    second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the list of i),
-    ``wall_position``, ``wall_weight`` and ``wall_foot``; and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have
-    before any of it is used, so that the loads do not wait for one another (on a GPU a tenth of a whole step).
+    (grad a . u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x);
+    ``per_size`` (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction
+    per_size x . G, of second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the
+    list of i), ``wall_position``, ``wall_weight`` and ``wall_foot``; and ``vectors`` and ``numbers``, which load what
+    `UNROLL` neighbours have before any of it is used, so that the loads do not wait for one another (on a GPU a tenth
+    of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)

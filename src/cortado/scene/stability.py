@@ -4,7 +4,7 @@ from math import inf, sqrt
 
 import numpy as np
 
-from cortado.discretise.calibration import laplacian_rate, pairwise_rate
+from cortado.discretise.calibration import laplacian_rate, pairwise_rate, stress_rate
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.scene.model import SceneTables
@@ -12,7 +12,7 @@ from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.parameters.tilt import Tilt
 from cortado.scene.parameters.values import Arrays
 
-VISCOUS_RATES = {"pairwise": (pairwise_rate, 0.65), "laminar": (laplacian_rate, 0.5)}
+VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65), "laminar": (laplacian_rate, 0.5)}
 """By the form of the viscous force: what gives its greatest rate on a lattice, and which part of a lattice's longest
 step is taken. The rest is for fluid off the lattice and beside walls: with drops, jets that meet and dams, in the plane
 and in space, with every kernel, those steps held, and one a quarter to a half longer did not."""

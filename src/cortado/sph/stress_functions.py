@@ -36,27 +36,43 @@ class StressFunctions:
     """M, invertible in the plane too, from its diagonal and its entries yz, xz and xy."""
     moment_change: Any
     """The same of a tangent of M."""
-    fluidity: Any
-    """1 / mu."""
     velocity_gradient: Any
     """G of M and A, 0 where S is."""
     viscosity: Any
     """mu of M, R and mu_i."""
     traction: Any
-    """T of M, A and mu."""
+    """T of M, A, mu and C."""
     work: Any
-    """T . T_bar + mu mu_bar of M, A, R and mu_i, whose gradient is the adjoint of T and mu."""
+    """T . T_bar + mu mu_bar of M, A, R, mu_i and C, whose gradient is the adjoint of T and mu."""
 
 
 @cache
-def stress_functions(precision: Precision, dimension: int, control: float) -> StressFunctions:
-    """Of a precision in 2 or 3 dimensions; ``control`` is C."""
+def matrix_type(precision: Precision) -> Any:
+    """The Warp type of 3 x 3 matrices."""
+    return wp.types.matrix(shape=(3, 3), dtype=precision.real)
+
+
+@cache
+def fluidity_function(precision: Precision) -> Any:
+    """1 / mu as a Warp function, see `LEAST_VISCOSITY`."""
+    real = precision.real
+    least = wp.constant(real(LEAST_VISCOSITY))
+
+    @wp.func
+    def fluidity(mu: real) -> real:
+        return real(1.0) / (mu + least)
+
+    return fluidity
+
+
+@cache
+def stress_functions(precision: Precision, dimension: int) -> StressFunctions:
+    """Of a precision in 2 or 3 dimensions; their argument ``control`` is C."""
     real, vector = precision.real, precision.vector
-    matrix = wp.types.matrix(shape=(3, 3), dtype=real)
+    matrix, fluidity = matrix_type(precision), fluidity_function(precision)
     plane = wp.constant(real(float(dimension == 2)))
-    C = wp.constant(real(control))
     empty, width = wp.constant(real(EMPTY)), wp.constant(real(FULL - EMPTY))
-    least, tiny = wp.constant(real(LEAST_VISCOSITY)), wp.constant(real(1e-12))
+    tiny = wp.constant(real(1e-12))
 
     @wp.func
     def moment_change(diagonal: vector, others: vector) -> matrix:
@@ -67,10 +83,6 @@ def stress_functions(precision: Precision, dimension: int, control: float) -> St
     def moment(diagonal: vector, others: vector) -> matrix:
         """In the plane M_zz is 1, which changes none of what lies in it."""
         return moment_change(diagonal + vector(real(0.0), real(0.0), plane), others)
-
-    @wp.func
-    def fluidity(mu: real) -> real:
-        return real(1.0) / (mu + least)
 
     @wp.func
     def fullness(M: matrix) -> real:
@@ -115,14 +127,14 @@ def stress_functions(precision: Precision, dimension: int, control: float) -> St
         return A * inverse(regular(M))
 
     @wp.func
-    def traction(M: matrix, A: matrix, mu: real) -> matrix:
+    def traction(M: matrix, A: matrix, mu: real, control: real) -> matrix:
         K = inverse(regular(M))
         G = A * K
-        return mu * ((G + wp.transpose(G)) * K - C * G)
+        return mu * ((G + wp.transpose(G)) * K - control * G)
 
     @wp.func
-    def work(M: matrix, A: matrix, R: real, mu_i: real, T_bar: matrix, mu_bar: real) -> real:
+    def work(M: matrix, A: matrix, R: real, mu_i: real, control: real, T_bar: matrix, mu_bar: real) -> real:
         mu = viscosity(M, R, mu_i)
-        return wp.ddot(traction(M, A, mu), T_bar) + mu * mu_bar
+        return wp.ddot(traction(M, A, mu, control), T_bar) + mu * mu_bar
 
-    return StressFunctions(matrix, moment, moment_change, fluidity, velocity_gradient, viscosity, traction, work)
+    return StressFunctions(matrix, moment, moment_change, velocity_gradient, viscosity, traction, work)

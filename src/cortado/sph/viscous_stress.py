@@ -2,12 +2,12 @@
 
 import warp as wp
 
-from cortado.discretise.calibration import circulation_factor
+from cortado.discretise.calibration import stress_control
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
 from cortado.scene.scene import Scene
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.stress_functions import stress_functions
+from cortado.sph.stress_functions import matrix_type
 from cortado.sph.stress_kernels import stress_kernels
 
 CLOSEST = 0.25
@@ -21,12 +21,11 @@ class ViscousStress:
     batches = True
 
     def __init__(self, discretisation: Discretisation, scene: Scene, control: float, layout: Layout):
-        """``control`` is C, as `control_factor` gives it."""
+        """``control`` is C, as `stress_control` gives it."""
         sticks = getattr(scene.container, "slip", "free") == "no"
-        self._stress, self._force = stress_kernels(discretisation, scene.dimension, control, sticks)
-        self._constants = {"least": CLOSEST * scene.discretisation.spacing}
-        precision = layout.precision
-        matrix = stress_functions(precision, scene.dimension, control).matrix
+        self._stress, self._force = stress_kernels(discretisation, scene.dimension, sticks)
+        self._constants = {"control": control, "least": CLOSEST * scene.discretisation.spacing}
+        precision, matrix = layout.precision, matrix_type(layout.precision)
         kinds = {"M": matrix, "A": matrix, "R": precision.real, "T": matrix, "eta": precision.real}
         size, device = layout.all_particles, layout.device
         self._of = {
@@ -53,12 +52,9 @@ class ViscousStress:
         step.launch(self._force.adjoint, *known, change)
 
 
-def control_factor(setting: Setting) -> float:
-    """C = 4 / (3 m_2), with the second moment m_2 of s_ij on the lattice along an axis."""
-    cut, smoothing = setting.scene.discretisation, setting.discretisation.smoothing
-    return 4.0 / (3.0 * circulation_factor(smoothing, cut.spacing, cut.support_radius, setting.scene.dimension))
-
-
 def viscous_stress(setting: Setting) -> ViscousStress:
     """The force of a scene."""
-    return ViscousStress(setting.discretisation, setting.scene, control_factor(setting), setting.layout)
+    scene, smoothing = setting.scene, setting.discretisation.smoothing
+    cut = scene.discretisation
+    control = stress_control(smoothing, cut.spacing, cut.support_radius, scene.dimension)
+    return ViscousStress(setting.discretisation, scene, control, setting.layout)

@@ -1,0 +1,193 @@
+"""The sum over neighbours of viscosity as a stress, m_i a_i of `cortado.sph.stress_kernels`; here mu is that of the
+stress."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.particles.by_hand import tangent_of
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.pair_sums import fluid_sum, pair_sum
+from cortado.sph.stress_functions import matrix_type
+from cortado.sph.wall_contact import contact_functions
+
+
+@dataclass(frozen=True)
+class StressSums:
+    """Warp functions of sums."""
+
+    force: Any
+    """The acceleration."""
+    tangent: Any
+    """Its tangent."""
+    traction_back: Any
+    """What its adjoint gives to the rows of T and to mu."""
+    back: Any
+    """What its adjoint gives to x, v and m."""
+
+
+@cache
+def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
+    """With walls without slip if it ``sticks``; their argument ``control`` is C."""
+    precision = discretisation.precision
+    real, vector = precision.real, precision.vector
+    neighbourhood = neighbourhood_type(precision)
+    slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
+    weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
+    hold, hold_gradient = contact.hold, contact.hold_gradient
+    matrix = matrix_type(precision)
+
+    def summed(wall_term: Any, ahead: bool = True) -> Any:
+        """The decorator of a sum over what the fluid rubs against."""
+        return pair_sum(discretisation, wall_term, ahead) if sticks else fluid_sum(discretisation, ahead)
+
+    def wall_force(
+        x_ij: vector,
+        v_ij: vector,
+        m_i: real,
+        T_i: matrix,
+        mu_i: real,
+        control: real,
+        least: real,
+        foot: vector,
+        s: neighbourhood,
+    ) -> vector:
+        return (-hold(x_ij, foot, least, s) / m_i) * (T_i * fall(x_ij, foot) + (control * mu_i) * v_ij)
+
+    @summed(wall_force)
+    def force(
+        x_ij: vector,
+        v_ij: vector,
+        m_i: real,
+        T_i: matrix,
+        T_j: matrix,
+        mu_i: real,
+        mu_j: real,
+        control: real,
+        least: real,
+        s: neighbourhood,
+    ) -> vector:
+        return (-weight(x_ij, s) / m_i) * ((T_i + T_j) * x_ij + (control * (mu_i + mu_j)) * v_ij)
+
+    def wall_force_tangent(
+        x_ij: vector,
+        x_dot_ij: vector,
+        v_ij: vector,
+        v_dot_ij: vector,
+        m_i: real,
+        m_dot_i: real,
+        T_i: matrix,
+        T_dot_i: matrix,
+        mu_i: real,
+        mu_dot_i: real,
+        control: real,
+        least: real,
+        foot: vector,
+        s: neighbourhood,
+    ) -> vector:
+        w, y, u = hold(x_ij, foot, least, s), fall(x_ij, foot), fall_change(x_ij, x_dot_ij, foot)
+        w_dot = wp.dot(hold_gradient(x_ij, foot, least, s), x_dot_ij) - w * m_dot_i / m_i
+        pull = T_i * y + (control * mu_i) * v_ij
+        change = T_dot_i * y + T_i * u + control * (mu_dot_i * v_ij + mu_i * v_dot_ij)
+        return (real(-1.0) / m_i) * (w_dot * pull + w * change)
+
+    @tangent_of(force)
+    @summed(wall_force_tangent, ahead=False)
+    def force_tangent(
+        x_ij: vector,
+        x_dot_ij: vector,
+        v_ij: vector,
+        v_dot_ij: vector,
+        m_i: real,
+        m_dot_i: real,
+        T_i: matrix,
+        T_j: matrix,
+        T_dot_i: matrix,
+        T_dot_j: matrix,
+        mu_i: real,
+        mu_j: real,
+        mu_dot_i: real,
+        mu_dot_j: real,
+        control: real,
+        least: real,
+        s: neighbourhood,
+    ) -> vector:
+        w = weight(x_ij, s)
+        w_dot = -s.volume * wp.dot(slope_gradient(x_ij, s), x_dot_ij) - w * m_dot_i / m_i
+        T, mu = T_i + T_j, control * (mu_i + mu_j)
+        pull = T * x_ij + mu * v_ij
+        change = (T_dot_i + T_dot_j) * x_ij + T * x_dot_ij + (control * (mu_dot_i + mu_dot_j)) * v_ij + mu * v_dot_ij
+        return (real(-1.0) / m_i) * (w_dot * pull + w * change)
+
+    def wall_traction_back(
+        x_ij: vector,
+        v_ij: vector,
+        m_i: real,
+        bar_i: vector,
+        control: real,
+        least: real,
+        foot: vector,
+        s: neighbourhood,
+    ) -> tuple[vector, vector, vector, real]:
+        z = (-hold(x_ij, foot, least, s) / m_i) * bar_i
+        y = fall(x_ij, foot)
+        return z[0] * y, z[1] * y, z[2] * y, control * wp.dot(z, v_ij)
+
+    @summed(wall_traction_back)
+    def traction_back(
+        x_ij: vector,
+        v_ij: vector,
+        m_i: real,
+        m_j: real,
+        bar_i: vector,
+        bar_j: vector,
+        control: real,
+        least: real,
+        s: neighbourhood,
+    ) -> tuple[vector, vector, vector, real]:
+        """What it gives to the rows of T and to mu."""
+        z = -weight(x_ij, s) * (bar_i / m_i - bar_j / m_j)
+        return z[0] * x_ij, z[1] * x_ij, z[2] * x_ij, control * wp.dot(z, v_ij)
+
+    def wall_force_back(
+        x_ij: vector,
+        v_ij: vector,
+        m_i: real,
+        T_i: matrix,
+        mu_i: real,
+        bar_i: vector,
+        control: real,
+        least: real,
+        foot: vector,
+        s: neighbourhood,
+    ) -> tuple[vector, vector, real]:
+        w, y, u = hold(x_ij, foot, least, s), fall(x_ij, foot), bar_i / m_i
+        level = -wp.dot(u, T_i * y + (control * mu_i) * v_ij)
+        x_part = level * hold_gradient(x_ij, foot, least, s) - w * fall_change(x_ij, wp.transpose(T_i) * u, foot)
+        return x_part, (-w * control * mu_i) * u, -level * w / m_i
+
+    @summed(wall_force_back)
+    def force_back(
+        x_ij: vector,
+        v_ij: vector,
+        m_i: real,
+        m_j: real,
+        T_i: matrix,
+        T_j: matrix,
+        mu_i: real,
+        mu_j: real,
+        bar_i: vector,
+        bar_j: vector,
+        control: real,
+        least: real,
+        s: neighbourhood,
+    ) -> tuple[vector, vector, real]:
+        """What the pair gives to x, v and m of i, for an adjoint of the acceleration."""
+        w, T, mu, own_u = weight(x_ij, s), T_i + T_j, control * (mu_i + mu_j), bar_i / m_i
+        u, pull = own_u - bar_j / m_j, T * x_ij + mu * v_ij
+        x_part = (s.volume * wp.dot(u, pull)) * slope_gradient(x_ij, s) - w * (wp.transpose(T) * u)
+        return x_part, (-w * mu) * u, w * wp.dot(own_u, pull) / m_i
+
+    return StressSums(force, force_tangent, traction_back, force_back)
