@@ -163,6 +163,7 @@ def test_what_does_not_fit_is_a_sentence(device):
         ({"velocities": np.array([["fast"]])}, "velocities cannot be taken: Unsupported"),
         ({"velocities": given(simulation, single)}, "not finite"),
         ({"positions": given(simulation, crowded)}, "at one place"),
+        ({"velocities": given(simulation, crowded + np.float32(1.0))}, "velocities has a third component other than 0"),
         ({"pressure": given(simulation, crowded)}, "'pressure', but must have only positions"),
     ]:
         with pytest.raises(InputError, match=words):

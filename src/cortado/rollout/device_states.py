@@ -1,7 +1,7 @@
 """States that stay on the device, whose arrays other programs take and give by DLPack, and derivatives with respect to
 them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from cortado.errors import InputError, shown
+from cortado.particles.fields import Entry
 from cortado.particles.state import State
 from cortado.rollout.host_states import HostStates, States, clocks_after, require_fields, time_of
 from cortado.rollout.parameter_space import ParameterSpace
@@ -76,11 +77,12 @@ class DeviceStates(HostStates):
 
     def replaced(self, space: ParameterSpace, state: DeviceState, fields: Values) -> DeviceState:
         """A state, whose arrays are overwritten, with other fields: it is judged on the host as any state is."""
-        require_fields("state", fields, state.arrays)
-        copy_to(state.arrays, "state", fields)
+        given = require_fields("state", fields, state.arrays)
+        copy_to(state.arrays, "state", given)
         densities = np.array([scene.origin.rest_density for scene in state.scenes if scene.origin])
         values = {"rest_density": densities[0] if self._simulation.batch is None else densities}
         space.check_restarts(self.states(state.arrays, state.scenes), values)
+        self._require_plane(state, given)
         return state
 
     def on_host(self, state: DeviceState) -> States:
@@ -90,6 +92,13 @@ class DeviceStates(HostStates):
         judged = zip(found, state.scenes, strict=True)
         self._simulation.judged_states.update(one for one, scene in judged if scene in self._simulation.judged_states)
         return found[0] if self._simulation.batch is None else found
+
+    def _require_plane(self, state: DeviceState, names: Iterable[str]) -> None:
+        """Vectors of a scene in 2-D lie in its plane."""
+        vectors = {field.name for field in state.arrays.fields if field.entry is Entry.VECTOR}
+        for name in vectors.intersection(names) if self._simulation.dimension == 2 else ():
+            if state[name].numpy()[..., 2].any():
+                raise InputError(f"state {name} has a third component other than 0, but must have 0 there in 2-D.")
 
     def _require_own(self, state: DeviceState) -> None:
         own, found = self._simulation.initial, state.arrays
