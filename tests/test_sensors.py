@@ -173,7 +173,53 @@ def test_the_command_reads_the_sensors_of_a_scene(tmp_path, monkeypatch):
     assert np.array_equal(plain.positions, alone.positions) and not plain.sensors
 
 
+class Odd:
+    """A sensor of one column, which reads what it is told to."""
+
+    def __init__(self, read):
+        self.read = read
+
+    def columns(self, dimension):
+        return {"read": "m"}
+
+    def value(self, at):
+        return self.read
+
+    def adjoint(self, at, bar):
+        return {}
+
+
+PROBE = PressureProbe([0.2, 0.1])
+
+
+def series_of(sensor, values=(1.0, 2.0), time_step=0.0021, parameters=None, **options):
+    """Its value in a run of the plane."""
+    loss = Series(sensor, [0.0, 0.0084], values, time_step, **options)
+    return cortado.Problem(cortado.Simulation(plane()), 4, loss).value(parameters or {})
+
+
 MISTAKES = [
+    (lambda: cortado.Simulation(plane()).run(1, sensors=[PROBE]), "sensors is .* but must be given by name"),
+    (
+        lambda: cortado.Simulation(plane()).run(1, sensors={"o": Odd(3.0)}),
+        r"sensor Odd has shape \(\), but must be \(1,\)",
+    ),
+    (lambda: cortado.Simulation(plane()).run(1, sensors={"o": Odd([3.0, 4.0])}), r"Odd has shape \(2,\), but must be"),
+    (lambda: cortado.Simulation(plane()).run(1, sensors={"o": Odd("deep")}), "sensor Odd is 'deep', but must be"),
+    (lambda: PressureProbe([np.nan, 0.0]), "position is .* but must be numbers"),
+    (lambda: PressureProbe([np.inf, 0.0]), "position is .* but must be finite"),
+    (lambda: PressureProbe([0.0, 0.0], np.inf), "radius is inf, but must be greater than 0 and finite"),
+    (lambda: WallForce([np.nan, 0.0]), "lower is .* but must be numbers"),
+    (lambda: Series(PROBE, [0.0, 1.0], ["a", "b"], 0.1), "values is made of text"),
+    (lambda: Series(PROBE, [0.0, 1.0], [[1.0], [1.0, 2.0]], 0.1), "values is .* but must be a number or an array"),
+    (lambda: Series(PROBE, [0.0, 1.0], [np.inf, 0.0], 0.1), "values must be finite"),
+    (lambda: Series(PROBE, [0.0, 1.0], [np.nan, np.nan], 0.1), "values must be finite, .* not for all of them"),
+    (lambda: Series(PROBE, [0.0, 1.0], [1.0, 0.0], 0.1, scale=[1.0, 2.0]), r"scale has shape \(2,\), but must be"),
+    (lambda: Series(PressureProbe, [0.0, 1.0], [1.0, 0.0], 0.1), "sensor is .* but must be a sensor, such as"),
+    (lambda: series_of(PROBE, [[1.0, 2.0], [3.0, 4.0]]), "values has 2 columns, but must have 1"),
+    (lambda: series_of(PROBE, time_step=0.002), "time_step of the series is 0.002 s, but must be .* 0.0021 s"),
+    (lambda: series_of(PROBE, parameters={"time_step": 0.001}), "time_step of the series is 0.0021 s, but must be"),
+    (lambda: series_of(Odd(3.0)), r"sensor Odd has shape \(\)"),
     (lambda: PressureProbe([0.0]), "position has shape"),
     (lambda: PressureProbe([0.0, 0.0], -1.0), "radius is -1, but must be greater than 0"),
     (lambda: FlowRate([0.0, 0.0], [0.0, 0.0]), "normal is .* but must not be 0"),
@@ -193,6 +239,25 @@ MISTAKES = [
 def test_a_mistake_is_a_sentence(make, words):
     with pytest.raises((InputError, cortado.SceneError), match=words):
         make()
+
+
+def test_a_sensor_has_places_of_its_own_and_a_region_may_have_no_end():
+    place = np.array([0.21, 0.13])
+    probe = PressureProbe(place)
+    place[:] = 9.0
+    assert probe.position.tolist() == [0.21, 0.13]
+    sensors = {"open": WallForce(upper=[0.35, np.inf]), "left": WallForce(lower=[-np.inf, -np.inf], upper=[0.35, 9.0])}
+    read = cortado.Simulation(plane()).run(8, sensors=sensors).sensors
+    assert np.abs(read["open"].values[-1]).max() > 0.0
+    assert read["open"].values.tobytes() == read["left"].values.tobytes()
+
+
+def test_a_series_in_a_batch_is_that_of_each_scene():
+    loss = Series(PROBE, [0.0, 0.0084], [1.0, 200.0], 0.0021)
+    viscosities, alone = [0.05, 0.5], cortado.Problem(cortado.Simulation(plane()), 4, loss)
+    each = [alone.value({"viscosity": viscosity}) for viscosity in viscosities]
+    together = cortado.Problem(cortado.Simulation(plane(), batch=2), 4, loss).value({"viscosity": viscosities})
+    assert together.tolist() == each and each[0] != each[1]
 
 
 def test_a_run_that_diverges_says_where_also_with_sensors(tmp_path, monkeypatch, capsys):
