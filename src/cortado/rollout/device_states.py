@@ -52,6 +52,7 @@ class DeviceStates(HostStates):
     def begin(self, space: ParameterSpace, rollout: Rollout, state: Any, values: Arrays, varied: set[str]) -> None:
         """As `HostStates.begin`."""
         self._require_own(state)
+        self._require_judged(state)
         space.check_restarts(state.scenes, values)
         space.begin(rollout, values, varied, state.scenes)
         rollout.initial.assign(state.arrays)
@@ -99,6 +100,16 @@ class DeviceStates(HostStates):
         for name in vectors.intersection(names) if self._simulation.dimension == 2 else ():
             if state[name].numpy()[..., 2].any():
                 raise InputError(f"state {name} has a third component other than 0, but must have 0 there in 2-D.")
+
+    def _require_judged(self, state: DeviceState) -> None:
+        """Arrays on the device are not looked at: they are those of a step of this simulation, in which no scene was
+        lost."""
+        others = [b for b, scene in enumerate(state.scenes) if scene not in self._simulation.judged_states]
+        if len(others) == len(state.scenes):
+            advice = "simulation.on_host(state) is taken by any of the same scene"
+            raise InputError(f"state is of another simulation, but must be of this one: {advice}.")
+        if others:
+            raise InputError(f"state has no numbers of scene {others[0]}, which was lost, but must have some of each.")
 
     def _require_own(self, state: DeviceState) -> None:
         own, found = self._simulation.initial, state.arrays
