@@ -83,6 +83,9 @@ def test_what_a_sensor_makes_of_its_adjoint_is_its_derivative(make, name, sensor
     assert distance(value, dict(at), along, derivative, [1e-2, 1e-3, 1e-4, 1e-5], enough=1e-5) < 1e-5
 
 
+FRICTIONLESS = {"viscosity": "none", "gravity": [1.0, -9.81]}
+
+
 def still_water(precision="float64", **changes):
     """A column of water, 0.5 m wide and 0.5 m high, in the plane."""
     tables = {
@@ -123,7 +126,7 @@ def test_still_water_pushes_walls_and_probes_as_it_must():
 
 def test_the_force_on_walls_is_what_the_fluid_lacks_of_its_momentum():
     """Without friction, to round-off, in every step: M (v' - v) / dt = M g - F."""
-    simulation = still_water(forces={"viscosity": "none", "gravity": [1.0, -9.81]})
+    simulation = still_water(forces=FRICTIONLESS)
     gravity, dt = np.array([1.0, -9.81]), simulation.scene.solver.time_step
     trajectory = simulation.run(30, sensors={"walls": WallForce()})
     masses = trajectory.constants["reference_density"] * simulation.lattice.volume
@@ -132,6 +135,25 @@ def test_the_force_on_walls_is_what_the_fluid_lacks_of_its_momentum():
     lack = masses.sum() * gravity - np.diff(momentum, axis=0) / dt
     assert np.abs(force).max() > 1000.0
     np.testing.assert_allclose(force, lack, atol=1e-9 * np.abs(force).max())
+
+
+@pytest.mark.parametrize("in_space", [False, True])
+def test_the_torque_on_walls_is_what_the_fluid_lacks_of_its_angular_momentum(in_space):
+    """As the forces between particles are along the lines between them: T = sum_i a_i x m_i (g - (v_i' - v_i) / dt)."""
+    made = scene(forces={"viscosity": "none", "gravity": [1.0, -9.81, 0.5]}) if in_space else None
+    simulation = cortado.Simulation(made, precision="float64") if made else still_water(forces=FRICTIONLESS)
+    d, dt, about = simulation.dimension, simulation.scene.solver.time_step, np.array([0.1, 0.05, -0.2])
+    about = about[:d]
+    trajectory = simulation.run(30, sensors={"walls": WallForce(about=about)})
+    masses = trajectory.constants["reference_density"] * simulation.lattice.volume
+    arms = np.zeros((30, simulation.particles, 3))
+    pushes = np.zeros_like(arms)
+    arms[..., :d] = trajectory.positions[:-1] - about
+    pushes[..., :d] = simulation.scene.forces.gravity - np.diff(trajectory.velocities, axis=0) / dt
+    lack = (masses[:, None] * np.cross(arms, pushes)).sum(axis=1)
+    torque = trajectory.sensors["walls"].values[:-1, d:]
+    assert np.abs(torque).max() > 1.0
+    np.testing.assert_allclose(torque, lack if in_space else lack[:, 2:], atol=1e-9 * np.abs(torque).max())
 
 
 def test_the_flow_of_an_emitter_is_its_flow_rate():
