@@ -130,7 +130,7 @@ def test_a_scene_of_a_batch_that_is_lost_has_no_numbers_on_the_device(device):
     state = simulation.step(simulation.on_device(parameters={"initial_velocities": fast}), steps=3)
     one, lost = taken(state["positions"])
     assert one[:, :2].tobytes() == Simulation(plane(), device).run(3).positions[-1].tobytes() and np.isnan(lost).all()
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="state has no numbers of scene 1, which was lost"):
         simulation.step(state)
 
 
@@ -163,6 +163,7 @@ def test_what_does_not_fit_is_a_sentence(device):
         ({"velocities": np.array([["fast"]])}, "velocities cannot be taken: Unsupported"),
         ({"velocities": given(simulation, single)}, "not finite"),
         ({"positions": given(simulation, crowded)}, "at one place"),
+        ({"velocities": given(simulation, crowded + np.float32(1.0))}, "velocities has a third component other than 0"),
         ({"pressure": given(simulation, crowded)}, "'pressure', but must have only positions"),
     ]:
         with pytest.raises(InputError, match=words):
@@ -173,6 +174,8 @@ def test_what_does_not_fit_is_a_sentence(device):
         Simulation(plane(), precision="float64").step(state)
     with pytest.raises(InputError, match="of a simulation with other arrays"):
         Simulation(plane(), batch=2).step(state)
+    with pytest.raises(InputError, match="state is of another simulation, but must be of this one"):
+        Simulation(plane(), device).step(state)
     with pytest.raises(InputError, match="has no 'pressure', but has positions"):
         state["pressure"]
     with pytest.raises(InputError, match="to be given again"):

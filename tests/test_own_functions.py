@@ -296,6 +296,18 @@ def one(x):
     return x
 
 
+def turned(v, x, k):
+    return -k * v
+
+
+def time_second(x_ij, t, v_ij, k):
+    return -k * t * v_ij
+
+
+def fixed_time(x, v, t=0.0, k=1.0):
+    return -k * t * v
+
+
 AWAY = [1.0, 0.0, 0.0]
 
 
@@ -341,6 +353,10 @@ def helped_part(x, v, k):
         (lambda: Body(np.sin, k=1.0), "Body has <ufunc 'sin'>, but must have a function"),
         (lambda: Body(drag), "Body function drag is given no value of k, but must have one of each parameter"),
         (lambda: Body(three, k=1.0), "Body function three is given no value of c, but must have"),
+        (lambda: Body(turned, k=1.0), "turned has the arguments v, x, k, but must have x, v first, and then t"),
+        (lambda: Pair(time_second, k=1.0), "time_second has the arguments .*, but must have x_ij, v_ij first"),
+        (lambda: Body(fixed_time), "fixed_time is given a value of t, but must be given none"),
+        (lambda: Body(drag, k=1.0, x=2.0), "drag is given a value of x, but must be given none"),
         (lambda: Body(one), "Body function one has x without a value, but must have"),
         (
             lambda: Pair(drag, k=1.0, c=2.0),

@@ -154,3 +154,51 @@ def test_what_works_as_a_part_must_be_one():
 def test_a_part_writes_its_fields():
     with pytest.raises(InputError, match="the force Idle has fields, but no method `end` that writes them"):
         Simulation(plane(), forces=[Made(type("Idle", (MemoryForce,), {"end": Part.end}))])
+
+
+class Memories:
+    """The mean square of the velocities that particles had."""
+
+    def value(self, end):
+        return float((end[U.name] ** 2).mean())
+
+    def adjoint(self, end):
+        return {U.name: 2.0 * end[U.name] / end[U.name].size}
+
+
+def test_its_field_is_in_losses_and_derivatives_go_through_it():
+    judged = Problem(Simulation(plane(), precision="float64", forces=[Memory()]), 12, Memories())
+    point, along = {"memory.k": 30.0, "gravity": [1.0, -9.81]}, {"memory.k": 2.0, "gravity": [0.3, 0.7]}
+    gradient, derivative = judged.value_and_gradient(point)[1], judged.tangent(point, along)
+    assert gradient["memory.k"] != 0.0
+    assert sum((gradient[name] * along[name]).sum() for name in along) == pytest.approx(derivative, rel=1e-12)
+    up, down = ({n: point[n] + s * 1e-5 * np.asarray(along[n]) for n in along} for s in (1.0, -1.0))
+    assert (judged.value(up) - judged.value(down)) / 2e-5 == pytest.approx(derivative, rel=1e-6)
+    assert cortado.certify(judged, ["memory.k", "gravity"]).right
+
+
+def test_its_field_is_read_by_name(tmp_path):
+    simulation = Simulation(plane(), forces=[Memory()])
+    trajectory = simulation.run(6, record_every=2)
+    field = trajectory.others[U.name]
+    assert np.abs(field[-1]).max() > 1e-3
+    trajectory.save(tmp_path / "run.vtkhdf")
+    for read in (trajectory, cortado.Trajectory.load(tmp_path / "run.vtkhdf")):
+        assert read.quantity(U.name).tobytes() == field.tobytes() and read[1][U.name].tobytes() == field[1].tobytes()
+    np.testing.assert_array_equal(simulation.quantity(U.name, trajectory.last_state), field[-1])
+    np.testing.assert_array_equal(simulation.quantity(U.name, trajectory), field)
+    with pytest.raises(InputError, match=f"quantity is 'memories', but must be one of .*, {U.name}, density"):
+        trajectory.quantity("memories")
+    end = Problem(simulation, 6, Memories()).end({})
+    np.testing.assert_array_equal(end[U.name], field[-1])
+
+
+def test_its_field_colours_pictures():
+    simulation = Simulation(plane(picture={"width": 160, "height": 120}), forces=[Memory()])
+    frame = simulation.run(6)[-1]
+    found = simulation.picture(frame, colour_by=U.name)
+    assert found.shape == (120, 160, 3)
+    assert np.abs(found - simulation.picture(frame)).max() > 0.1
+    assert np.abs(found - simulation.picture(frame, colour_by="speed")).max() > 0.1
+    with pytest.raises(cortado.SceneError, match="colour_by"):
+        simulation.picture(frame, colour_by="mass_fractions")

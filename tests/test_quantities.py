@@ -155,7 +155,8 @@ def test_fluid_that_turns_as_a_whole_has_twice_its_rate():
 
 def test_a_wrong_name_is_told_those_that_there_are():
     simulation = cortado.Simulation(plane())
-    with pytest.raises(InputError, match="quantity is 'presure', but must be one of density, pressure, speed"):
+    known = "positions, velocities, mass_fractions, reference_density, density, pressure, speed"
+    with pytest.raises(InputError, match=f"quantity is 'presure', but must be one of {known}"):
         simulation.quantity("presure")
     end = cortado.Problem(simulation, 1, Weighted("density", 1.0)).end({})
     with pytest.raises(InputError, match="a field of a state is 'rho', but must be one of positions, velocities"):
@@ -225,7 +226,7 @@ def test_what_was_not_recorded_is_told_how():
     np.testing.assert_allclose(trajectory[1]["speed"], np.linalg.norm(trajectory.velocities[1], axis=1))
     with pytest.raises(InputError, match=r'density was not recorded.*record=\["density"\]'):
         trajectory[0]["density"]
-    with pytest.raises(InputError, match="quantity is 'rho', but must be one of density"):
+    with pytest.raises(InputError, match="quantity is 'rho', but must be one of positions, velocities, density"):
         trajectory.quantity("rho")
     with pytest.raises(InputError, match="record is 'rho', but must be one of density"):
         simulation.run(1, record=["rho"])

@@ -83,6 +83,9 @@ def test_what_a_sensor_makes_of_its_adjoint_is_its_derivative(make, name, sensor
     assert distance(value, dict(at), along, derivative, [1e-2, 1e-3, 1e-4, 1e-5], enough=1e-5) < 1e-5
 
 
+FRICTIONLESS = {"viscosity": "none", "gravity": [1.0, -9.81]}
+
+
 def still_water(precision="float64", **changes):
     """A column of water, 0.5 m wide and 0.5 m high, in the plane."""
     tables = {
@@ -123,7 +126,7 @@ def test_still_water_pushes_walls_and_probes_as_it_must():
 
 def test_the_force_on_walls_is_what_the_fluid_lacks_of_its_momentum():
     """Without friction, to round-off, in every step: M (v' - v) / dt = M g - F."""
-    simulation = still_water(forces={"viscosity": "none", "gravity": [1.0, -9.81]})
+    simulation = still_water(forces=FRICTIONLESS)
     gravity, dt = np.array([1.0, -9.81]), simulation.scene.solver.time_step
     trajectory = simulation.run(30, sensors={"walls": WallForce()})
     masses = trajectory.constants["reference_density"] * simulation.lattice.volume
@@ -132,6 +135,25 @@ def test_the_force_on_walls_is_what_the_fluid_lacks_of_its_momentum():
     lack = masses.sum() * gravity - np.diff(momentum, axis=0) / dt
     assert np.abs(force).max() > 1000.0
     np.testing.assert_allclose(force, lack, atol=1e-9 * np.abs(force).max())
+
+
+@pytest.mark.parametrize("in_space", [False, True])
+def test_the_torque_on_walls_is_what_the_fluid_lacks_of_its_angular_momentum(in_space):
+    """As the forces between particles are along the lines between them: T = sum_i a_i x m_i (g - (v_i' - v_i) / dt)."""
+    made = scene(forces={"viscosity": "none", "gravity": [1.0, -9.81, 0.5]}) if in_space else None
+    simulation = cortado.Simulation(made, precision="float64") if made else still_water(forces=FRICTIONLESS)
+    d, dt, about = simulation.dimension, simulation.scene.solver.time_step, np.array([0.1, 0.05, -0.2])
+    about = about[:d]
+    trajectory = simulation.run(30, sensors={"walls": WallForce(about=about)})
+    masses = trajectory.constants["reference_density"] * simulation.lattice.volume
+    arms = np.zeros((30, simulation.particles, 3))
+    pushes = np.zeros_like(arms)
+    arms[..., :d] = trajectory.positions[:-1] - about
+    pushes[..., :d] = simulation.scene.forces.gravity - np.diff(trajectory.velocities, axis=0) / dt
+    lack = (masses[:, None] * np.cross(arms, pushes)).sum(axis=1)
+    torque = trajectory.sensors["walls"].values[:-1, d:]
+    assert np.abs(torque).max() > 1.0
+    np.testing.assert_allclose(torque, lack if in_space else lack[:, 2:], atol=1e-9 * np.abs(torque).max())
 
 
 def test_the_flow_of_an_emitter_is_its_flow_rate():
@@ -173,7 +195,53 @@ def test_the_command_reads_the_sensors_of_a_scene(tmp_path, monkeypatch):
     assert np.array_equal(plain.positions, alone.positions) and not plain.sensors
 
 
+class Odd:
+    """A sensor of one column, which reads what it is told to."""
+
+    def __init__(self, read):
+        self.read = read
+
+    def columns(self, dimension):
+        return {"read": "m"}
+
+    def value(self, at):
+        return self.read
+
+    def adjoint(self, at, bar):
+        return {}
+
+
+PROBE = PressureProbe([0.2, 0.1])
+
+
+def series_of(sensor, values=(1.0, 2.0), time_step=0.0021, parameters=None, **options):
+    """Its value in a run of the plane."""
+    loss = Series(sensor, [0.0, 0.0084], values, time_step, **options)
+    return cortado.Problem(cortado.Simulation(plane()), 4, loss).value(parameters or {})
+
+
 MISTAKES = [
+    (lambda: cortado.Simulation(plane()).run(1, sensors=[PROBE]), "sensors is .* but must be given by name"),
+    (
+        lambda: cortado.Simulation(plane()).run(1, sensors={"o": Odd(3.0)}),
+        r"sensor Odd has shape \(\), but must be \(1,\)",
+    ),
+    (lambda: cortado.Simulation(plane()).run(1, sensors={"o": Odd([3.0, 4.0])}), r"Odd has shape \(2,\), but must be"),
+    (lambda: cortado.Simulation(plane()).run(1, sensors={"o": Odd("deep")}), "sensor Odd is 'deep', but must be"),
+    (lambda: PressureProbe([np.nan, 0.0]), "position is .* but must be numbers"),
+    (lambda: PressureProbe([np.inf, 0.0]), "position is .* but must be finite"),
+    (lambda: PressureProbe([0.0, 0.0], np.inf), "radius is inf, but must be greater than 0 and finite"),
+    (lambda: WallForce([np.nan, 0.0]), "lower is .* but must be numbers"),
+    (lambda: Series(PROBE, [0.0, 1.0], ["a", "b"], 0.1), "values is made of text"),
+    (lambda: Series(PROBE, [0.0, 1.0], [[1.0], [1.0, 2.0]], 0.1), "values is .* but must be a number or an array"),
+    (lambda: Series(PROBE, [0.0, 1.0], [np.inf, 0.0], 0.1), "values must be finite"),
+    (lambda: Series(PROBE, [0.0, 1.0], [np.nan, np.nan], 0.1), "values must be finite, .* not for all of them"),
+    (lambda: Series(PROBE, [0.0, 1.0], [1.0, 0.0], 0.1, scale=[1.0, 2.0]), r"scale has shape \(2,\), but must be"),
+    (lambda: Series(PressureProbe, [0.0, 1.0], [1.0, 0.0], 0.1), "sensor is .* but must be a sensor, such as"),
+    (lambda: series_of(PROBE, [[1.0, 2.0], [3.0, 4.0]]), "values has 2 columns, but must have 1"),
+    (lambda: series_of(PROBE, time_step=0.002), "time_step of the series is 0.002 s, but must be .* 0.0021 s"),
+    (lambda: series_of(PROBE, parameters={"time_step": 0.001}), "time_step of the series is 0.0021 s, but must be"),
+    (lambda: series_of(Odd(3.0)), r"sensor Odd has shape \(\)"),
     (lambda: PressureProbe([0.0]), "position has shape"),
     (lambda: PressureProbe([0.0, 0.0], -1.0), "radius is -1, but must be greater than 0"),
     (lambda: FlowRate([0.0, 0.0], [0.0, 0.0]), "normal is .* but must not be 0"),
@@ -193,6 +261,25 @@ MISTAKES = [
 def test_a_mistake_is_a_sentence(make, words):
     with pytest.raises((InputError, cortado.SceneError), match=words):
         make()
+
+
+def test_a_sensor_has_places_of_its_own_and_a_region_may_have_no_end():
+    place = np.array([0.21, 0.13])
+    probe = PressureProbe(place)
+    place[:] = 9.0
+    assert probe.position.tolist() == [0.21, 0.13]
+    sensors = {"open": WallForce(upper=[0.35, np.inf]), "left": WallForce(lower=[-np.inf, -np.inf], upper=[0.35, 9.0])}
+    read = cortado.Simulation(plane()).run(8, sensors=sensors).sensors
+    assert np.abs(read["open"].values[-1]).max() > 0.0
+    assert read["open"].values.tobytes() == read["left"].values.tobytes()
+
+
+def test_a_series_in_a_batch_is_that_of_each_scene():
+    loss = Series(PROBE, [0.0, 0.0084], [1.0, 200.0], 0.0021)
+    viscosities, alone = [0.05, 0.5], cortado.Problem(cortado.Simulation(plane()), 4, loss)
+    each = [alone.value({"viscosity": viscosity}) for viscosity in viscosities]
+    together = cortado.Problem(cortado.Simulation(plane(), batch=2), 4, loss).value({"viscosity": viscosities})
+    assert together.tolist() == each and each[0] != each[1]
 
 
 def test_a_run_that_diverges_says_where_also_with_sensors(tmp_path, monkeypatch, capsys):

@@ -13,6 +13,7 @@ from cortado.cli.commands.run import run_scene
 from cortado.scene.parameters.parameter import Axis, Parameter
 from cortado.scene.solvers import PackageSolver
 from cortado.solvers.build import particle_system
+from cortado.solvers.particles import ParticleSolver
 from own_forces import Breeze
 from packages import on_path
 from scenes import plane, scene, two_layers
@@ -215,6 +216,23 @@ class Alone:
     def new_state(self):
         raise AssertionError
 
+    new_parameters = new_log = set_substeps = reset = make_room = step = new_state
+
+
+class MakeStill:
+    def build(self, setting):
+        return ParticleSolver(particle_system(setting))
+
+
+class Uncounted(Falling):
+    def end_step(self, x, v, new_state, log):
+        pass
+
+
+class MakeUncounted:
+    def build(self, setting):
+        return Uncounted(particle_system(setting))
+
 
 @pytest.mark.parametrize(
     ("solver", "options", "said"),
@@ -227,12 +245,19 @@ class Alone:
         (Wrong(None, [number("gravity")]), {}, "parameter gravity of a solver has the name of another one"),
         (MakeRemembering(np.nan), {}, "parameter memory.rate has a value that is not finite"),
         (MakeFalling(), {"batch": 2}, "batch is 2, but must be left out, as the solver MakeFalling has no batches"),
+        (MakeStill(), {}, "build of the solver MakeStill returned .*, which has no step, but must have one"),
         (Wrong(Alone()), {"forces": [Breeze()]}, "forces is given, but must be left out, as the solver Wrong takes no"),
     ],
 )
 def test_a_solver_that_does_not_fit_is_a_sentence(solver, options, said):
     with pytest.raises(InputError, match=said):
         Simulation(plane(), solver=solver, **options)
+
+
+def test_a_solver_that_does_not_count_its_steps_is_a_sentence():
+    simulation = Simulation(plane(), solver=MakeUncounted())
+    with pytest.raises(InputError, match=r"solver Uncounted has not counted its steps, but must: .* self\.end_step"):
+        simulation.run(3)
 
 
 def run_command(tmp_path, monkeypatch, kind):

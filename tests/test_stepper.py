@@ -138,6 +138,22 @@ def test_a_scene_of_a_batch_that_is_lost_has_no_numbers_and_cannot_go_on():
         simulation.step([one, lost])
 
 
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_derivatives_of_a_scene_of_a_batch_that_is_lost_have_no_numbers_and_go_back_beside_those_of_others():
+    simulation, alone = Simulation(plane(), batch=2), Simulation(plane())
+    fast = np.zeros((2, simulation.particles, 2))
+    fast[1, 0] = [400.0, 0.0]
+    states, residual = simulation.stepper(3).step(simulation.state({"initial_velocities": fast}))
+    bar = simulation.stepper(3).vjp(residual, {"positions": np.stack([one["positions"] for one in states])})[0]
+    wanted = alone.vjp(alone.state(), {}, {"positions": states[0]["positions"]}, steps=3)[0]
+    assert bar["velocities"][0].tobytes() == wanted["velocities"].tobytes()
+    assert np.isnan(bar["velocities"][1]).all() and np.isnan(bar["time"][1])
+    partly = np.zeros((2, simulation.particles, 2))
+    partly[1, 3] = np.nan
+    with pytest.raises(InputError, match="positions has a value that is not finite"):
+        simulation.stepper(3).vjp(residual, {"positions": partly})
+
+
 @pytest.mark.parametrize("name", ["one fluid", "mixture", "jet"])
 def test_from_the_second_call_on_nothing_is_allocated_on_the_device(name, monkeypatch):
     simulation = Simulation(SCENES[name]())
@@ -373,6 +389,8 @@ def test_a_problem_keeps_its_own_copy_of_a_state():
         ({"positions": np.zeros((63, 2))}, r"has shape \(63, 2\), but must be \(64, 2\)"),
         ({"time": [1.0]}, r"time has shape \(1,\)"),
         ({"velocities": "fast"}, "velocities"),
+        ({"velocities": np.full((64, 2), np.nan)}, "velocities has a value that is not finite, but must be numbers"),
+        ({"time": np.inf}, "time has a value that is not finite"),
         (None, "must be a table"),
     ],
 )

@@ -13,11 +13,13 @@ from cortado.cli.commands.view import opened
 from cortado.cli.viewer import quantities as view_quantities
 from cortado.cli.viewer.live import LiveView
 from cortado.cli.viewer.quantities import AHEAD, upwards
+from cortado.cli.viewer.recorded import RecordedView
 from cortado.cli.viewer.task import TaskView
 from cortado.cli.viewer.window import LONGEST_ARROW, PULL
 from cortado.pictures.scene_view import outline
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.scene import Scene
+from remembering_force import Memory, U
 
 viser = pytest.importorskip("viser")
 PORT = 18310
@@ -233,6 +235,24 @@ def test_a_run_is_played_and_gone_through(scene):
         assert shown.slider.value > 0
     finally:
         shown.window.close()
+
+
+def test_the_field_of_a_part_colours_particles(scene):
+    simulation = cortado.Simulation("scene.toml", forces=[Memory()])
+    for shown in (
+        LiveView(simulation, PORT + 2),
+        RecordedView(simulation.scene, simulation.run(3), lambda: simulation, PORT + 3),
+    ):
+        try:
+            for _ in range(3):
+                shown.tick()
+            if isinstance(shown, RecordedView):
+                shown.show(3)
+            assert len(np.unique(coloured(shown, "phase"), axis=0)) == 1
+            assert len(np.unique(coloured(shown, U.name), axis=0)) > 1
+            assert U.name in shown.window.legend.content
+        finally:
+            shown.window.close()
 
 
 @pytest.mark.parametrize(

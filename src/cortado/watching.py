@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 
+from cortado.arrays import require_table
 from cortado.errors import InputError
 from cortado.losses.loss import Snapshot
 from cortado.particles.state import State
@@ -32,6 +33,8 @@ class Watch:
     ):
         """``sensors`` are read besides those of the scene, which a batch does not read. Raises `InputError` for names
         of quantities that there are not, and for sensors of a batch."""
+        if sensors is not None:
+            require_table("sensors", sensors, "{'probe': cortado.sensors.PressureProbe([0.1, 0.1])}")
         if sensors and simulation.batch is not None:
             raise InputError("sensors is given, but must be left out, as a batch reads none: read one scene's.")
 

@@ -8,18 +8,23 @@ import numpy as np
 from cortado.arrays import as_numbers, as_one_number, read_only, whole_number
 from cortado.errors import InputError
 from cortado.fixed import fixed
-from cortado.losses.loss import Adjoint, Frames, Snapshot
-from cortado.runs.sensors.sensor import Sensor
+from cortado.losses.loss import Adjoint, Frames, Snapshot, moment_of
+from cortado.runs.sensors.sensor import Sensor, checked_sensor, value_of
+
+SAME = 1e-6
+"""Relative: time steps that differ by less are the same, as one of them may have been rounded to float32."""
 
 
 @fixed
 class SensorMatch:
     """Sum of the squared differences of what a sensor reads from what it should read, over squared scales."""
 
-    def __init__(self, sensor: Sensor, target: Any, weight: float = 1.0, scale: Any = 1.0):
+    def __init__(
+        self, sensor: Sensor, target: Any, weight: float = 1.0, scale: Any = 1.0, time_step: float | None = None
+    ):
         """``target`` (k,), a number for each column of the sensor, NaN for one that does not count; ``weight`` of the
-        sum; ``scale``, a number or (k,)."""
-        self.sensor, self.weight = sensor, float(weight)
+        sum; ``scale``, a number or (k,); ``time_step`` that the run must have [s]."""
+        self.sensor, self.weight, self._time_step = checked_sensor(sensor), float(weight), time_step
         self.target = np.atleast_1d(np.array(target, dtype=np.float64))
         self.scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), self.target.shape)
         arrays = self.target.tobytes() + self.scale.tobytes()
@@ -34,13 +39,24 @@ class SensorMatch:
         return self.value(end), self.sensor.adjoint(end, bar)
 
     def _miss(self, end: Snapshot) -> np.ndarray:
-        found = self.sensor.value(end)
+        self._check_time_step(end)
+        found = value_of(self.sensor, end)
         if found.shape != self.target.shape:
             columns = ", ".join(self.sensor.columns(end.dimension))
             raise InputError(
                 f"values has {len(self.target)} columns, but must have {len(found)}, those of the sensor: {columns}."
             )
         return np.where(np.isnan(self.target), 0.0, found - self.target) / self.scale
+
+    def _check_time_step(self, end: Snapshot) -> None:
+        """The state is of the time that its number of steps stands for in the series."""
+        if self._time_step is None:
+            return
+        of_run = np.ravel(moment_of(end).parameters["time_step"])
+        other = of_run[np.abs(of_run - self._time_step) > SAME * of_run]
+        if len(other):
+            found = f"time_step of the series is {self._time_step:g} s"
+            raise InputError(f"{found}, but must be that of the run, {other[0]:g} s, which cannot be varied beside it.")
 
 
 @fixed
@@ -56,13 +72,20 @@ class Series(Frames):
         """``times`` (m,) [s], rising; ``values`` (m,) or (m, k), a number for each column of the sensor, NaN for one
         that does not count; ``time_step`` of the problem [s]; ``every``: take only every so many steps into account;
         ``scale``: what a difference is divided by, a number or (k,)."""
-        moments, series = read_only("times", times), np.array(values, dtype=np.float64)
+        moments, series = read_only("times", times), as_numbers("values", values)
         series = series[:, None] if series.ndim == 1 else series
         if moments.ndim != 1 or len(moments) < 2 or not (np.diff(moments) > 0.0).all():
             raise InputError("times must be a list of at least two rising numbers.")
         if series.ndim != 2 or len(series) != len(moments):
             raise InputError(f"values has shape {series.shape}, but must have {len(moments)} rows, one for each time.")
-        if not (as_numbers("scale", scale) > 0.0).all():
+        if np.isinf(series).any() or np.isnan(series).all():
+            raise InputError("values must be finite, or NaN for those that do not count, but not for all of them.")
+        columns, sizes = series.shape[1], as_numbers("scale", scale)
+        if sizes.shape not in ((), (columns,)):
+            raise InputError(
+                f"scale has shape {sizes.shape}, but must be a number or ({columns},), one for each column."
+            )
+        if not (sizes > 0.0).all():
             raise InputError("scale must be greater than 0.")
         step, stride = as_one_number("time_step", time_step), whole_number("every", every, 1)
         if not step > 0.0:
@@ -73,4 +96,5 @@ class Series(Frames):
             raise InputError(f"times go from {moments[0]:g} to {moments[-1]:g} s, between which there is no step.")
         rows = np.stack([np.interp(np.array(steps) * step, moments, column) for column in series.T], axis=1)
         weight = 1.0 / len(steps)
-        super().__init__({k: SensorMatch(sensor, row, weight, scale) for k, row in zip(steps, rows, strict=True)})
+        each = zip(steps, rows, strict=True)
+        super().__init__({k: SensorMatch(sensor, row, weight, scale, step) for k, row in each})

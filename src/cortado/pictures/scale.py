@@ -20,14 +20,16 @@ class Scale:
     """The numbers of a quantity from one end of the colours to the other."""
 
     name: str
+    unit: str
     least: float
     greatest: float
 
     @classmethod
-    def of(cls, name: str, values: NDArray) -> "Scale":
-        """That of numbers, such as those of all frames of a film."""
+    def of(cls, name: str, values: NDArray, unit: str | None = None) -> "Scale":
+        """That of numbers, such as those of all frames of a film; ``unit`` of what is no quantity that all scenes
+        have."""
         least, greatest = np.percentile(values, OUTERMOST)
-        return cls(name, float(least), float(greatest))
+        return cls(name, QUANTITIES[name].unit if unit is None else unit, float(least), float(greatest))
 
     def colours(self, values: NDArray) -> Points:
         """(n, 3) linear, of numbers (n,)."""
@@ -38,9 +40,7 @@ class Scale:
         are."""
         rows, columns = image.shape[:2]
         height, margin = max(rows // 60, 3), max(rows // 40, 4)
-        words = (
-            f"{self.name.replace('_', ' ')} from {self.least:.3g} to {self.greatest:.3g} {QUANTITIES[self.name].unit}"
-        )
+        words = f"{self.name.replace('_', ' ')} from {self.least:.3g} to {self.greatest:.3g} {self.unit}"
         told = labelled(image, words)
         told[rows - margin - height : rows - margin, margin : columns - margin] = _colours(
             np.linspace(0.0, 1.0, columns - 2 * margin)

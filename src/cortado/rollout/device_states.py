@@ -1,7 +1,7 @@
 """States that stay on the device, whose arrays other programs take and give by DLPack, and derivatives with respect to
 them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from cortado.errors import InputError, shown
+from cortado.particles.fields import Entry
 from cortado.particles.state import State
 from cortado.rollout.host_states import HostStates, States, clocks_after, require_fields, time_of
 from cortado.rollout.parameter_space import ParameterSpace
@@ -51,6 +52,7 @@ class DeviceStates(HostStates):
     def begin(self, space: ParameterSpace, rollout: Rollout, state: Any, values: Arrays, varied: set[str]) -> None:
         """As `HostStates.begin`."""
         self._require_own(state)
+        self._require_judged(state)
         space.check_restarts(state.scenes, values)
         space.begin(rollout, values, varied, state.scenes)
         rollout.initial.assign(state.arrays)
@@ -76,11 +78,12 @@ class DeviceStates(HostStates):
 
     def replaced(self, space: ParameterSpace, state: DeviceState, fields: Values) -> DeviceState:
         """A state, whose arrays are overwritten, with other fields: it is judged on the host as any state is."""
-        require_fields("state", fields, state.arrays)
-        copy_to(state.arrays, "state", fields)
+        given = require_fields("state", fields, state.arrays)
+        copy_to(state.arrays, "state", given)
         densities = np.array([scene.origin.rest_density for scene in state.scenes if scene.origin])
         values = {"rest_density": densities[0] if self._simulation.batch is None else densities}
         space.check_restarts(self.states(state.arrays, state.scenes), values)
+        self._require_plane(state, given)
         return state
 
     def on_host(self, state: DeviceState) -> States:
@@ -90,6 +93,23 @@ class DeviceStates(HostStates):
         judged = zip(found, state.scenes, strict=True)
         self._simulation.judged_states.update(one for one, scene in judged if scene in self._simulation.judged_states)
         return found[0] if self._simulation.batch is None else found
+
+    def _require_plane(self, state: DeviceState, names: Iterable[str]) -> None:
+        """Vectors of a scene in 2-D lie in its plane."""
+        vectors = {field.name for field in state.arrays.fields if field.entry is Entry.VECTOR}
+        for name in vectors.intersection(names) if self._simulation.dimension == 2 else ():
+            if state[name].numpy()[..., 2].any():
+                raise InputError(f"state {name} has a third component other than 0, but must have 0 there in 2-D.")
+
+    def _require_judged(self, state: DeviceState) -> None:
+        """Arrays on the device are not looked at: they are those of a step of this simulation, in which no scene was
+        lost."""
+        others = [b for b, scene in enumerate(state.scenes) if scene not in self._simulation.judged_states]
+        if len(others) == len(state.scenes):
+            advice = "simulation.on_host(state) is taken by any of the same scene"
+            raise InputError(f"state is of another simulation, but must be of this one: {advice}.")
+        if others:
+            raise InputError(f"state has no numbers of scene {others[0]}, which was lost, but must have some of each.")
 
     def _require_own(self, state: DeviceState) -> None:
         own, found = self._simulation.initial, state.arrays

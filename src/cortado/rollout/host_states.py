@@ -69,9 +69,19 @@ class HostStates:
         for name, array in arrays.items():
             if array.shape != shapes[name]:
                 raise InputError(f"{what} {name} has shape {array.shape}, but must be {shapes[name]}.")
+            self._require_finite(f"{what} {name}", array)
         to.clear()
         to.set(arrays)
-        return time_of(what, given, to)
+        times = time_of(what, given, to)
+        self._require_finite(f"{what} {STATE_TIME}", times)
+        return times
+
+    def _require_finite(self, what: str, array: np.ndarray) -> None:
+        """But for scenes of a batch that have no numbers at all, as those that are lost."""
+        for scene in [array] if self._simulation.batch is None else array:
+            lost = self._simulation.batch is not None and np.isnan(scene).all()
+            if not lost and not np.isfinite(scene).all():
+                raise InputError(f"{what} has a value that is not finite, but must be numbers.")
 
     def read(self, rollout: Rollout, state: State) -> dict[str, Any]:
         """Derivatives of a state's fields, by name."""

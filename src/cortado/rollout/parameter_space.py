@@ -39,6 +39,8 @@ class ParameterSpace:
         self._first_positions = FirstPositions(simulation)
         self._told: set[str] = set()
         """The limits of stability that were warned of."""
+        self._judged: Arrays | None = None
+        """The last values that make sense: a step after another often has the same ones."""
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
         """Values as float64 arrays; raises `InputError` in a sentence. A ``what`` of "direction" may be negative."""
@@ -47,11 +49,18 @@ class ParameterSpace:
         if "tilt" in values and "gravity" in values:
             raise InputError(f"{what} gravity is given, but must be left out, as the tilt says where it points.")
         found = {name: self._checked(name, value, what) for name, value in values.items()}
-        if what != "direction":
+        if what != "direction" and not self._is_judged(found):
             check_sizes(found, self._simulation.precision, self._known)
             for number, own in enumerate(self._different(found)):
                 self._check(own, number)
+            self._judged = {name: value.copy() for name, value in found.items()}
         return found
+
+    def _is_judged(self, values: Arrays) -> bool:
+        last = self._judged
+        if last is None or last.keys() != values.keys():
+            return False
+        return all(np.array_equal(value, last[name]) for name, value in values.items())
 
     def checked_names(self, what: str, names: Iterable[str]) -> list[str]:
         """Names of parameters that the scene has; raises `InputError` for anything else."""

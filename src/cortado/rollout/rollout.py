@@ -20,6 +20,7 @@ from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Parameters, State, StateSeries
 from cortado.rollout.checkpoints import Checkpoints, checkpoint_interval
+from cortado.rollout.counted import require_counted
 from cortado.rollout.evaluation import Pending, PutAside
 from cortado.scene.restart import Clock, Origin
 from cortado.solvers.containment import Lost
@@ -205,9 +206,11 @@ class Rollout:
         self.solver.step_number.fill_(first)
         self._buffer.assign(state)
         length = last - first
-        if length not in self._chunks:
+        if is_new := length not in self._chunks:
             self._chunks[length] = CapturedGraph(partial(self._take, length), self.solver.launch)
         self._chunks[length]()
+        if is_new:
+            require_counted(self.solver, last)
         return self._chunk[:length]
 
     def _take(self, length: int) -> None:

@@ -64,7 +64,7 @@ class Measuring:
         controls: Mapping[str, Any] | None = None,
     ) -> NDArray:
         """A quantity of the particles: "density" [kg / m3], "pressure" [Pa], "speed" [m / s], "vorticity" [1 / s],
-        "wall_force" [N]; see `docs/sensors.md`.
+        "wall_force" [N]; see `docs/sensors.md`. Or a field of the state, such as one that a part of one's own keeps.
 
         Args:
             name: of the quantity.
@@ -74,12 +74,12 @@ class Measuring:
                 trajectory they are those of its run.
 
         Returns:
-            (n,) or (n, k), of a trajectory (frames, n, ...), float64, in the scene's order.
+            (n,) or (n, k), of a trajectory (frames, n, ...), float64, in the scene's order, of a field its shape.
 
         Raises:
             InputError: another name, or a state that is none of this simulation's.
         """
-        check_quantity(name)
+        check_quantity(name, others=cast(Measured, self).initial.names)
         if not isinstance(of, Trajectory):
             return self._quantity(name, of, controls)
         frames = [self._quantity(name, of[: k + 1].last_state, _at(controls, of, k)) for k in range(len(of))]
@@ -87,7 +87,10 @@ class Measuring:
 
     @in_turn
     def _quantity(self, name: str, state: Any, controls: Mapping[str, Any] | None) -> NDArray:
-        rollout = cast(Measured, self).rollout(1, controls, state)
+        own = cast(Measured, self)
+        rollout = own.rollout(1, controls, state)
+        if name in rollout.initial.names:
+            return rollout.initial.numpy(own.dimension, only=[name])[name].astype(np.float64)
         return Moment.of(rollout, 0, rollout.initial, self.evaluator).value(name)
 
 

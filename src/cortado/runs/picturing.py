@@ -5,13 +5,16 @@ from typing import Any, cast
 import numpy as np
 
 from cortado.errors import InputError, shown
+from cortado.particles.fields import Entry, StateField
+from cortado.particles.state import State
 from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.scale import Scale
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import Pictured, scene_renderer
 from cortado.runs.trajectory import Frame
+from cortado.scene.parameters.parameter import Axis
 from cortado.scene.picture import Picture
-from cortado.scene.quantities import sizes
+from cortado.scene.quantities import NAMES, sizes
 from cortado.scene.scene import Scene
 
 
@@ -23,6 +26,8 @@ class Picturing:
     """Of Warp."""
     particles: int
     """How many there are."""
+    initial: State
+    """The first state."""
 
     @property
     def dimension(self) -> int:
@@ -40,7 +45,8 @@ class Picturing:
 
     def picture(self, frame: Frame, **settings: Any) -> np.ndarray:
         """A shaded picture of a frame, (rows, columns, 3), linear from 0 to 1, as the table ``[picture]`` of the scene
-        says; ``settings`` replace keys of it: ``width=640, height=360``.
+        says; ``settings`` replace keys of it: ``width=640, height=360``. ``colour_by`` may also name a field of the
+        particles that a part of one's own keeps.
 
         Raises:
             SceneError: settings that do not fit.
@@ -50,11 +56,22 @@ class Picturing:
         if not isinstance(frame, Frame):
             raise InputError(f"frame is {shown(frame)}, but must be one frame of a trajectory, such as trajectory[-1].")
         given = {} if self.scene.picture is None else self.scene.picture.model_dump()
-        table = Picture(**{**given, **settings}).in_dimension(self.dimension, ("picture",))
+        wanted = {**given, **settings}
+        own = self._own_field(wanted.get("colour_by"))
+        judged = {**wanted, "colour_by": None} if own else wanted
+        table = Picture(**judged).in_dimension(self.dimension, ("picture",))
+        if own:
+            table = table.model_copy(update={"colour_by": own.name})
         scene = self.scene.model_copy(update={"picture": table})
         draws = painter(scene, frame.positions, self.device)
         if table.colour_by is None:
             return draws.image(frame.positions, colours_of(scene, frame.mass_fractions, self.particles))
-        values = sizes(table.colour_by, frame[table.colour_by], self.dimension)
-        scale = Scale.of(table.colour_by, values)
+        values, unit = sizes(table.colour_by, frame[table.colour_by], self.dimension), own.unit if own else None
+        scale = Scale.of(table.colour_by, values, unit)
         return scale.beside(draws.image(frame.positions, scale.colours(values)))
+
+    def _own_field(self, name: Any) -> StateField | None:
+        """The field of the particles by that name that is no quantity of all scenes."""
+        drawn = (Entry.NUMBER, Entry.VECTOR)
+        known = (field for field in self.initial.fields if field.entry in drawn and field.axis is Axis.PARTICLE)
+        return next((field for field in known if field.name == name and name not in NAMES), None)

@@ -44,16 +44,18 @@ class Frame:
     """[s]"""
     quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """(n,) or (n, k) by name: those that were recorded, such as ``density``"""
+    others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """further fields of the state by name, such as those that parts keep; see `Trajectory`"""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """A quantity of the particles by its name, one that was recorded or the speed.
+        """A quantity of the particles by its name, one that was recorded or the speed, or a field of the state.
 
         Raises:
             InputError: it was not recorded, or there is no such quantity.
         """
-        if name == "speed" and name not in self.quantities:
-            return np.linalg.norm(self.velocities, axis=1)
-        return chosen(self.quantities, name)
+        fractions = {} if self.mass_fractions is None else {"mass_fractions": self.mass_fractions}
+        fields = {"positions": self.positions, "velocities": self.velocities, **fractions, **self.others}
+        return chosen(self.quantities, name, fields)
 
     def __repr__(self) -> str:
         return f"Frame({counted(len(self.positions), 'particle')}, t = {self.time:.4g} s)"
@@ -155,19 +157,17 @@ class Trajectory:
         if place not in range(-len(self), len(self)):
             raise IndexError(f"frame {place} is asked for, but there are {len(self)} frames.")
         fractions = None if self.mass_fractions is None else self.mass_fractions[place]
-        own = {name: array[place] for name, array in self.quantities.items()}
-        return Frame(self.positions[place], self.velocities[place], fractions, float(self.times[place]), own)
+        own, others = ({n: a[place] for n, a in each.items()} for each in (self.quantities, self.others))
+        return Frame(self.positions[place], self.velocities[place], fractions, float(self.times[place]), own, others)
 
     def quantity(self, name: str) -> NDArray[Any]:
-        """(frames, n) or (frames, n, k) a quantity of the particles, one that was recorded or the speed; that of any
-        other `Simulation.quantity` computes.
+        """(frames, n) or (frames, n, k) a quantity of the particles, one that was recorded or the speed, or a field of
+        the states, which may have other axes behind the first; any other quantity `Simulation.quantity` computes.
 
         Raises:
             InputError: it was not recorded, or there is no such quantity.
         """
-        if name == "speed" and name not in self.quantities:
-            return np.linalg.norm(self.velocities, axis=2)
-        return chosen(self.quantities, name)
+        return chosen(self.quantities, name, self._fields)
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
@@ -291,9 +291,14 @@ def _spacing(positions: NDArray[Any]) -> float:
     return float(np.median(KDTree(positions).query(positions[:MANY], k=2)[0][:, 1])) or 1.0
 
 
-def chosen(quantities: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
-    """A quantity that was recorded; raises `InputError` for any other name."""
-    if check_quantity(name) not in quantities:
+def chosen(quantities: Mapping[str, NDArray[Any]], name: str, fields: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    """A quantity that was recorded, the speed, or one of ``fields``; raises `InputError` for any other name."""
+    check_quantity(name, others=tuple(fields))
+    if name in fields:
+        return fields[name]
+    if name == "speed" and name not in quantities:
+        return np.linalg.norm(fields["velocities"], axis=-1)
+    if name not in quantities:
         found = f"{', '.join(quantities)} and the speed are" if quantities else "only the speed is"
         advice = f'record it, as in simulation.run(steps, record=["{name}"]), or ask simulation.quantity for it'
         raise InputError(f"{name} was not recorded, {found} there: {advice}.")

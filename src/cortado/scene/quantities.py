@@ -49,8 +49,10 @@ NAMES = tuple(QUANTITIES)
 
 
 def sizes(name: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Numbers (..., n) of a quantity's values, of vectors (..., n, k) their lengths."""
-    is_vector = len(QUANTITIES[name].shape(1, dimension)) == 2
+    """Numbers (..., n) of the values of a quantity or, of one frame, of a field; of vectors (..., n, k) their
+    lengths."""
+    known = QUANTITIES.get(name)
+    is_vector = values.ndim == 2 if known is None else len(known.shape(1, dimension)) == 2
     return np.linalg.norm(values, axis=-1) if is_vector else values
 
 

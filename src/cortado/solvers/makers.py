@@ -60,6 +60,10 @@ def called(table: SolverTable, given: SolverMaker | None) -> str:
     return f'solver.kind "{table.kind}"' if given is None else f"the solver {type(given).__name__}"
 
 
+NEEDED = ("new_parameters", "new_log", "set_substeps", "reset", "make_room", "step")
+"""Methods without which a solver takes no steps."""
+
+
 def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
     """The solver that a maker makes; raises `InputError` where it does not fit the simulation."""
     if setting.batch is not None and not getattr(maker, "batches", False):
@@ -67,6 +71,10 @@ def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
     solver = maker.build(setting)
     if not callable(getattr(solver, "new_state", None)):
         raise InputError(f"build of {setting.called} returned {shown(solver)}, but must return a solver.")
+    lacking = [name for name in NEEDED if not callable(getattr(solver, name, None))]
+    if lacking:
+        found = f"build of {setting.called} returned {shown(solver)}, which has no {lacking[0]}"
+        raise InputError(f"{found}, but must have one: see cortado.solvers.solver.Solver.")
     if setting.forces and not hasattr(solver, "forces"):
         raise InputError(f"forces is given, but must be left out, as {setting.called} takes no others.")
     return solver

@@ -16,6 +16,8 @@ from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
 from cortado.sph.function_text import REAL, VECTOR, DerivativeCheck, InPrecision, check_names, check_returns
 
+VECTORS = {"Body": ("x", "v"), "Pair": ("x_ij", "v_ij")}
+"""The vectors that functions of forces are given, by what sentences call them."""
 _SENT: WeakKeyDictionary[FunctionType, str] = WeakKeyDictionary()
 """Texts of functions that came from other processes."""
 
@@ -79,7 +81,7 @@ def formula(
     """A user's function with its text, called ``kind`` in sentences, and the values of its parameters: those given, and
     its own for what is not. Raises `InputError`."""
     name, what = function.__name__, f"{kind} function {function.__name__}"
-    inputs, values = _arguments(what, function, parameters)
+    inputs, values = _arguments(what, function, parameters, (*VECTORS[kind], "t"))
     definition, scope = _definition(what, source), _scope(function)
     tree = ast.Module([definition], [])
     helpers = _called(scope)
@@ -96,17 +98,26 @@ def formula(
     return Formula(name, text, inputs, tuple(values), outside, MappingProxyType(scope)), values
 
 
-def _arguments(what: str, function: FunctionType, given: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Names of the inputs, and the parameters' values in the order of the function's arguments."""
+def _arguments(
+    what: str, function: FunctionType, given: Mapping[str, Any], known: tuple[str, ...]
+) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Names of the inputs, and the parameters' values in the order of the function's arguments. Inputs may have any
+    names, but those by which they are ``known`` stand for nothing else."""
     signature = inspect.signature(function).parameters
     for argument in signature.values():
         if argument.kind is not argument.POSITIONAL_OR_KEYWORD:
             raise InputError(f"{what} has the argument {argument}, but must have arguments by position alone.")
+    if any(name in known and known.index(name) != place for place, name in enumerate(signature)):
+        found = f"{what} has the arguments {', '.join(signature)}"
+        raise InputError(f"{found}, but must have {', '.join(known[:2])} first, and then {known[2]} if it takes time.")
     for name in given:
         if name not in signature:
             found = f"({', '.join(signature)})"
             raise InputError(f"{what} is given a value of {name}, but must have {name} among its arguments {found}.")
     values = {n: given.get(n, a.default) for n, a in signature.items() if n in given or a.default is not a.empty}
+    for name in known:
+        if name in values:
+            raise InputError(f"{what} is given a value of {name}, but must be given none, as the run has its own.")
     inputs = tuple(name for name in signature if name not in values)
     if lacking := [name for name in tuple(signature)[3:] if name in inputs]:
         found = f"{what} is given no value of {', '.join(lacking)}"

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.cli.viewer.quantities import HEIGHT_UNITS, pull_on_height, quantities_of
+from cortado.cli.viewer.quantities import HEIGHT_UNITS, own_fields, pull_on_height, quantities_of
 from cortado.cli.viewer.window import Shown, Window
 from cortado.errors import CortadoError, CortadoWarning
 from cortado.pictures.painter import colours_of
@@ -29,7 +29,9 @@ class LiveView:
         scene, self.simulation = simulation.scene, simulation
         self.steps = max(round(SHOWN / scene.solver.time_step), 1)
         """Between two pictures."""
-        self.window = Window(scene, port, HEIGHT_UNITS)
+        own = own_fields(simulation.initial.numpy(simulation.dimension), simulation.particles)
+        units = {field.name: field.unit for field in simulation.initial.fields if field.name in own}
+        self.window = Window(scene, port, {**HEIGHT_UNITS, **units})
         gui = self.window.server.gui
         self.running = gui.add_checkbox("Run", True)
         reset = gui.add_button("Begin again")
@@ -81,6 +83,7 @@ class LiveView:
         if self._nozzle is not None:
             controls["nozzle_path"] = self._nozzle
         quantities = quantities_of(state["velocities"], lambda: self.simulation, state, controls)
+        quantities |= own_fields(state.fields, self.simulation.particles)
         pull = pull_on_height(lambda: self.simulation, state, controls)
         self.window.show(Shown(state["positions"], colours, quantities, pull))
 

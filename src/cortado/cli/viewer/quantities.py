@@ -1,7 +1,7 @@
 """What particles of a state may be coloured by, each computed when it is asked for, and where a loss pulls them."""
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from cortado.cli.viewer.window import PULL, Quantity
 from cortado.errors import InputError
 from cortado.gradients import Exact
 from cortado.losses import CentreOfMassAlong, Loss, Snapshot
-from cortado.losses.loss import by_field
+from cortado.losses.loss import ADJOINT_FIELDS, by_field
 from cortado.rollout.rollout import Rollout
 from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene
@@ -38,6 +38,13 @@ def quantities_of(
         "vorticity": lambda: sizes_of(simulation().quantity("vorticity", state, controls)),
         "wall_force": lambda: sizes_of(simulation().quantity("wall_force", state, controls)),
     }
+
+
+def own_fields(fields: Mapping[str, np.ndarray], particles: int) -> dict[str, Quantity]:
+    """By name those of a state's further fields, such as ones that parts keep, that have a number or a vector for each
+    particle."""
+    own = {name: array for name, array in fields.items() if name not in ADJOINT_FIELDS and array.ndim in (1, 2)}
+    return {name: partial(sizes_of, array) for name, array in own.items() if len(array) == particles}
 
 
 def sizes_of(values: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.cli.viewer.quantities import HEIGHT_UNITS, pull_on_height, quantities_of, sizes_of
+from cortado.cli.viewer.quantities import HEIGHT_UNITS, own_fields, pull_on_height, quantities_of, sizes_of
 from cortado.cli.viewer.window import Shown, Window
 from cortado.pictures.painter import colours_of
 from cortado.runs.trajectory import Trajectory
@@ -32,7 +32,8 @@ class RecordedView:
     ):
         """``simulation``: of the scene, asked for when something has to be computed; ``units`` as of `Window`."""
         self.scene, self._simulation = scene, simulation
-        self.window = Window(scene, port, units)
+        own = own_fields(trajectory[0].others, trajectory.particles)
+        self.window = Window(scene, port, {**units, **dict.fromkeys(own, "")})
         gui, last = self.window.server.gui, len(trajectory) - 1
         self.playing = gui.add_checkbox("Play", last > 0)
         self.slider = gui.add_slider("Frame", 0, max(last, 1), 1, 0, disabled=not last)
@@ -73,6 +74,7 @@ class RecordedView:
         colours = colours_of(self.scene, frame.mass_fractions, self.trajectory.particles)
         state, controls = self.trajectory[: k + 1].last_state, self._controls_at(k)
         quantities = quantities_of(frame.velocities, self._simulation, state, controls)
+        quantities |= own_fields(frame.others, self.trajectory.particles)
         recorded = {name: sizes_of(values) for name, values in frame.quantities.items()}
         quantities |= {name: partial(np.asarray, values) for name, values in recorded.items()}
         pull = (lambda: self._pulls[k]) if len(self._pulls) else pull_on_height(self._simulation, state, controls)

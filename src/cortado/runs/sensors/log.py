@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import DivergedError, InputError, shown
-from cortado.runs.sensors.sensor import Reading, Sensor
+from cortado.runs.sensors.sensor import Reading, Sensor, value_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class SensorLog:
     def _value(self, name: str, sensor: Sensor, at: Reading) -> NDArray[Any]:
         """NaN where the step after the state loses a particle: the run says so where it takes it."""
         try:
-            return np.asarray(sensor.value(at), dtype=np.float64)
+            return value_of(sensor, at)
         except DivergedError:
             return np.full(len(self._units[name]), np.nan)
 

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.arrays import as_numbers, as_one_number
+from cortado.arrays import as_numbers, as_one_number, read_only, require_methods
 from cortado.errors import InputError
 from cortado.scene.discrete_scene import Lattice
 
@@ -61,10 +61,19 @@ ACROSS = {1: 1.5, 2: 7.0 / np.pi}
 
 def point(what: str, values: Any) -> NDArray[Any]:
     """A place or a direction, (d,), finite; raises `InputError`."""
-    array = as_numbers(what, values)
+    array = corner(what, values)
+    if not np.isfinite(array).all():
+        raise InputError(f"{what} is {array.tolist()}, but must be finite.")
+    return array
+
+
+def corner(what: str, values: Any) -> NDArray[Any]:
+    """The same, or infinite where a region has no end."""
+    array = read_only(what, values)
     if array.shape not in ((2,), (3,)):
         raise InputError(f"{what} has shape {array.shape}, but must have 2 or 3 components.")
-    array.flags.writeable = False
+    if np.isnan(array).any():
+        raise InputError(f"{what} is {array.tolist()}, but must be numbers.")
     return array
 
 
@@ -78,11 +87,26 @@ def direction(what: str, values: Any) -> NDArray[Any]:
 
 
 def positive(what: str, value: Any) -> float:
-    """A number above 0; raises `InputError`."""
+    """A finite number above 0; raises `InputError`."""
     number = as_one_number(what, value)
-    if not number > 0.0:
-        raise InputError(f"{what} is {number:g}, but must be greater than 0.")
+    if not 0.0 < number < np.inf:
+        raise InputError(f"{what} is {number:g}, but must be greater than 0 and finite.")
     return number
+
+
+def checked_sensor(sensor: Any) -> Sensor:
+    """What a user gives as a sensor; raises `InputError`."""
+    require_methods("sensor", sensor, ("columns", "value", "adjoint"), "a sensor, such as one of cortado.sensors")
+    return sensor
+
+
+def value_of(sensor: Sensor, at: Reading) -> NDArray[Any]:
+    """(k,) what a sensor reads; raises `InputError` unless it has one number for each of its columns."""
+    what, columns = f"value of the sensor {type(sensor).__name__}", len(sensor.columns(at.dimension))
+    found = as_numbers(what, sensor.value(at))
+    if found.shape != (columns,):
+        raise InputError(f"{what} has shape {found.shape}, but must be ({columns},), a number for each column.")
+    return found
 
 
 def in_dimension(what: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:

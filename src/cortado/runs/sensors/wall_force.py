@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cortado.errors import InputError
 from cortado.fixed import fixed
-from cortado.runs.sensors.sensor import Reading, in_dimension, point
+from cortado.runs.sensors.sensor import Reading, corner, in_dimension, point
 
 
 @fixed
@@ -25,17 +25,17 @@ class WallForce:
         """``lower``, ``upper`` (d,) corners of the region [m], which has no end there if left out; ``about`` (d,) the
         point of the torque [m], the origin if left out."""
         self.lower, self.upper, self.about = (
-            None if corner is None else point(what, corner)
-            for what, corner in (("lower", lower), ("upper", upper), ("about", about))
+            None if values is None else read(what, values)
+            for what, values, read in (("lower", lower, corner), ("upper", upper, corner), ("about", about, point))
         )
-        given = [corner for corner in (self.lower, self.upper, self.about) if corner is not None]
-        if len({len(corner) for corner in given}) > 1:
+        given = [values for values in (self.lower, self.upper, self.about) if values is not None]
+        if len({len(values) for values in given}) > 1:
             raise InputError("lower, upper and about must have as many components as one another.")
         if self.lower is not None and self.upper is not None and not (self.lower < self.upper).all():
             raise InputError(f"upper is {self.upper.tolist()}, but must be greater than lower, {self.lower.tolist()}.")
 
     def __repr__(self) -> str:
-        shown = (None if corner is None else corner.tolist() for corner in (self.lower, self.upper, self.about))
+        shown = (None if values is None else values.tolist() for values in (self.lower, self.upper, self.about))
         return f"WallForce({', '.join(map(str, shown))})"
 
     def columns(self, dimension: int) -> dict[str, str]:
