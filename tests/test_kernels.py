@@ -42,6 +42,7 @@ from cortado.sph.materials import mixture_kernels
 from cortado.sph.pair_forces import laminar, pairwise
 from cortado.sph.stress_kernels import stress_kernels
 from cortado.sph.viscosity import viscosity_kernels
+from cortado.sph.viscosity_law import newtonian_law
 from finite_differences import central_difference, decades, plateau
 
 N, WALLS = 60, 40
@@ -356,8 +357,14 @@ class Stress(Viscosity):
 
     def __init__(self, cloud):
         super().__init__(cloud)
-        self.stress, self.force = stress_kernels(DISCRETISATION, cloud.dimension, self.sticks)
-        self.given = {"s": self.s, "control": 1.3, "least": 0.05}
+        self.stress, self.force = stress_kernels(DISCRETISATION, cloud.dimension, newtonian_law(), self.sticks)
+        self.given = {
+            "s": self.s,
+            "control": 1.3,
+            "least": 0.05,
+            "theta": np.zeros((1, 1)),
+            "theta_dot": np.zeros((1, 1)),
+        }
         self.room = {name: np.zeros((N, 3, 3)) for name in "MAT"} | {name: np.zeros(N) for name in ("R", "eta")}
 
     def known(self, values):
@@ -378,6 +385,7 @@ class Stress(Viscosity):
     def adjoint(self, values, bars):
         known = {**self.known(values), "acceleration_bar": bars["acceleration"]}
         change = {"M_bar": np.zeros((N, 3, 3)), "A_bar": np.zeros((N, 3, 3)), "R_bar": np.zeros(N)}
+        change["theta_bar"] = np.zeros((N, 1))
         names = ("x", "v", "m", "mu")
         found = launch(self.stress.adjoint, **known, **change, **zeros("mu_bar"))
         known |= {name: found[name] for name in (*change, "mu_bar")} | zeros("x_bar", "v_bar", "m_bar")

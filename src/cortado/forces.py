@@ -3,8 +3,9 @@
 from cortado.sph.body import Body
 from cortado.sph.own_force import OverTime
 from cortado.sph.pair import Pair
+from cortado.sph.rheology import Rheology
 
-__all__ = ["Body", "OverTime", "Pair"]
+__all__ = ["Body", "OverTime", "Pair", "Rheology"]
 
 
 def __dir__() -> list[str]:

@@ -61,6 +61,13 @@ def _check_phases(scene: SceneTables) -> None:
     for path, body in _bodies(scene):
         if body.phase not in names:
             raise field_error((*path, "phase"), body.phase, f"the name of a phase, of {shown(names)}")
+    for index, phase in enumerate(scene.phase):
+        if phase.rheology is not None and len(names) > 1:
+            wanted = "left out where there are several phases"
+            raise field_error(("phase", index, "rheology"), phase.rheology.kind, wanted)
+    if scene.phase[0].rheology is not None and scene.forces.viscosity != "stress":
+        found = scene.forces.viscosity
+        raise field_error(("forces", "viscosity"), found, '"stress", as the phase has a rheology')
     if len(names) == 1 and scene.mixture != MixtureTable():
         raise field_error(("mixture",), Words("given"), "left out, as the scene has only one phase")
 

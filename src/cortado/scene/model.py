@@ -16,6 +16,7 @@ from cortado.scene.package_tables import AnyForces
 from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.picture import Picture
 from cortado.scene.render import Render
+from cortado.scene.rheology import AnyRheology
 from cortado.scene.schedule import Schedule
 from cortado.scene.sensors import AnySensor
 from cortado.scene.solvers import AnySolver
@@ -50,6 +51,8 @@ class Phase(Table):
     """Density of the fluid at rest [kg/m3]."""
     viscosity: Annotated[float, quantity("Pa s", ge=0.0)]
     """Dynamic viscosity [Pa s]."""
+    rheology: AnyRheology | None = None
+    """How the viscosity depends on the shear rate; not at all if left out."""
     colour: Colour = (0.1, 0.3, 0.8)
     """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light: half as bright is 0.5."""
 

@@ -11,6 +11,7 @@ from cortado.scene.model import SceneTables
 from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.parameters.tilt import Tilt
 from cortado.scene.parameters.values import Arrays
+from cortado.scene.rheology import greatest_viscosity
 
 VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65), "laminar": (laplacian_rate, 0.5)}
 """By the form of the viscous force: what gives its greatest rate on a lattice, and which part of a lattice's longest
@@ -117,7 +118,8 @@ def _viscous_limit(scene: SceneTables, values: Arrays) -> float:
     used = [k for k, phase in enumerate(scene.phase) if phase.name in names]
     densities = np.atleast_1d(values.get("rest_density", [phase.rest_density for phase in scene.phase]))
     viscosities = np.atleast_1d(values.get("viscosity", [phase.viscosity for phase in scene.phase]))
-    density, viscosity = float(densities[used].min()), float(viscosities[used].max())
+    thickest = [greatest_viscosity(scene.phase[k], float(viscosities[k])) for k in used]
+    density, viscosity = float(densities[used].min()), max(thickest)
     if viscosity <= 0.0:
         return inf
     rate, part = VISCOUS_RATES[scene.forces.viscosity]

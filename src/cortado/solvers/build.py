@@ -87,7 +87,8 @@ def _forces(
 ) -> list[Force]:
     """Those of the parameters that the scene has, in the order of the registry, and then those of the makers."""
     setting = Setting(scene, discretisation, discrete.lattice, discrete.wall_layers, layout)
-    modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene)]
+    replaced = {getattr(maker, "replaces", None) for maker in makers}
+    modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene) and p.force not in replaced]
     found = [maker.force(setting) for maker in (*map(import_module, modules), *makers)]
     forces = [force for force in found if force is not None]
     for force in forces:

@@ -6,7 +6,9 @@ from cortado.scene.parameters.known import REGISTRY, Known
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import PackageSolver, SolverTable
 from cortado.solvers.makers import SolverMaker, checked_solver
+from cortado.sph.laws import LAWS
 from cortado.sph.makers import ForceMaker, checked_makers, known_of
+from cortado.sph.rheology import Rheology
 
 MODULES = {"pcisph": "cortado.solvers.pcisph.build"}
 """By the kind of Cortado's own, the module whose ``maker`` takes the table."""
@@ -21,13 +23,19 @@ def solver_named(table: SolverTable) -> SolverMaker:
 
 
 def forces_named(scene: Scene) -> tuple[ForceMaker, ...]:
-    """What makes the forces of installed packages that a scene names."""
-    return checked_makers([table.make() for table in scene.force])
+    """What makes the forces that a scene names by their kinds: laws of viscosity, and those of installed packages."""
+    laws = [
+        Rheology(LAWS[phase.rheology.kind], None, **phase.rheology.numbers(phase.viscosity))
+        for phase in scene.phase
+        if phase.rheology is not None
+    ]
+    return checked_makers([*laws, *(table.make() for table in scene.force)])
 
 
 def known_in(scene: Scene) -> Known:
     """The parameters of a scene by itself, those of parts of packages among them; raises `InputError` where two of them
     have one name."""
-    if not scene.force and not isinstance(scene.solver, PackageSolver):
+    own = scene.force or any(phase.rheology for phase in scene.phase) or isinstance(scene.solver, PackageSolver)
+    if not own:
         return REGISTRY
     return known_of(forces_named(scene), solver_named(scene.solver))

@@ -16,8 +16,23 @@ from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
 from cortado.sph.function_text import REAL, VECTOR, DerivativeCheck, InPrecision, check_names, check_returns
 
-VECTORS = {"Body": ("x", "v"), "Pair": ("x_ij", "v_ij")}
-"""The vectors that functions of forces are given, by what sentences call them."""
+
+@dataclass(frozen=True)
+class Inputs:
+    """What functions of a kind are given before their parameters, but for the time, which they may leave out."""
+
+    names: tuple[str, str]
+    """What sentences call them."""
+    kind: str = "vector"
+    """"vector" or "number": what they are, and what the function returns."""
+
+
+INPUTS = {
+    "Body": Inputs(("x", "v")),
+    "Pair": Inputs(("x_ij", "v_ij")),
+    "Rheology": Inputs(("shear_rate", "viscosity"), "number"),
+}
+"""By what sentences call a force."""
 _SENT: WeakKeyDictionary[FunctionType, str] = WeakKeyDictionary()
 """Texts of functions that came from other processes."""
 
@@ -30,7 +45,9 @@ class Formula:
     text: str
     """Its definition, with types of the precision and with numbers from outside written out."""
     inputs: tuple[str, ...]
-    """Its arguments before the parameters: two vectors, and time if there is a third."""
+    """Its arguments before the parameters: two vectors or numbers, and time if there is a third."""
+    kind: str
+    """"vector" or "number": what the first two are, and what it returns."""
     parameters: tuple[str, ...]
     """Its other arguments."""
     outside: tuple[str, ...]
@@ -45,9 +62,10 @@ class Formula:
         code = compile(self.text, f"<force {self.name}>", "exec")
         exec(code, scope)
         made: Any = scope[self.name]
-        known = (vector, vector, real)[: len(self.inputs)]
+        own = vector if self.kind == "vector" else real
+        known = (own, own, real)[: len(self.inputs)]
         made.__annotations__ = dict(zip((*self.inputs, *self.parameters), (*known, *types), strict=True))
-        made.__annotations__["return"] = vector
+        made.__annotations__["return"] = own
         return wp.Function(func=made, key=self.name, namespace="", module=module, source=self.text)
 
 
@@ -81,7 +99,7 @@ def formula(
     """A user's function with its text, called ``kind`` in sentences, and the values of its parameters: those given, and
     its own for what is not. Raises `InputError`."""
     name, what = function.__name__, f"{kind} function {function.__name__}"
-    inputs, values = _arguments(what, function, parameters, (*VECTORS[kind], "t"))
+    inputs, values = _arguments(what, function, parameters, INPUTS[kind])
     definition, scope = _definition(what, source), _scope(function)
     tree = ast.Module([definition], [])
     helpers = _called(scope)
@@ -91,19 +109,19 @@ def formula(
     outside = (*(helper.adj.source for helper in helpers), *map(_values, scopes))
     local = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
     own = {*inputs, *values, *local}
-    check_returns(what, definition)
+    check_returns(what, definition, INPUTS[kind].kind)
     check_names(what, definition, own, scope)
     rewritten = InPrecision(scope, own).visit(tree)
     text = ast.unparse(ast.fix_missing_locations(rewritten)) + "\n"
-    return Formula(name, text, inputs, tuple(values), outside, MappingProxyType(scope)), values
+    return Formula(name, text, inputs, INPUTS[kind].kind, tuple(values), outside, MappingProxyType(scope)), values
 
 
 def _arguments(
-    what: str, function: FunctionType, given: Mapping[str, Any], known: tuple[str, ...]
+    what: str, function: FunctionType, given: Mapping[str, Any], first: Inputs
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
     """Names of the inputs, and the parameters' values in the order of the function's arguments. Inputs may have any
-    names, but those by which they are ``known`` stand for nothing else."""
-    signature = inspect.signature(function).parameters
+    names, but those of ``first``, and t, stand for nothing else."""
+    signature, known = inspect.signature(function).parameters, (*first.names, "t")
     for argument in signature.values():
         if argument.kind is not argument.POSITIONAL_OR_KEYWORD:
             raise InputError(f"{what} has the argument {argument}, but must have arguments by position alone.")
@@ -123,7 +141,7 @@ def _arguments(
         found = f"{what} is given no value of {', '.join(lacking)}"
         raise InputError(f"{found}, but must have one of each parameter, as in {lacking[0]}=1.0.")
     if len(inputs) not in (2, 3) or tuple(signature)[: len(inputs)] != inputs:
-        wanted = "two vectors first, then time or nothing, and then parameters that all have values"
+        wanted = f"two {first.kind}s first, then time or nothing, and then parameters that all have values"
         raise InputError(f"{what} has {', '.join(inputs) or 'nothing'} without a value, but must have {wanted}.")
     return inputs, values
 
@@ -162,11 +180,14 @@ def _values(scope: Mapping[str, Any]) -> str:
     return str({name: np.asarray(value).tolist() for name, value in kept.items()})
 
 
-def compiled(what: str, module: Any, device: Any) -> None:
-    """Compile a module with a user's function; raises `InputError` where Warp cannot."""
+def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> None:
+    """Compile a module with a user's function, which returns a vector or a number; raises `InputError` where
+    Warp cannot."""
     try:
         wp.load_module(module, device)
     except Exception as error:  # Warp raises any kind for a text that it does not understand
         reason = str(error).replace("\\n", "\n").strip().splitlines()[-1:] or [type(error).__name__]
-        wanted = "it must use numbers, vectors of three components and functions of Warp alone, and return a vector"
+        wanted = (
+            f"it must use numbers, vectors of three components and functions of Warp alone, and return a {returned}"
+        )
         raise InputError(f"{what} cannot be compiled: {reason[0].lstrip('; ').rstrip('.')}; {wanted}.") from error

@@ -10,8 +10,9 @@ from cortado.sph.packed import theta_of
 
 
 def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
-    """The Warp function of two vectors and theta that a user's function is; in 2-D without what it has along z."""
-    timed = len(text.inputs) == 3
+    """The Warp function of two vectors or numbers and theta that a user's function is; in 2-D without what a vector has
+    along z."""
+    timed, of_numbers = len(text.inputs) == 3, text.kind == "number"
     types = tuple(precision.vector if rank else precision.real for rank in ranks[timed:])
     terms, first = [], 0
     for rank in ranks:
@@ -19,10 +20,11 @@ def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimensi
         terms.append(f"vector({at})" if rank else at)
         first += 3 if rank else 1
     called = f"own({', '.join(['x', 'v', *terms])})"
-    result = called if dimension == 3 else f"wp.cw_mul(vector(one, one, zero), {called})"
-    source = f"def applied(x: vector, v: vector, theta: numbers):\n    return {result}\n"
+    result = called if dimension == 3 or of_numbers else f"wp.cw_mul(vector(one, one, zero), {called})"
+    source = f"def applied(x: own_type, v: own_type, theta: numbers):\n    return {result}\n"
     scope = {
         "vector": precision.vector,
+        "own_type": precision.real if of_numbers else precision.vector,
         "one": wp.constant(precision.real(1.0)),
         "zero": wp.constant(precision.real(0.0)),
         "wp": wp,

@@ -48,10 +48,10 @@ class DerivativeCheck(ast.NodeVisitor):
     visit_While = visit_Break = visit_Continue = _refuse
 
 
-def check_returns(what: str, function: ast.FunctionDef) -> None:
+def check_returns(what: str, function: ast.FunctionDef, kind: str) -> None:
     """Raises `InputError` for a function that may end without returning anything."""
     if not _returns(function.body):
-        raise InputError(f"{what} may end without return, but must return a vector, whatever its arguments are.")
+        raise InputError(f"{what} may end without return, but must return a {kind}, whatever its arguments are.")
 
 
 def _returns(body: list[ast.stmt]) -> bool:

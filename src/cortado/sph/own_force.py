@@ -19,7 +19,7 @@ from cortado.scene.parameters.parameter import Axis, Parameter, Source
 from cortado.scene.schedule import Course
 from cortado.sph.formula import Formula, compiled, formula, keep_source, plain_function, source_of
 from cortado.sph.packed import Packed
-from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
+from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 
 
 class OverTime:
@@ -54,8 +54,8 @@ class OverTime:
 
 
 @fixed
-class OwnForce(ABC):
-    """A force that is one function of a user's, given to `Simulation`; see `cortado.forces`."""
+class OwnFunction(ABC):
+    """A force whose formula is one function of a user's, given to `Simulation`; see `cortado.forces`."""
 
     kind: ClassVar[str]
     """What sentences call it."""
@@ -116,6 +116,14 @@ class OwnForce(ABC):
         )
 
     @abstractmethod
+    def force(self, setting: Setting) -> Force:
+        """The force in a solver; raises `InputError` for a function that Warp cannot compile."""
+
+
+class OwnForce(OwnFunction):
+    """One that returns a force or an acceleration, and has kernels for it alone."""
+
+    @abstractmethod
     def kernels(self, discretisation: Discretisation, dimension: int) -> Kernels:
         """Of the force, in a precision, in a scene of 2 or 3 dimensions."""
 
@@ -171,7 +179,9 @@ def topic(kind: str, text: Formula, ranks: tuple[int, ...], dimension: int) -> s
     return f"{kind}_{text.name}_{sha256(words.encode()).hexdigest()[:12]}"
 
 
-def _made_again(made: type[OwnForce], function: Any, source: str, name: str, values: Mapping[str, Any]) -> OwnForce:
+def _made_again(
+    made: type[OwnFunction], function: Any, source: str, name: str, values: Mapping[str, Any]
+) -> OwnFunction:
     keep_source(function, source)
     return made(function, name, **values)
 

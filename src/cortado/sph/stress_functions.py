@@ -1,7 +1,9 @@
 """The viscous stress of one particle from the sums over its neighbours (`cortado.sph.viscous_stress`):
 
-    G = A M^-1,   D = (G + G^T) / 2,   mu = S / (1 / (2 mu_i) + R / (2 tr M)),
-    T = 2 mu D M^-1 - C mu G
+    G = A M^-1,   D = (G + G^T) / 2,   mu_m = 1 / (1 / (2 mu_i) + R / (2 tr M)),
+    mu = S law(sqrt(2 D : D), mu_m),   T = 2 mu D M^-1 - C mu G
+
+mu_m is the harmonic mean of the viscosities between i and its neighbours, and the law of a Newtonian fluid is mu_m.
 
 S(M) is 1 where neighbours lie on all sides or on one side, and falls smoothly to 0 where they lie on a line or are
 missing: M has no inverse there, and the particle takes no part in the stress. With the invariants of M, I_2 and I_3,
@@ -19,9 +21,13 @@ from typing import Any
 import warp as wp
 
 from cortado.device.precision import Precision
+from cortado.sph.packed import theta_of
+from cortado.sph.viscosity_law import Law
 
 LEAST_VISCOSITY = 1e-12
 """What is added to viscosities [Pa s]: the mean of their reciprocals is finite where there is none."""
+SLOWEST = 1e-6
+"""Shear rate [1/s] that is added to that of the fluid, in squares: at rest a law has a derivative."""
 EMPTY, FULL = 0.2, 0.5
 """H below which a particle takes no part in the stress, and above which it takes part in all of it."""
 
@@ -36,14 +42,14 @@ class StressFunctions:
     """M, invertible in the plane too, from its diagonal and its entries yz, xz and xy."""
     moment_change: Any
     """The same of a tangent of M."""
-    velocity_gradient: Any
-    """G of M and A, 0 where S is."""
     viscosity: Any
-    """mu of M, R and mu_i."""
+    """mu of M, A, R, mu_i and theta, the parameters of the law."""
     traction: Any
     """T of M, A, mu and C."""
-    work: Any
-    """T . T_bar + mu mu_bar of M, A, R, mu_i and C, whose gradient is the adjoint of T and mu."""
+    viscosity_work: Any
+    """mu mu_bar of the same, whose gradient is the adjoint of mu."""
+    traction_work: Any
+    """T . T_bar, whose gradient is the adjoint of T."""
 
 
 @cache
@@ -66,13 +72,14 @@ def fluidity_function(precision: Precision) -> Any:
 
 
 @cache
-def stress_functions(precision: Precision, dimension: int) -> StressFunctions:
-    """Of a precision in 2 or 3 dimensions; their argument ``control`` is C."""
+def stress_functions(precision: Precision, dimension: int, law: Law, module: Any) -> StressFunctions:
+    """Of a precision in 2 or 3 dimensions, with a law of viscosity, in a Warp module; ``control`` is C."""
     real, vector = precision.real, precision.vector
     matrix, fluidity = matrix_type(precision), fluidity_function(precision)
     plane = wp.constant(real(float(dimension == 2)))
     empty, width = wp.constant(real(EMPTY)), wp.constant(real(FULL - EMPTY))
-    tiny = wp.constant(real(1e-12))
+    tiny, slowest = wp.constant(real(1e-12)), wp.constant(real(SLOWEST**2))
+    theta_type, apparent = theta_of(precision, law.ranks), law.applied(precision, module)
 
     @wp.func
     def moment_change(diagonal: vector, others: vector) -> matrix:
@@ -116,25 +123,26 @@ def stress_functions(precision: Precision, dimension: int) -> StressFunctions:
             )
         return result
 
-    @wp.func
-    def viscosity(M: matrix, R: real, mu: real) -> real:
+    @wp.func(module=module)
+    def viscosity(M: matrix, A: matrix, R: real, mu: real, theta: theta_type) -> real:
         trace = M[0, 0] + M[1, 1] + M[2, 2] - plane
-        mean = real(0.5) * fluidity(mu) + real(0.5) * R / (trace + tiny)
-        return fullness(M) / mean
+        mean = real(1.0) / (real(0.5) * fluidity(mu) + real(0.5) * R / (trace + tiny))
+        G = A * inverse(regular(M))
+        D = G + wp.transpose(G)
+        return fullness(M) * apparent(wp.sqrt(real(0.5) * wp.ddot(D, D) + slowest), mean, theta)
 
-    @wp.func
-    def velocity_gradient(M: matrix, A: matrix) -> matrix:
-        return A * inverse(regular(M))
-
-    @wp.func
+    @wp.func(module=module)
     def traction(M: matrix, A: matrix, mu: real, control: real) -> matrix:
         K = inverse(regular(M))
         G = A * K
         return mu * ((G + wp.transpose(G)) * K - control * G)
 
-    @wp.func
-    def work(M: matrix, A: matrix, R: real, mu_i: real, control: real, T_bar: matrix, mu_bar: real) -> real:
-        mu = viscosity(M, R, mu_i)
-        return wp.ddot(traction(M, A, mu, control), T_bar) + mu * mu_bar
+    @wp.func(module=module)
+    def viscosity_work(M: matrix, A: matrix, R: real, mu: real, theta: theta_type, bar: real) -> real:
+        return viscosity(M, A, R, mu, theta) * bar
 
-    return StressFunctions(matrix, moment, moment_change, velocity_gradient, viscosity, traction, work)
+    @wp.func(module=module)
+    def traction_work(M: matrix, A: matrix, mu: real, control: real, bar: matrix) -> real:
+        return wp.ddot(traction(M, A, mu, control), bar)
+
+    return StressFunctions(matrix, moment, moment_change, viscosity, traction, viscosity_work, traction_work)

@@ -30,36 +30,46 @@ from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.sph.packed import theta_of
 from cortado.sph.stress_forces import stress_sums
 from cortado.sph.stress_functions import stress_functions
 from cortado.sph.stress_moments import moment_sums
+from cortado.sph.viscosity_law import Law
 
 
 @cache
-def stress_kernels(discretisation: Discretisation, dimension: int, sticks: bool) -> tuple[Kernels, Kernels]:
+def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> tuple[Kernels, Kernels]:
     """The kernels of M, A, R and what follows from them for each particle, and those of the acceleration, in 2 or 3
-    dimensions; with ``sticks`` walls have no slip. Their argument ``control`` is C."""
+    dimensions, with a law of viscosity; with ``sticks`` walls have no slip. Their argument ``control`` is C, and
+    ``theta`` are the parameters of the law."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
     neighbourhood = neighbourhood_type(precision)
-    own = stress_functions(precision, dimension)
-    matrix, moment_of, change_of_moment = own.matrix, own.moment, own.moment_change
-    viscosity_of, traction_of, work = own.viscosity, own.traction, own.work
+    name = f"viscous_stress_{law.topic}{dimension}d" + "_no_slip" * sticks
+    module = discretisation.module(True, name)
+    tangent_module, adjoint_module = discretisation.tangent_module(name), discretisation.module(False, name)
+    own = stress_functions(precision, dimension, law, module)
+    matrix, moment_of, viscosity_of, traction_of = own.matrix, own.moment, own.viscosity, own.traction
+    along = stress_functions(precision, dimension, law, tangent_module)
+    change_of_moment, viscosity_along, traction_along = along.moment_change, along.viscosity_work, along.traction_work
+    back = stress_functions(precision, dimension, law, adjoint_module)
+    viscosity_back, stress_back = back.viscosity_work, back.traction_work
+    theta_type = theta_of(precision, law.ranks)
     sums_of, force_of = moment_sums(discretisation, sticks), stress_sums(discretisation, sticks)
     moments, moments_tangent, moments_back = sums_of.sums, sums_of.tangent, sums_of.back
     force, force_tangent = force_of.force, force_of.tangent
     traction_back, force_back = force_of.traction_back, force_of.back
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
-    sums, of_one = bundle(M=matrix, A=matrix, R=real), bundle(T=matrix, eta=real)
-    seen, changes = bundle(x=vector, v=vector, m=real), bundle(x=vector, v=vector, mu=real)
-    name = f"viscous_stress_{dimension}d" + "_no_slip" * sticks
+    of_all, of_one = bundle(M=matrix, A=matrix, R=real, eta=real), bundle(T=matrix, eta=real)
+    seen, of_particles = bundle(x=vector, v=vector, m=real), bundle(x=vector, v=vector, mu=real)
 
-    @wp.kernel(module=discretisation.module(True, name))
+    @wp.kernel(module=module)
     def stress(
         s: neighbourhood,
         control: real,
         least: real,
+        theta: wp.array(dtype=theta_type),
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         mu: wp.array(dtype=real),
@@ -75,14 +85,14 @@ def stress_kernels(discretisation: Discretisation, dimension: int, sticks: bool)
         if lane() > 0:
             return
         M_i, A_i = moment_of(diagonal, others), wp.matrix_from_rows(row_x, row_y, row_z)
-        eta_i = viscosity_of(M_i, thin, mu[i])
+        eta_i = viscosity_of(M_i, A_i, thin, mu[i], theta[i // s.particles])
         M[i] = M_i
         A[i] = A_i
         R[i] = thin
         T[i] = traction_of(M_i, A_i, eta_i, control)
         eta[i] = eta_i
 
-    @wp.kernel(module=discretisation.module(True, name))
+    @wp.kernel(module=module)
     def acceleration_of(
         s: neighbourhood,
         control: real,
@@ -102,45 +112,45 @@ def stress_kernels(discretisation: Discretisation, dimension: int, sticks: bool)
             return
         acceleration[i] = acceleration_in[i] + total
 
-    @wp.kernel(module=discretisation.tangent_module(name), enable_backward=False)
+    @wp.kernel(module=tangent_module, enable_backward=False)
     def stress_tangent(
         s: neighbourhood,
         control: real,
         least: real,
-        x: wp.array(dtype=vector),
-        v: wp.array(dtype=vector),
-        mu: wp.array(dtype=real),
-        dot: changes,
-        M: wp.array(dtype=matrix),
-        A: wp.array(dtype=matrix),
-        R: wp.array(dtype=real),
+        theta: wp.array(dtype=theta_type),
+        theta_dot: wp.array(dtype=theta_type),
+        now: of_particles,
+        dot: of_particles,
+        of: of_all,
         # out
         T_dot: wp.array(dtype=matrix),
         eta_dot: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        diagonal, others, row_x, row_y, row_z, thin = moments_tangent(i, x, dot.x, v, dot.v, mu, dot.mu, least, s)
+        diagonal, others, row_x, row_y, row_z, thin = moments_tangent(
+            i, now.x, dot.x, now.v, dot.v, now.mu, dot.mu, least, s
+        )
         if lane() > 0:
             return
         M_dot, A_dot = change_of_moment(diagonal, others), wp.matrix_from_rows(row_x, row_y, row_z)
+        b = i // s.particles
+        by_M, by_A, by_R, by_mu, by_theta, _by_bar = wp.grad(viscosity_along)(
+            of.M[i], of.A[i], of.R[i], now.mu[i], theta[b], real(1.0)
+        )
+        eta_i_dot = wp.ddot(by_M, M_dot) + wp.ddot(by_A, A_dot) + by_R * thin + by_mu * dot.mu[i]
+        eta_i_dot += wp.dot(by_theta, theta_dot[b])
         change = matrix()
-        for k in range(10):  # of each entry of T and of mu
-            T_bar, eta_bar = matrix(), real(0.0)
-            if k < 9:
-                T_bar[k // 3, k % 3] = real(1.0)
-            else:
-                eta_bar = real(1.0)
-            by_M, by_A, by_R, by_mu, _by_C, _by_T, _by_eta = wp.grad(work)(
-                M[i], A[i], R[i], mu[i], control, T_bar, eta_bar
+        for k in range(9):
+            entry = matrix()
+            entry[k // 3, k % 3] = real(1.0)
+            for_M, for_A, for_eta, _for_C, _for_entry = wp.grad(traction_along)(
+                of.M[i], of.A[i], of.eta[i], control, entry
             )
-            slope_k = wp.ddot(by_M, M_dot) + wp.ddot(by_A, A_dot) + by_R * thin + by_mu * dot.mu[i]
-            if k < 9:
-                change[k // 3, k % 3] = slope_k
-            else:
-                eta_dot[i] = slope_k
+            change[k // 3, k % 3] = wp.ddot(for_M, M_dot) + wp.ddot(for_A, A_dot) + for_eta * eta_i_dot
         T_dot[i] = change
+        eta_dot[i] = eta_i_dot
 
-    @wp.kernel(module=discretisation.tangent_module(name), enable_backward=False)
+    @wp.kernel(module=tangent_module, enable_backward=False)
     def acceleration_tangent(
         s: neighbourhood,
         control: real,
@@ -162,14 +172,15 @@ def stress_kernels(discretisation: Discretisation, dimension: int, sticks: bool)
             return
         acceleration_dot[i] = acceleration_in_dot[i] + total
 
-    @wp.kernel(module=discretisation.module(False, name), enable_backward=False)
+    @wp.kernel(module=adjoint_module, enable_backward=False)
     def stress_adjoint(
         s: neighbourhood,
         control: real,
         least: real,
+        theta: wp.array(dtype=theta_type),
         now: seen,
         mu: wp.array(dtype=real),
-        of: sums,
+        of: of_all,
         acceleration_bar: wp.array(dtype=vector),
         # in and out
         mu_bar: wp.array(dtype=real),
@@ -177,22 +188,26 @@ def stress_kernels(discretisation: Discretisation, dimension: int, sticks: bool)
         M_bar: wp.array(dtype=matrix),
         A_bar: wp.array(dtype=matrix),
         R_bar: wp.array(dtype=real),
+        theta_bar: wp.array(dtype=theta_type),
     ):
-        """From the adjoint of the acceleration to those of the sums."""
+        """From the adjoint of the acceleration to those of the sums and of the law."""
         i = s.first + wp.tid() // LANES
         row_x, row_y, row_z, eta_bar = traction_back(i, now.x, now.v, now.m, acceleration_bar, control, least, s)
         if lane() > 0:
             return
         T_bar = wp.matrix_from_rows(row_x, row_y, row_z)
-        by_M, by_A, by_R, by_mu, _by_C, _by_T, _by_eta = wp.grad(work)(
-            of.M[i], of.A[i], of.R[i], mu[i], control, T_bar, eta_bar
+        by_M, by_A, by_eta, _by_C, _by_T = wp.grad(stress_back)(of.M[i], of.A[i], of.eta[i], control, T_bar)
+        for_M, for_A, for_R, for_mu, for_theta, _for_eta = wp.grad(viscosity_back)(
+            of.M[i], of.A[i], of.R[i], mu[i], theta[i // s.particles], eta_bar + by_eta
         )
-        M_bar[i] = real(0.5) * (by_M + wp.transpose(by_M))
-        A_bar[i] = by_A
-        R_bar[i] = by_R
-        mu_bar[i] = mu_bar[i] + by_mu
+        M_i_bar = by_M + for_M
+        M_bar[i] = real(0.5) * (M_i_bar + wp.transpose(M_i_bar))
+        A_bar[i] = by_A + for_A
+        R_bar[i] = for_R
+        mu_bar[i] = mu_bar[i] + for_mu
+        theta_bar[i] = for_theta
 
-    @wp.kernel(module=discretisation.module(False, name), enable_backward=False)
+    @wp.kernel(module=adjoint_module, enable_backward=False)
     def acceleration_adjoint(
         s: neighbourhood,
         control: real,

@@ -1,17 +1,21 @@
 """The viscous force as a stress: its kernels (`cortado.sph.stress_kernels`), their arrays and their constants."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import warp as wp
 
 from cortado.discretise.calibration import stress_control
-from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.state import Layout
-from cortado.scene.scene import Scene
+from cortado.scene.parameters.parameter import Parameter
+from cortado.sph.formula import compiled
+from cortado.sph.packed import Packed
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.stress_functions import matrix_type
 from cortado.sph.stress_kernels import stress_kernels
+from cortado.sph.viscosity_law import Law, newtonian_law
 
 CLOSEST = 0.25
-"""In spacings: walls without slip pull no harder on particles that are closer, see `cortado.sph.stress_kernels`."""
+"""In spacings: walls without slip pull no harder on particles that are closer, see `cortado.sph.wall_contact`."""
 
 
 class ViscousStress:
@@ -20,41 +24,41 @@ class ViscousStress:
     shares: tuple[str, ...] = ()  # viscosities reach particles through the mixture, which has the phases' adjoints
     batches = True
 
-    def __init__(self, discretisation: Discretisation, scene: Scene, control: float, layout: Layout):
-        """``control`` is C, as `stress_control` gives it."""
-        sticks = getattr(scene.container, "slip", "free") == "no"
-        self._stress, self._force = stress_kernels(discretisation, scene.dimension, sticks)
-        self._constants = {"control": control, "least": CLOSEST * scene.discretisation.spacing}
-        precision, matrix = layout.precision, matrix_type(layout.precision)
-        kinds = {"M": matrix, "A": matrix, "R": precision.real, "T": matrix, "eta": precision.real}
-        size, device = layout.all_particles, layout.device
-        self._of = {
-            name: wp.zeros(size, dtype=kind, device=device, requires_grad=discretisation.taped)
-            for name, kind in kinds.items()
-        }
-        self._change = {name: wp.zeros(size, dtype=kind, device=device) for name, kind in kinds.items()}
+    def __init__(self, setting: Setting, law: Law | None = None, parameters: Sequence[Parameter] = ()):
+        """``law``: of the viscosity, with its parameters; by default that of a Newtonian fluid."""
+        scene, discretisation, layout = setting.scene, setting.discretisation, setting.layout
+        sticks, cut = getattr(scene.container, "slip", "free") == "no", scene.discretisation
+        self._stress, self._force = stress_kernels(discretisation, scene.dimension, law or newtonian_law(), sticks)
+        control = stress_control(discretisation.smoothing, cut.spacing, cut.support_radius, scene.dimension)
+        self._constants: dict[str, Any] = {"control": control, "least": CLOSEST * cut.spacing}
+        self._packed, self._device = Packed(parameters, layout, discretisation.taped), layout.device
+        matrix, real = matrix_type(layout.precision), layout.precision.real
+        kinds = {"M": matrix, "A": matrix, "R": real, "T": matrix, "eta": real}
+        sizes = {"shape": layout.all_particles, "device": layout.device}
+        taped = discretisation.taped
+        self._of = {name: wp.zeros(dtype=kind, **sizes, requires_grad=taped) for name, kind in kinds.items()}
+        self._change = {name: wp.zeros(dtype=kind, **sizes) for name, kind in kinds.items()}
         """Tangents of T and eta, or adjoints of M, A and R."""
 
+    def compile(self, what: str) -> None:
+        """Compile the law in it; raises `InputError` where Warp cannot."""
+        compiled(what, self._stress.forward.module, self._device, "number")
+
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
-        step.launch(self._stress.forward, self._constants, **self._of)
+        step.launch(self._stress.forward, self._constants, **self._of, theta=self._packed.theta(step))
         step.launch(self._force.forward, self._constants, self._of, acceleration_in=before, acceleration=after)
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
         known = (*dot.named, self._constants, self._of)
+        theta = {"theta": self._packed.theta(step), "theta_dot": self._packed.theta_dot(step, dot.parameters)}
         change = {f"{name}_dot": self._change[name] for name in ("T", "eta")}
-        step.launch(self._stress.tangent, *known, **change)
+        step.launch(self._stress.tangent, *known, **theta, **change)
         step.launch(self._force.tangent, *known, change, acceleration_in_dot=before, acceleration_dot=after)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
         known = (*bar.named, self._constants, self._of, {"acceleration_bar": acceleration_bar})
         change = {f"{name}_bar": self._change[name] for name in ("M", "A", "R")}
-        step.launch(self._stress.adjoint, *known, **change)
+        theta = {"theta": self._packed.theta(step), "theta_bar": self._packed.shares}
+        step.launch(self._stress.adjoint, *known, **theta, **change)
         step.launch(self._force.adjoint, *known, change)
-
-
-def viscous_stress(setting: Setting) -> ViscousStress:
-    """The force of a scene."""
-    scene, smoothing = setting.scene, setting.discretisation.smoothing
-    cut = scene.discretisation
-    control = stress_control(smoothing, cut.spacing, cut.support_radius, scene.dimension)
-    return ViscousStress(setting.discretisation, scene, control, setting.layout)
+        self._packed.collect(step, bar)

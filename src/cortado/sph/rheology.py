@@ -1,0 +1,34 @@
+"""Generalised Newtonian fluids: viscosity as a stress with a law that is one function of a user's."""
+
+from cortado.errors import InputError
+from cortado.scene.scene import Scene
+from cortado.sph.own_force import OwnFunction, topic
+from cortado.sph.parts import Setting
+from cortado.sph.viscosity_law import Law
+from cortado.sph.viscous_stress import ViscousStress
+
+
+class Rheology(OwnFunction):
+    """A law of viscosity: ``function(shear_rate, viscosity, ...)`` returns the viscosity [Pa s] at a shear rate
+    sqrt(2 D : D) [1/s], where ``viscosity`` [Pa s] is that of the phase and D the symmetric velocity gradient. It takes
+    the place of the viscous force of a scene, whose viscosity is "stress"."""
+
+    kind = "Rheology"
+    replaces = "cortado.sph.viscosity"
+    """The module of the scene's force that does not act beside it."""
+
+    def force(self, setting: Setting) -> ViscousStress:
+        """The viscous force with this law; raises `InputError` for a function that Warp cannot compile."""
+        check_form(setting.scene)
+        ranks = tuple(p.rank for p in self.parameters)
+        law = Law(self._formula, ranks, topic("rheology", self._formula, ranks, setting.scene.dimension) + "_")
+        made = ViscousStress(setting, law, self.parameters)
+        made.compile(f"{self.kind} function {self._formula.name}")
+        return made
+
+
+def check_form(scene: Scene) -> None:
+    """Raises `InputError` for a scene whose viscous force is no stress."""
+    if scene.forces.viscosity != "stress":
+        found = f"forces.viscosity is {scene.forces.viscosity!r}"
+        raise InputError(f"{found}, but must be 'stress' where the viscosity depends on the shear rate.")
