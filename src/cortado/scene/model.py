@@ -64,6 +64,10 @@ class FixedForces(Table):
     """(d,) Acceleration that acts on all fluid [m/s2]."""
     viscosity: Literal["stress", "pairwise", "laminar", "none"] = "stress"
     """Form of the viscous force. "pairwise": that of Monaghan (2005); "laminar": Morris et al. (1997)."""
+    viscous_solve: Literal["automatic", "explicit", "implicit"] = "automatic"
+    """When the viscous stress acts. "explicit": as velocities are at the start of a step, which limits the time step;
+    "implicit": as they are at its end, for any time step, which takes a system of equations; "automatic": implicit
+    where the time step is too long for the other."""
     pressure: Flag = True
     """Whether the fluid resists compression."""
 

@@ -87,8 +87,15 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
         for p in PARAMETERS
         if p.is_optional and p.present(scene)
     }
-    depth = _depth_limit(scene, gravity)
-    return {"speed": courant, "gravity": force, "depth": depth, "viscosity": _viscous_limit(scene, values), **optional}
+    depth, viscous = _depth_limit(scene, gravity), inf if is_implicit(scene) else viscous_limit(scene, values)
+    return {"speed": courant, "gravity": force, "depth": depth, "viscosity": viscous, **optional}
+
+
+def is_implicit(scene: SceneTables) -> bool:
+    """Whether the viscous force is a stress that acts as velocities are at the end of a step."""
+    if scene.forces.viscosity != "stress" or scene.forces.viscous_solve == "explicit":
+        return False
+    return scene.forces.viscous_solve == "implicit" or scene.solver.time_step > viscous_limit(scene, {})
 
 
 def _gravity(scene: SceneTables) -> Points:
@@ -111,7 +118,8 @@ def _first_speed(scene: SceneTables, values: Arrays) -> float:
     return max(speed, faster * scene.emitter.speed(scene.discretisation.spacing))
 
 
-def _viscous_limit(scene: SceneTables, values: Arrays) -> float:
+def viscous_limit(scene: SceneTables, values: Arrays) -> float:
+    """The longest step at which viscosity is likely to be stable where it is explicit [s]."""
     if scene.forces.viscosity == "none":
         return inf
     names = {fluid.phase for fluid in scene.fluid} | ({scene.emitter.phase} if scene.emitter else set())

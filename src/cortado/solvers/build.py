@@ -90,7 +90,7 @@ def _forces(
     replaced = {getattr(maker, "replaces", None) for maker in makers}
     modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene) and p.force not in replaced]
     found = [maker.force(setting) for maker in (*map(import_module, modules), *makers)]
-    forces = [force for force in found if force is not None]
+    forces = sorted((force for force in found if force is not None), key=lambda one: getattr(one, "is_last", False))
     for force in forces:
         _check_force(force)
         if layout.batch is not None and not getattr(force, "batches", False):

@@ -122,7 +122,8 @@ class ParticleAdjoint:
     def accelerate(self, context: StepContext, acceleration_bar: wp.array) -> None:
         """Of `ParticleSolver.accelerate`, for the adjoint of its accelerations, (n,) vectors."""
         for force in reversed(self._solver.forces):
-            force.adjoint(context, acceleration_bar, self.bar)
+            passed = force.adjoint(context, acceleration_bar, self.bar)
+            acceleration_bar = acceleration_bar if passed is None else passed
 
     def mix(self, context: StepContext, state_bar: State) -> None:
         """Of the parts, and of the particles' masses, in `ParticleSolver.sort`."""

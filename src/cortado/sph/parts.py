@@ -143,5 +143,6 @@ class Force(Protocol):
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
         """The same for the tangents of the accelerations, along ``dot``."""
 
-    def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
-        """Add to ``bar`` what the adjoint of the acceleration, (n,) vectors, asks for."""
+    def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array | None:
+        """Add to ``bar`` what the adjoint of the acceleration, (n,) vectors, asks for. A force whose own acceleration
+        depends on ``before`` returns the adjoint of that; it says ``is_last = True``, and comes after all others."""

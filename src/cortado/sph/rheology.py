@@ -2,6 +2,7 @@
 
 from cortado.errors import InputError
 from cortado.scene.scene import Scene
+from cortado.sph.implicit_viscosity import stress_of
 from cortado.sph.own_force import OwnFunction, topic
 from cortado.sph.parts import Setting
 from cortado.sph.viscosity_law import Law
@@ -22,7 +23,7 @@ class Rheology(OwnFunction):
         check_form(setting.scene)
         ranks = tuple(p.rank for p in self.parameters)
         law = Law(self._formula, ranks, topic("rheology", self._formula, ranks, setting.scene.dimension) + "_")
-        made = ViscousStress(setting, law, self.parameters)
+        made = stress_of(setting.scene)(setting, law, self.parameters)
         made.compile(f"{self.kind} function {self._formula.name}")
         return made
 

@@ -23,6 +23,7 @@ from cortado.device.lanes import lane_functions
 from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import fluid_sum, pair_sum
+from cortado.sph.implicit_viscosity import stress_of
 from cortado.sph.pair_forces import PairForm, laminar, pairwise
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.viscous_stress import ViscousStress
@@ -282,7 +283,7 @@ def force(setting: Setting) -> Viscosity | ViscousStress | None:
     scene, walls = setting.scene, setting.walls
     sticks = getattr(scene.container, "slip", "free") == "no"
     if scene.forces.viscosity == "stress":
-        return ViscousStress(setting)
+        return stress_of(scene)(setting)
     if scene.forces.viscosity == "pairwise":
         return Viscosity(setting.discretisation, pairwise, 2.0 * (scene.dimension + 2), friction=float(sticks))
     if scene.forces.viscosity == "laminar":

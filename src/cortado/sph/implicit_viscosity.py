@@ -1,0 +1,150 @@
+"""Viscosity as a stress at the end of a step: its time step has no limit.
+
+With the acceleration a by all other forces, and g(v) by the stress of fluid with velocities v
+(`cortado.sph.stress_kernels`), with M and mu of the velocities at the start, what acts is a' of
+
+    a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y),
+
+which conjugate gradients solve to round-off. So the derivatives are those of the solution, whatever way led to it: the
+tangent is one more solve with B, and so is the adjoint, as B is symmetric in the product weighted with masses.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from cortado.device.precision import FLOAT32
+from cortado.errors import MissingDerivativeError
+from cortado.particles.state import Layout
+from cortado.scene.scene import Scene
+from cortado.scene.stability import is_implicit
+from cortado.sph.implicit_derivatives import implicit_kernels
+from cortado.sph.implicit_kernels import operator_kernels, solve_kernels
+from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
+from cortado.sph.viscosity_law import Law, newtonian_law
+from cortado.sph.viscous_stress import ViscousStress
+
+MOST = 1_000
+"""Iterations of a solve."""
+
+
+class Solve:
+    """Conjugate gradients for the particles of one solver, with arrays of its own."""
+
+    def __init__(self, layout: Layout, operator: tuple[Any, Any]):
+        """``operator``: the kernels that `operator_kernels` gives."""
+        self._kernels, (self._pull, self._multiply), self._layout = solve_kernels(layout.precision), operator, layout
+        self._tolerance = 3e-7 if layout.precision is FLOAT32 else 1e-14
+        real, vector = layout.precision.real, layout.precision.vector
+        sizes = {"shape": layout.all_particles, "device": layout.device}
+        self._p, self._product = (wp.zeros(dtype=vector, **sizes) for _ in range(2))
+        self._share = wp.zeros(dtype=real, **sizes)
+        scenes = {"shape": layout.members, "device": layout.device}
+        self._first, self._size = (wp.zeros(dtype=real, **scenes) for _ in range(2))
+        self.count, self._going = (wp.zeros(dtype=wp.int32, **scenes) for _ in range(2))
+        """(members,) iterations of the last solve."""
+        self._active = wp.zeros(1, dtype=wp.int32, device=layout.device)
+        self._sums = layout.sum_of(real), layout.sum_of(real)
+
+    def __call__(self, step: StepContext, known: Any, r: wp.array, y: wp.array) -> None:
+        """Write to ``y`` what solves B y = r, (n,) vectors both, and overwrite ``r``; ``known``: arguments of the
+        kernels of B."""
+        kernels, members, (sum_shares, sum_curvatures) = self._kernels, self._layout.members, self._sums
+        n = self._layout.all_particles
+        step.launch(kernels.begin, r=r, p=self._p, y=y, share=self._share, threads=n)
+        self._active.zero_()
+        scene = {"size": self._size, "count": self.count, "going": self._going, "active": self._active}
+        total = sum_shares(self._share)
+        step.launch(kernels.start, scene, total=total, first=self._first, threads=members)
+
+        def iterate() -> None:
+            step.launch(self._pull, *known, v=self._p)
+            step.launch(self._multiply, *known, v=self._p, product=self._product, share=self._share)
+            curvature = sum_curvatures(self._share)
+            own = {"p": self._p, "product": self._product, "r": r, "y": y, "share": self._share}
+            step.launch(kernels.descend, scene, own, curvature=curvature, threads=n)
+            total = sum_shares(self._share)
+            step.launch(kernels.turn, scene, own, total=total, threads=n)
+            limits = {"tolerance": self._tolerance, "most": MOST, "first": self._first}
+            step.launch(kernels.decide, scene, limits, total=total, threads=members)
+
+        wp.capture_while(self._active, iterate)
+
+
+class ImplicitViscousStress(ViscousStress):
+    """Viscosity as a stress at the end of the step. It comes after all other forces."""
+
+    is_last = True
+
+    def __init__(self, setting: Setting, law: Law | None = None, parameters: Any = ()):
+        """As `ViscousStress`."""
+        if setting.discretisation.taped:
+            raise MissingDerivativeError("implicit viscosity has no tape: try gradients.Exact.")
+        super().__init__(setting, law, parameters)
+        scene, discretisation, layout = setting.scene, setting.discretisation, setting.layout
+        made_for = (discretisation, scene.dimension, law or newtonian_law(), self.sticks)
+        operator, self._implicit = operator_kernels(*made_for), implicit_kernels(*made_for)
+        self._pull, self._solve = operator[0], Solve(layout, operator)
+        sizes = {"shape": layout.all_particles, "device": layout.device}
+        vectors = (wp.zeros(dtype=layout.precision.vector, **sizes) for _ in range(4))
+        self._u, self._r, self._y, self._still = vectors
+        matrix = self._of["T"].dtype
+        self._A_u, self._T_u, self._A_bar, no_matrix = (wp.zeros(dtype=matrix, **sizes) for _ in range(4))
+        self._no_bars = {"M_bar": no_matrix, "R_bar": wp.zeros(dtype=layout.precision.real, **sizes)}
+        self._after: Any = None
+        """a' of the last step."""
+
+    def _known(self, *more: Any) -> tuple[Any, ...]:
+        """Arguments of the kernels of B, with A and T of the velocities u."""
+        return *more, self._constants, {**self._of, "A": self._A_u, "T": self._T_u}
+
+    def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
+        step.launch(self._stress.forward, self._constants, **self._of, theta=self._packed.theta(step))
+        step.launch(self._implicit.predict, acceleration=before, u=self._u)
+        known = self._known()
+        step.launch(self._pull, *known, v=self._u)
+        step.launch(self._force.forward, *known, v=self._u, acceleration_in=self._still, acceleration=self._r)
+        self._solve(step, known, self._r, self._y)
+        step.launch(self._implicit.add, a=before, b=self._y, total=after)
+        self._after = after
+
+    def _at_the_end(self, step: StepContext) -> None:
+        """u = v + dt a', with A and T of it."""
+        step.launch(self._implicit.predict, acceleration=self._after, u=self._u)
+        step.launch(self._pull, *self._known(), v=self._u)
+
+    def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
+        self._at_the_end(step)
+        u_dot, change = self._y, {f"{name}_dot": self._change[name] for name in ("T", "eta")}
+        step.launch(self._implicit.predict_tangent, *dot.named, acceleration=self._after, u_dot=u_dot)
+        theta = {"theta": self._packed.theta(step), "theta_dot": self._packed.theta_dot(step, dot.parameters)}
+        both = {"u": self._u, "u_dot": u_dot, "A_u": self._A_u}
+        step.launch(self._implicit.stress_tangent, *dot.named, self._constants, self._of, both, **theta, **change)
+        now = {"v": self._u, "v_dot": u_dot, "acceleration_in_dot": before, "acceleration_dot": self._r}
+        step.launch(self._force.tangent, now, change, *self._known(*dot.named))
+        self._solve(step, self._known(), self._r, after)
+
+    def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array:
+        """Returns the adjoint of the acceleration by all other forces."""
+        step.launch(self._implicit.weigh, acceleration_bar=acceleration_bar, r=self._r)
+        self._solve(step, self._known(), self._r, self._y)
+        step.launch(self._implicit.unweigh, y=self._y, r=self._r)
+        self._at_the_end(step)
+        theta = {"theta": self._packed.theta(step), "theta_bar": self._packed.shares}
+        change = {f"{name}_bar": self._change[name] for name in ("M", "A", "R")}
+        now = {"v": self._u, "acceleration_bar": self._r}
+        both = {"A_u": self._A_u, "A_v_bar": self._A_bar}
+        step.launch(self._implicit.stress_adjoint, now, both, change, *bar.named, self._constants, self._of, **theta)
+        u_bar = self._y
+        u_bar.zero_()
+        step.launch(self._force.adjoint, now, {"v_bar": u_bar}, change, *self._known(*bar.named))
+        step.launch(self._implicit.end_adjoint, {"u_bar": u_bar, "acceleration": self._after}, *bar.named)
+        strain = {"A_bar": self._A_bar, **self._no_bars}
+        step.launch(self._implicit.strain_adjoint, strain, self._constants, *bar.named)
+        self._packed.collect(step, bar)
+        return self._r
+
+
+def stress_of(scene: Scene) -> type[ViscousStress]:
+    """The class of the viscous stress in a scene."""
+    return ImplicitViscousStress if is_implicit(scene) else ViscousStress
