@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from programs import ProgramError, last_json
 
+from benchmarks.bench.dam_break import memory_high
 from benchmarks.bench.scene import dam_break
 from cortado import Problem, Simulation
-from cortado.cli.commands.memory_use import estimated_bytes, memory_high
+from cortado.cli.commands.memory_use import estimated_bytes
 from cortado.losses import FinalPositions
 
 BUDGETS = (8, 24, 80, 141)

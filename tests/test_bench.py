@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from benchmarks.__main__ import BENCH
-from benchmarks.bench.dam_break import measure_dam_break, with_floors
+from benchmarks.bench.dam_break import ESTIMATED, measure_dam_break, with_floors
 from benchmarks.bench.environment import OtherProcesses
 from benchmarks.bench.floor import copy_bandwidth, least_bytes, sums_over_neighbours
 from benchmarks.bench.passes import AGAIN, PassTimer
@@ -19,7 +19,6 @@ from benchmarks.bench.scene import ITERATIONS, dam_break
 from benchmarks.bench.text import as_text
 from benchmarks.bench.timing import LaunchTimer, median_seconds
 from cortado import Simulation
-from cortado.cli.commands.memory_use import ESTIMATED
 from cortado.device.launching import KernelLauncher, watched
 
 STEP = [

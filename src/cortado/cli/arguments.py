@@ -13,6 +13,9 @@ Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Flag = Annotated[bool, arg(help_behavior_hint="")]
 """An option without a value, of which the help says no default."""
 Overrides = Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")]
+Device = Annotated[str, arg(help='"cpu", or "cuda:0" for the first GPU.')]
+Precision = Annotated[str, arg(help='"float32" or "float64".')]
+Json = Annotated[bool, arg(help="Print JSON for machines.", help_behavior_hint="")]
 
 
 def require_at_least(least: int, value: int, option: str) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tyro.extras import SubcommandApp
 
-from cortado.cli.arguments import Flag, Overrides, Scene, as_text, require_at_least
+from cortado.cli.arguments import Device, Flag, Overrides, Scene, as_text, require_at_least
 from cortado.cli.command import Work, command
 
 gradients = SubcommandApp()
@@ -20,7 +20,7 @@ def check(
     perturbation: float = 0.05,
     out: Path | None = None,
     overrides: Overrides = (),
-    device: str = "cpu",
+    device: Device = "cpu",
     json: Flag = False,
     seed: int = 0,
 ) -> Work:
@@ -34,7 +34,6 @@ def check(
         perturbation: How large a meaningful perturbation of a parameter is, relative to its size.
         out: Folder for a figure and the numbers.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
-        device: "cpu", or "cuda:0" for the first GPU.
         json: Print JSON for machines instead of a table.
         seed: Of the random directions.
     """

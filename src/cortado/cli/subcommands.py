@@ -7,7 +7,17 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from cortado.cli.arguments import Flag, Overrides, Scene, as_text, command_line, require_at_least
+from cortado.cli.arguments import (
+    Device,
+    Flag,
+    Json,
+    Overrides,
+    Precision,
+    Scene,
+    as_text,
+    command_line,
+    require_at_least,
+)
 from cortado.cli.command import Work, command
 from cortado.cli.gradient_commands import gradients
 from cortado.cli.parsing import Program, completion_script
@@ -55,9 +65,9 @@ def describe(
     steps: int = 200,
     picture: Path | None = None,
     overrides: Overrides = (),
-    device: str = "cpu",
-    precision: str = "float32",
-    json: Flag = False,
+    device: Device = "cpu",
+    precision: Precision = "float32",
+    json: Json = False,
 ) -> Work:
     """Describe a scene before it is run: its particles, what limits its time step, its memory, its time.
 
@@ -66,9 +76,6 @@ def describe(
         steps: Number of time steps that it shall run.
         picture: Draw its first state into this PNG file.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
-        device: "cpu", or "cuda:0" for the first GPU.
-        precision: "float32" or "float64".
-        json: Print JSON for machines.
     """
     from cortado.cli.commands.describe import describe_scene
 
@@ -81,8 +88,8 @@ def run(
     steps: int = 200,
     out: Path = Path("runs/run"),
     overrides: Overrides = (),
-    device: str = "cpu",
-    precision: str = "float32",
+    device: Device = "cpu",
+    precision: Precision = "float32",
     record_every: int = 1,
     overwrite: Flag = False,
     pictures: Flag = True,
@@ -95,8 +102,6 @@ def run(
         steps: Number of time steps.
         out: Folder of the run.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
-        device: "cpu", or "cuda:0" for the first GPU.
-        precision: "float32" or "float64".
         record_every: Steps from one frame of the trajectory to the next.
         overwrite: Replace an earlier run in the same folder.
         pictures: Leave out the shaded pictures and the film.
@@ -116,14 +121,13 @@ def run(
 def compare(
     first: Annotated[Positional[Path], arg(metavar="RUN")],
     second: Annotated[Positional[Path], arg(metavar="RUN")],
-    json: Flag = False,
+    json: Json = False,
 ) -> Work:
     """Compare two runs: their scenes and settings, their last states, their metrics, and where they were made.
 
     Args:
         first: The folder of a run.
         second: The folder of another.
-        json: Print JSON for machines.
     """
     from cortado.cli.commands.compare import compare_runs
 
@@ -135,8 +139,8 @@ def optimise(
     task: Annotated[Positional[Path], arg(metavar="TASK.toml")],
     out: Path = Path("runs/optimise"),
     overrides: Overrides = (),
-    device: str = "cpu",
-    precision: str = "float32",
+    device: Device = "cpu",
+    precision: Precision = "float32",
     resume: Flag = False,
     overwrite: Flag = False,
     scheduler: str | None = None,
@@ -149,8 +153,6 @@ def optimise(
         task: A scene file with the tables [problem] and [optimise].
         out: Folder of the run.
         overrides: Replace a value of the file, such as optimise.iterations=50; may be given again.
-        device: "cpu", or "cuda:0" for the first GPU.
-        precision: "float32" or "float64".
         resume: Go on with the run in the folder, bit for bit.
         overwrite: Replace an earlier run in the same folder.
         scheduler: Address of a scheduler of Dask's, whose workers compute the samples of an ensemble.
@@ -173,7 +175,7 @@ def picture(
     film: Flag = False,
     out: Path | None = None,
     overrides: Overrides = (),
-    device: str = "cpu",
+    device: Device = "cpu",
 ) -> Work:
     """Draw a shaded picture, or a film, of a run that `cortado run` wrote.
 
@@ -183,7 +185,6 @@ def picture(
         film: A film of all frames in its place.
         out: Where to write it; into the run's figures if left out.
         overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
-        device: "cpu", or "cuda:0" for the first GPU.
     """
     from cortado.cli.commands.picture import draw_run
 
@@ -194,7 +195,7 @@ def picture(
 def view(
     path: Annotated[Positional[Path], arg(metavar="RUN|SCENE.toml|TASK.toml")],
     overrides: Overrides = (),
-    device: str = "cpu",
+    device: Device = "cpu",
     precision: str = "float32",
     port: int = 8080,
 ) -> Work:
@@ -204,7 +205,6 @@ def view(
     Args:
         path: The folder of a run, a scene file, or a task file.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
-        device: "cpu", or "cuda:0" for the first GPU.
         precision: "float32" or "float64", of a scene or a task that runs.
         port: Of the page on this machine; the next one that is free if it is taken.
     """
@@ -221,7 +221,7 @@ def sweep(
     time: float | None = None,
     out: Path = Path("runs/sweep"),
     device: str = "cpu",
-    precision: str = "float32",
+    precision: Precision = "float32",
     scheduler: str | None = None,
     workers: int | None = None,
 ) -> Work:
@@ -235,7 +235,6 @@ def sweep(
         time: Seconds that a scene is simulated, in the place of steps.
         out: Folder of the sweep, with a folder for each combination and a table of them all.
         device: "cpu", or "cuda:0" for the first GPU, of each worker.
-        precision: "float32" or "float64".
         scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
         workers: Number of worker processes on this machine; on a GPU each has one of its own.
     """

@@ -1,20 +1,9 @@
-"""How much memory a simulation takes: measured on a GPU, where Warp's pool counts it, and estimated on a CPU."""
-
-from typing import Any
-
-import warp as wp
+"""How much memory a simulation takes, by an estimate."""
 
 from cortado.device.memory import gradient_parts, simulation_parts
 from cortado.rollout.rollout import Rollout
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
-
-MEASURED, ESTIMATED = "measured: high-water mark of the memory pool", "estimated: cortado.device.memory"
-
-
-def memory_high(device: Any) -> int:
-    """[bytes] in use on a GPU at most so far; 0 on a CPU."""
-    return 0 if device.is_cpu else int(wp.get_mempool_used_mem_high(device))
 
 
 def estimated_bytes(simulation: Simulation, rollout: Rollout) -> tuple[float, float]:
