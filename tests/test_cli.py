@@ -23,8 +23,8 @@ from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
 from cortado import Problem, Scene, Trajectory
 from cortado.files.folder_lock import locked
-from cortado.optimisation.inverse.chapters import Chapters
 from cortado.optimisation.inverse.task import load_task
+from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.transforms import TimeInterpolation
 from cortado.pictures.image_files import heart, rosetta, write_picture
 from cortado.runs.run_folder import FIGURES, RunFolder
@@ -42,7 +42,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # tests/test_shading.py draws them
     monkeypatch.setattr("cortado.cli.commands.run_report.run_pictures", lambda *_: [])
-    monkeypatch.setattr("cortado.cli.commands.optimise.shaded_figures", lambda *_: Chapters())
+    monkeypatch.setattr("cortado.cli.commands.optimise.shaded_figures", lambda *_: TaskFigures())
     return tmp_path
 
 

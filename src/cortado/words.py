@@ -21,7 +21,7 @@ def sized(arrays: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {shape}" if shape else name for name, shape in shapes.items())
 
 
-class Brief:
+class ShortRepr:
     """A dataclass (made with ``repr=False``) whose arrays are shown by their shapes."""
 
     def __repr__(self) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 
 from cortado.certificate.loss_history import LossHistory
 from cortado.scene.parameters.values import Arrays
-from cortado.words import Brief
+from cortado.words import ShortRepr
 
 STEPS = tuple(10.0**-k for k in range(3, 9))
 """Steps h of the central differences, in units of the direction. Smaller ones are tried until the differences stop
@@ -29,7 +29,7 @@ DIFFERENCE_ROUND_OFF = 1e-15
 
 
 @dataclass(frozen=True, repr=False)
-class Consistency(Brief):
+class Consistency(ShortRepr):
     """Derivatives of the loss along one direction, by reverse mode, forward mode and central differences."""
 
     sample_steps: np.ndarray

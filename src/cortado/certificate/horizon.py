@@ -6,7 +6,7 @@ import numpy as np
 
 from cortado.certificate.loss_history import LossHistory
 from cortado.scene.parameters.values import Arrays
-from cortado.words import Brief
+from cortado.words import ShortRepr
 
 WITHIN = 0.25
 """The exact derivative counts as useful where its relative distance from the finite difference is at most this."""
@@ -15,7 +15,7 @@ LINEAR = 0.3
 
 
 @dataclass(frozen=True, repr=False)
-class Horizon(Brief):
+class Horizon(ShortRepr):
     """The derivative of the loss along a meaningful perturbation of one parameter, exact and as a finite difference."""
 
     parameter: str

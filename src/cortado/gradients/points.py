@@ -47,7 +47,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Daring(Point):
+class FalliblePoint(Point):
     """A point that may diverge."""
 
     loss_if_diverged: float = np.nan

@@ -100,7 +100,7 @@ class _Member(Snapshot):
 
 
 @runtime_checkable
-class Together(Protocol):
+class BatchedLoss(Protocol):
     """A loss that looks at all scenes of a batch at once, which saves a launch and a look of the host for each. Scene b
     gets the bits that it would get alone."""
 
@@ -115,7 +115,7 @@ class Together(Protocol):
 def values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray:
     """(batch,) the losses of some scenes; NaN for others."""
     found = np.full(len(end), np.nan)
-    if isinstance(loss, Together):
+    if isinstance(loss, BatchedLoss):
         found[members] = loss.values(end)[members]
         return found
     for b in members:
@@ -126,7 +126,7 @@ def values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray
 def values_and_adjoints(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> tuple[np.ndarray, SnapshotAdjoint]:
     """The same, with the adjoints of the states of these scenes; 0 for others."""
     found = np.full(len(end), np.nan)
-    if isinstance(loss, Together):
+    if isinstance(loss, BatchedLoss):
         all_found, state = loss.values_and_adjoint(end)
         found[members] = all_found[members]
         for b in set(range(len(end))).difference(members):

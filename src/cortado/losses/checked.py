@@ -10,7 +10,7 @@ import warp as wp
 from cortado.arrays import as_numbers, as_one_number
 from cortado.errors import InputError, shown
 from cortado.losses import Loss, Recorded, Snapshot, SnapshotAdjoint, SnapshotBatch
-from cortado.losses.batch import Together
+from cortado.losses.batch import BatchedLoss
 from cortado.losses.loss import ADJOINT_FIELDS, Adjoint
 from cortado.particles.state import State
 from cortado.scene.quantities import check_quantity
@@ -55,7 +55,7 @@ class CheckedLoss:
         return tuple(_checked_array(*entry) for entry in zip(forms, bar, wanted, strict=False))
 
 
-class CheckedTogether(CheckedLoss):
+class CheckedBatchedLoss(CheckedLoss):
     """The same of a loss that looks at all scenes of a batch at once."""
 
     def values(self, end: SnapshotBatch) -> np.ndarray:
@@ -74,7 +74,7 @@ def as_loss(loss: Any) -> Loss:
     if derivative is not None and hasattr(loss, "value"):
         for name in ("value", derivative):
             _require_arguments(f"the loss's {name}", getattr(loss, name), ("the end of a trajectory",))
-        return CheckedTogether(loss) if isinstance(loss, Together) else CheckedLoss(loss)
+        return CheckedBatchedLoss(loss) if isinstance(loss, BatchedLoss) else CheckedLoss(loss)
     if not callable(loss):
         raise InputError(f"loss is a {type(loss).__name__}, but must have a value and an adjoint, or be a function.")
     _require_arguments("loss", loss, ("positions", "velocities", "an array for the loss"))

@@ -43,11 +43,11 @@ class FinalPositions:
         return self.value(end), self._adjoint(end)
 
     def values(self, end: SnapshotBatch) -> np.ndarray:
-        """See `losses.batch.Together`."""
+        """See `losses.batch.BatchedLoss`."""
         return self._mean_squares(end)
 
     def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
-        """See `losses.batch.Together`."""
+        """See `losses.batch.BatchedLoss`."""
         return self.values(end), self._adjoint(end)
 
     @WARP

@@ -10,7 +10,7 @@ from cortado.device.executors.executor import Executor, InProcess, OnResult, che
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.gradients import Estimate, GradientEstimator
 from cortado.gradients.estimator import Differentiable, checked_estimator
-from cortado.gradients.points import Daring, evaluated
+from cortado.gradients.points import FalliblePoint, evaluated
 from cortado.scene.parameters.values import Values
 from cortado.words import counted
 
@@ -47,7 +47,7 @@ def evaluate(
     chosen = checked_executor(InProcess() if executor is None else executor)
     estimator = None if gradient is None else checked_estimator(gradient)
     loss = np.nan if loss_if_diverged is None else loss_if_diverged
-    made = (Daring(_by_name(values), estimator, loss) for values in points)
+    made = (FalliblePoint(_by_name(values), estimator, loss) for values in points)
     found = evaluated(problem, made, chosen, on_result=on_result)
     lost = [number for number, one in enumerate(found) if one.diverged is not None]
     if lost and loss_if_diverged is None:

@@ -10,7 +10,7 @@ import numpy as np
 from cortado.arrays import as_numbers, as_one_number
 from cortado.device.executors.executor import InProcess
 from cortado.errors import ComputationError, DivergedError, InputError
-from cortado.gradients.points import Daring, evaluated
+from cortado.gradients.points import FalliblePoint, evaluated
 from cortado.optimisation.differentiable import Optimisable, loss_and_gradient
 from cortado.optimisation.replay_log import Log, LoggedEvaluation, ParameterLayout, Vector
 from cortado.optimisation.result import Parameters, Record
@@ -104,7 +104,7 @@ class Evaluator:
         points, problem = [self.layout.unravel(vector) for vector in left], self.problem
         if callable(getattr(problem, "value", None)):
             made: Any = problem
-            trials = [Daring(point, loss_if_diverged=math.inf, errors=REFUSED) for point in points]
+            trials = [FalliblePoint(point, loss_if_diverged=math.inf, errors=REFUSED) for point in points]
             evaluated(made, trials, InProcess(), on_result=lambda _, one: keep(one.loss))
         else:
             for point in points:

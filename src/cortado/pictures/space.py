@@ -12,10 +12,10 @@ from cortado.device.cores import usable_cores
 from cortado.device.launching import launch
 from cortado.device.threads import MOST_CORES, WARP, helpers
 from cortado.discretise.shapes import Points
-from cortado.pictures.meeting import FluidSurface
 from cortado.pictures.scenery import Scenery, State, processes_for, sceneries, scenery
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.surface import Surface
+from cortado.pictures.surface_hit import FluidSurface
 from cortado.pictures.surroundings import GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Environment
 from cortado.pictures.trace import Eye, find_contrast, illuminate, trace
 

@@ -9,7 +9,7 @@ and of what remains fluid takes away the colours that it does not have.
 import warp as wp
 
 from cortado.pictures.glass import background, glass
-from cortado.pictures.meeting import FluidSurface, leave, meet
+from cortado.pictures.surface_hit import FluidSurface, leave, meet
 from cortado.pictures.surroundings import FAR, Environment, mirrored, schlick, sky
 
 SEGMENTS = 4

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cortado.errors import InputError, shown
 from cortado.fixed import FixedDict
-from cortado.words import Brief
+from cortado.words import ShortRepr
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Origin:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RestartState(Brief):
+class RestartState(ShortRepr):
     """The state at the end of a step, whole: `Trajectory.last_state` gives it and `Simulation.run` takes it."""
 
     fields: Mapping[str, NDArray]

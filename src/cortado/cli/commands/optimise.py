@@ -18,12 +18,12 @@ from cortado.files.interruption import keeping
 from cortado.files.progress import announce, track
 from cortado.files.terminal import say
 from cortado.losses.image_losses import psnr
-from cortado.optimisation.inverse.chapters import Chapters
 from cortado.optimisation.inverse.figures import task_figures
 from cortado.optimisation.inverse.knots import knot_values
 from cortado.optimisation.inverse.setup import Setup, setup
 from cortado.optimisation.inverse.shaded import shaded_figures
 from cortado.optimisation.inverse.task import Task, load_task
+from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.pictures.film import lacking
 from cortado.runs.report import Section, write_report
@@ -120,12 +120,12 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
     return f"The results are in {folder.path}; open {to_open}."
 
 
-def _shaded(made: Setup, result: Result, folder: Path, wished: bool) -> Chapters:
+def _shaded(made: Setup, result: Result, folder: Path, wished: bool) -> TaskFigures:
     """Shaded pictures and films, where they are wished; none, and a sentence, where a package is missing."""
     missing = lacking(made.task.scene) if wished else None
     if missing:
         say(missing)
-    return shaded_figures(made, result, folder) if wished and not missing else Chapters()
+    return shaded_figures(made, result, folder) if wished and not missing else TaskFigures()
 
 
 def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) -> Result:

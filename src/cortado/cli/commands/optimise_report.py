@@ -7,10 +7,10 @@ import numpy as np
 
 from cortado.cli.commands.found import Rows
 from cortado.cli.commands.verdict import Verdict
-from cortado.optimisation.inverse.chapters import Chapters
 from cortado.optimisation.inverse.in_words import task_in_words
 from cortado.optimisation.inverse.knots import KnotValues
 from cortado.optimisation.inverse.setup import Setup
+from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.result import Result
 from cortado.pictures.scene_view import scene_view
 from cortado.runs.report import Section
@@ -33,7 +33,7 @@ def sections(
     result: Result,
     verdict: Verdict,
     told: list[str],
-    figures: Chapters,
+    figures: TaskFigures,
     rows: Rows,
 ) -> list[Section]:
     """The report, in the order in which one would tell it; ``told``: what was found, in words."""

@@ -45,8 +45,8 @@ def write_run_report(
         films = [(caption, path) for caption, path in shaded if Path(path).suffix == ".mp4"]
         stills = [pair for pair in shaded if pair not in films]
         looks = Section("What it looks like", figures=films)
-        chapters = [asked, looks, view, told, *sensors, Section("Pictures", figures=[*stills, *figures]), solver]
-        write_report(folder, scene.name, chapters)
+        sections = [asked, looks, view, told, *sensors, Section("Pictures", figures=[*stills, *figures]), solver]
+        write_report(folder, scene.name, sections)
 
     write([])
     missing = lacking(scene) if pictures else None

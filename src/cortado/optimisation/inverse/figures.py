@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from cortado.files.video import MOST_FRAMES, write_video
-from cortado.optimisation.inverse.chapters import Chapters
 from cortado.optimisation.inverse.setup import Setup
 from cortado.optimisation.inverse.task import Task
+from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.optimise import Result
 from cortado.pictures.figures import images, loss_curve, panels, particles
 from cortado.pictures.painter import colours_of
@@ -24,17 +24,17 @@ IMAGES = 6
 """Images that show the course of the optimisation."""
 
 
-def task_figures(made: Setup, result: Result, folder: Path) -> Chapters:
+def task_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
     """Draw them into a folder."""
     losses = [record.loss for record in result.history]
     label = "loss [m²]" if made.renderer is None else "loss"
-    figures = Chapters(search=[("The loss.", loss_curve(losses, folder / "loss.png", label=label))])
+    figures = TaskFigures(search=[("The loss.", loss_curve(losses, folder / "loss.png", label=label))])
     if made.renderer is None:
-        figures += Chapters(compared=[_particles(made, result, folder)])
+        figures += TaskFigures(compared=[_particles(made, result, folder)])
     else:
         figures += _images(made, result, folder)
     for name in result.parameters:
-        figures += Chapters(parameters=_parameter(made, result, name, folder))
+        figures += TaskFigures(parameters=_parameter(made, result, name, folder))
     return figures
 
 
@@ -48,7 +48,7 @@ def _particles(made: Setup, result: Result, folder: Path) -> tuple[str, Path]:
     return "Where the fluid ends: with the first guess, as found, and the target.", path
 
 
-def _images(made: Setup, result: Result, folder: Path) -> Chapters:
+def _images(made: Setup, result: Result, folder: Path) -> TaskFigures:
     last, target = max(made.targets.items())
 
     def image(u: dict[str, np.ndarray]) -> np.ndarray:
@@ -66,7 +66,7 @@ def _images(made: Setup, result: Result, folder: Path) -> Chapters:
         states = made.problem.states(made.search.parameters(result.parameters), numbers.tolist())
         path = write_video(folder / "estimate.mp4", (made.image(states[k]) for k in numbers.tolist()), 20)
         compared.append(("The run with the parameters that were found.", path))
-    return Chapters(compared=compared, search=search)
+    return TaskFigures(compared=compared, search=search)
 
 
 def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:

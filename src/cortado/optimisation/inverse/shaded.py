@@ -9,8 +9,8 @@ import numpy as np
 
 from cortado.discretise.shapes import Points
 from cortado.losses import Snapshot
-from cortado.optimisation.inverse.chapters import Chapters
 from cortado.optimisation.inverse.setup import Setup
+from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.optimise import Result
 from cortado.pictures.film import film
 from cortado.pictures.image_files import write_picture
@@ -27,7 +27,7 @@ Run = Mapping[int, Snapshot]
 """States by the number of steps before them."""
 
 
-def shaded_figures(made: Setup, result: Result, folder: Path) -> Chapters:
+def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
     """Draw them into a folder."""
     picture, device = made.task.scene.picture or Picture(), made.problem.simulation.device
     steps = np.unique(np.linspace(0, made.problem.steps, max(picture.most_frames, 2)).astype(int)).tolist()
@@ -53,12 +53,12 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> Chapters:
     write_picture(path, searched.image(steps[-1]))
     search: Figures = [("The end of the run as the search went on.", path)]
     if not picture.most_frames or len(steps) < 2:
-        return Chapters(compared=compared, search=search)
+        return TaskFigures(compared=compared, search=search)
     pair = {name: runs[name] for name in (("found", "target") if "target" in runs else ("first guess", "found"))}
     two = page(list(pair), list(pair.values()))
     motion = film(folder / "found.mp4", two, steps, picture.film_frames)
     search.insert(0, ("The search in motion.", film(folder / "search.mp4", searched, steps, picture.film_frames)))
-    return Chapters(found=[(f"The run: {' and '.join(pair)}.", motion)], compared=compared, search=search)
+    return TaskFigures(found=[(f"The run: {' and '.join(pair)}.", motion)], compared=compared, search=search)
 
 
 def _page(made: Setup, names: Sequence[str], runs: Sequence[Run], device: Any) -> Page:

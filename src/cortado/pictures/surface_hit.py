@@ -50,8 +50,8 @@ def facing(normal: wp.vec3, face_normal: wp.vec3, d: wp.vec3):
 
 
 @wp.struct
-class Meeting:
-    """Where a ray meets the surface of the fluid."""
+class SurfaceHit:
+    """Where a ray hits the surface of the fluid."""
 
     found: wp.bool
     t: wp.float32
@@ -63,13 +63,13 @@ class Meeting:
 
 @wp.func
 def at_surface(surface: FluidSurface, t: wp.float32, d: wp.vec3, face: wp.int32, u: wp.float32, v: wp.float32):
-    """A meeting with a triangle."""
+    """Where a ray hits a triangle."""
     i = surface.corners[3 * face]
     j = surface.corners[3 * face + 1]
     k = surface.corners[3 * face + 2]
     mesh = wp.mesh_get(surface.mesh)
     flat = wp.normalize(wp.cross(mesh.points[j] - mesh.points[i], mesh.points[k] - mesh.points[i]))
-    met = Meeting()
+    met = SurfaceHit()
     met.found = True
     met.t = t
     met.normal = facing(at_corners(surface, surface.normals, face, u, v), flat, d)
@@ -80,7 +80,7 @@ def at_surface(surface: FluidSurface, t: wp.float32, d: wp.vec3, face: wp.int32,
 
 @wp.func
 def at_wall(s: Environment, surface: FluidSurface, o: wp.vec3, d: wp.vec3, t: wp.float32):
-    """A meeting with the wall that fluid touches, beyond which its triangles go on: they are near."""
+    """Where a ray hits the wall that fluid touches, beyond which its triangles go on: they are near."""
     p = o + t * d
     near = wp.mesh_query_point_no_sign(surface.mesh, p, surface.reach)
     if not near.result:  # deep within fluid that has just reached the wall
@@ -94,7 +94,7 @@ def at_wall(s: Environment, surface: FluidSurface, o: wp.vec3, d: wp.vec3, t: wp
 @wp.func
 def meet(s: Environment, surface: FluidSurface, o: wp.vec3, d: wp.vec3):
     """Where a ray from outside of the fluid comes into it."""
-    none = Meeting()
+    none = SurfaceHit()
     none.found = False
     none.t = FAR
     part = room(s, o, d)
@@ -118,7 +118,7 @@ def leave(s: Environment, surface: FluidSurface, o: wp.vec3, d: wp.vec3):
     hit = wp.mesh_query_ray(surface.mesh, o, d, FAR)
     if hit.result and (hit.t <= part[1] or part[1] <= 0.0):
         return at_surface(surface, hit.t, d, hit.face, hit.u, hit.v)
-    met = Meeting()
+    met = SurfaceHit()
     met.found = hit.result
     met.t = 0.0
     if hit.result:  # the wall comes first; what colour fluid has there does not matter

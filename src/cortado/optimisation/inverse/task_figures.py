@@ -6,7 +6,7 @@ from cortado.runs.report import Figures
 
 
 @dataclass(frozen=True)
-class Chapters:
+class TaskFigures:
     """Pictures and films, (caption, path) of each."""
 
     found: Figures = field(default_factory=list)
@@ -18,6 +18,6 @@ class Chapters:
     search: Figures = field(default_factory=list)
     """How the search went."""
 
-    def __add__(self, other: "Chapters") -> "Chapters":
+    def __add__(self, other: "TaskFigures") -> "TaskFigures":
         """These, and then those of another."""
-        return Chapters(**{name: figures + getattr(other, name) for name, figures in vars(self).items()})
+        return TaskFigures(**{name: figures + getattr(other, name) for name, figures in vars(self).items()})
