@@ -9,6 +9,7 @@ import argparse
 import ast
 import importlib
 import inspect
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
@@ -66,8 +67,9 @@ def by_hand(d: Discretisation) -> dict[str, ByHand]:
 class Caller:
     """A Warp function of a sum, in a kernel of its own."""
 
-    def __init__(self, function: Any, names: Sequence[str], results: Sequence[Any], d: Discretisation):
-        """``names`` of its arguments between i and s, and the types of its results."""
+    def __init__(self, name: str, function: Any, names: Sequence[str], results: Sequence[Any], d: Discretisation):
+        """``names`` of its arguments between i and s, and the types of its results. ``name`` is that of its Warp
+        module, by which the cache of kernels knows it in the next process."""
         self._names, self._results, self._lanes = names, results, d.lanes
         kinds = list(function.adj.arg_types.values())[1:-1]
         assert len(kinds) == len(names)
@@ -83,7 +85,7 @@ class Caller:
         text += "    if lane() > 0:\n        return\n"
         text += "".join(f"    out_{n}[i] = r_{n}\n" for n in range(len(results)))
         exec(text, known)
-        module = wp.get_module(f"cortado_call_{function.key}_{id(function)}")
+        module = wp.get_module(f"cortado_call_{re.sub('[^a-z_0-9]+', '_', name)}_{d.precision.name}")
         module.options["enable_backward"] = False
         self._kernel = wp.Kernel(known["call"], key="call", module=module, source=text)
 
@@ -121,8 +123,8 @@ class Pair:
         self.compared = min(len(results), len(own.results))
         """Results that both have."""
         assert self.compared >= (len(results) if one.kind == "tangent" else len(term.arrays))
-        self.made = Caller(KINDS[one.kind](d, lambda _: term.function), [*arrays, *others], results, d)
-        self.by_hand = Caller(one.function, [*own_arrays, *own.others], own.results, d)
+        self.made = Caller(f"made {name}", KINDS[one.kind](d, lambda _: term.function), [*arrays, *others], results, d)
+        self.by_hand = Caller(f"by hand {name}", one.function, [*own_arrays, *own.others], own.results, d)
 
     def values(self, x: wp.array, seed: int) -> dict[str, Any]:
         """Random arguments, numbers positive, at positions x."""
