@@ -74,8 +74,8 @@ d stands for the number of dimensions, 2 or 3. Defaults of vectors are for 3-D: 
 key whose last but one column says *needed* has to be there; all others may be left out. A key that does not exist, a
 number out of its range or a missing key is refused in a sentence that names the file and the key.
 
-Each example below is a part of a file. Put in the place of the table of the same name in the file above, it makes
-another whole file.
+Each example below is a part of a file. Swap it for the table of the same name in the file above to get a complete
+file.
 
 ## At the top of the file
 

@@ -44,7 +44,7 @@ def _array(field: str, label: str) -> str:
 
 
 def unbundled(arguments: Iterable[Any]) -> Iterator[Any]:
-    """The arguments of a launch, with its arrays in the place of the bundles that they are in."""
+    """The arguments of a launch, with its arrays instead of the bundles that they are in."""
     for argument in arguments:
         struct = getattr(argument, "_cls", None)
         if struct in _FIELDS:

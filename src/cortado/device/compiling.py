@@ -187,14 +187,13 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_HEADERS.wait)  # a child would wait for ever for what no thread of its own ends
 
 
-# ---- what is said ----------------------------------------------------------------------------------------------------
+# ---- messages --------------------------------------------------------------------------------------------------------
 
 
 class _Said:
-    """What was said of compiling in this process."""
+    """Whether this process has announced that it compiles."""
 
     anything = False
-    """Whether anything was."""
 
 
 @contextmanager
@@ -207,7 +206,7 @@ def _announced(count: int, device: Any) -> Iterator[None]:
 
 def watch_compilation() -> None:
     """From now on one line on stderr says so when a kernel of Cortado's has to be compiled, which takes long enough to
-    wonder, and threads share precompiled headers; nothing is said where all kernels come from the cache."""
+    wonder, and threads share precompiled headers; there is no message where all kernels come from the cache."""
     with suppress(ImportError):  # Warp keeps it for itself, and may move it
         from warp._src import build
 

@@ -42,7 +42,7 @@ FARTHEST = 0.15
 DAMPING, MOST_INNER_ROUNDS = 0.02, 20
 """Of the linear least squares: among solutions that are nearly as good, the one that moves particles least."""
 MANY = 20_000
-"""Particles, of which it is said that they are packed, as it takes some seconds or minutes."""
+"""Particles: a line announces the packing of so many, as it takes some seconds or minutes."""
 GRAINS = 2.0**13
 """Particles move by whole numbers of this part of a spacing, so that round-off, which differs between machines, does
 not show in where they are."""

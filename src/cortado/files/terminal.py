@@ -1,4 +1,4 @@
-"""What is said to the user, whatever stands at the other end of stdout and stderr."""
+"""Messages to the user, whatever stands at the other end of stdout and stderr."""
 
 import io
 import os
@@ -49,7 +49,7 @@ def is_quiet() -> bool:
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Within it, in all threads, nothing is said but results, warnings and errors."""
+    """Within it all threads write only results, warnings and errors."""
     _Quiet.depth += 1
     try:
         yield

@@ -41,7 +41,7 @@ class Point:
         return self.estimator.estimate(problem, self.values, observe)
 
     def without_a_run(self, why: Exception, loss: float = np.nan) -> Estimate:
-        """What there is to say where no run is possible: a gradient that is no number."""
+        """The estimate where no run is possible: its gradient is no number."""
         names = self.values if self.estimator is not None else ()
         return Estimate(loss, {name: np.full(np.shape(self.values[name]), np.nan) for name in names}, diverged=why)
 
@@ -83,8 +83,8 @@ Group = tuple[Point, ...]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A problem as a function of groups of points, which a worker process keeps. What is wrong with a point, or with
-    the run there, is said as it would be of the point alone."""
+    """A problem as a function of groups of points, which a worker process keeps. An error in a point, or in
+    the run there, has the sentence that it would have for the point alone."""
 
     problem: Differentiable
     observe: Observer | None = None

@@ -2,7 +2,7 @@
 
 A ray that meets the fluid is split in two, by Fresnel's law. What is reflected sees the surroundings, or other fluid.
 What is refracted goes on through the fluid and out of it, up to `SEGMENTS` times; on a way L within the fluid it loses
-the part 1 - exp(-scattering L), in the place of which it gets the colour of the fluid in the light that falls on it,
+the part 1 - exp(-scattering L), instead of which it gets the colour of the fluid in the light that falls on it,
 and of what remains fluid takes away the colours that it does not have.
 """
 

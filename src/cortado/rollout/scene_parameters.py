@@ -86,7 +86,7 @@ class SceneParameters:
         return self._known[name].shapes(self._steps, len(simulation.scene.phase), simulation.positions.shape)
 
     def upright(self, values: Arrays) -> Arrays:
-        """The values, with gravity in the place of a tilt."""
+        """The values, with gravity instead of a tilt."""
         return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values
 
     def _courses(self, values: Arrays) -> dict[str, Changing]:

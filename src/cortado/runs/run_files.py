@@ -22,7 +22,7 @@ def asked_for(scene_json: str) -> str:
         if scene["picture"]["film_frames"] == MOST_FRAMES:
             del scene["picture"]["film_frames"]
     except (ValueError, RecursionError, LookupError, TypeError):
-        return scene_json  # what is wrong is said where it is read
+        return scene_json  # an error is reported where it is read
     return json.dumps(scene)
 
 

@@ -188,7 +188,7 @@ class RunFolder:
         return self.path / "result.json"
 
     def read_scene(self, overrides: Sequence[str] = ()) -> Scene:
-        """The scene, with replacements as for `load_scene`; what there is to warn of was said when it ran.
+        """The scene, with replacements as for `load_scene`; without its warnings, which came when it ran.
 
         Raises:
             InputError: the file is damaged; `SceneError` where what it says, or a replacement, does not fit.

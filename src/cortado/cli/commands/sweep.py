@@ -87,7 +87,7 @@ class Member:
         return check_steps(max(round(self.duration / self.time_step(combination)), 1))
 
     def _computed(self, combination: Combination) -> dict[str, Any]:
-        """Compute a combination, or go on with it; what fails is said in the result."""
+        """Compute a combination, or go on with it; the result reports a failure."""
         out, overrides = self.out / combination.name, combination.overrides
         begun = self._folder(combination) is not None
         words = [str(self.file), *(word for one in overrides for word in ("--set", one)), "--out", str(out)]
@@ -161,7 +161,7 @@ def run_sweep(
 
 def _there(member: Member, chosen: list[Combination]) -> dict[int, dict[str, Any]]:
     """What came out of the combinations that have ended, by their numbers. All of them are looked at, so that a mistake
-    is found before anything is computed; what there is to warn of is said when they are."""
+    is found before anything is computed; warnings come when they are."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
         found = {number: member.finished(one) for number, one in enumerate(chosen)}
@@ -187,7 +187,7 @@ def _duration(file: Path, chosen: list[Combination], steps: int | None, time: fl
 
 
 def _time_step(file: Path, combination: Combination) -> float:
-    """Of a scene [s]; what there is to warn of is said when it is run."""
+    """Of a scene [s]; warnings come when it is run."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
         return load_scene(file, combination.overrides).solver.time_step

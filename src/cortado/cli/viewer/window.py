@@ -92,7 +92,7 @@ class Window:
         self._guarded.close()
 
     def show(self, shown: Shown) -> None:
-        """Draw particles in the place of those before."""
+        """Draw particles instead of those before."""
         self._shown = shown
         self._draw()
 

@@ -41,7 +41,7 @@ class LocalWorkers(Distributed):
         """Since when nannies have been seen to have no worker [s], by their names."""
 
     def mend(self) -> None:
-        """Have new nannies in the place of those that have ended, without waiting for them."""
+        """Replace nannies that have ended by new ones, without waiting for them."""
         now = time.monotonic()
         there = {worker.name for worker in [*self._cluster.scheduler.workers.values()]}
         nannies = {name: nanny for name, nanny in [*self._cluster.workers.items()] if name not in there}

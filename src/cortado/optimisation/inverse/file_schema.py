@@ -8,7 +8,7 @@ from cortado.scene.scene import Scene
 
 
 def file_schema() -> dict[str, Any]:
-    """Of a scene or a task. It knows names, types, units and ranges; what must fit together is said by Cortado."""
+    """Of a scene or a task. It knows names, types, units and ranges; Cortado itself checks what must fit together."""
     scene, task = (model.model_json_schema() for model in (Scene, TaskTables))
     tables = {**scene["$defs"], **task["$defs"]}
     for table in tables.values():
