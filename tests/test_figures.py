@@ -86,14 +86,6 @@ def test_particles_that_cannot_be_seen_do_not_stop_the_picture(tmp_path, points)
     pixels(figures.particles([points], ["odd"], tmp_path / "a.png"))
 
 
-@pytest.mark.parametrize("shape", [(3,), (1,), (8, 3)])
-def test_parameters_are_drawn_against_the_hidden_ones(tmp_path, shape):
-    history = np.linspace(0.0, 1.0, 20).reshape(20, *[1] * len(shape)) * np.ones(shape)
-    known = pixels(figures.parameters(history, np.full(shape, 0.9), tmp_path / "a.png", unit="m/s²"))
-    unknown = pixels(figures.parameters(history, None, tmp_path / "b.png"))
-    assert np.any(known.shape != unknown.shape) or np.any(known != unknown)
-
-
 def test_steps_that_did_not_converge_are_marked(tmp_path):
     mark = (0xA8, 0x50, 0x4F)
     image = pixels(density_errors(trajectory_of(50), tmp_path / "a.png", tolerance=0.01))
@@ -103,25 +95,18 @@ def test_steps_that_did_not_converge_are_marked(tmp_path):
 
 
 def test_what_is_hidden_is_seen_where_it_was_found(tmp_path):
-    labels = {"title": "", "x_label": "", "y_label": ""}
-    found, ink = {"found": [0.0, 1.0, 2.0]}, (0x2B, 0x2A, 0x28)
+    found, ink = [[0.0], [1.0], [2.0]], (0x2B, 0x2A, 0x28)
     alone, both = (
-        pixels(figures.curve([0.0, 1.0, 2.0], found, tmp_path / f"{k}.png", **labels, true=true))
-        for k, true in enumerate([(), ([0.0, 1.0, 2.0],)])
+        pixels(figures.panels(range(3), found, tmp_path / "a.png", names=["a"], title="", x_label="", true=true))
+        for true in (None, found)
     )
     assert share_of(ink, both) > share_of(ink, alone) + 1e-3
 
 
-def test_a_curve_leaves_out_what_has_no_place_on_it(tmp_path):
-    labels = {"title": "a", "x_label": "iteration", "y_label": "loss"}
-    odd = {"odd": [1.0, np.nan, 0.0, 10.0], "none": [-1.0, 0.0, np.inf, np.nan]}
-    for logarithmic in (False, True):
-        path = tmp_path / f"{logarithmic}.png"
-        image = pixels(figures.curve(np.arange(4), odd, path, **labels, logarithmic=logarithmic))
-        assert share_of((0x3D, 0x6B, 0x8E), image) > 1e-3
-    pixels(figures.curve([0.0], {"none": [0.0]}, tmp_path / "c.png", **labels, logarithmic=True))
-    with pytest.raises(InputError, match="'a' has shape"):
-        figures.curve([0.0, 1.0], {"a": [1.0]}, tmp_path / "d.png", **labels)
+@pytest.mark.parametrize("losses", [[1.0, np.nan, 0.0, 10.0], [-1.0, 0.0, np.inf, np.nan]])
+def test_a_loss_without_a_place_on_the_curve_is_left_out(tmp_path, losses):
+    image = pixels(figures.loss_curve(losses, tmp_path / "a.png"))
+    assert share_of((0x3D, 0x6B, 0x8E), image) > 1e-3
 
 
 @pytest.mark.parametrize("count", [1, 3, 6])

@@ -11,12 +11,10 @@ from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.scale import Scale
 from cortado.pictures.scene_view import scene_view
 from cortado.pictures.scenery import State
+from cortado.runs.report import Figures
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
-
-Figures = list[tuple[str, str | Path]]
-"""(caption, path) of each picture or film"""
 
 
 def run_pictures(
