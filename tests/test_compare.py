@@ -33,7 +33,8 @@ def runs(first, tmp_path, monkeypatch):
 
 
 def run(out, *options):
-    main(["run", "scene.toml", "--steps", "4", "--out", out, "--quiet", *options])
+    """Without pictures, which nobody compares."""
+    main(["run", "scene.toml", "--steps", "4", "--out", out, "--quiet", "--no-pictures", *options])
 
 
 def compared(capsys, *arguments):
@@ -103,7 +104,7 @@ def test_one_metric_or_one_particle_is_enough(capsys):
 
 def test_searches_can_be_compared_too(capsys):
     Path("task.toml").write_text(GOOD_TASK)
-    easy = ["--set", "optimise.iterations=1", "--set", "optimise.check={}", "--quiet"]
+    easy = ["--set", "optimise.iterations=1", "--set", "optimise.check={}", "--quiet", "--no-pictures"]
     main(["optimise", "task.toml", "--out", "a", *easy])
     main(["optimise", "task.toml", "--out", "b", *easy, "--set", "optimise.learning_rate=0.1"])
     found = compared(capsys, "a", "b")
