@@ -150,7 +150,7 @@ def test_densities_are_those_of_the_rest_lattice():
 
 
 def test_a_run_ends_with_them(capsys):
-    main(["run", "scene.toml", "--steps", "4"])
+    main(["run", "scene.toml", "--steps", "4", "--no-pictures"])
     summary, place = capsys.readouterr().out.splitlines()
     assert summary.startswith("4 steps of 0.0021 s in ") and " ms a step; energy " in summary and "kg/m3." in summary
     result = json.loads(Path("runs/run/result.json").read_text())

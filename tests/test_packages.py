@@ -99,7 +99,9 @@ def test_a_force_that_is_named_and_one_that_is_given_act_together(file):
 
 def test_a_task_searches_for_a_parameter_of_one(file, tmp_path, cortado_command):
     out = tmp_path / "out"
-    code, words, told = cortado_command("optimise", file(DRAG + TASK), "--out", out, "--precision", "float64")
+    code, words, told = cortado_command(
+        "optimise", file(DRAG + TASK), "--out", out, "--precision", "float64", "--no-pictures"
+    )
     assert code == 0, told
     found = json.loads((out / "result.json").read_text())["parameters"]["drag.k"]
     assert abs(found - 5.0) < 0.05 and "drag.k" in words
@@ -107,7 +109,7 @@ def test_a_task_searches_for_a_parameter_of_one(file, tmp_path, cortado_command)
 
 def test_the_solver_of_a_package_is_reported(file, tmp_path, cortado_command):
     out = tmp_path / "out"
-    code, _, told = cortado_command("run", file(THEIRS), "--steps", 4, "--out", out)
+    code, _, told = cortado_command("run", file(THEIRS), "--steps", 4, "--out", out, "--no-pictures")
     assert code == 0 and (out / "figures" / "density_errors.png").exists(), told
     assert Scene.from_json((out / "scene.json").read_text()).force[0].kind == "breeze"
 
@@ -126,7 +128,8 @@ def test_they_are_there_in_processes_of_their_own(tmp_path):
     scene.write_text(SCENE + DRAG)
     paths = [str(tmp_path), str(Path(__file__).parent)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-    run = [sys.executable, "-m", "cortado", "run", str(scene), "--steps", "2", "--out", str(tmp_path / "out")]
+    out = ["--steps", "2", "--out", str(tmp_path / "out"), "--no-pictures"]
+    run = [sys.executable, "-m", "cortado", "run", str(scene), *out]
     done = subprocess.run(run, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "out" / "scene.json").read_text())["force"] == [{"kind": "drag", "k": 3.0}]
