@@ -16,6 +16,7 @@ from cortado.reference import Digits, Terms
 from scenes import plane, scene, splash, two_layers
 
 WALLS = {"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"}
+PAIRWISE = {"gravity": [0.0, -9.81], "viscosity": "pairwise"}
 SCENES = {
     "splash": splash(),
     "tolerance": splash(minimum_iterations=2, maximum_iterations=40, density_tolerance=0.001),
@@ -26,13 +27,29 @@ SCENES = {
         container=WALLS,
     ),
     "pairwise, no slip": scene(container=WALLS),
-    "plane": plane(),
+    "stress, no slip": scene(
+        discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"},
+        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "stress"},
+        container=WALLS,
+    ),
+    "stress, free slip": scene(forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "stress"}),
+    "stress, plane, no slip": plane(
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.8], "slip": "no"},
+        forces={"gravity": [0.0, -9.81], "viscosity": "stress"},
+    ),
+    "stress, periodic": plane(
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False], "slip": "no"},
+        forces={"gravity": [1.0, -9.81], "viscosity": "stress"},
+    ),
+    "plane": plane(forces=PAIRWISE),
     "periodic": plane(
         container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]},
         forces={"gravity": [1.0, -9.81], "viscosity": "laminar"},
     ),
     "free space": scene(container={"shape": "none"}),
-    "without pressure": scene(forces={"gravity": [0.0, -9.81, 0.0], "pressure": False}),
+    "without pressure": scene(
+        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise", "pressure": False}
+    ),
     "without viscosity": plane(forces={"gravity": [0.0, -9.81], "viscosity": "none"}),
 }
 scenes = pytest.mark.parametrize("made", SCENES.values(), ids=SCENES)
@@ -221,7 +238,9 @@ def test_terms_make_a_difference():
 def test_printed_equations_against_numpy(method):
     """One step with one iteration, compressed, in free space; the twin differentiates factors by complex step."""
     made = plane(
-        container={"shape": "none"}, solver={"time_step": 0.002, "minimum_iterations": 1, "maximum_iterations": 1}
+        container={"shape": "none"},
+        forces=PAIRWISE,
+        solver={"time_step": 0.002, "minimum_iterations": 1, "maximum_iterations": 1},
     )
     simulation, warp = reference.Simulation(made), Simulation(made, precision="float64")
     lattice, mass, mu, dt = warp.solver.lattice, 1000.0, 0.05, 0.002
@@ -347,7 +366,11 @@ def test_an_observer_may_stop_a_run():
         (lambda s: reference.Simulation(two_layers()), "several phases or an emitter"),
         (
             lambda s: reference.Simulation(SCENES["laminar, no slip"]).tangent({}, {}, 5, method="as_printed"),
-            "must not be used with laminar viscosity",
+            "must not be used with the laminar viscosity",
+        ),
+        (
+            lambda s: reference.Simulation(SCENES["stress, periodic"]).tangent({}, {}, 5, method="as_printed"),
+            "must not be used with the stress viscosity",
         ),
     ],
 )
