@@ -164,12 +164,12 @@ def test_methods_agree_in_float64(made, method):
     assert distance(other.velocity_tangents[-1], exact.velocity_tangents[-1]) < 1e-12
 
 
-@pytest.fixture(scope="module")
-def quadruple():
+@pytest.fixture(scope="module", params=["splash", "stress, plane, no slip"])
+def quadruple(request):
     """The exact tangent at 50, 100, 150 and 200 steps, in float128."""
     if "float128" not in reference.precisions():
         pytest.skip("the compiler has no float128")
-    simulation = reference.Simulation(splash(), "float128")
+    simulation = reference.Simulation(SCENES[request.param], "float128")
     point, directions = point_and_direction(simulation, 200)
     return simulation, point, directions, simulation.tangent(point, directions, 200, record_every=50)
 
