@@ -13,7 +13,7 @@ import reference as twins
 from benchmarks.bench.run import bench_reference
 from cortado import DivergedError, InputError, Problem, Simulation, losses, reference
 from cortado.reference import Digits, Terms
-from scenes import plane, scene, splash, two_layers
+from scenes import plane, scatter, scene, splash, two_layers
 
 WALLS = {"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"}
 PAIRWISE = {"gravity": [0.0, -9.81], "viscosity": "pairwise"}
@@ -47,9 +47,7 @@ SCENES = {
         forces={"gravity": [1.0, -9.81], "viscosity": "laminar"},
     ),
     "free space": scene(container={"shape": "none"}),
-    "without pressure": scene(
-        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise", "pressure": False}
-    ),
+    "without pressure": scene(forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise", "pressure": False}),
     "without viscosity": plane(forces={"gravity": [0.0, -9.81], "viscosity": "none"}),
 }
 scenes = pytest.mark.parametrize("made", SCENES.values(), ids=SCENES)
@@ -78,6 +76,8 @@ def point_and_direction(simulation, steps, seed=0, off_lattice=0.001):
         "initial_velocities": 0.1 * noise(*shape) / np.sqrt(shape[0]),
         "viscosity": np.array(0.05),
     }
+    if simulation.scene.forces.viscosity == "stress":
+        scatter(point["initial_positions"], simulation.scene.discretisation.spacing)
     if simulation.scene.forces.viscosity == "none":
         del point["viscosity"], directions["viscosity"]
     return point, directions

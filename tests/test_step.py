@@ -10,7 +10,7 @@ from cortado.discretise.smoothing import KERNELS
 from cortado.gradients import Exact
 from cortado.losses.loss import ADJOINT_FIELDS
 from cortado.rollout.parameter_space import ParameterSpace
-from scenes import jet, plane, plane_of_three, pour, scene, two_layers
+from scenes import jet, plane, plane_of_three, pour, scatter, scene, two_layers
 from twins import emitter_twin, nozzle_of, tension_twin, twin
 
 GRAVITY, STEPS, ITERATIONS = np.array([0.3, -9.81, 0.1]), 3, 5
@@ -48,6 +48,8 @@ def point_of(simulation, seed=0):
         "initial_velocities": 0.3 * random.standard_normal(shape),
         **(ONE if phases == 1 else SEVERAL),
     }
+    if simulation.scene.forces.viscosity == "stress":
+        scatter(point["initial_positions"], spacing)
     if phases > 1:
         point |= {name: simulation.parameters()[name] for name in ("mobility", "interface_width")}
         point |= {name: point[name][:phases] for name in ("rest_density", "viscosity")}
