@@ -1,4 +1,9 @@
-// Viscosity as a stress of one fluid, over its viscosity: docs/discretisation.md has the equations.
+// Viscosity as a stress of one fluid, over its viscosity. Neighbours of particle i are arms (s, y):
+//
+//     M = sum s y y^T,   A = sum s v_ij y^T,   G = A M^-1,   T = S ((G + G^T) M^-1 - C G),
+//     force on i = -sum s ((T_i + T_j) y + C (S_i + S_j) v_ij)
+//
+// S is the fullness of M: 1 where neighbours lie on all sides or on one side, 0 where they lie on a line.
 #pragma once
 
 #include <Eigen/LU>
