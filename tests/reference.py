@@ -51,6 +51,7 @@ class Pcisph:
         self.friction = options.get("friction", 0.0)
         self.reach, self.response = options["reach"], options["response"]
         self.laplacian_correction = options.get("laplacian_correction", 1.0)
+        self.stress = options.get("stress")
 
     def _pairs(self, x, y):
         s = x[:, None, :] - y[None, :, :]
@@ -60,9 +61,12 @@ class Pcisph:
         _, q = self._pairs(x, y)
         return self.sigma * value(self.name, q)
 
+    def slope(self, x, y):
+        """a of grad W = a (x - y)."""
+        return self.sigma / self.h**2 * slope(self.name, self._pairs(x, y)[1])
+
     def gradient(self, x, y):
-        s, q = self._pairs(x, y)
-        return (self.sigma / self.h**2 * slope(self.name, q))[..., None] * s
+        return self.slope(x, y)[..., None] * self._pairs(x, y)[0]
 
     def near(self, x):
         """Which fluid and which wall particles the lists of x hold."""
@@ -104,6 +108,8 @@ class Pcisph:
     def viscous(self, x, v, sigma, g, g_walls, mass, viscosity):
         if self.viscosity_form == "none":
             return np.zeros_like(x)
+        if self.viscosity_form == "stress":
+            return self.stress.acceleration(x, v, self.slope(x, x), self.slope(x, self.walls), mass, viscosity)
         kappa = 2 * (self.d + 2) if self.viscosity_form == "pairwise" else 2
         fluid = (harmonic(viscosity) / sigma[None, :])[..., None] * self.phi(x, x, v[:, None] - v[None, :], g)
         total = fluid.sum(1)

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+
 from cortado import Scene
 
 
@@ -81,3 +83,10 @@ def pour(**changes: Any) -> Scene:
     phases = [scene().phase[0].model_dump(), OIL]
     tables = {"name": "pour", "phase": phases, "fluid": [pool], "container": room, "mixture": MIXING}
     return scene(**{**tables, "emitter": nozzle, **changes})
+
+
+def scatter(positions: np.ndarray, spacing: float) -> None:
+    """Move particles to where the stress has corners: the lowest four close to the floor or behind it, and the last
+    three away from the others."""
+    positions[np.argsort(positions[:, 1])[:4], 1] = spacing * np.array([-0.1, 0.05, 0.15, 0.35])
+    positions[-3:, 1] += 3 * spacing

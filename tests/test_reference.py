@@ -13,9 +13,10 @@ import reference as twins
 from benchmarks.bench.run import bench_reference
 from cortado import DivergedError, InputError, Problem, Simulation, losses, reference
 from cortado.reference import Digits, Terms
-from scenes import plane, scene, splash, two_layers
+from scenes import plane, scatter, scene, splash, two_layers
 
 WALLS = {"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"}
+PAIRWISE = {"gravity": [0.0, -9.81], "viscosity": "pairwise"}
 SCENES = {
     "splash": splash(),
     "tolerance": splash(minimum_iterations=2, maximum_iterations=40, density_tolerance=0.001),
@@ -26,13 +27,27 @@ SCENES = {
         container=WALLS,
     ),
     "pairwise, no slip": scene(container=WALLS),
-    "plane": plane(),
+    "stress, no slip": scene(
+        discretisation={"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"},
+        forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "stress"},
+        container=WALLS,
+    ),
+    "stress, free slip": scene(forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "stress"}),
+    "stress, plane, no slip": plane(
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.8], "slip": "no"},
+        forces={"gravity": [0.0, -9.81], "viscosity": "stress"},
+    ),
+    "stress, periodic": plane(
+        container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False], "slip": "no"},
+        forces={"gravity": [1.0, -9.81], "viscosity": "stress"},
+    ),
+    "plane": plane(forces=PAIRWISE),
     "periodic": plane(
         container={"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]},
         forces={"gravity": [1.0, -9.81], "viscosity": "laminar"},
     ),
     "free space": scene(container={"shape": "none"}),
-    "without pressure": scene(forces={"gravity": [0.0, -9.81, 0.0], "pressure": False}),
+    "without pressure": scene(forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise", "pressure": False}),
     "without viscosity": plane(forces={"gravity": [0.0, -9.81], "viscosity": "none"}),
 }
 scenes = pytest.mark.parametrize("made", SCENES.values(), ids=SCENES)
@@ -61,6 +76,8 @@ def point_and_direction(simulation, steps, seed=0, off_lattice=0.001):
         "initial_velocities": 0.1 * noise(*shape) / np.sqrt(shape[0]),
         "viscosity": np.array(0.05),
     }
+    if simulation.scene.forces.viscosity == "stress":
+        scatter(point["initial_positions"], simulation.scene.discretisation.spacing)
     if simulation.scene.forces.viscosity == "none":
         del point["viscosity"], directions["viscosity"]
     return point, directions
@@ -147,12 +164,12 @@ def test_methods_agree_in_float64(made, method):
     assert distance(other.velocity_tangents[-1], exact.velocity_tangents[-1]) < 1e-12
 
 
-@pytest.fixture(scope="module")
-def quadruple():
+@pytest.fixture(scope="module", params=["splash", "stress, plane, no slip"])
+def quadruple(request):
     """The exact tangent at 50, 100, 150 and 200 steps, in float128."""
     if "float128" not in reference.precisions():
         pytest.skip("the compiler has no float128")
-    simulation = reference.Simulation(splash(), "float128")
+    simulation = reference.Simulation(SCENES[request.param], "float128")
     point, directions = point_and_direction(simulation, 200)
     return simulation, point, directions, simulation.tangent(point, directions, 200, record_every=50)
 
@@ -221,7 +238,9 @@ def test_terms_make_a_difference():
 def test_printed_equations_against_numpy(method):
     """One step with one iteration, compressed, in free space; the twin differentiates factors by complex step."""
     made = plane(
-        container={"shape": "none"}, solver={"time_step": 0.002, "minimum_iterations": 1, "maximum_iterations": 1}
+        container={"shape": "none"},
+        forces=PAIRWISE,
+        solver={"time_step": 0.002, "minimum_iterations": 1, "maximum_iterations": 1},
     )
     simulation, warp = reference.Simulation(made), Simulation(made, precision="float64")
     lattice, mass, mu, dt = warp.solver.lattice, 1000.0, 0.05, 0.002
@@ -347,7 +366,11 @@ def test_an_observer_may_stop_a_run():
         (lambda s: reference.Simulation(two_layers()), "several phases or an emitter"),
         (
             lambda s: reference.Simulation(SCENES["laminar, no slip"]).tangent({}, {}, 5, method="as_printed"),
-            "must not be used with laminar viscosity",
+            "must not be used with the laminar viscosity",
+        ),
+        (
+            lambda s: reference.Simulation(SCENES["stress, periodic"]).tangent({}, {}, 5, method="as_printed"),
+            "must not be used with the stress viscosity",
         ),
     ],
 )

@@ -10,7 +10,7 @@ from cortado.discretise.smoothing import KERNELS
 from cortado.gradients import Exact
 from cortado.losses.loss import ADJOINT_FIELDS
 from cortado.rollout.parameter_space import ParameterSpace
-from scenes import jet, plane, plane_of_three, pour, scene, two_layers
+from scenes import jet, plane, plane_of_three, pour, scatter, scene, two_layers
 from twins import emitter_twin, nozzle_of, tension_twin, twin
 
 GRAVITY, STEPS, ITERATIONS = np.array([0.3, -9.81, 0.1]), 3, 5
@@ -48,6 +48,8 @@ def point_of(simulation, seed=0):
         "initial_velocities": 0.3 * random.standard_normal(shape),
         **(ONE if phases == 1 else SEVERAL),
     }
+    if simulation.scene.forces.viscosity == "stress":
+        scatter(point["initial_positions"], spacing)
     if phases > 1:
         point |= {name: simulation.parameters()[name] for name in ("mobility", "interface_width")}
         point |= {name: point[name][:phases] for name in ("rest_density", "viscosity")}
@@ -118,10 +120,14 @@ def twins_steps(simulation, substeps):
 CASES = [
     (scene, "cubic_spline", "pairwise", "free"),
     (scene, "wendland_c2", "laminar", "no"),
+    (scene, "wendland_c4", "stress", "no"),
     (scene, "wendland_c4", "none", "free"),
     (plane, "cubic_spline", "laminar", "no"),
     (plane, "wendland_c2", "pairwise", "no"),
+    (plane, "cubic_spline", "stress", "free"),
+    (plane_of_three, "cubic_spline", "stress", "no"),
     (two_layers, "cubic_spline", "pairwise", "free"),
+    (two_layers, "wendland_c2", "stress", "no"),
     (plane_of_three, "cubic_spline", "laminar", "no"),
     (tense, "cubic_spline", "pairwise", "free"),
     (tense_cube, "wendland_c2", "pairwise", "no"),

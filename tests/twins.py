@@ -3,14 +3,17 @@
 import numpy as np
 
 import reference
+from cortado.discretise.calibration import stress_control
 from cortado.sph.emitter import Nozzle
 from cortado.sph.surface_tension import SurfaceTension, tension_constants
 from cortado.sph.viscosity import Viscosity
+from reference_stress import Stress
 
 
 def twin(simulation):
     """The slow twin of a simulation's solver, in the simulation's own dimension."""
     lattice, search, d = simulation.solver.lattice, simulation.solver.search, simulation.dimension
+    walls = search.wall_positions.numpy()[:, :d].astype(np.float64), search.wall_weights.numpy().astype(np.float64)
     viscous = [force for force in simulation.solver.forces if isinstance(force, Viscosity)]
     return reference.Pcisph(
         simulation.solver.discretisation.smoothing,
@@ -18,13 +21,28 @@ def twin(simulation):
         lattice.support,
         lattice.volume,
         lattice.stiffness,
-        search.wall_positions.numpy()[:, :d].astype(np.float64),
-        search.wall_weights.numpy().astype(np.float64),
+        *walls,
         viscosity=simulation.scene.forces.viscosity,
         friction=viscous[0].friction if viscous else 0.0,
         reach=1.03 * lattice.support,
         response=lattice.response,
         laplacian_correction=lattice.laplacian_correction,
+        stress=stress_twin(simulation, *walls),
+    )
+
+
+def stress_twin(simulation, walls, wall_weights):
+    """The slow twin of its viscosity as a stress, given its walls (b, d) and their weights."""
+    solver, scene, d = simulation.solver, simulation.scene, simulation.dimension
+    lattice, spacing = solver.lattice, scene.discretisation.spacing
+    feet = solver.search.wall_feet.numpy()[:, :d].astype(np.float64)
+    return Stress(
+        lattice.volume,
+        stress_control(solver.discretisation.smoothing, spacing, lattice.support, d),
+        0.25 * spacing,
+        walls,
+        wall_weights,
+        feet if getattr(scene.container, "slip", "free") == "no" else None,
     )
 
 

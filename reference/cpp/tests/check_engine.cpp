@@ -35,12 +35,16 @@ Scene box(int d, const std::string& kernel, const std::string& viscosity, bool p
             s.wall_positions.insert(s.wall_positions.end(), {x, -0.02});
             if (d == 3) s.wall_positions.push_back(z);
             s.wall_weights.push_back(1.1);
+            s.wall_feet.insert(s.wall_feet.end(), {0, 0.02});
+            if (d == 3) s.wall_feet.push_back(0);
         }
     if (periodic) s.periods = {0.3, 0, 0};
     s.rest_density = 1000;
     s.time_step = 0.002;
     s.viscosity = viscosity;
     s.friction = 0.8;
+    s.control = 1.4;
+    s.closest = 0.0125;
     s.pressure = true;
     s.minimum_iterations = 2;
     s.maximum_iterations = 5;
@@ -93,7 +97,9 @@ void check(const std::string& name, std::unique_ptr<Engine> (*make)(const Scene&
     for (const auto& [d, kernel, viscosity, periodic] : {Case{2, "cubic_spline", "pairwise", false},
                                                          Case{2, "wendland_c2", "laminar", true},
                                                          Case{2, "wendland_c4", "none", true},
+                                                         Case{2, "cubic_spline", "stress", true},
                                                          Case{3, "cubic_spline", "laminar", true},
+                                                         Case{3, "wendland_c2", "stress", false},
                                                          Case{3, "wendland_c2", "pairwise", false},
                                                          Case{3, "wendland_c4", "laminar", false}}) {
         const std::string what = name + " " + std::to_string(d) + "-D " + kernel;

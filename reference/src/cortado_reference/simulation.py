@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cortado.device.cores import usable_cores
-from cortado.discretise.calibration import SKIN
+from cortado.discretise.calibration import SKIN, stress_control
 from cortado.discretise.region import TOLERANCE
 from cortado.errors import DivergedError, InputError, shown
 from cortado.scene.discrete_scene import DiscreteScene, discretise
@@ -33,6 +33,8 @@ METHODS = (
 )
 """Ways to a tangent; see `Simulation.tangent`."""
 PARAMETERS = ("gravity", "initial_positions", "initial_velocities", "viscosity")
+CLOSEST = 0.25
+"""In spacings: from where on a wall without slip pulls no harder, with the stress."""
 LEAST_PARALLEL = {"float128": 30}
 """Particles for which another thread is worth its while, 1000 where not said: in float128 every operation is slow."""
 Observer = Callable[[int], None]
@@ -135,8 +137,11 @@ class Simulation:
             raise InputError(
                 f"terms are given, but must be left out with the method {method!r}: only analytic has them."
             )
-        if method.startswith("as_printed") and self.scene.forces.viscosity == "laminar":
-            raise InputError("method is as printed, which must not be used with laminar viscosity: (14) is pairwise.")
+        form = self.scene.forces.viscosity
+        if method.startswith("as_printed") and form in ("laminar", "stress"):
+            raise InputError(
+                f"method is as printed, which must not be used with the {form} viscosity: (14) is pairwise."
+            )
         if method.startswith("as_printed") and "viscosity" in directions:
             raise InputError("directions has viscosity, but must not as printed: (14) has no such derivative.")
         if not (np.isfinite(difference) and difference > 0.0):
@@ -246,7 +251,7 @@ def _engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:
     lattice, solver, form = discrete.lattice, scene.solver, scene.forces.viscosity
     assert isinstance(solver, PcisphSolver)
     no_slip = getattr(scene.container, "slip", "free") == "no"
-    greatest = solver.maximum_density_tolerance
+    greatest, spacing = solver.maximum_density_tolerance, scene.discretisation.spacing
     values = {
         "dimension": scene.dimension,
         "kernel": discrete.kernel.name,
@@ -259,11 +264,14 @@ def _engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:
         "laplacian_correction": lattice.laplacian_correction,
         "wall_positions": discrete.walls.positions.ravel().tolist(),
         "wall_weights": discrete.walls.weights.tolist(),
+        "wall_feet": discrete.walls.feet.ravel().tolist(),
         "periods": [*map(float, discrete.periods), *[0.0] * (3 - scene.dimension)],
         "rest_density": scene.phase[0].rest_density,
         "time_step": solver.time_step,
         "viscosity": form,
         "friction": (discrete.wall_layers.friction if form == "laminar" else 1.0) if no_slip else 0.0,
+        "control": stress_control(discrete.kernel, spacing, lattice.support, scene.dimension),
+        "closest": CLOSEST * spacing,
         "pressure": scene.forces.pressure,
         "minimum_iterations": solver.minimum_iterations,
         "maximum_iterations": solver.maximum_iterations,

@@ -1,7 +1,7 @@
 // The adjoint of a step: the transpose of `step_tangent`, every sum a gather.
 #pragma once
 
-#include "step.hpp"
+#include "stress_derivative.hpp"
 #include "viscosity_derivative.hpp"
 
 namespace cortado {
@@ -72,7 +72,14 @@ void step_adjoint(const Model<Real, D>& model, Step<Real, D>& step, const State<
     }
     for (const auto& one : a_bar) gravity_bar += one;
 
-    if (model.viscosity != Viscosity::none && terms.viscosity) {
+    if (model.viscosity == Viscosity::stress && terms.viscosity) {
+        Vectors<Real, D> force_bar(count);
+        for (std::size_t i = 0; i < count; ++i) {
+            force_bar[i] = viscosity / m * a_bar[i];
+            viscosity_bar += step.friction_sum[i].dot(a_bar[i]) / m;
+        }
+        stress_adjoint(model, step, state, force_bar, bar);
+    } else if (model.viscosity != Viscosity::none && terms.viscosity) {
         Values<Real> work(count);
         each_particle(count, model.threads, [&](std::size_t i) {
             const Real factor = model.kappa * viscosity * model.volume / (m * step.n[i]);

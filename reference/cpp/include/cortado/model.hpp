@@ -7,7 +7,7 @@
 
 namespace cortado {
 
-enum class Viscosity { none, pairwise, laminar };
+enum class Viscosity { none, pairwise, laminar, stress };
 
 template <class Scalar, int D>
 struct Model {
@@ -18,12 +18,13 @@ struct Model {
     std::array<double, 3> periods;
     double reach;
     Scalar volume, self_weight, stiffness, response, laplacian_correction, size_floor;
-    Scalar rest_density, time_step, friction, kappa;
+    Scalar rest_density, time_step, friction, control, closest, kappa;
     Viscosity viscosity;
     bool pressure;
     int minimum_iterations, maximum_iterations;
     Real density_tolerance, maximum_density_tolerance;
-    Vectors<Real, D> wall_positions;
+    Vectors<Real, D> wall_positions, wall_normals;
+    Values<Real> wall_depths;  // behind the surface
     Values<Scalar> wall_weights;
     Cells<D> wall_cells;
     int threads;
@@ -42,8 +43,11 @@ struct Model {
           rest_density(Real(s.rest_density)),
           time_step(Real(s.time_step)),
           friction(Real(s.friction)),
-          kappa(Real(s.viscosity == "pairwise" ? 2 * (D + 2) : 2)),
+          control(Real(s.control)),
+          closest(Real(s.closest)),
+          kappa(Real(s.viscosity == "pairwise" ? 2 * (D + 2) : s.viscosity == "stress" ? 1 : 2)),
           viscosity(s.viscosity == "pairwise"  ? Viscosity::pairwise
+                    : s.viscosity == "stress"  ? Viscosity::stress
                     : s.viscosity == "laminar" ? Viscosity::laminar
                                                : Viscosity::none),
           pressure(s.pressure),
@@ -52,9 +56,16 @@ struct Model {
           density_tolerance(Real(s.density_tolerance)),
           maximum_density_tolerance(Real(s.maximum_density_tolerance)),
           wall_positions(joined_vectors<Real, D>(high_only(s.wall_positions))),
+          wall_normals(joined_vectors<Real, D>(high_only(s.wall_feet))),
+          wall_depths(wall_normals.size()),
           wall_weights(s.wall_weights.begin(), s.wall_weights.end()),
           wall_cells(cells_of<Real, D>(wall_positions, s.reach, s.periods)),
-          threads(threads) {}
+          threads(threads) {
+        for (std::size_t b = 0; b < wall_normals.size(); ++b) {
+            wall_depths[b] = square_root(Real(wall_normals[b].dot(wall_normals[b])));
+            wall_normals[b] /= wall_depths[b];
+        }
+    }
 
     // phi of the viscosity, of a pair at rest and its gradient: see docs/discretisation.md.
     Vector<Scalar, D> phi(const Pair<Scalar, D>& pair, const Vector<Scalar, D>& v) const {

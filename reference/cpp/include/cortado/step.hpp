@@ -2,7 +2,7 @@
 // value that its derivatives need. Memory is kept from one step to the next. docs/discretisation.md writes the same step in the same order.
 #pragma once
 
-#include "model.hpp"
+#include "stress.hpp"
 
 namespace cortado {
 
@@ -14,7 +14,8 @@ struct Step {
     Values<Scalar> n;                  // number density
     Values<Scalar> y;                  // yield beside walls
     Vectors<Scalar, D> wall_gradient;  // sum_b w_b G_ib
-    Vectors<Scalar, D> friction_sum;   // sum_j (V / n_j) phi_ij + friction sum_b V w_b phi_ib
+    Vectors<Scalar, D> friction_sum;   // sum_j (V / n_j) phi_ij + friction sum_b V w_b phi_ib, or the stress's force
+    Stress<Scalar, D> stress;
     Vectors<Scalar, D> acceleration;   // without pressure
     std::vector<Vectors<Scalar, D>> x_star;  // [k]: at which iteration k finds the density; the last is the result
     std::vector<Values<Scalar>> excess;      // [k]: m n* - rho_0
@@ -54,7 +55,13 @@ struct Step {
         });
         friction_sum.assign(count, Vector<Scalar, D>::Constant(Scalar(0)));
         acceleration.assign(count, gravity);
-        if (model.viscosity != Viscosity::none) {
+        if (model.viscosity == Viscosity::stress) {
+            stress.find(model, fluid, walls, state.v);
+            each_particle(count, model.threads, [&](std::size_t i) {
+                friction_sum[i] = stress.force(model, i, fluid, walls, state.v);
+                acceleration[i] += viscosity / m * friction_sum[i];
+            });
+        } else if (model.viscosity != Viscosity::none) {
             each_particle(count, model.threads, [&](std::size_t i) {
                 Vector<Scalar, D> total = friction_sum[i];
                 for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {

@@ -1,7 +1,7 @@
 // The tangent of a step, derived by hand: the report's Algorithm 2 and eqs. 11 to 14, put right.
 #pragma once
 
-#include "step.hpp"
+#include "stress_derivative.hpp"
 #include "viscosity_derivative.hpp"
 
 namespace cortado {
@@ -42,6 +42,12 @@ Vectors<Real, D> acceleration_tangent(const Model<Real, D>& model, const Step<Re
     Vectors<Real, D> da(state.x.size(), gravity_dot);
     if (model.viscosity == Viscosity::none) return da;
     const Real m = model.rest_density;
+    if (model.viscosity == Viscosity::stress) {
+        const Vectors<Real, D> change = stress_tangent(model, step, state, dot);
+        for (std::size_t i = 0; i < da.size(); ++i)
+            da[i] += (coefficient * change[i] + coefficient_dot * step.friction_sum[i]) / m;
+        return da;
+    }
     each_particle(state.x.size(), model.threads, [&](std::size_t i) {
         Vector<Real, D> total = -dn[i] / step.n[i] * step.friction_sum[i];
         for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair) {
