@@ -131,7 +131,7 @@ class Pair:
         random, device, real = np.random.default_rng(seed), x.device, self._d.precision.real
 
         def numbers(kind: Any) -> np.ndarray:
-            return random.uniform(0.5, 1.5, len(x)) if kind is real else random.standard_normal((len(x), len(kind())))
+            return random.uniform(0.5, 1.5, len(x)) if kind is real else random.standard_normal((len(x), *kind._shape_))
 
         found = {name: wp.array(numbers(kind), dtype=kind, device=device) for name, kind in self._arrays.items()}
         found |= {

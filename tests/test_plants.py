@@ -23,6 +23,13 @@ UNNAMED = {
     "sph.integration": {"integration_kernels.collect_masses"},
     "sph.emitter_kernels": {"emitter_kernels.collect"},
     "sph.surface_stress": {"tension_functions.stress_derivative"},
+    "sph.implicit_derivatives": {"implicit_kernels.weigh", "implicit_kernels.unweigh"},
+    "sph.packed": {"packing_kernels.add_number"},
+    "sph.stress_moments": {"moment_sums.moments_back", "moment_sums.wall_moments_back"},
+    "sph.stress_forces": {
+        *("stress_sums.traction_back", "stress_sums.wall_traction_back"),
+        *("stress_sums.force_back", "stress_sums.wall_force_back"),
+    },
 }
 """Functions of adjoints, by module, whose names do not say so."""
 SHARED = {
@@ -37,6 +44,7 @@ SHARED = {
     "sph.surface_normals": {"normal_kernels.change"},
     "sph.surface_stress": {"tension_functions.pull_derivative"},
     "sph.viscosity": {"viscosity_kernels.pair_viscosity_derivative"},
+    "sph.wall_contact": {"contact_functions.hold_gradient"},
 }
 """Derivatives that forward mode uses too, and those of pictures, so that only differences can tell."""
 ELSEWHERE = {
@@ -63,6 +71,13 @@ NOZZLE = {"phase": "oil", "outlet": [0.16, 0.24], "radius": 0.05, "length": 0.11
 ROOM = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.3, 0.6], "slip": "no"}
 POOL = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.3, 0.2], "phase": "water"}
 PHASES = [{"name": "water", "rest_density": 1000.0, "viscosity": 2.0}, {**OIL, "viscosity": 8.0}]
+THICK = {
+    "name": "paste",
+    "rest_density": 1000.0,
+    "viscosity": 8.0,
+    "rheology": {"kind": "bingham", "yield_stress": 8.0, "regularisation": 0.5},
+}
+IMPLICIT = {"gravity": [1.0, -9.81], "viscosity": "stress", "viscous_solve": "implicit"}
 SOLVER = {"time_step": 0.002, "minimum_iterations": 3, "maximum_iterations": 3}
 
 
@@ -100,6 +115,11 @@ SCENES = {
     "pairwise, miscible": (
         small("pairwise", mixture={**MIXING, "free_energy": "miscible", "mobility_form": "constant"}),
         "everything",
+    ),
+    "stress": (small("stress"), "everything"),
+    "implicit": (
+        small("stress", phase=[THICK], fluid=[{**POOL, "phase": "paste"}], emitter=None, forces=IMPLICIT),
+        "positions",
     ),
     "one phase": (small("pairwise", phase=[HONEY], fluid=[{**POOL, "phase": "honey"}], emitter=None), "positions"),
     "surface tension": (small("pairwise", forces={"gravity": [1.0, -9.81], "surface_tension": 3.0}), "everything"),

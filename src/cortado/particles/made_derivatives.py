@@ -126,7 +126,9 @@ def _tangent(term: Term, d: Discretisation) -> Body:
         return {"i": own, "j": other, "ij": f"{own} - {other}"}[name.rpartition("_")[2]]
 
     def product(first: str, name: str, second: str) -> str:
-        return f"{first} * ({second})" if kinds[name] is d.precision.real else f"_wp.dot({first}, {second})"
+        if kinds[name] is d.precision.real:
+            return f"{first} * ({second})"
+        return f"_wp.{'dot' if len(kinds[name]._shape_) == 1 else 'ddot'}({first}, {second})"
 
     def body(of_j: Mapping[str, str]) -> Iterator[str]:
         moved = [name for name in term.parameters if name not in (*NUMBERS, "s")]

@@ -11,7 +11,9 @@ tangent is one more solve with B, and so is the adjoint, as B is symmetric in th
 
 from typing import Any
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from cortado.device.precision import FLOAT32
 from cortado.errors import MissingDerivativeError
@@ -93,6 +95,11 @@ class ImplicitViscousStress(ViscousStress):
         self._no_bars = {"M_bar": no_matrix, "R_bar": wp.zeros(dtype=layout.precision.real, **sizes)}
         self._after: Any = None
         """a' of the last step."""
+
+    @property
+    def iterations(self) -> NDArray:
+        """(members,) those of the last solve, of a run or of a derivative."""
+        return np.asarray(self._solve.count.numpy())
 
     def _known(self, *more: Any) -> tuple[Any, ...]:
         """Arguments of the kernels of B, with A and T of the velocities u."""

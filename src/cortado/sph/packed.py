@@ -65,8 +65,8 @@ def packing_kernels(precision: Precision, taped: bool) -> PackingKernels:
         values_bar: wp.array2d(dtype=real),
     ):
         member = wp.tid()
-        n = wp.min(step[member], values_bar.shape[1] - 1)
-        values_bar[member, n] = values_bar[member, n] + total[member, first]
+        row = wp.min(step[member], values_bar.shape[1] - 1)
+        values_bar[member, row] = values_bar[member, row] + total[member, first]
 
     @wp.kernel(module=backward, enable_backward=False)
     def add_vector(
@@ -77,9 +77,9 @@ def packing_kernels(precision: Precision, taped: bool) -> PackingKernels:
         values_bar: wp.array2d(dtype=vector),
     ):
         member = wp.tid()
-        n = wp.min(step[member], values_bar.shape[1] - 1)
+        row = wp.min(step[member], values_bar.shape[1] - 1)
         bar = vector(total[member, first], total[member, first + 1], total[member, first + 2])
-        values_bar[member, n] = values_bar[member, n] + bar
+        values_bar[member, row] = values_bar[member, row] + bar
 
     return PackingKernels((pack_number, pack_vector), (add_number, add_vector))
 

@@ -1,0 +1,149 @@
+"""Fluids whose viscosity depends on the shear rate: the laws, their derivatives, and what is said of wrong ones."""
+
+import math
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado import InputError, Problem, SceneError, Simulation, losses
+from cortado.forces import Rheology
+from cortado.sph.laws import LAWS, bingham, carreau, herschel_bulkley, power_law
+from scenes import HONEY, plane
+
+KINDS = {
+    "power_law": {"flow_index": 0.6, "least_shear_rate": 0.1},
+    "carreau": {"relaxation_time": 0.2, "flow_index": 0.5, "infinite_viscosity": 0.2},
+    "bingham": {"yield_stress": 3.0, "regularisation": 0.3},
+    "herschel_bulkley": {"yield_stress": 3.0, "flow_index": 0.7, "regularisation": 0.3, "least_shear_rate": 0.1},
+}
+STEPS = 8
+FLUID = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.25, 0.3], "velocity": [0.5, 0.2], "phase": "honey"}
+ROOM = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.5, 0.5], "slip": "no"}
+
+
+def thick(rheology=None, solve="automatic", **changes):
+    """A block of fluid that moves beside walls without slip."""
+    phase = {**HONEY, "viscosity": 1.5, **({} if rheology is None else {"rheology": rheology})}
+    forces = {"gravity": [0.3, -9.81], "viscosity": "stress", "viscous_solve": solve}
+    return plane(**{"phase": [phase], "fluid": [FLUID], "container": ROOM, "forces": forces, **changes})
+
+
+def problem(made, precision="float64", **options):
+    simulation = Simulation(made, precision=precision, **options)
+    target = simulation.positions + 0.02 * np.sin(7.0 * simulation.positions)
+    return Problem(simulation, STEPS, losses.FinalPositions(target))
+
+
+@pytest.mark.parametrize("shear_rate", [1e-6, 0.03, 2.0, 500.0])
+def test_laws_are_the_published_ones(shear_rate):
+    g = shear_rate
+    assert power_law(g, 2.0, 0.6, 0.1) == pytest.approx(2.0 * math.hypot(g, 0.1) ** -0.4, rel=1e-6)
+    wanted = 0.2 + 1.8 * (1.0 + (0.3 * g) ** 2) ** -0.25
+    assert carreau(g, 2.0, 0.3, 0.5, 0.2) == pytest.approx(wanted, rel=1e-6)
+    yielding = 3.0 * -math.expm1(-0.7 * g) / g
+    assert bingham(g, 2.0, 3.0, 0.7) == pytest.approx(2.0 + yielding, rel=1e-5)
+    wanted = 2.0 * math.hypot(g, 0.1) ** -0.4 + yielding
+    assert herschel_bulkley(g, 2.0, 3.0, 0.7, 0.6, 0.1) == pytest.approx(wanted, rel=1e-5)
+
+
+@pytest.mark.parametrize("solve", ["explicit", "implicit"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_number_of_a_law_is_certified(kind, solve):
+    judged = problem(thick({"kind": kind, **KINDS[kind]}, solve))
+    names = [name for name in judged.simulation.parameters() if name.startswith(f"{kind}.")]
+    assert sorted(names) == sorted(f"{kind}.{key}" for key in KINDS[kind])
+    assert cortado.certify(judged, [*names, "viscosity", "initial_velocities", "initial_positions", "time_step"]).right
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_forward_and_reverse_mode_agree_and_the_tape(kind):
+    judged = problem(thick({"kind": kind, **KINDS[kind]}, "explicit"))
+    point = judged.simulation.parameters()
+    found = judged.value_and_gradient(point)[1]
+    taped = judged.value_and_gradient(point, cortado.gradients.Tape())[1]
+    for name in (name for name in point if "." in name):
+        assert found[name] != 0.0
+        assert judged.tangent(point, {name: 1.0}) == pytest.approx(float(found[name]), rel=1e-10)
+        assert float(taped[name]) == pytest.approx(float(found[name]), rel=1e-10)
+
+
+def test_in_float32_the_gradient_is_near_that_of_float64():
+    made = thick({"kind": "bingham", **KINDS["bingham"]})
+    found = [problem(made, precision) for precision in ("float32", "float64")]
+    single, double = (one.value_and_gradient(one.simulation.parameters())[1] for one in found)
+    for name in ("bingham.yield_stress", "bingham.regularisation", "viscosity"):
+        assert float(single[name]) == pytest.approx(float(double[name]), rel=2e-2), name
+
+
+def test_a_law_that_is_newton_s_changes_nothing():
+    newtonian = Simulation(thick(), precision="float64").run(STEPS).positions[-1]
+    for rheology in (
+        {"kind": "carreau", "relaxation_time": 0.3, "flow_index": 1.0},
+        {"kind": "power_law", "flow_index": 1.0},
+        {"kind": "bingham", "yield_stress": 0.0},
+    ):
+        found = Simulation(thick(rheology), precision="float64").run(STEPS).positions[-1]
+        np.testing.assert_allclose(found, newtonian, rtol=0.0, atol=1e-14)
+
+
+def cross(shear_rate, viscosity, time, index):
+    """Of Cross (1965)."""
+    return viscosity / (1.0 + (time * shear_rate) ** index)
+
+
+def test_a_law_of_one_s_own_is_one_function():
+    own = Simulation(thick(), precision="float64", forces=[Rheology(LAWS["carreau"], **KINDS["carreau"])])
+    named = Simulation(thick({"kind": "carreau", **KINDS["carreau"]}), precision="float64")
+    np.testing.assert_array_equal(own.run(STEPS).positions, named.run(STEPS).positions)
+    judged = problem(thick(), forces=[Rheology(cross, time=0.4, index=0.8)])
+    assert cortado.certify(judged, ["cross.time", "cross.index", "viscosity"]).right
+
+
+def test_a_law_of_one_s_own_in_two_phases_has_the_viscosity_of_each():
+    """The same as a Newtonian fluid whose viscosities are twice as large."""
+    phases = [{**HONEY, "viscosity": v, "name": name} for v, name in ((1.0, "honey"), (3.0, "syrup"))]
+    bodies = [FLUID, {**FLUID, "lower": [0.25, 0.0], "upper": [0.5, 0.3], "phase": "syrup"}]
+
+    def twice(shear_rate, viscosity):
+        return 2.0 * viscosity
+
+    law = Simulation(thick(phase=phases, fluid=bodies), precision="float64", forces=[Rheology(twice)])
+    doubled = [{**phase, "viscosity": 2.0 * phase["viscosity"]} for phase in phases]
+    plain = Simulation(thick(phase=doubled, fluid=bodies), precision="float64")
+    np.testing.assert_allclose(law.run(STEPS).positions[-1], plain.run(STEPS).positions[-1], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("rheology", "words"),
+    [
+        ({"kind": "jelly"}, "phase[0].rheology"),
+        ({"kind": "bingham"}, "yield_stress"),
+        ({"kind": "bingham", "yield_stress": -1.0}, "yield_stress"),
+        ({"kind": "carreau", "relaxation_time": 0.1, "flow_index": 0.0}, "flow_index"),
+        ({"kind": "carreau", "relaxation_time": 0.1, "flow_index": 0.5, "yield_stress": 1.0}, "yield_stress"),
+    ],
+)
+def test_what_is_no_law_is_a_sentence(rheology, words):
+    with pytest.raises(SceneError) as caught:
+        thick(rheology)
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_where_there_can_be_no_law_it_is_a_sentence():
+    law = {"kind": "bingham", "yield_stress": 1.0}
+    with pytest.raises(SceneError, match="several phases"):
+        thick(phase=[{**HONEY, "rheology": law}, {**HONEY, "name": "syrup"}])
+    with pytest.raises(SceneError, match=r'forces.viscosity is "laminar", but must be "stress"'):
+        thick(law, forces={"gravity": [0.0, -9.81], "viscosity": "laminar"})
+    with pytest.raises(InputError, match="forces.viscosity is 'pairwise', but must be 'stress'"):
+        Simulation(
+            thick(forces={"gravity": [0.0, 0.0], "viscosity": "pairwise"}),
+            forces=[Rheology(cross, time=1.0, index=1.0)],
+        )
+    with pytest.raises(InputError, match="must have shear_rate, viscosity first"):
+        Rheology(lambda_free)
+
+
+def lambda_free(viscosity, shear_rate):
+    return viscosity
