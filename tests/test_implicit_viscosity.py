@@ -5,11 +5,20 @@ import pytest
 
 import cortado
 from cortado import CortadoError, Problem, Simulation, gradients, losses
+from cortado.cli import main
 from cortado.scene.stability import is_implicit, stability_limits, viscous_limit
 from cortado.sph.implicit_viscosity import ImplicitViscousStress
 from scenes import HONEY, plane, scene
 
 STEPS = 6
+TEXT = """
+dimension = 2
+phase = [{{ name = "honey", rest_density = 1400.0, viscosity = 10.0 }}]
+fluid = [{{ shape = "box", lower = [0.0, 0.0], upper = [0.2, 0.2], phase = "honey" }}]
+discretisation = {{ spacing = 0.05 }}
+forces = {{ viscous_solve = "{solve}" }}
+solver = {{ time_step = 0.001 }}
+"""
 FLUID = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.3, 0.4], "velocity": [0.5, 0.2], "phase": "honey"}
 ROOM = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.6], "slip": "no"}
 
@@ -58,6 +67,14 @@ def test_it_is_chosen_where_the_time_step_is_too_long():
     forces = Simulation(thick("automatic", 1.1 * limit)).solver.forces
     assert isinstance(forces[-1], ImplicitViscousStress)
     assert not any(isinstance(one, ImplicitViscousStress) for one in Simulation(thick("explicit")).solver.forces)
+
+
+def test_describe_says_which_is_chosen_and_why(tmp_path, capsys):
+    file = tmp_path / "thick.toml"
+    for solve, words in (("implicit", "implicit, at the end of a step; "), ("explicit", "explicit, at the start of a")):
+        file.write_text(TEXT.format(solve=solve))
+        main(["describe", str(file)])
+        assert f"stress, {words}" in " ".join(capsys.readouterr().out.split())
 
 
 def test_it_comes_to_the_explicit_flow_with_the_first_order_of_the_time_step():

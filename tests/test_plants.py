@@ -121,6 +121,16 @@ SCENES = {
         small("stress", phase=[THICK], fluid=[{**POOL, "phase": "paste"}], emitter=None, forces=IMPLICIT),
         "positions",
     ),
+    "a law in space": (
+        scene(
+            phase=[THICK],
+            fluid=[{"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.1, 0.15, 0.15], "phase": "paste"}],
+            container={"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.3, 0.3, 0.3], "slip": "no"},
+            forces={"gravity": [1.0, -9.81, 0.5], "viscosity": "stress"},
+            solver=SOLVER,
+        ),
+        "positions",
+    ),
     "one phase": (small("pairwise", phase=[HONEY], fluid=[{**POOL, "phase": "honey"}], emitter=None), "positions"),
     "surface tension": (small("pairwise", forces={"gravity": [1.0, -9.81], "surface_tension": 3.0}), "everything"),
     "a picture of the plane": (small("pairwise", render={"view": "plane", "resolution": [8, 12]}), "pyramid"),

@@ -22,8 +22,8 @@ from cortado.pictures.figures import particles
 from cortado.pictures.painter import colours_of
 from cortado.rollout.rollout import MEMORY_BUDGET, Rollout
 from cortado.scene.in_words import vector
-from cortado.scene.scene import load_scene
-from cortado.scene.stability import stability_limits
+from cortado.scene.scene import Scene, load_scene
+from cortado.scene.stability import is_implicit, stability_limits, viscous_limit
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
@@ -98,6 +98,7 @@ def _described(simulation: Simulation, steps: int) -> dict[str, Any]:
         "spacing_m": scene.discretisation.spacing,
         "time_step_s": scene.solver.time_step,
         "time_step_limits_s": {name: limit if math.isfinite(limit) else None for name, limit in limits.items()},
+        "viscosity": _viscosity(scene),
         "scheduled_until_s": {name: course.times[-1] for name, course in scene.schedule.courses.items()},
         "device": str(simulation.device),
         "precision": simulation.precision.name,
@@ -105,6 +106,15 @@ def _described(simulation: Simulation, steps: int) -> dict[str, Any]:
         "simulated_time_s": steps * scene.solver.time_step,
     }
     return {**found, **_memory(simulation, steps), **_expected(simulation, steps)}
+
+
+def _viscosity(scene: Scene) -> str:
+    """Which form the viscous force has, and why it acts at the start or at the end of a step."""
+    form, limit = scene.forces.viscosity, viscous_limit(scene, {})
+    if form != "stress" or not math.isfinite(limit):
+        return str(form)
+    when = "implicit, at the end of a step" if is_implicit(scene) else "explicit, at the start of a step"
+    return f"stress, {when}; an explicit one bears steps of {limit:.3g} s"
 
 
 def _masses(simulation: Simulation) -> dict[str, float]:
@@ -165,6 +175,7 @@ def _as_text(found: dict[str, Any]) -> str:
         ("spacing", f"{found['spacing_m']:g} m, in {found['dimension']}-D"),
         ("size", _size(found)),
         ("time step", f"{found['time_step_s']:g} s; {allowed}"),
+        ("viscosity", found["viscosity"]),
         (
             "memory",
             f"{_bytes(found['memory_bytes'])} for a run, {_bytes(found['gradient_memory_bytes'])} for a gradient, "
