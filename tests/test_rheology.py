@@ -1,6 +1,9 @@
 """Fluids whose viscosity depends on the shear rate: the laws, their derivatives, and what is said of wrong ones."""
 
 import math
+import re
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ from cortado.forces import Rheology
 from cortado.sph.laws import LAWS, bingham, carreau, herschel_bulkley, power_law
 from scenes import HONEY, plane
 
+ROOT = Path(__file__).parents[1]
 KINDS = {
     "power_law": {"flow_index": 0.6, "least_shear_rate": 0.1},
     "carreau": {"relaxation_time": 0.2, "flow_index": 0.5, "infinite_viscosity": 0.2},
@@ -145,3 +149,16 @@ def test_where_there_can_be_no_law_it_is_a_sentence():
 
 def turned(viscosity, shear_rate):
     return viscosity
+
+
+def test_the_law_of_the_page_runs_as_printed(tmp_path, monkeypatch):
+    """From a file, as Warp wants the text of functions, with what stands on the page before it."""
+    page = (ROOT / "docs/viscosity.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```(?:py|python)\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    assert len(blocks) == 2
+    program = tmp_path / "page.py"
+    program.write_text(
+        "\n".join([blocks[0].partition("carreau = ")[0], blocks[1], "thinning.run(3)"]), encoding="utf-8"
+    )
+    monkeypatch.chdir(ROOT)
+    runpy.run_path(str(program))
