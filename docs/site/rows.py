@@ -45,7 +45,7 @@ def _kind(value: Schema) -> str:
             return f"{len(names)} {_plural(value['items'])}"
         case {"type": "array", "items": items, "maxItems": _}:
             return f"d {_plural(items)}"
-        case {"$ref": _}:
+        case {"$ref": _} | {"oneOf": _}:
             return "table"
         case {"type": "array", "items": {"items": items}}:
             return f"list of lists of {_plural(items)}"

@@ -57,6 +57,12 @@ LINKS = {
 }
 """Of keys that are tables what they are, with the heading that describes them, and their meaning."""
 
+
+def _with_law(rheology: str) -> str:
+    """A phase with a law of viscosity."""
+    return f'[[phase]]\nname = "water"\nrest_density = 1000.0\nviscosity = 0.05\nrheology = {rheology}'
+
+
 BEGINNING = """# The scene file
 
 A scene file says what a simulation starts from: which fluids there are, where they are, what holds them, which forces
@@ -160,6 +166,25 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 '[container]\nshape = "cylinder"\nbase = [0.25, 0.0, 0.25]\nradius = 0.5\nheight = 1.0\nlid = false',
             ),
             ("NoContainer", "### No walls", '[container]\nshape = "none"'),
+        ),
+    ),
+    (
+        "## Viscosity that depends on the shear rate: `rheology`",
+        'A law in a phase, in a scene with one phase and the viscous force "stress" ([thick fluids](viscosity.md)). '
+        "`kind` decides which other keys it has; each number is a parameter, such as `carreau.flow_index`.",
+        (
+            ("PowerLaw", "### A power law", _with_law('{ kind = "power_law", flow_index = 0.6 }')),
+            (
+                "Carreau",
+                "### Carreau's law",
+                _with_law('{ kind = "carreau", relaxation_time = 0.2, flow_index = 0.5 }'),
+            ),
+            ("Bingham", "### Bingham's law", _with_law('{ kind = "bingham", yield_stress = 2.0 }')),
+            (
+                "HerschelBulkley",
+                "### The law of Herschel and Bulkley",
+                _with_law('{ kind = "herschel_bulkley", yield_stress = 2.0, flow_index = 0.7 }'),
+            ),
         ),
     ),
     (
