@@ -33,6 +33,7 @@ VALIDATION = {
     "test_validation_mixture",
     "test_validation_rayleigh_taylor",
     "test_validation_rheology",
+    "test_validation_viscosity",
 }
 """Files: physics against published data and closed forms, studies, walls that hold, and every plant."""
 SLOW = {

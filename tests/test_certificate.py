@@ -73,7 +73,8 @@ def centre(simulation):
 @cache
 def long():
     """250 steps of a splash in the plane, long beyond its horizon; after 300 no estimator agrees by more than 0.75."""
-    return certify(problem_of(plane(), 250, centre), ["gravity"])
+    forces = {"gravity": [0.0, -9.81], "viscosity": "pairwise"}
+    return certify(problem_of(plane(forces=forces), 250, centre), ["gravity"])
 
 
 def test_beyond_the_horizon_another_estimator_is_advised():

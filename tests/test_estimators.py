@@ -117,7 +117,7 @@ class Twin:
             phase=[{"name": "honey", "rest_density": 1000.0, "viscosity": 5.0}],
             fluid=[{"shape": "box", "lower": [0.0] * d, "upper": BLOCKS[d], "phase": "honey"}],
             container={"shape": "box", "lower": [0.0] * d, "upper": [0.3] * d},
-            forces={"gravity": [0.3, -9.81, 0.1][:d]},
+            forces={"gravity": [0.3, -9.81, 0.1][:d], "viscosity": "pairwise"},
         )
         self.simulation = Simulation(made, precision="float64")
         point = point_of(self.simulation)

@@ -75,7 +75,7 @@ def column_at_rest(
             phase=[{**WATER, "viscosity": 5.0}],
             fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [width, 1.0], "phase": "water"}],
             container={"shape": "box", "lower": [0.0, 0.0], "upper": [width, 1.5]},
-            forces={"gravity": [0.0, -GRAVITY]},
+            forces={"gravity": [0.0, -GRAVITY], "viscosity": "pairwise"},  # see validation/README.md
             solver={"time_step": time_step, "maximum_iterations": 100, "density_tolerance": tolerance},
         ),
         precision=precision,

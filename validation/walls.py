@@ -27,7 +27,7 @@ def scene(kernel: str, support: float, spacing: float, viscosity: float, **table
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": viscosity}],
         fluid=[{"shape": "box", "phase": "water", **tables["fluid"]}],
         container=tables["container"],
-        forces={"gravity": [0.0, -GRAVITY, 0.0][:dimension]},
+        forces={"viscosity": "pairwise", "gravity": [0.0, -GRAVITY, 0.0][:dimension]},
         solver=tables["solver"],
     )
 

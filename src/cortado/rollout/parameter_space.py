@@ -20,6 +20,7 @@ from cortado.scene.parameters.registry import names
 from cortado.scene.parameters.values import Arrays, Values, check_known, checked_value, scene_values
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.scene.stability import divergence_advice
+from cortado.scene.viscous_forms import parameter_sentence
 
 STATE = names(Role.STATE)
 STATE_TIME = "time"
@@ -38,7 +39,7 @@ class ParameterSpace:
         self._one = SceneParameters(simulation, steps)
         self._first_positions = FirstPositions(simulation)
         self._told: set[str] = set()
-        """The limits of stability that were warned of."""
+        """What was warned of: limits of stability by their names, and sentences."""
         self._judged: Arrays | None = None
         """The last values that make sense: a step after another often has the same ones."""
 
@@ -97,6 +98,10 @@ class ParameterSpace:
         diffusion even where it is 0. ``states``, one for each scene, replace the scene's first state.
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
+        sought = parameter_sentence(simulation.scene) if "viscosity" in varied else None
+        if sought and sought not in self._told:
+            self._told.add(sought)
+            warnings.warn(sought, CortadoWarning, stacklevel=4)
         rollout.begin_evaluation()
         rollout.goes_on = bool(states)
         rollout.clocks = [state.clock for state in states] or [Clock()] * len(rollout.clocks)

@@ -18,6 +18,7 @@ from cortado.scene.model import OTHER_TABLES, SceneTables
 from cortado.scene.sentences import sentences
 from cortado.scene.stability import broken_limit
 from cortado.scene.toml import put_in, read_toml
+from cortado.scene.viscous_forms import wall_sentence
 
 LIGHTEST = 50.0
 """Rest density below which a scene warns [kg/m3]: liquid hydrogen has 71, mercury 13.5 g/cm3."""
@@ -37,6 +38,8 @@ class Scene(SceneTables):
         if broken := broken_limit(self, {}, time_step):
             found = f"solver.time_step is {time_step:g} s, but the limit of stability is about {broken[1]:.3g} s"
             warnings.warn(f"{found}, which comes from {broken[0]}.", CortadoWarning, stacklevel=2)
+        if wrong := wall_sentence(self):
+            warnings.warn(wrong, CortadoWarning, stacklevel=2)
         return self
 
     def replaced(self, *overrides: str) -> "Scene":

@@ -59,7 +59,7 @@ slip = "free"                       # "no" for walls that hold the fluid back
 
 [forces]
 gravity = $gravity        # m/s2
-viscosity = "pairwise"              # or "laminar", "none"
+viscosity = "stress"                # or "none"; "pairwise" and "laminar" are there to compare
 #surface_tension = 0.07             # N/m
 
 [solver]
