@@ -1,5 +1,5 @@
-"""How viscous is a fluid? ``python validation/viscosity.py OUT`` writes the figures of waves of shear, bodies that turn,
-layers and channels that `tests/test_validation_viscosity.py` compares, as PNGs."""
+"""How viscous is a fluid? ``python validation/viscosity.py OUT`` writes figures as PNGs: waves of shear, bodies that turn,
+layers and channels, which `tests/test_validation_viscosity.py` compares."""
 
 import argparse
 import sys
@@ -34,7 +34,7 @@ def waves(folder: Path) -> None:
         axis.set(xlabel="particles in a side of the box", title=title, xticks=counts, xticklabels=counts)
         axis.minorticks_off()
     axes[0].set_ylabel("effective over asked viscosity")
-    axes[0].legend()
+    axes[1].legend()
     _save(figure, folder / "viscosity_waves.png")
 
 
