@@ -1,4 +1,4 @@
-"""How viscous is a fluid? ``python validation/viscosity.py OUT`` writes figures as PNGs: waves of shear, bodies that turn,
+"""How viscous is a fluid? ``python validation/viscosity.py OUT`` writes figures as PNGs: waves of shear, bodies,
 layers and channels, which `tests/test_validation_viscosity.py` compares."""
 
 import argparse
