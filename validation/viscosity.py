@@ -77,10 +77,11 @@ def channels(folder: Path) -> None:
     figure, axis = plt.subplots(figsize=(7, 4.5), layout="constrained")
     counts = (10, 20, 40)
     for low, name, mark in (0.0, "Poiseuille", "o"), (0.45, "Couette", "s"):
-        found = [Channel(n, 1.0, low, pressure=False).run() for n in counts]
+        own = [n for n in counts if low == 0.0 or n > 10]  # the band that is pushed is a tenth of the width
+        found = [Channel(n, 1.0, low, pressure=False).run() for n in own]
         for quantity, label, style in ("flow", "flow", "-"), ("slope", "its derivative", "--"):
             errors = [abs(one[quantity] - 1.0) for one in found]
-            axis.loglog(counts, errors, mark + style, label=f"{name}, {label}")
+            axis.loglog(own, errors, mark + style, label=f"{name}, {label}")
     axis.loglog(counts, 1.0 / np.array(counts) ** 2.0, "k:", label="second order")
     axis.set(xlabel="particles across", ylabel="error", title="Flow between plates, Re = 1")
     axis.set_xticks(counts, [str(n) for n in counts])

@@ -21,7 +21,7 @@ def dam(spacing: float, counts: tuple[int, ...], **tables: Any) -> dict[str, Any
         "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.05}],
         "fluid": [{"shape": "box", "lower": [0.0] * len(counts), "upper": [width, height, *depth], "phase": "water"}],
         "container": {"shape": "box", "lower": [0.0] * len(counts), "upper": [2.0 * width, 2.0 * height, *depth]},
-        "forces": {"gravity": [0.0, -9.81, *[0.0 for _ in depth]]},
+        "forces": {"gravity": [0.0, -9.81, *[0.0 for _ in depth]], "viscosity": "pairwise"},
         "solver": {"time_step": 0.04 * spacing, "minimum_iterations": 4, "maximum_iterations": 4},
         **tables,
     }

@@ -70,6 +70,7 @@ class Solve:
             limits = {"tolerance": self._tolerance, "most": MOST, "first": self._first}
             step.launch(kernels.decide, scene, limits, total=total, threads=members)
 
+        step.join()  # a loop of a graph cannot begin while something is computed aside
         wp.capture_while(self._active, iterate)
 
 
