@@ -308,10 +308,8 @@ class Rollout:
     def _require(self, what: str, evaluation: int) -> None:
         """Whether a forward run was of the present evaluation; raises `InputError`."""
         if evaluation != self.evaluation:
-            raise InputError(
-                f"The rollout cannot go {what}, as it has not gone forward with these parameters, or has kept no "
-                "states: run forward first, with keep=True."
-            )
+            lacking = "as it has not gone forward with these parameters, or has kept no states"
+            raise InputError(f"The rollout cannot go {what}, {lacking}: run forward first, with keep=True.")
 
     def _replayed(self, n: int, state: State) -> State:
         """The state after state n, computed once more."""
