@@ -45,7 +45,7 @@ SCENES = {
     "plane": plane(),
     "two fluids": two_layers(),
     "three fluids": plane_of_three(),
-    "stress": splash(forces={"gravity": [0.0, -9.81, 0.0], "viscosity": "stress"}),
+    "stress": plane(forces={"gravity": [0.0, -9.81], "viscosity": "stress"}),
     "implicit, with a law": plane(
         phase=[{**HONEY, "rheology": {"kind": "bingham", "yield_stress": 5.0, "regularisation": 0.5}}],
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "honey"}],
