@@ -245,6 +245,7 @@ def test_some_particles_have_left_the_nozzle_and_some_have_not():
 
 ELSEWHERE = {
     "frozen_force_adjoint": "an estimator that is not exact: tests/test_estimators.py",
+    "implicit_kernels": "of what comes before and after a solve: whole steps in tests/test_implicit_viscosity.py",
     "phase_colour_kernels": "of pictures, by differences: tests/test_render.py",
     "colour_field_kernels": "the same",
     "absorption_kernels": "the same",

@@ -23,9 +23,11 @@ from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
 from cortado.sph.integration import integration_kernels
 from cortado.sph.pair_forces import laminar, pairwise
+from cortado.sph.stress_kernels import stress_kernels
 from cortado.sph.surface_normals import normal_kernels
 from cortado.sph.surface_stress import surface_tension_kernels
 from cortado.sph.viscosity import viscosity_kernels
+from cortado.sph.viscosity_law import newtonian_law
 
 
 class Device:
@@ -57,6 +59,7 @@ def kernels_of(discretisation):
         wall_kernels(discretisation),
         viscosity_kernels(discretisation, pairwise, True),
         viscosity_kernels(discretisation, laminar, True),
+        *stress_kernels(discretisation, 3, newtonian_law(), True),
         density_ratio_kernels(discretisation),
         normal_kernels(discretisation),
         surface_tension_kernels(discretisation),

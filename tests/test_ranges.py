@@ -18,6 +18,7 @@ ROOT = Path(cortado.__file__).parent
 APART = "study/one_kernel_loops.py"
 """Kernels of a study of Warp's tape, which is never cut."""
 LAMINAR = {"gravity": [1.0, -9.81], "viscosity": "laminar"}
+BINGHAM = {"kind": "bingham", "yield_stress": 10.0, "regularisation": 0.5}
 CASES = {
     "one phase, iterations by tolerance": lambda: splash(minimum_iterations=2, maximum_iterations=20),
     "no viscosity, free space": lambda: scene(
@@ -35,6 +36,11 @@ CASES = {
     "surface tension": lambda: scene(
         forces={"gravity": [0.0, -9.81, 0.0], "surface_tension": 0.5},
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 2.0}],
+    ),
+    "implicit viscosity with a law, no slip": lambda: scene(
+        forces={"gravity": [1.0, -9.81, 0.0], "viscosity": "stress", "viscous_solve": "implicit"},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 20.0, "rheology": BINGHAM}],
+        container={"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"},
     ),
     "forces of one's own": splash,
 }
