@@ -97,7 +97,7 @@ class Packed:
         self._theta, self._theta_dot = self._vectors(self._flat), self._vectors(self._flat_dot)
         self.shares = wp.zeros(layout.all_particles, dtype=self.dtype, device=layout.device)
         """(n,) for what every particle adds to the adjoint of theta in a step."""
-        self._sum = layout.sum_of(self.dtype)
+        self._sum = layout.sum_of(self.dtype) if self._parameters else None
 
     def theta(self, step: StepContext) -> wp.array:
         """(members,) in a step."""
@@ -109,7 +109,7 @@ class Packed:
 
     def collect(self, step: StepContext, bar: Adjoints) -> None:
         """Add up the `shares`, into the adjoints of the parameters."""
-        if not self._parameters:
+        if self._sum is None:
             return
         total = self._sum(self.shares)
         flat = self._view(total, self._layout.precision.real, (self._layout.members, self._size))
