@@ -324,9 +324,9 @@ def test_states_are_shared_with_other_libraries():
 
 
 def test_a_force_of_a_users_own_is_not_trusted_with_a_batch(monkeypatch):
-    monkeypatch.setattr("cortado.sph.viscosity.Viscosity.batches", False)
+    monkeypatch.setattr("cortado.sph.viscous_stress.ViscousStress.batches", False)
     Simulation(scenes.plane())
-    with pytest.raises(InputError, match=r"batch is 2, .* as the force Viscosity has no `batches = True`"):
+    with pytest.raises(InputError, match=r"batch is 2, .* as the force ViscousStress has no `batches = True`"):
         Simulation(scenes.plane(), batch=2)
 
 
