@@ -157,7 +157,8 @@ def test_an_emitter_counts_for_the_stability_limit():
     honey += [{"name": "honey", "rest_density": 1400, "viscosity": 1e5}]
     with pytest.warns(CortadoWarning, match="limit of stability"):
         scene = Scene(**plane(emitter=SLOT | {"phase": "honey"}, phase=honey, forces={"viscosity": "pairwise"}))
-        thicker = Scene(**plane(emitter=SLOT | {"phase": "honey"}, phase=[honey[0], honey[1] | {"viscosity": 2e5}]))
+        thick = [honey[0], honey[1] | {"viscosity": 2e5}]
+        thicker = Scene(**plane(emitter=SLOT | {"phase": "honey"}, phase=thick, forces={"viscosity": "pairwise"}))
     assert stability_limit(scene) == pytest.approx(2.0 * stability_limit(thicker))
     assert stability_limit(scene) < 0.06 * 0.2**2 * 1000 / 1e5
 

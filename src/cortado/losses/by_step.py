@@ -8,7 +8,7 @@ import numpy as np
 from cortado.errors import InputError
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, batch
 from cortado.losses.checked import as_loss
-from cortado.losses.loss import Adjoint, by_field
+from cortado.losses.loss import Adjoint, by_field, moment_of
 from cortado.particles.state import State
 
 
@@ -23,6 +23,7 @@ class LossesByStep(Mapping[int, Loss]):
             if step not in range(steps + 1):
                 raise InputError(f"losses has the frame {step!r}, but must have frames from 0 to {steps}.")
         self._losses: dict[int, Loss] = {step: as_loss(one) for step, one in by_step.items()}
+        self._frames = loss if isinstance(loss, Frames) else None
 
     def __getitem__(self, step: int) -> Loss:
         return self._losses[step]
@@ -33,9 +34,16 @@ class LossesByStep(Mapping[int, Loss]):
     def __len__(self) -> int:
         return len(self._losses)
 
+    def _check(self, ends: Mapping[int, Any]) -> None:
+        """Raises `InputError` for states of a run that the losses do not fit."""
+        if self._frames is not None:
+            end = next(iter(ends.values()))
+            self._frames.check(np.ravel(moment_of(end).parameters["time_step"]))
+
     def total(self, ends: Mapping[int, Any], going: Sequence[int] | None) -> Any:
         """Their sum, given states by the number of steps before them; of a batch (batch,), NaN but for the scenes that
         are ``going``, which is None of a single scene."""
+        self._check(ends)
         if going is None:
             return sum(loss.value(ends[step]) for step, loss in self._losses.items())
         return sum(batch.values(loss, ends[step], going) for step, loss in self._losses.items())
@@ -44,6 +52,7 @@ class LossesByStep(Mapping[int, Loss]):
         self, ends: Mapping[int, Any], going: Sequence[int] | None
     ) -> tuple[Any, dict[int, SnapshotAdjoint]]:
         """The same, and the adjoints of the states by the number of steps before them."""
+        self._check(ends)
         if going is None:
             one = {step: loss.value_and_adjoint(ends[step]) for step, loss in self._losses.items()}
             bars = {step: _on_device(bar, ends[step]) for step, (_, bar) in one.items()}

@@ -185,6 +185,9 @@ class Frames:
                 raise InputError(f"losses has the frame {shown(step)}, but must have whole numbers of steps.")
         self.losses = FixedDict(losses)
 
+    def check(self, time_steps: np.ndarray) -> None:
+        """Raises `InputError` where it does not fit a run with these time steps (scenes,) [s]."""
+
     @property
     def fingerprint(self) -> str:
         """Tells one set of targets from another, for checkpoints."""

@@ -8,7 +8,7 @@ import numpy as np
 from cortado.arrays import as_numbers, as_one_number, read_only, whole_number
 from cortado.errors import InputError
 from cortado.fixed import fixed
-from cortado.losses.loss import Adjoint, Frames, Snapshot, moment_of
+from cortado.losses.loss import Adjoint, Frames, Snapshot
 from cortado.runs.sensors.sensor import Sensor, checked_sensor, value_of
 
 SAME = 1e-6
@@ -19,12 +19,10 @@ SAME = 1e-6
 class SensorMatch:
     """Sum of the squared differences of what a sensor reads from what it should read, over squared scales."""
 
-    def __init__(
-        self, sensor: Sensor, target: Any, weight: float = 1.0, scale: Any = 1.0, time_step: float | None = None
-    ):
+    def __init__(self, sensor: Sensor, target: Any, weight: float = 1.0, scale: Any = 1.0):
         """``target`` (k,), a number for each column of the sensor, NaN for one that does not count; ``weight`` of the
-        sum; ``scale``, a number or (k,); ``time_step`` that the run must have [s]."""
-        self.sensor, self.weight, self._time_step = checked_sensor(sensor), float(weight), time_step
+        sum; ``scale``, a number or (k,)."""
+        self.sensor, self.weight = checked_sensor(sensor), float(weight)
         self.target = np.atleast_1d(np.array(target, dtype=np.float64))
         self.scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), self.target.shape)
         arrays = self.target.tobytes() + self.scale.tobytes()
@@ -39,7 +37,6 @@ class SensorMatch:
         return self.value(end), self.sensor.adjoint(end, bar)
 
     def _miss(self, end: Snapshot) -> np.ndarray:
-        self._check_time_step(end)
         found = value_of(self.sensor, end)
         if found.shape != self.target.shape:
             columns = ", ".join(self.sensor.columns(end.dimension))
@@ -47,16 +44,6 @@ class SensorMatch:
                 f"values has {len(self.target)} columns, but must have {len(found)}, those of the sensor: {columns}."
             )
         return np.where(np.isnan(self.target), 0.0, found - self.target) / self.scale
-
-    def _check_time_step(self, end: Snapshot) -> None:
-        """The state is of the time that its number of steps stands for in the series."""
-        if self._time_step is None:
-            return
-        of_run = np.ravel(moment_of(end).parameters["time_step"])
-        other = of_run[np.abs(of_run - self._time_step) > SAME * of_run]
-        if len(other):
-            found = f"time_step of the series is {self._time_step:g} s"
-            raise InputError(f"{found}, but must be that of the run, {other[0]:g} s, which cannot be varied beside it.")
 
 
 @fixed
@@ -96,5 +83,12 @@ class Series(Frames):
             raise InputError(f"times go from {moments[0]:g} to {moments[-1]:g} s, between which there is no step.")
         rows = np.stack([np.interp(np.array(steps) * step, moments, column) for column in series.T], axis=1)
         weight = 1.0 / len(steps)
-        each = zip(steps, rows, strict=True)
-        super().__init__({k: SensorMatch(sensor, row, weight, scale, step) for k, row in each})
+        self.time_step = step
+        super().__init__({k: SensorMatch(sensor, row, weight, scale) for k, row in zip(steps, rows, strict=True)})
+
+    def check(self, time_steps: np.ndarray) -> None:
+        """The states are of the times that their numbers of steps stand for in the series."""
+        other = time_steps[np.abs(time_steps - self.time_step) > SAME * time_steps]
+        if len(other):
+            found = f"time_step of the series is {self.time_step:g} s"
+            raise InputError(f"{found}, but must be that of the run, {other[0]:g} s, which cannot be varied beside it.")
