@@ -48,6 +48,16 @@ def fluid_sum(d: Discretisation, ahead: bool = True, module: Any = None) -> Deco
     return make
 
 
+def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
+    """What gives the decorator of a sum over what the fluid rubs against, for the term of walls: `pair_sum` where walls
+    have no slip, and `fluid_sum` where they slip freely."""
+
+    def summed(walls: Function, ahead: bool = True) -> Decorator:
+        return pair_sum(d, walls, ahead) if sticks else fluid_sum(d, ahead)
+
+    return summed
+
+
 def wall_sum(d: Discretisation) -> Decorator:
     """As `pair_sum`, over the walls alone."""
 

@@ -64,7 +64,7 @@ class Term:
 
     def seen_from_i(self, of_j: Mapping[str, str], j: str = "_j") -> str:
         """The text of its arguments, given those of a neighbour's entries and of its number."""
-        return self._arguments("_x_ij", own_entry, of_j.__getitem__, {"i": "i", "j": j})
+        return self._arguments("_x_ij", own_entry, of_j.__getitem__, {"i": "i", "j": j, "foot": "_foot"})
 
     def seen_from_j(self, of_j: Mapping[str, str]) -> str:
         """The same with the particles exchanged."""
@@ -77,8 +77,6 @@ class Term:
             array = array_of(name)
             if name == "x_ij":
                 return separation
-            if name == "foot":
-                return "_foot"
             if not array:
                 return numbers.get(name, name)
             if name.endswith("_ij"):

@@ -20,6 +20,11 @@ from cortado.scene.tables import Table
 class Container(Table):
     """What holds the fluid."""
 
+    @property
+    def sticks(self) -> bool:
+        """Whether its walls have no slip."""
+        return getattr(self, "slip", "free") == "no"
+
     @abstractmethod
     def extent(self) -> tuple[Points, Points] | None:
         """The box around it: lower and upper, each (d,) [m]; None if there is none."""

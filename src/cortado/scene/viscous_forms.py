@@ -11,8 +11,7 @@ FAULTS = {
 
 def wall_sentence(scene: SceneTables) -> str | None:
     """What to say of a scene whose walls hold the fluid back; None if there is nothing."""
-    slip = getattr(scene.container, "slip", "free")
-    return _sentence(scene, 'container.slip is "no"') if slip == "no" else None
+    return _sentence(scene, 'container.slip is "no"') if scene.container.sticks else None
 
 
 def parameter_sentence(scene: SceneTables) -> str | None:

@@ -8,7 +8,7 @@ import warp as wp
 
 from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import fluid_sum, pair_sum
+from cortado.particles.pair_sums import rubbing_sum
 from cortado.sph.stress_functions import fluidity_function, matrix_type
 from cortado.sph.wall_contact import contact_functions
 
@@ -34,11 +34,8 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
     hold, hold_gradient = contact.hold, contact.hold_gradient
+    summed = rubbing_sum(discretisation, sticks)
     fluidity, matrix = fluidity_function(precision), matrix_type(precision)
-
-    def summed(wall_term: Any, ahead: bool = True) -> Any:
-        """The decorator of a sum over what the fluid rubs against."""
-        return pair_sum(discretisation, wall_term, ahead) if sticks else fluid_sum(discretisation, ahead)
 
     @wp.func
     def cross_terms(a: vector, b: vector) -> vector:

@@ -22,7 +22,7 @@ from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
-from cortado.particles.pair_sums import fluid_sum, pair_sum
+from cortado.particles.pair_sums import rubbing_sum
 from cortado.sph.implicit_viscosity import stress_of
 from cortado.sph.pair_forces import PairForm, laminar, pairwise
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
@@ -42,11 +42,8 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
     changes = bundle(x=vector, v=vector, n=real, m=real, mu=real)
     reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
     tiny = wp.constant(real(discretisation.precision.tiny))
+    summed = rubbing_sum(discretisation, sticks)
     name = form.__name__ + "_no_slip" * sticks  # a module for each: their functions have the same names
-
-    def summed(wall_term: Any, ahead: bool = True) -> Any:
-        """The decorator of a sum over what the fluid rubs against."""
-        return pair_sum(discretisation, wall_term, ahead) if sticks else fluid_sum(discretisation, ahead)
 
     @wp.func
     def part(a: real, b: real) -> real:
@@ -281,7 +278,7 @@ def force(setting: Setting) -> Viscosity | ViscousStress | None:
     """The form that a scene names: that of Monaghan (2005), which keeps linear and angular momentum, or that of Morris,
     Fox and Zhu (1997), which carries shear to a wall. None for a scene without."""
     scene, walls = setting.scene, setting.walls
-    sticks = getattr(scene.container, "slip", "free") == "no"
+    sticks = scene.container.sticks
     if scene.forces.viscosity == "stress":
         return stress_of(scene)(setting)
     if scene.forces.viscosity == "pairwise":
