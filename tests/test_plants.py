@@ -25,6 +25,7 @@ UNNAMED = {
     "sph.surface_stress": {"tension_functions.stress_derivative"},
     "sph.implicit_derivatives": {"implicit_kernels.weigh", "implicit_kernels.unweigh"},
     "sph.packed": {"packing_kernels.add_number"},
+    "sph.stress_functions": {"stress_functions.back"},
     "sph.stress_moments": {"moment_sums.moments_back", "moment_sums.wall_moments_back"},
     "sph.stress_forces": {
         *("stress_sums.traction_back", "stress_sums.wall_traction_back"),

@@ -24,11 +24,7 @@ class ImplicitKernels:
     """The kernels, by what they do."""
 
     predict: Any
-    """u = v + dt a."""
-    add: Any
-    """The sum of two accelerations."""
-    predict_tangent: Any
-    """The tangent of u where a does not change."""
+    """u = v + dt a; with tangents of v and dt that of u, where a does not change."""
     stress_tangent: Any
     """The tangents of T and mu."""
     weigh: Any
@@ -52,9 +48,8 @@ def implicit_kernels(discretisation: Discretisation, dimension: int, law: Law, s
     name = f"implicit_step_{law.topic}{dimension}d" + "_no_slip" * sticks
     module, tangent_module = discretisation.module(False, name), discretisation.tangent_module(name)
     along = stress_functions(precision, dimension, law, tangent_module)
-    change_of_moment, viscosity_along, traction_along = along.moment_change, along.viscosity_work, along.traction_work
-    back = stress_functions(precision, dimension, law, module)
-    viscosity_back, stress_back = back.viscosity_work, back.traction_work
+    change_of_moment, change_of = along.moment_change, along.change
+    stress_back = stress_functions(precision, dimension, law, module).back
     sums = moment_sums(discretisation, sticks)
     moments_tangent, moments_back = sums.tangent, sums.back
     traction_back = stress_sums(discretisation, sticks).traction_back
@@ -75,28 +70,6 @@ def implicit_kernels(discretisation: Discretisation, dimension: int, law: Law, s
     ):
         i = wp.tid()
         u[i] = v[i] + time_step[i // particles] * acceleration[i]
-
-    @wp.kernel(module=module, enable_backward=False)
-    def add(
-        a: wp.array(dtype=vector),
-        b: wp.array(dtype=vector),
-        # out
-        total: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        total[i] = a[i] + b[i]
-
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    def predict_tangent(
-        particles: int,
-        time_step_dot: wp.array(dtype=real),
-        v_dot: wp.array(dtype=vector),
-        acceleration: wp.array(dtype=vector),
-        # out
-        u_dot: wp.array(dtype=vector),
-    ):
-        i = wp.tid()
-        u_dot[i] = v_dot[i] + time_step_dot[i // particles] * acceleration[i]
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def stress_tangent(
@@ -123,20 +96,23 @@ def implicit_kernels(discretisation: Discretisation, dimension: int, law: Law, s
             return
         M_dot, A_dot = change_of_moment(diagonal, others), wp.matrix_from_rows(row_x, row_y, row_z)
         A_u_dot, b = wp.matrix_from_rows(end_x, end_y, end_z), i // s.particles
-        by_M, by_A, by_R, by_mu, by_theta, _by_bar = wp.grad(viscosity_along)(
-            of.M[i], of.A[i], of.R[i], now.mu[i], theta[b], real(1.0)
+        T_i_dot, eta_i_dot = change_of(
+            of.M[i],
+            of.A[i],
+            of.A_u[i],
+            of.R[i],
+            now.mu[i],
+            theta[b],
+            of.eta[i],
+            control,
+            M_dot,
+            A_dot,
+            A_u_dot,
+            thin,
+            dot.mu[i],
+            theta_dot[b],
         )
-        eta_i_dot = wp.ddot(by_M, M_dot) + wp.ddot(by_A, A_dot) + by_R * thin + by_mu * dot.mu[i]
-        eta_i_dot += wp.dot(by_theta, theta_dot[b])
-        change = matrix()
-        for k in range(9):
-            entry = matrix()
-            entry[k // 3, k % 3] = real(1.0)
-            for_M, for_A, for_eta, _for_C, _for_entry = wp.grad(traction_along)(
-                of.M[i], of.A_u[i], of.eta[i], control, entry
-            )
-            change[k // 3, k % 3] = wp.ddot(for_M, M_dot) + wp.ddot(for_A, A_u_dot) + for_eta * eta_i_dot
-        T_dot[i] = change
+        T_dot[i] = T_i_dot
         eta_dot[i] = eta_i_dot
 
     @wp.kernel(module=module, enable_backward=False)
@@ -183,18 +159,16 @@ def implicit_kernels(discretisation: Discretisation, dimension: int, law: Law, s
         row_x, row_y, row_z, eta_bar = traction_back(i, now.x, now.v, now.m, acceleration_bar, control, least, s)
         if lane() > 0:
             return
-        T_bar = wp.matrix_from_rows(row_x, row_y, row_z)
-        by_M, by_A, by_eta, _by_C, _by_T = wp.grad(stress_back)(of.M[i], of.A_u[i], of.eta[i], control, T_bar)
-        for_M, for_A, for_R, for_mu, for_theta, _for_eta = wp.grad(viscosity_back)(
-            of.M[i], of.A[i], of.R[i], mu[i], theta[i // s.particles], eta_bar + by_eta
+        T_bar, member = wp.matrix_from_rows(row_x, row_y, row_z), i // s.particles
+        by_M, by_A, by_A_u, by_R, by_mu, by_theta = stress_back(
+            of.M[i], of.A[i], of.A_u[i], of.R[i], mu[i], theta[member], of.eta[i], control, T_bar, eta_bar
         )
-        M_i_bar = by_M + for_M
-        M_bar[i] = real(0.5) * (M_i_bar + wp.transpose(M_i_bar))
-        A_bar[i] = by_A
-        A_v_bar[i] = for_A
-        R_bar[i] = for_R
-        mu_bar[i] = mu_bar[i] + for_mu
-        theta_bar[i] = for_theta
+        M_bar[i] = by_M
+        A_bar[i] = by_A_u
+        A_v_bar[i] = by_A
+        R_bar[i] = by_R
+        mu_bar[i] = mu_bar[i] + by_mu
+        theta_bar[i] = by_theta
 
     @wp.kernel(module=module, enable_backward=False)
     def end_adjoint(
@@ -229,6 +203,4 @@ def implicit_kernels(discretisation: Discretisation, dimension: int, law: Law, s
         x_bar[i] = x_bar[i] + x_sum
         v_bar[i] = v_bar[i] + v_sum
 
-    return ImplicitKernels(
-        predict, add, predict_tangent, stress_tangent, weigh, unweigh, stress_adjoint, end_adjoint, strain_adjoint
-    )
+    return ImplicitKernels(predict, stress_tangent, weigh, unweigh, stress_adjoint, end_adjoint, strain_adjoint)

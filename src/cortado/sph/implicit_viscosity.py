@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from cortado.device.launching import add
 from cortado.device.precision import FLOAT32
 from cortado.errors import MissingDerivativeError
 from cortado.particles.state import Layout
@@ -23,7 +24,7 @@ from cortado.scene.stability import is_implicit
 from cortado.sph.implicit_derivatives import implicit_kernels
 from cortado.sph.implicit_kernels import operator_kernels, solve_kernels
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.viscosity_law import Law, newtonian_law
+from cortado.sph.viscosity_law import Law
 from cortado.sph.viscous_stress import ViscousStress
 
 MOST = 1_000
@@ -84,9 +85,8 @@ class ImplicitViscousStress(ViscousStress):
         if setting.discretisation.taped:
             raise MissingDerivativeError("implicit viscosity has no tape: try gradients.Exact.")
         super().__init__(setting, law, parameters)
-        scene, discretisation, layout = setting.scene, setting.discretisation, setting.layout
-        made_for = (discretisation, scene.dimension, law or newtonian_law(), self.sticks)
-        operator, self._implicit = operator_kernels(*made_for), implicit_kernels(*made_for)
+        layout, operator = setting.layout, operator_kernels(*self._made_for)
+        self._implicit = implicit_kernels(*self._made_for)
         self._pull, self._solve = operator[0], Solve(layout, operator)
         sizes = {"shape": layout.all_particles, "device": layout.device}
         vectors = (wp.zeros(dtype=layout.precision.vector, **sizes) for _ in range(4))
@@ -113,7 +113,8 @@ class ImplicitViscousStress(ViscousStress):
         step.launch(self._pull, *known, v=self._u)
         step.launch(self._force.forward, *known, v=self._u, acceleration_in=self._still, acceleration=self._r)
         self._solve(step, known, self._r, self._y)
-        step.launch(self._implicit.add, a=before, b=self._y, total=after)
+        wp.copy(after, before)
+        add(self._y, after)
         self._after = after
 
     def _at_the_end(self, step: StepContext) -> None:
@@ -124,7 +125,8 @@ class ImplicitViscousStress(ViscousStress):
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
         self._at_the_end(step)
         u_dot, change = self._y, {f"{name}_dot": self._change[name] for name in ("T", "eta")}
-        step.launch(self._implicit.predict_tangent, *dot.named, acceleration=self._after, u_dot=u_dot)
+        along = {"v": dot.fields["v"], "time_step": dot.parameters["time_step"]}
+        step.launch(self._implicit.predict, along, acceleration=self._after, u=u_dot)
         theta = {"theta": self._packed.theta(step), "theta_dot": self._packed.theta_dot(step, dot.parameters)}
         both = {"u": self._u, "u_dot": u_dot, "A_u": self._A_u}
         step.launch(self._implicit.stress_tangent, *dot.named, self._constants, self._of, both, **theta, **change)
@@ -147,8 +149,9 @@ class ImplicitViscousStress(ViscousStress):
         u_bar.zero_()
         step.launch(self._force.adjoint, now, {"v_bar": u_bar}, change, *self._known(*bar.named))
         step.launch(self._implicit.end_adjoint, {"u_bar": u_bar, "acceleration": self._after}, *bar.named)
-        strain = {"A_bar": self._A_bar, **self._no_bars}
-        step.launch(self._implicit.strain_adjoint, strain, self._constants, *bar.named)
+        if not self._law.is_newtonian:
+            strain = {"A_bar": self._A_bar, **self._no_bars}
+            step.launch(self._implicit.strain_adjoint, strain, self._constants, *bar.named)
         self._packed.collect(step, bar)
         return self._r
 

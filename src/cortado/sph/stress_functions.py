@@ -46,10 +46,10 @@ class StressFunctions:
     """mu of M, A, R, mu_i and theta, the parameters of the law."""
     traction: Any
     """T of M, A, mu and C."""
-    viscosity_work: Any
-    """mu mu_bar of the same, whose gradient is the adjoint of mu."""
-    traction_work: Any
-    """T . T_bar, whose gradient is the adjoint of T."""
+    change: Any
+    """The tangents of T and mu, of those of the sums, of mu_i and of theta."""
+    back: Any
+    """The adjoints of the sums, of mu_i and of theta, for those of T and mu."""
 
 
 @cache
@@ -145,4 +145,53 @@ def stress_functions(precision: Precision, dimension: int, law: Law, module: Any
     def traction_work(M: matrix, A: matrix, mu: real, control: real, bar: matrix) -> real:
         return wp.ddot(traction(M, A, mu, control), bar)
 
-    return StressFunctions(matrix, moment, moment_change, viscosity, traction, viscosity_work, traction_work)
+    @wp.func(module=module)
+    def change(
+        M: matrix,
+        A: matrix,
+        A_u: matrix,
+        R: real,
+        mu_i: real,
+        theta: theta_type,
+        mu: real,
+        control: real,
+        M_dot: matrix,
+        A_dot: matrix,
+        A_u_dot: matrix,
+        R_dot: real,
+        mu_i_dot: real,
+        theta_dot: theta_type,
+    ):
+        """A is of the velocities that mu follows from, A_u of those that are resisted. Put together of the gradients of
+        mu and of each entry of T."""
+        by_M, by_A, by_R, by_mu, by_theta, _by_bar = wp.grad(viscosity_work)(M, A, R, mu_i, theta, real(1.0))
+        mu_dot = wp.ddot(by_M, M_dot) + wp.ddot(by_A, A_dot) + by_R * R_dot + by_mu * mu_i_dot
+        mu_dot += wp.dot(by_theta, theta_dot)
+        T_dot = matrix()
+        for k in range(9):
+            entry = matrix()
+            entry[k // 3, k % 3] = real(1.0)
+            for_M, for_A, for_mu, _for_C, _for_entry = wp.grad(traction_work)(M, A_u, mu, control, entry)
+            T_dot[k // 3, k % 3] = wp.ddot(for_M, M_dot) + wp.ddot(for_A, A_u_dot) + for_mu * mu_dot
+        return T_dot, mu_dot
+
+    @wp.func(module=module)
+    def back(
+        M: matrix,
+        A: matrix,
+        A_u: matrix,
+        R: real,
+        mu_i: real,
+        theta: theta_type,
+        mu: real,
+        control: real,
+        T_bar: matrix,
+        mu_bar: real,
+    ):
+        """For A and A_u as in `change`: the adjoints of M, A, A_u, R, mu_i and theta."""
+        by_M, by_A_u, by_mu, _by_C, _by_T = wp.grad(traction_work)(M, A_u, mu, control, T_bar)
+        for_M, for_A, for_R, for_mu, for_theta, _for_mu = wp.grad(viscosity_work)(M, A, R, mu_i, theta, mu_bar + by_mu)
+        M_bar = by_M + for_M
+        return real(0.5) * (M_bar + wp.transpose(M_bar)), for_A, by_A_u, for_R, for_mu, for_theta
+
+    return StressFunctions(matrix, moment, moment_change, viscosity, traction, change, back)

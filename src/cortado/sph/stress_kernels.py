@@ -51,9 +51,8 @@ def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sti
     own = stress_functions(precision, dimension, law, module)
     matrix, moment_of, viscosity_of, traction_of = own.matrix, own.moment, own.viscosity, own.traction
     along = stress_functions(precision, dimension, law, tangent_module)
-    change_of_moment, viscosity_along, traction_along = along.moment_change, along.viscosity_work, along.traction_work
-    back = stress_functions(precision, dimension, law, adjoint_module)
-    viscosity_back, stress_back = back.viscosity_work, back.traction_work
+    change_of_moment, change_of = along.moment_change, along.change
+    stress_back = stress_functions(precision, dimension, law, adjoint_module).back
     theta_type = theta_of(precision, law.ranks)
     sums_of, force_of = moment_sums(discretisation, sticks), stress_sums(discretisation, sticks)
     moments, moments_tangent, moments_back = sums_of.sums, sums_of.tangent, sums_of.back
@@ -134,20 +133,23 @@ def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sti
             return
         M_dot, A_dot = change_of_moment(diagonal, others), wp.matrix_from_rows(row_x, row_y, row_z)
         b = i // s.particles
-        by_M, by_A, by_R, by_mu, by_theta, _by_bar = wp.grad(viscosity_along)(
-            of.M[i], of.A[i], of.R[i], now.mu[i], theta[b], real(1.0)
+        T_i_dot, eta_i_dot = change_of(
+            of.M[i],
+            of.A[i],
+            of.A[i],
+            of.R[i],
+            now.mu[i],
+            theta[b],
+            of.eta[i],
+            control,
+            M_dot,
+            A_dot,
+            A_dot,
+            thin,
+            dot.mu[i],
+            theta_dot[b],
         )
-        eta_i_dot = wp.ddot(by_M, M_dot) + wp.ddot(by_A, A_dot) + by_R * thin + by_mu * dot.mu[i]
-        eta_i_dot += wp.dot(by_theta, theta_dot[b])
-        change = matrix()
-        for k in range(9):
-            entry = matrix()
-            entry[k // 3, k % 3] = real(1.0)
-            for_M, for_A, for_eta, _for_C, _for_entry = wp.grad(traction_along)(
-                of.M[i], of.A[i], of.eta[i], control, entry
-            )
-            change[k // 3, k % 3] = wp.ddot(for_M, M_dot) + wp.ddot(for_A, A_dot) + for_eta * eta_i_dot
-        T_dot[i] = change
+        T_dot[i] = T_i_dot
         eta_dot[i] = eta_i_dot
 
     @wp.kernel(module=tangent_module, enable_backward=False)
@@ -195,17 +197,15 @@ def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sti
         row_x, row_y, row_z, eta_bar = traction_back(i, now.x, now.v, now.m, acceleration_bar, control, least, s)
         if lane() > 0:
             return
-        T_bar = wp.matrix_from_rows(row_x, row_y, row_z)
-        by_M, by_A, by_eta, _by_C, _by_T = wp.grad(stress_back)(of.M[i], of.A[i], of.eta[i], control, T_bar)
-        for_M, for_A, for_R, for_mu, for_theta, _for_eta = wp.grad(viscosity_back)(
-            of.M[i], of.A[i], of.R[i], mu[i], theta[i // s.particles], eta_bar + by_eta
+        T_bar, member = wp.matrix_from_rows(row_x, row_y, row_z), i // s.particles
+        by_M, by_A, by_A_u, by_R, by_mu, by_theta = stress_back(
+            of.M[i], of.A[i], of.A[i], of.R[i], mu[i], theta[member], of.eta[i], control, T_bar, eta_bar
         )
-        M_i_bar = by_M + for_M
-        M_bar[i] = real(0.5) * (M_i_bar + wp.transpose(M_i_bar))
-        A_bar[i] = by_A + for_A
-        R_bar[i] = for_R
-        mu_bar[i] = mu_bar[i] + for_mu
-        theta_bar[i] = for_theta
+        M_bar[i] = by_M
+        A_bar[i] = by_A_u + by_A
+        R_bar[i] = by_R
+        mu_bar[i] = mu_bar[i] + by_mu
+        theta_bar[i] = by_theta
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def acceleration_adjoint(

@@ -19,6 +19,11 @@ class Law:
     topic: str
     """Tells the Warp modules of one law from those of others; empty for Newtonian fluids."""
 
+    @property
+    def is_newtonian(self) -> bool:
+        """Whether the viscosity does not depend on the shear rate."""
+        return not self.topic
+
     def applied(self, precision: Precision, module: Any) -> Any:
         """The Warp function of the shear rate [1/s], of the viscosity that particles have [Pa s], and of theta: the
         viscosity [Pa s]."""

@@ -27,9 +27,10 @@ class ViscousStress:
     def __init__(self, setting: Setting, law: Law | None = None, parameters: Sequence[Parameter] = ()):
         """``law``: of the viscosity, with its parameters; by default that of a Newtonian fluid."""
         scene, discretisation, layout = setting.scene, setting.discretisation, setting.layout
-        cut, self.sticks = scene.discretisation, getattr(scene.container, "slip", "free") == "no"
-        made_for = (discretisation, scene.dimension, law or newtonian_law(), self.sticks)
-        self._stress, self._force = stress_kernels(*made_for)
+        cut, self._law = scene.discretisation, law or newtonian_law()
+        self._made_for = (discretisation, scene.dimension, self._law, scene.container.sticks)
+        """What its kernels are made for."""
+        self._stress, self._force = stress_kernels(*self._made_for)
         control = stress_control(discretisation.smoothing, cut.spacing, cut.support_radius, scene.dimension)
         self._constants: dict[str, Any] = {"control": control, "least": CLOSEST * cut.spacing}
         self._packed, self._device = Packed(parameters, layout, discretisation.taped), layout.device
