@@ -20,15 +20,12 @@ class RheologyTable(Table):
 
     def thickest(self, viscosity: float) -> float:
         """The greatest viscosity of the fluid [Pa s], for that of the phase."""
-        raise NotImplementedError
+        return viscosity
 
 
-class PowerLaw(RheologyTable):
-    """eta = viscosity (shear rate)^(flow_index - 1), of Ostwald and de Waele: viscosity is the consistency, which is
-    that at a shear rate of 1/s."""
+class Thinning(RheologyTable):
+    """What laws with a power of the shear rate have in common."""
 
-    kind: Literal["power_law"] = "power_law"
-    """Name of the law."""
     flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
     """n [-]: below 1 the fluid gets thinner where it is sheared, above 1 thicker."""
     least_shear_rate: Annotated[float, quantity("1/s", gt=0.0)] = 0.01
@@ -36,6 +33,14 @@ class PowerLaw(RheologyTable):
 
     def thickest(self, viscosity: float) -> float:
         return viscosity * max(self.least_shear_rate ** (self.flow_index - 1.0), 1.0)
+
+
+class PowerLaw(Thinning):
+    """eta = viscosity (shear rate)^(flow_index - 1), of Ostwald and de Waele: viscosity is the consistency, which is
+    that at a shear rate of 1/s."""
+
+    kind: Literal["power_law"] = "power_law"
+    """Name of the law."""
 
 
 class Carreau(RheologyTable):
@@ -71,7 +76,7 @@ class Yielding(RheologyTable):
         return {**super().numbers(viscosity), "regularisation": growth}
 
     def thickest(self, viscosity: float) -> float:
-        return viscosity + self.yield_stress * self.numbers(viscosity)["regularisation"]
+        return super().thickest(viscosity) + self.yield_stress * self.numbers(viscosity)["regularisation"]
 
 
 class Bingham(Yielding):
@@ -82,19 +87,11 @@ class Bingham(Yielding):
     """Name of the law."""
 
 
-class HerschelBulkley(Yielding):
+class HerschelBulkley(Yielding, Thinning):
     """The sum of a power law and of a yield stress, as of Bingham's: viscosity is the consistency."""
 
     kind: Literal["herschel_bulkley"] = "herschel_bulkley"
     """Name of the law."""
-    flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
-    """n [-]."""
-    least_shear_rate: Annotated[float, quantity("1/s", gt=0.0)] = 0.01
-    """Added to the shear rate in squares [1/s], so that the viscosity at rest is finite."""
-
-    def thickest(self, viscosity: float) -> float:
-        flowing = viscosity * max(self.least_shear_rate ** (self.flow_index - 1.0), 1.0)
-        return super().thickest(viscosity) - viscosity + flowing
 
 
 AnyRheology = Annotated[PowerLaw | Carreau | Bingham | HerschelBulkley, Field(discriminator="kind")]
