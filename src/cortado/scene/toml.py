@@ -41,6 +41,7 @@ def read_toml(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> di
         line = problem.object[: problem.start].count(b"\n") + 1
         raise _unreadable(file, f"is not text in UTF-8 (at line {line}).") from None
     except (ValueError, RecursionError) as problem:  # among them TOMLDecodeError, which names the line
+        problem.__traceback__ = None  # it may have a thousand frames, too many to be pickled where a library does so
         said = _TWICE.sub(r"\g<0>; entries of a list are written [[\1]]", reason(problem))
         raise _unreadable(file, f"is not valid TOML: {said}.") from None
     except OSError as problem:
