@@ -11,7 +11,13 @@ from cortado.scene.quantities import NAMES, QUANTITIES
 from finite_differences import distance
 from scenes import jet, plane, scene, two_layers
 
-SCENES = {"plane": plane, "space": scene, "two fluids": two_layers, "jet": jet}
+SCENES = {
+    "plane": plane,
+    "space": scene,
+    "two fluids": two_layers,
+    "jet": jet,
+    "projection": lambda: plane(solver={"kind": "projection", "time_step": 0.0021}),
+}
 
 
 class Weighted:
@@ -60,6 +66,25 @@ def test_the_gradient_of_a_quantity_is_that_of_forward_mode_and_of_differences(m
     gradient = problem.value_and_gradient(point)[1]
     assert paired(gradient, along) == pytest.approx(derivative, rel=1e-11)
     assert distance(problem.value, point, along, derivative, [1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7], enough=1e-6) < 1e-6
+
+
+@pytest.mark.parametrize("make", [SCENES["plane"], SCENES["projection"]])
+def test_a_loss_of_several_quantities_has_the_sum_of_their_gradients(make):
+    """Of a pressure and a speed: the adjoint of velocities at the start of a step is none of the forces in it."""
+    problem, point, along = problem_of(make, "pressure")
+    speed = Weighted("speed", 1e4)
+
+    class Both:
+        def value(self, end):
+            return problem.loss.value(end) + speed.value(end)
+
+        def adjoint(self, end):
+            return {**problem.loss.adjoint(end), **speed.adjoint(end)}
+
+    both = cortado.Problem(problem.simulation, 6, Both())
+    derivative = both.tangent(point, along)
+    assert paired(both.value_and_gradient(point)[1], along) == pytest.approx(derivative, rel=1e-11)
+    assert distance(both.value, point, along, derivative, [1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7], enough=1e-6) < 1e-6
 
 
 @pytest.mark.parametrize("name", NAMES)

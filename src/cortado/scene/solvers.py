@@ -9,7 +9,7 @@ from cortado.scene.fields import Text, count, field_error, quantity
 from cortado.scene.package_tables import Inline, PackageTable
 from cortado.scene.tables import Table
 
-OWN = ("pcisph",)
+OWN = ("pcisph", "projection")
 """The kinds that are Cortado's own."""
 
 
@@ -44,6 +44,17 @@ class PcisphSolver(SolverTable):
         return self
 
 
+class ProjectionSolver(SolverTable):
+    """How a step is solved by a projection of velocities, which pulls where fluid is on all sides."""
+
+    kind: Literal["projection"]
+    """Name of the algorithm."""
+    iterations: Annotated[int, count(1, 1_000)] = 8
+    """Iterations of the pressure in every step, each from that of the step before."""
+    repairs: Annotated[int, count(1, 1_000)] = 3
+    """Iterations in every step that bring positions back to the rest density."""
+
+
 class PackageSolver(SolverTable, PackageTable):
     """How a step is solved by a solver that an installed package registers."""
 
@@ -58,10 +69,14 @@ class PackageSolver(SolverTable, PackageTable):
 def _table_of(solver: Any) -> str:
     """Which table a solver is, by its kind."""
     kind = solver.get("kind", OWN[0]) if isinstance(solver, Mapping) else getattr(solver, "kind", OWN[0])
+    if kind == "projection":
+        return "ProjectionSolver"
     return "PackageSolver" if isinstance(kind, str) and kind.strip() and kind not in OWN else "PcisphSolver"
 
 
 AnySolver = Annotated[
-    Annotated[PcisphSolver, Tag("PcisphSolver")] | Annotated[PackageSolver, Tag("PackageSolver"), Inline()],
+    Annotated[PcisphSolver, Tag("PcisphSolver")]
+    | Annotated[ProjectionSolver, Tag("ProjectionSolver")]
+    | Annotated[PackageSolver, Tag("PackageSolver"), Inline()],
     Discriminator(_table_of),
 ]

@@ -4,13 +4,13 @@ from importlib import import_module
 
 from cortado.scene.parameters.known import REGISTRY, Known
 from cortado.scene.scene import Scene
-from cortado.scene.solvers import PackageSolver, SolverTable
+from cortado.scene.solvers import OWN, PackageSolver, SolverTable
 from cortado.solvers.makers import SolverMaker, checked_solver
 from cortado.sph.laws import LAWS
 from cortado.sph.makers import ForceMaker, checked_makers, known_of
 from cortado.sph.rheology import Rheology
 
-MODULES = {"pcisph": "cortado.solvers.pcisph.build"}
+MODULES = {kind: f"cortado.solvers.{kind}.build" for kind in OWN}
 """By the kind of Cortado's own, the module whose ``maker`` takes the table."""
 
 

@@ -4,6 +4,7 @@ from weakref import finalize
 
 import warp as wp
 
+from cortado.device.launching import add
 from cortado.particles.arrays import Fields
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particles import ParticleSolver
@@ -118,6 +119,12 @@ class ParticleAdjoint:
         own = {"acceleration_bar": self._acceleration_bar}
         context.launch(self._solver.integration.acceleration_adjoint, *self.bar.named, **own)
         self.accelerate(context, self._acceleration_bar)
+
+    def add(self, fields_bar: Fields) -> None:
+        """Adjoints of the sorted fields at the start of the step: after `predict`, which takes what the adjoint of
+        velocities is by then for that of v*."""
+        for own, total in zip(fields_bar.arrays(), self.bar.fields.arrays(), strict=True):
+            add(own, total)
 
     def accelerate(self, context: StepContext, acceleration_bar: wp.array) -> None:
         """Of `ParticleSolver.accelerate`, for the adjoint of its accelerations, (n,) vectors."""

@@ -67,6 +67,8 @@ class ParticleSolver:
     """What the solver itself carries from step to step, of particles."""
     topic = "density"
     """Of the Warp modules that have the kernels of the density."""
+    density_power = 2
+    """The pressure force of a pair has p_i over this power of its number density n_i."""
     shares: tuple[str, ...] = ()
     """Parameters of its own to whose adjoints every particle adds a share, as those of a `Force`."""
 
@@ -239,6 +241,10 @@ class ParticleSolver:
         while self.make_room():
             self.sort(state, parameters)
         return self.in_scene_order(self.fields["m"].numpy() * self.fields["n"].numpy())
+
+    def sorted_pressures(self) -> NDArray | None:
+        """(n,) of the last `step`, of sorted particles [Pa]; None of a solver or a scene without pressures."""
+        return None
 
     def in_scene_order(self, values: NDArray) -> NDArray:
         """(n,) numbers of sorted particles in the scene's order, of a batch one scene behind the other."""

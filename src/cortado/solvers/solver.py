@@ -4,7 +4,7 @@ Rollouts, gradients and the certificate know a solver by this protocol, and so d
 `cortado.solvers.particles` has what solvers of particles share; `cortado.solvers.pcisph` is one.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, Self
 
 import warp as wp
@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from cortado.device.launching import KernelLauncher
 from cortado.device.threads import Turn
+from cortado.particles.arrays import Fields
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout, Parameters, State
 from cortado.solvers.containment import Containment
-from cortado.sph.parts import StepContext
+from cortado.sph.parts import StepContext, Tangents
 
 Counts = tuple[int, ...]
 """How often each loop of a step went round: with it the step can be taken again, bit for bit."""
@@ -60,6 +61,26 @@ class StepAdjoint(Protocol):
 
     def collect(self) -> Parameters:
         """The adjoints of the parameters, of all steps since `begin`."""
+
+
+class PressureTangent(StepTangent, Protocol):
+    """That of a solver with pressures, which quantities and sensors can be differentiated through."""
+
+    dot: Tangents
+
+    def pressures(self, rounds: Sequence[int]) -> list[NDArray]:
+        """Tangents (n,) of the pressure of the last step, of sorted particles, of each scene; its first loop went round
+        so often."""
+
+
+class PressureAdjoint(StepAdjoint, Protocol):
+    """The same in reverse mode."""
+
+    def from_within(
+        self, counts: Counts, fields_bar: Fields, p_bar: wp.array, state_bar: State, parameters: Parameters
+    ) -> None:
+        """Write to ``state_bar`` the adjoint of the replayed step's state, for adjoints of its sorted fields and of its
+        pressures, (n,), with none of its result."""
 
 
 class Solver(Protocol):

@@ -12,9 +12,10 @@ import warp as wp
 from cortado.device.bundles import bundle
 from cortado.device.lanes import lane_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.sph.moment_functions import matrix_type
 from cortado.sph.packed import theta_of
 from cortado.sph.stress_forces import stress_sums
-from cortado.sph.stress_functions import matrix_type, stress_functions
+from cortado.sph.stress_functions import stress_functions
 from cortado.sph.stress_moments import moment_sums
 from cortado.sph.viscosity_law import Law
 

@@ -21,6 +21,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.precision import Precision
+from cortado.sph.moment_functions import matrix_type, moment_functions
 from cortado.sph.packed import theta_of
 from cortado.sph.viscosity_law import Law
 
@@ -53,12 +54,6 @@ class StressFunctions:
 
 
 @cache
-def matrix_type(precision: Precision) -> Any:
-    """The Warp type of 3 x 3 matrices."""
-    return wp.types.matrix(shape=(3, 3), dtype=precision.real)
-
-
-@cache
 def fluidity_function(precision: Precision) -> Any:
     """1 / mu as a Warp function, see `LEAST_VISCOSITY`."""
     real = precision.real
@@ -74,50 +69,24 @@ def fluidity_function(precision: Precision) -> Any:
 @cache
 def stress_functions(precision: Precision, dimension: int, law: Law, module: Any) -> StressFunctions:
     """Of a precision in 2 or 3 dimensions, with a law of viscosity, in a Warp module; ``control`` is C."""
-    real, vector = precision.real, precision.vector
-    matrix, fluidity = matrix_type(precision), fluidity_function(precision)
+    real, matrix, fluidity = precision.real, matrix_type(precision), fluidity_function(precision)
+    moments = moment_functions(precision, dimension)
+    fullness, inverse, smoothstep = moments.fullness, moments.inverse, moments.smoothstep
     plane = wp.constant(real(float(dimension == 2)))
-    empty, width = wp.constant(real(EMPTY)), wp.constant(real(FULL - EMPTY))
+    empty, full = wp.constant(real(EMPTY)), wp.constant(real(FULL))
     tiny, slowest = wp.constant(real(1e-12)), wp.constant(real(SLOWEST**2))
     theta_type, apparent = theta_of(precision, law.ranks), law.applied(precision, module)
 
     @wp.func
-    def moment_change(diagonal: vector, others: vector) -> matrix:
-        x, y, z = others[0], others[1], others[2]
-        return matrix(diagonal[0], z, y, z, diagonal[1], x, y, x, diagonal[2])
-
-    @wp.func
-    def moment(diagonal: vector, others: vector) -> matrix:
-        """In the plane M_zz is 1, which changes none of what lies in it."""
-        return moment_change(diagonal + vector(real(0.0), real(0.0), plane), others)
-
-    @wp.func
-    def fullness(M: matrix) -> real:
-        """S; tiny covers particles without neighbours, where H is 0."""
-        product = M[0, 0] * M[1, 1] + M[1, 1] * M[2, 2] + M[2, 2] * M[0, 0]
-        I_2 = product - M[0, 1] * M[0, 1] - M[1, 2] * M[1, 2] - M[0, 2] * M[0, 2]
-        I_3 = wp.determinant(M)
-        H = (real(3.0) - plane) * I_3 / (I_2 - plane * I_3 + tiny)
-        t = wp.clamp((H - empty) / width, real(0.0), real(1.0))
-        return t * t * (real(3.0) - real(2.0) * t)
-
-    @wp.func
-    def inverse(M: matrix) -> matrix:
-        """M^-1, by cofactors: the derivative of a determinant that is not 0."""
-        a = M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1]
-        b = M[0, 2] * M[2, 1] - M[0, 1] * M[2, 2]
-        c = M[0, 1] * M[1, 2] - M[0, 2] * M[1, 1]
-        e = M[0, 0] * M[2, 2] - M[0, 2] * M[2, 0]
-        f = M[0, 2] * M[1, 0] - M[0, 0] * M[1, 2]
-        h = M[0, 0] * M[1, 1] - M[0, 1] * M[1, 0]
-        per = real(1.0) / (M[0, 0] * a + M[1, 0] * b + M[2, 0] * c)
-        return per * matrix(a, b, c, b, e, f, c, f, h)
+    def part(M: matrix) -> real:
+        """S"""
+        return smoothstep(fullness(M), empty, full)
 
     @wp.func
     def regular(M: matrix) -> matrix:
         """M, or the unit matrix where S is 0 and nothing depends on it."""
         result = M
-        if fullness(M) == real(0.0):
+        if part(M) == real(0.0):
             result = matrix(
                 real(1.0), real(0.0), real(0.0), real(0.0), real(1.0), real(0.0), real(0.0), real(0.0), real(1.0)
             )
@@ -129,7 +98,7 @@ def stress_functions(precision: Precision, dimension: int, law: Law, module: Any
         mean = real(1.0) / (real(0.5) * fluidity(mu) + real(0.5) * R / (trace + tiny))
         G = A * inverse(regular(M))
         D = G + wp.transpose(G)
-        return fullness(M) * apparent(wp.sqrt(real(0.5) * wp.ddot(D, D) + slowest), mean, theta)
+        return part(M) * apparent(wp.sqrt(real(0.5) * wp.ddot(D, D) + slowest), mean, theta)
 
     @wp.func(module=module)
     def traction(M: matrix, A: matrix, mu: real, control: real) -> matrix:
@@ -194,4 +163,4 @@ def stress_functions(precision: Precision, dimension: int, law: Law, module: Any
         M_bar = by_M + for_M
         return real(0.5) * (M_bar + wp.transpose(M_bar)), for_A, by_A_u, for_R, for_mu, for_theta
 
-    return StressFunctions(matrix, moment, moment_change, viscosity, traction, change, back)
+    return StressFunctions(matrix, moments.whole, moments.change, viscosity, traction, change, back)

@@ -9,7 +9,8 @@ import warp as wp
 from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import rubbing_sum
-from cortado.sph.stress_functions import fluidity_function, matrix_type
+from cortado.sph.moment_functions import matrix_type
+from cortado.sph.stress_functions import fluidity_function
 from cortado.sph.wall_contact import contact_functions
 
 

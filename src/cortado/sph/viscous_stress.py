@@ -8,9 +8,9 @@ import warp as wp
 from cortado.discretise.calibration import stress_control
 from cortado.scene.parameters.parameter import Parameter
 from cortado.sph.formula import compiled
+from cortado.sph.moment_functions import matrix_type
 from cortado.sph.packed import Packed
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.stress_functions import matrix_type
 from cortado.sph.stress_kernels import stress_kernels
 from cortado.sph.viscosity_law import Law, newtonian_law
 

@@ -16,7 +16,6 @@ from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
-from cortado.solvers.pcisph.steps import PcisphSteps
 
 UNITS = {"speed": "m/s", "density": "kg/m³", "pressure": "Pa", "vorticity": "1/s", "wall_force": "N"}
 """Of what every state has."""
@@ -63,10 +62,12 @@ def densities(rollout: Rollout) -> np.ndarray:
 def pressures(rollout: Rollout) -> np.ndarray:
     """(n,) that act in the first step of a rollout of one step [Pa]."""
     solver = rollout.solver
-    if not isinstance(solver, PcisphSteps) or solver.limits is None:
-        raise InputError("This scene is computed without a pressure of particles, so that there is none to show.")
+    assert isinstance(solver, ParticleSolver)
     rollout.forward(keep=False)
-    return solver.pressures()
+    found = solver.sorted_pressures()
+    if found is None:
+        raise InputError("This scene is computed without a pressure of particles, so that there is none to show.")
+    return solver.in_scene_order(found)
 
 
 def pull_on_height(

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,7 @@ from cortado.scene.parameters.values import Arrays
 from cortado.scene.quantities import check_quantity
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver
-from cortado.solvers.pcisph.derivatives import PcisphAdjoint, PcisphTangent
-from cortado.solvers.pcisph.steps import PcisphSteps
-from cortado.solvers.solver import Counts, Solver
+from cortado.solvers.solver import Counts, PressureAdjoint, PressureTangent, Solver
 from cortado.sph.parts import StepContext
 
 OF_PRESSURE = {"pressure", "wall_force"}
@@ -118,13 +117,14 @@ class QuantityEvaluator:
     def _solve(self, replay: bool) -> tuple[StepContext, NDArray]:
         """The step, and its pressures (n,), sorted."""
         solver, rollout = self._solver, self._rollout
-        if not isinstance(solver, PcisphSteps) or solver.limits is None:
-            raise InputError("This scene is computed without a pressure of particles, so that there is none to see.")
         rollout.forward(keep=False)
+        found = solver.sorted_pressures()
+        if found is None:
+            raise InputError("This scene is computed without a pressure of particles, so that there is none to see.")
+        pressures = found.astype(np.float64)  # a replay overwrites what was found
         self._counts = rollout.log.seek(0)
-        rounds = rollout.diagnostics[solver.pressure_loop.iterations_name][0]
+        rounds = rollout.diagnostics[solver.loops[0].iterations_name][0]
         self._rounds = [int(k) for k in np.atleast_1d(rounds)]
-        pressures = solver.iterates.p[1].numpy().astype(np.float64)
         if replay:
             solver.step_number.fill_(0)
             solver.replay(rollout.initial, rollout.parameters, self._counts)
@@ -134,15 +134,14 @@ class QuantityEvaluator:
 
     def _tangent(
         self, names: Iterable[str], state_dot: State, along: Parameters
-    ) -> tuple[ParticleTangent, NDArray | None]:
+    ) -> tuple[ParticleTangent | PressureTangent, NDArray | None]:
         """That of the sorted particles, and of their pressures."""
         solver, parameters = self._solver, self._rollout.parameters
         if OF_PRESSURE.isdisjoint(names):
             own = ParticleTangent(solver, along)
             own.sort(solver.context(parameters), state_dot)
             return own, None
-        whole = solver.tangent(along)
-        assert isinstance(whole, PcisphTangent)
+        whole = cast(PressureTangent, solver.tangent(along))
         whole.step(self._counts, state_dot, parameters)
         return whole, np.concatenate(whole.pressures(self._rounds)).astype(np.float64)
 
@@ -151,10 +150,10 @@ class QuantityEvaluator:
         adjoint.begin()
         adjoint.bar.fields.assign(fields)
         adjoint.mix(context, state_bar)
-        adjoint.sort(context, state_bar)
+        adjoint.sort(context, state_bar, **{f.name: adjoint.carried_bar[f.name] for f in self._solver.carried_fields})
         return adjoint
 
-    def _from_pressure(self, fields: Fields, pressure: NDArray, state_bar: State) -> ParticleAdjoint:
+    def _from_pressure(self, fields: Fields, pressure: NDArray, state_bar: State) -> PressureAdjoint:
         adjoint, p_bar = self._pressure_adjoint, self._solver.numbers()
         p_bar.assign(pressure)
         adjoint.begin()
@@ -171,10 +170,8 @@ class QuantityEvaluator:
         return ParticleAdjoint(self._solver, 1)
 
     @cached_property
-    def _pressure_adjoint(self) -> PcisphAdjoint:
-        made = self._solver.adjoint(1)
-        assert isinstance(made, PcisphAdjoint)
-        return made
+    def _pressure_adjoint(self) -> PressureAdjoint:
+        return cast(PressureAdjoint, self._solver.adjoint(1))
 
     # ---- orders --------------------------------------------------------------------------------------------------
 

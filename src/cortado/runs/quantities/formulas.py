@@ -166,28 +166,30 @@ class Vorticity:
 
 @dataclass(frozen=True)
 class WallForceQuantity:
-    """V^2 p_i / n_i^2 g_i: see `cortado.sph.wall_slope`."""
+    """V^2 p_i / n_i^power g_i: see `cortado.sph.wall_slope`."""
 
     volume: float
     dimension: int
+    power: int
+    """That of the solver's pressure force."""
 
     def value(self, at: Particles, sums: Sums) -> NDArray:
         return (self._strength(at)[:, None] * sums(sums.walls.slope))[:, : self.dimension]
 
     def tangent(self, at: Particles, sums: Sums, dot: Particles, named: tuple[Named, ...]) -> NDArray:
         slope, change = sums(sums.walls.slope), sums(sums.walls.change, along=dot["x"])
-        strength_dot = self.volume**2 / at["n"] ** 2 * (dot.p - 2.0 * at.p * dot["n"] / at["n"])
+        strength_dot = self.volume**2 / at["n"] ** self.power * (dot.p - self.power * at.p * dot["n"] / at["n"])
         return (strength_dot[:, None] * slope + self._strength(at)[:, None] * change)[:, : self.dimension]
 
     def adjoint(self, at: Particles, sums: Sums, own: NDArray, bar: Particles) -> None:
         whole = padded(own)
         strength_bar = (whole * sums(sums.walls.slope)).sum(axis=1)
-        bar.p[:] += strength_bar * self.volume**2 / at["n"] ** 2
-        bar["n"][:] -= 2.0 * strength_bar * self._strength(at) / at["n"]
+        bar.p[:] += strength_bar * self.volume**2 / at["n"] ** self.power
+        bar["n"][:] -= self.power * strength_bar * self._strength(at) / at["n"]
         bar["x"][:] += sums(sums.walls.change, along=self._strength(at)[:, None] * whole)
 
     def _strength(self, at: Particles) -> NDArray:
-        return self.volume**2 * at.p / at["n"] ** 2
+        return self.volume**2 * at.p / at["n"] ** self.power
 
 
 def formulas(solver: ParticleSolver, dimension: int, circulation_factor: float) -> dict[str, QuantityFormula]:
@@ -197,5 +199,5 @@ def formulas(solver: ParticleSolver, dimension: int, circulation_factor: float) 
         "pressure": Pressure(),
         "speed": SpeedQuantity(),
         "vorticity": Vorticity(circulation_factor, dimension),
-        "wall_force": WallForceQuantity(solver.lattice.volume, dimension),
+        "wall_force": WallForceQuantity(solver.lattice.volume, dimension, solver.density_power),
     }

@@ -28,23 +28,20 @@ class PcisphAdjoint(ParticleAdjoint):
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         """Replace the adjoint of the replayed step's result by that of its state; adjoints of the parameters are added
         to ``bar``."""
-        self._finish(counts, state_bar, self._begin(counts, state_bar, parameters), parameters)
+        self._begin(counts, state_bar, parameters)
+        self._finish(counts, state_bar, parameters)
 
     def from_within(
         self, counts: Counts, fields_bar: Fields, p_bar: wp.array, state_bar: State, parameters: Parameters
     ) -> None:
-        """Write to ``state_bar`` the adjoint of the replayed step's state, for adjoints of its sorted fields and of the
-        pressure after the last iteration, (n,), with none of its result."""
+        """As that of `PressureAdjoint`."""
         state_bar.clear()
-        free_bar = self._begin(counts, state_bar, parameters)
-        for own, total in zip(fields_bar.arrays(), self.bar.fields.arrays(), strict=True):
-            add(own, total)
+        self._begin(counts, state_bar, parameters)
         add(p_bar, self._p_bar)
-        self._finish(counts, state_bar, free_bar, parameters)
+        self._finish(counts, state_bar, parameters, fields_bar)
 
-    def _begin(self, counts: Counts, state_bar: State, parameters: Parameters) -> State:
-        """From the adjoint of the result to that of the last prediction; returns the adjoint of what no emitter
-        prescribes."""
+    def _begin(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
+        """From the adjoint of the result to that of the last prediction."""
         (iterations,) = counts
         solver = self._solver
         context = solver.context(parameters)
@@ -59,10 +56,12 @@ class PcisphAdjoint(ParticleAdjoint):
             y_bar=self._y_bar,
             p_bar=self._p_bar,
         )
-        return free_bar
 
-    def _finish(self, counts: Counts, state_bar: State, free_bar: State, parameters: Parameters) -> None:
-        """From the adjoint of the last prediction to that of the state."""
+    def _finish(
+        self, counts: Counts, state_bar: State, parameters: Parameters, fields_bar: Fields | None = None
+    ) -> None:
+        """From the adjoint of the last prediction to that of the state, with ``fields_bar`` of the sorted fields at its
+        start."""
         (iterations,) = counts
         solver, it, kernels, scaled_bar = self._solver, self._solver.iterates, self._solver.kernels, self._scaled_bar
         context, known = solver.context(parameters), self.bar.named
@@ -85,6 +84,8 @@ class PcisphAdjoint(ParticleAdjoint):
             predicted = {"x_star": it.x_star[k], "v_star": it.v_star[k]}
             context.launch(kernels.pressure.adjoint, going, *known, r=self._r, scaled_bar=scaled_bar, **predicted)
         self.predict(context)
+        if fields_bar is not None:
+            self.add(fields_bar)
         if kernels.density_ratio:
             factors = {"t": solver.density_ratio, "y": solver.pressure_relaxation, "y_bar": self._y_bar}
             context.launch(kernels.density_ratio.factor_adjoint, **factors, t_bar=self._t_bar)
@@ -170,8 +171,7 @@ class PcisphTangent(ParticleTangent):
         self.unsort(context, self._x_star_dot, self._v_star_dot, state_dot)
 
     def pressures(self, rounds: Sequence[int]) -> list[NDArray]:
-        """Tangents (n,) of the pressure after the last iteration, of sorted particles, of each scene that went round so
-        often."""
+        """As that of `PressureTangent`."""
         own = [p_dot.numpy().reshape(len(rounds), -1) for p_dot in self._p_dot]
         return [own[(k - 1) % 2][b] for b, k in enumerate(rounds)]
 

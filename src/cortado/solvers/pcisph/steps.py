@@ -52,10 +52,8 @@ class PcisphSteps(ParticleSolver):
         it = self.iterates
         self.unsort(self.context(parameters), it.x_star[iterations], it.v_star[iterations], new_state)
 
-    def pressures(self) -> NDArray:
-        """(n,) of the last `step`, in the scene's order, of a batch one scene behind the other [Pa]; 0 without limits,
-        as nothing is iterated then."""
-        return self.in_scene_order(self.iterates.p[1].numpy())
+    def sorted_pressures(self) -> NDArray | None:
+        return None if self.limits is None else self.iterates.p[1].numpy()
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
         """Everything but the pressure, and the first prediction."""

@@ -1,0 +1,1 @@
+"""The velocity projection: it pulls as well as it pushes, and keeps particles even."""

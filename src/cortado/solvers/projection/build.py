@@ -1,0 +1,30 @@
+"""The projection as the solver of a scene."""
+
+from cortado.scene.solvers import ProjectionSolver
+from cortado.solvers.build import particle_system
+from cortado.solvers.makers import SolverSetting
+from cortado.solvers.pcisph.solver import Pcisph
+from cortado.solvers.projection.constants import ProjectionConstants
+from cortado.solvers.projection.solver import Projection
+from cortado.solvers.solver import Solver
+
+
+class ProjectionMaker:
+    """Makes the solver as the table [solver] of a scene says."""
+
+    batches = True
+
+    def __init__(self, table: ProjectionSolver):
+        self._table = table
+
+    def build(self, setting: SolverSetting) -> Solver:
+        """The solver of a scene that is cut into particles, on a device. Without pressure nothing is projected, and all
+        solvers take the same step."""
+        system, cut, table = particle_system(setting), setting.scene.discretisation, self._table
+        if not setting.scene.forces.pressure:
+            return Pcisph(system, None)
+        lattice = setting.discrete.kernel, cut.spacing, setting.discrete.lattice.support, setting.scene.dimension
+        return Projection(system, ProjectionConstants.of(*lattice), table.iterations, table.repairs)
+
+
+maker = ProjectionMaker

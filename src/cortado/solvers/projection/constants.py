@@ -1,0 +1,44 @@
+"""Constants of the projection on the lattice of the rest spacing, in float64 and without Warp."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from cortado.discretise.calibration import lattice_offsets, rest_volume
+from cortado.discretise.smoothing import SmoothingKernel
+
+MARGIN = 1.05
+"""By how much the relaxation stays below that of the lattice's stiffest wave."""
+DEPARTURE = 0.05
+"""Part of a_0 that is added to the diagonal: particles with few neighbours have a small one."""
+
+
+@dataclass(frozen=True)
+class ProjectionConstants:
+    """Of a smoothing kernel and a spacing."""
+
+    spacing: float
+    """[m]"""
+    relaxation: float
+    """omega = 1 / (1.05 lambda) of the Jacobi iteration [-]."""
+    least_diagonal: float
+    """[1 / m2], `DEPARTURE` times a_0 = sum_j |g_ij|^2."""
+    nearest_weight: float
+    """V W of two particles that are one spacing apart [-]."""
+
+    @classmethod
+    def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "ProjectionConstants":
+        """On a lattice with a spacing [m], for a support radius [m].
+
+        lambda = max_q |sum_j g_j sin(q . x_j)|^2 / a_0 is how many times too far one undamped Jacobi iteration goes in
+        the stiffest pressure wave exp(i q . x) of the lattice.
+        """
+        offsets = lattice_offsets(spacing, support, dimension)
+        volume = rest_volume(kernel, spacing, support, dimension)
+        gradients = volume * kernel.gradient(offsets, support)
+        square = float((gradients**2).sum())
+        waves = np.array(list(itertools.product(np.linspace(0.0, np.pi / spacing, 25), repeat=dimension)))
+        stiffest = float(((np.sin(waves @ offsets.T) @ gradients) ** 2).sum(axis=1).max()) / square
+        nearest = volume * float(kernel.weight(np.array([spacing]), dimension, support)[0])
+        return cls(spacing, 1.0 / (MARGIN * stiffest), DEPARTURE * square, nearest)

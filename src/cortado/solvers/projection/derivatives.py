@@ -1,0 +1,178 @@
+"""The tangent of a replayed step of the projection, and its transpose, the adjoint; every sum is a gather."""
+
+from collections.abc import Sequence
+
+import warp as wp
+from numpy.typing import NDArray
+
+from cortado.device.binding import Named
+from cortado.device.launching import add
+from cortado.particles.arrays import Fields
+from cortado.particles.state import Parameters, State
+from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
+from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
+from cortado.solvers.solver import Counts
+from cortado.sph.parts import StepContext
+
+
+def named(arrays: dict[str, wp.array], suffix: str) -> dict[str, wp.array]:
+    """Tangents or adjoints by the names that kernels have for them."""
+    return {f"{name}_{suffix}": array for name, array in arrays.items()}
+
+
+class ProjectionTangent(ParticleTangent):
+    """Forward mode, one step at a time, of a run along tangents of its parameters."""
+
+    def __init__(self, solver: ProjectionSteps, parameters_dot: Parameters):
+        super().__init__(solver, parameters_dot)
+        self._solver: ProjectionSteps = solver
+        self._around = named({name: wp.zeros_like(array) for name, array in solver.around.items()}, "dot")
+        self._x_star_dot, self._v_star_dot, self._v_new_dot = (solver.vectors() for _ in range(3))
+        self._u_dot, self._x_moved_dot, self._x_now_dot = (solver.vectors() for _ in range(3))
+        self._k_dot, self._y_dot, self._c_dot = (solver.numbers() for _ in range(3))
+
+    def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
+        """Replace the tangent of the replayed step's state by that of its result."""
+        solver, kernels = self._solver, self._solver.kernels
+        context = solver.context(parameters)
+        self.sort(context, state_dot)
+        known = (*self.dot.named, self._around, solver.around)
+        context.launch(kernels.surroundings.tangent, *known, solver.relaxed)
+        self.predict(context, solver.v_star, self._x_star_dot, self._v_star_dot)
+        start = {"k_before": solver.carried[IMPULSE], "k_before_dot": self.carried_dot[IMPULSE]}
+        steps = {"k_dot": self._k_dot, "y_dot": self._y_dot}
+        context.launch(kernels.pressure.start.tangent, *known, start, steps)
+        self._project(context, known, counts[0])
+        moved = {"v_new": solver.v_new, "v_new_dot": self._v_new_dot, "x_moved_dot": self._x_moved_dot}
+        context.launch(kernels.shift.tangent, *known, solver.kept, solver.shifted, moved)
+        wp.copy(self._x_now_dot, self._x_moved_dot)
+        self._c_dot.zero_()
+        for k in range(counts[1]):
+            at, new = solver.repaired[k], solver.repaired[k + 1]
+            measured = {"x_now": at["x_now"], "c_in": at["c"], "excess": at["excess"]}
+            change = {"x_now_dot": self._x_now_dot, "c_in_dot": self._c_dot, "c_out_dot": self._c_dot}
+            context.launch(kernels.repair.measure.tangent, *known, solver.relaxed, measured, change)
+            there = {"c": new["c"], "x_moved": solver.x_moved, "x_now": new["x_now"]}
+            change = {"c_dot": self._c_dot, "x_moved_dot": self._x_moved_dot, "x_now_dot": self._x_now_dot}
+            context.launch(kernels.repair.move.tangent, *known, there, change)
+        self.unsort(context, self._x_now_dot, self._v_new_dot, state_dot, **{IMPULSE: self._k_dot})
+
+    def pressures(self, rounds: Sequence[int]) -> list[NDArray]:
+        """As that of `PressureTangent`."""
+        solver = self._solver
+        k, k_dot = (a.numpy().reshape(len(rounds), -1) for a in (solver.iterates[rounds[0]]["k"], self._k_dot))
+        dt = solver.parameters["time_step"].numpy()[:, None]
+        dt_dot = self.dot.parameters["time_step"].numpy()[:, None]
+        return list(k_dot / dt - k * dt_dot / dt**2)
+
+    def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
+        """The iterations, and the new velocities."""
+        solver, kernels, velocity = self._solver, self._solver.kernels.pressure, self._solver.kernels.velocity
+        predicted = {"v_star": solver.v_star, "v_star_dot": self._v_star_dot}
+        for k in range(iterations):
+            at = solver.iterates[k]
+            change = {"u_dot": self._u_dot, "y_dot": self._y_dot, "k_dot": self._k_dot}
+            context.launch(velocity.velocity.tangent, *known, at, predicted, change)
+            new = {"k_out_dot": self._k_dot, "y_out_dot": self._y_dot, "beta": solver.momenta[k]}
+            context.launch(kernels.update.tangent, *known, at, solver.relaxed, change, new)
+        last = {"y": solver.iterates[iterations]["k"], "y_dot": self._k_dot}
+        context.launch(velocity.velocity.tangent, *known, predicted, last, u=solver.v_new, u_dot=self._v_new_dot)
+
+
+class ProjectionAdjoint(ParticleAdjoint):
+    """Reverse mode, one step at a time, of a run with some parameters."""
+
+    def __init__(self, solver: ProjectionSteps, steps: int):
+        super().__init__(solver, steps)
+        self._solver: ProjectionSteps = solver
+        self._around = named({name: wp.zeros_like(array) for name, array in solver.around.items()}, "bar")
+        self._kept = named({name: wp.zeros_like(array) for name, array in solver.kept.items()}, "bar")
+        self._x_now_bar, self._x_moved_bar, self._v_new_bar, self._f = (solver.vectors() for _ in range(4))
+        self._m_unused, self._k_before_bar, self._n_now_bar = (solver.numbers() for _ in range(3))
+        self._k_bar, self._y_bar, self._c_bar, self._d_bar = (solver.numbers() for _ in range(4))
+
+    def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
+        """Replace the adjoint of the replayed step's result by that of its state."""
+        self._begin(state_bar, parameters)
+        self._finish(counts, state_bar, parameters)
+
+    def from_within(
+        self, counts: Counts, fields_bar: Fields, p_bar: wp.array, state_bar: State, parameters: Parameters
+    ) -> None:
+        """As that of `PressureAdjoint`."""
+        solver = self._solver
+        state_bar.clear()
+        self._begin(state_bar, parameters)
+        own = {"k": solver.iterates[counts[0]]["k"], "p_bar": p_bar, "k_bar": self._k_bar}
+        solver.context(parameters).launch(solver.kernels.pressure.pressed_adjoint, *self.bar.named, own)
+        self._finish(counts, state_bar, parameters, fields_bar)
+
+    def _begin(self, state_bar: State, parameters: Parameters) -> None:
+        """From the adjoint of the result to those of the last positions, velocities and k."""
+        solver, context = self._solver, self._solver.context(parameters)
+        free_bar = self.unsort(context, state_bar)
+        scene = {
+            "x_scene": free_bar.positions,
+            "v_scene": free_bar.velocities,
+            "m_scene": state_bar["reference_density"],
+        }
+        new = {"x": self._x_now_bar, "v": self._v_new_bar, "m": self._m_unused}
+        context.launch(solver.integration.sort, scene, new)
+        for array in (*self.bar.fields.arrays(), *self._around.values(), self._x_moved_bar, self._c_bar, self._y_bar):
+            array.zero_()
+        wp.copy(self._k_bar, self.carried_bar[IMPULSE])
+
+    def _finish(
+        self, counts: Counts, state_bar: State, parameters: Parameters, fields_bar: Fields | None = None
+    ) -> None:
+        """From there to the adjoint of the state, with ``fields_bar`` of the sorted fields at its start."""
+        solver, kernels, context = self._solver, self._solver.kernels, self._solver.context(parameters)
+        known = (*self.bar.named, self._around, solver.around)
+        self._mend(context, known, counts[1])
+        moved = {"v_new": solver.v_new, "v_new_bar": self._v_new_bar, "x_moved_bar": self._x_moved_bar}
+        own, sums = kernels.shift.adjoint
+        for kernel in (own, sums):
+            context.launch(kernel, *known, self._kept, solver.kept, solver.shifted, moved)
+        self._project(context, known, counts[0])
+        start = {"k_before": solver.carried[IMPULSE], "k_before_bar": self._k_before_bar}
+        context.launch(kernels.pressure.start.adjoint, *known, start, k_bar=self._k_bar, y_bar=self._y_bar)
+        own, sums = kernels.surroundings.adjoint
+        for kernel in (own, sums):
+            context.launch(kernel, *known, solver.relaxed)
+        context.launch(kernels.velocity.time_adjoint, *known, acceleration=solver.accelerations[-1])
+        self.predict(context)
+        if fields_bar is not None:
+            self.add(fields_bar)
+        self.mix(context, state_bar)
+        self.sort(context, state_bar, **{IMPULSE: self._k_before_bar})
+
+    def _mend(self, context: StepContext, known: tuple[Named, ...], repairs: int) -> None:
+        """Of the repairs, to the adjoint of the positions before them."""
+        solver, kernels = self._solver, self._solver.kernels.repair
+        begin, move = kernels.move.adjoint
+        for k in reversed(range(repairs)):
+            at, new = solver.repaired[k], solver.repaired[k + 1]
+            bars = {"x_now_bar": self._x_now_bar, "x_moved_bar": self._x_moved_bar, "f": self._f}
+            context.launch(begin, *known, bars, x_now=new["x_now"], x_moved=solver.x_moved)
+            measured = {"c_in": at["c"], "c_out": new["c"], "excess": at["excess"]}
+            own = {"c_bar": self._c_bar, "n_now_bar": self._n_now_bar, "f": self._f}
+            context.launch(move, *known, solver.relaxed, measured, own)
+            own = {"x_now": at["x_now"], "n_now_bar": self._n_now_bar, "x_now_bar": self._x_now_bar}
+            context.launch(kernels.measure.adjoint, *known, own)
+        add(self._x_now_bar, self._x_moved_bar)
+
+    def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
+        """Of the new velocities and of the iterations, to the adjoints of v* and of the first k."""
+        solver, kernels, velocity = self._solver, self._solver.kernels.pressure, self._solver.kernels.velocity
+        last = {"u": solver.v_new, "u_bar": self._v_new_bar, "v_star": solver.v_star, "f": self._f}
+        context.launch(velocity.end_adjoint, *known, last)
+        context.launch(
+            velocity.velocity.adjoint, *known, y=solver.iterates[iterations]["k"], y_bar=self._k_bar, f=self._f
+        )
+        clamp, divergence = kernels.update.adjoint
+        steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar}
+        for k in reversed(range(iterations)):
+            at = solver.iterates[k]
+            context.launch(clamp, *known, at, solver.relaxed, steps, beta=solver.momenta[k])
+            context.launch(divergence, *known, at, steps, v_star=solver.v_star, f=self._f)
+            context.launch(velocity.velocity.adjoint, *known, at, steps, f=self._f)

@@ -1,0 +1,289 @@
+"""The projection of velocities, by accelerated Jacobi iterations with a leaky clamp.
+
+With k = dt p, the divergence D and its transpose, which is the force,
+
+    (D v)_i = L_i : sum_j g_ij v_ij^T + gamma_i . v_i,   (D^T k)_i = sum_j (k_i L_i + k_j L_j) g_ij + k_i gamma_i,
+
+an iteration from y, an extrapolation of k (Nesterov 1983), is
+
+    v = v* - D^T y / m,   z+ = y + omega (D v - b) / a,   z- = y + omega D v / a,
+    k' = z+ if z+ > 0;  sigma z- if z- < 0;  else 0,   y' = k' + beta (k' - k).
+
+b = (1 - f) max(1 - n, 0) / dt lets fluid that is scattered come together before it resists; the first k is f times
+that of the step before. Tension is let through by sigma, where particles are surrounded. Slopes of the clamp and of the
+maximum have corners, at which one of the two derivatives is taken. The result is v* - D^T k / m.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from cortado.device.bundles import bundle
+from cortado.device.kernels import Kernels
+from cortado.device.lanes import lane_functions
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.solvers.projection.sums import projection_sums
+from cortado.solvers.projection.surroundings import entries, weights_type
+from cortado.solvers.projection.velocity import symmetric_part
+
+
+@dataclass(frozen=True)
+class PressureKernels:
+    """Of the projection."""
+
+    start: Kernels
+    """The first k of a step."""
+    update: Kernels
+    """k' and y'; its adjoint are two kernels, that of the clamp and that of D."""
+    pressed_adjoint: wp.Kernel
+    """From the adjoint of p = k / dt to those of k and dt."""
+
+
+@cache
+def pressure_kernels(discretisation: Discretisation, dimension: int) -> PressureKernels:
+    """In 2 or 3 dimensions."""
+    precision = discretisation.precision
+    real, vector, pair_of = precision.real, precision.vector, precision.pair
+    neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
+    symmetric = symmetric_part(precision)
+    spread, spread_tangent, spread_back = sums.spread, sums.spread_tangent, sums.spread_back
+    topic = f"projection_{dimension}d"
+    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
+    adjoint_module = discretisation.module(False, topic)
+    weights4 = weights_type(precision)
+    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "a", "weights")}
+    seen = bundle(**own)
+    bars = bundle(x=vector, v=vector, n=real, m=real, time_step=real, **own)
+    iterate = bundle(u=vector, d=real, y=real, k=real)
+    LANES = discretisation.lanes
+    lane = lane_functions(precision, LANES).lane
+
+    @wp.func
+    def wanted(n: real, full: real, dt: real) -> real:
+        """b"""
+        return (real(1.0) - full) * wp.max(real(1.0) - n, real(0.0)) / dt
+
+    @wp.kernel(module=module)
+    def start(
+        k_before: wp.array(dtype=real),
+        weights: wp.array(dtype=weights4),
+        # out
+        k: wp.array(dtype=real),
+        y: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        first = weights[i][1] * k_before[i]
+        k[i] = first
+        y[i] = first
+
+    @wp.kernel(module=tangent_module, enable_backward=False)
+    def start_tangent(
+        k_before: wp.array(dtype=real),
+        k_before_dot: wp.array(dtype=real),
+        weights: wp.array(dtype=weights4),
+        weights_dot: wp.array(dtype=weights4),
+        # out
+        k_dot: wp.array(dtype=real),
+        y_dot: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        first = weights_dot[i][1] * k_before[i] + weights[i][1] * k_before_dot[i]
+        k_dot[i] = first
+        y_dot[i] = first
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def start_adjoint(
+        k_before: wp.array(dtype=real),
+        weights: wp.array(dtype=weights4),
+        k_bar: wp.array(dtype=real),
+        y_bar: wp.array(dtype=real),
+        # in and out
+        weights_bar: wp.array(dtype=weights4),
+        # out
+        k_before_bar: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        bar, no = k_bar[i] + y_bar[i], real(0.0)
+        k_before_bar[i] = weights[i][1] * bar
+        weights_bar[i] = weights_bar[i] + weights4(no, k_before[i] * bar, no, no)
+
+    @wp.kernel(module=module)
+    def update(
+        s: neighbourhood,
+        omega: real,
+        beta: real,
+        time_step: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        n: wp.array(dtype=real),
+        of: seen,
+        at: iterate,
+        # out
+        k_out: wp.array(dtype=real),
+        y_out: wp.array(dtype=real),
+        error: wp.array(dtype=pair_of),
+    ):
+        """``error``: the divergence that is not wanted, times the time step, twice (for a sum and a maximum). The
+        divergence is written to ``at``."""
+        i = s.first + wp.tid() // LANES
+        row_x, row_y, row_z = spread(i, x, at.u, s)
+        if lane() > 0:
+            return
+        dt = time_step[i // s.particles]
+        D = wp.ddot(of.L[i], wp.matrix_from_rows(row_x, row_y, row_z)) + wp.dot(of.gamma[i], at.u[i])
+        b = wanted(n[i], of.weights[i][1], dt)
+        per = omega / of.a[i]
+        up = at.y[i] + per * (D - b)
+        down = at.y[i] + per * D
+        new = real(0.0)
+        left = real(0.0)
+        if up > real(0.0):
+            new = up
+            left = D - b
+        elif down < real(0.0):
+            new = of.weights[i][0] * down
+            left = of.weights[i][0] * D
+        elif not (up <= real(0.0)):  # NaN, which must not be hidden
+            new = up
+        at.d[i] = D
+        y_out[i] = new + beta * (new - at.k[i])  # before k, which may be the same array
+        k_out[i] = new
+        error[i] = pair_of(dt * wp.abs(left), dt * wp.abs(left))
+
+    @wp.kernel(module=tangent_module, enable_backward=False)
+    def update_tangent(
+        s: neighbourhood,
+        omega: real,
+        beta: real,
+        time_step: wp.array(dtype=real),
+        time_step_dot: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        n: wp.array(dtype=real),
+        n_dot: wp.array(dtype=real),
+        of: seen,
+        at: iterate,
+        dot: bundle(u=vector, y=real, k=real, **own),
+        # out
+        k_out_dot: wp.array(dtype=real),
+        y_out_dot: wp.array(dtype=real),
+    ):
+        i = s.first + wp.tid() // LANES
+        row_x, row_y, row_z = spread_tangent(i, x, x_dot, at.u, dot.u, s)
+        own_x, own_y, own_z = spread(i, x, at.u, s)
+        if lane() > 0:
+            return
+        member = i // s.particles
+        dt = time_step[member]
+        D_dot = wp.ddot(of.L[i], wp.matrix_from_rows(row_x, row_y, row_z))
+        D_dot += wp.ddot(dot.L[i], wp.matrix_from_rows(own_x, own_y, own_z))
+        D_dot += wp.dot(of.gamma[i], dot.u[i]) + wp.dot(dot.gamma[i], at.u[i])
+        D, full = at.d[i], of.weights[i][1]
+        b = wanted(n[i], full, dt)
+        b_dot = -b * time_step_dot[member] / dt
+        if n[i] < real(1.0):
+            b_dot -= ((real(1.0) - full) * n_dot[i] + dot.weights[i][1] * (real(1.0) - n[i])) / dt
+        per = omega / of.a[i]
+        per_dot = -per * dot.a[i] / of.a[i]
+        up = at.y[i] + per * (D - b)
+        down = at.y[i] + per * D
+        new = real(0.0)
+        if up > real(0.0):
+            new = dot.y[i] + per_dot * (D - b) + per * (D_dot - b_dot)
+        elif down < real(0.0):
+            change = dot.y[i] + per_dot * D + per * D_dot
+            new = dot.weights[i][0] * down + of.weights[i][0] * change
+        y_out_dot[i] = new + beta * (new - dot.k[i])  # before k, which may be the same array
+        k_out_dot[i] = new
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def clamp_adjoint(
+        particles: int,
+        omega: real,
+        beta: real,
+        time_step: wp.array(dtype=real),
+        n: wp.array(dtype=real),
+        of: seen,
+        at: iterate,
+        # in and out: at first those of k' and y', at last those of k and y
+        k_bar: wp.array(dtype=real),
+        y_bar: wp.array(dtype=real),
+        bar: bars,
+        # out
+        d_bar: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        dt = time_step[i // particles]
+        D, full, a = at.d[i], of.weights[i][1], of.a[i]
+        b = wanted(n[i], full, dt)
+        per = omega / a
+        up = at.y[i] + per * (D - b)
+        down = at.y[i] + per * D
+        new_bar = k_bar[i] + (real(1.0) + beta) * y_bar[i]
+        z_bar, b_bar, gap, tension_bar = real(0.0), real(0.0), real(0.0), real(0.0)
+        if up > real(0.0):
+            z_bar = new_bar
+            b_bar = -per * new_bar
+            gap = D - b
+        elif down < real(0.0):
+            z_bar = of.weights[i][0] * new_bar
+            tension_bar = down * new_bar
+            gap = D
+        full_bar = real(0.0)
+        if n[i] < real(1.0):
+            bar.n[i] = bar.n[i] - (real(1.0) - full) / dt * b_bar
+            full_bar = -(real(1.0) - n[i]) / dt * b_bar
+        bar.weights[i] = bar.weights[i] + weights4(tension_bar, full_bar, real(0.0), real(0.0))
+        bar.time_step[i] = bar.time_step[i] - b / dt * b_bar
+        bar.a[i] = bar.a[i] - per * gap / a * z_bar
+        k_bar[i] = -beta * y_bar[i]
+        y_bar[i] = z_bar
+        d_bar[i] = per * z_bar
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def divergence_adjoint(
+        s: neighbourhood,
+        x: wp.array(dtype=vector),
+        m: wp.array(dtype=real),
+        v_star: wp.array(dtype=vector),
+        u: wp.array(dtype=vector),
+        of: seen,
+        d_bar: wp.array(dtype=real),
+        # in and out
+        bar: bars,
+        # out
+        f: wp.array(dtype=vector),
+    ):
+        """From that of D to f = -u_bar / m, and to that of v*, of which u = v* - ... is made."""
+        i = s.first + wp.tid() // LANES
+        u_part, x_part, row_x, row_y, row_z = spread_back(i, x, u, d_bar, of.L, s)
+        if lane() > 0:
+            return
+        u_bar = u_part + d_bar[i] * of.gamma[i]
+        bar.L[i] = bar.L[i] + d_bar[i] * symmetric(row_x, row_y, row_z)
+        bar.gamma[i] = bar.gamma[i] + d_bar[i] * u[i]
+        bar.x[i] = bar.x[i] + x_part
+        bar.v[i] = bar.v[i] + u_bar
+        bar.m[i] = bar.m[i] + wp.dot(u_bar, v_star[i] - u[i]) / m[i]
+        f[i] = -u_bar / m[i]
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def pressed_adjoint(
+        particles: int,
+        time_step: wp.array(dtype=real),
+        k: wp.array(dtype=real),
+        p_bar: wp.array(dtype=real),
+        # in and out
+        k_bar: wp.array(dtype=real),
+        time_step_bar: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        dt = time_step[i // particles]
+        k_bar[i] = k_bar[i] + p_bar[i] / dt
+        time_step_bar[i] = time_step_bar[i] - k[i] / (dt * dt) * p_bar[i]
+
+    return PressureKernels(
+        Kernels(start, start_tangent, start_adjoint),
+        Kernels(update, update_tangent, (clamp_adjoint, divergence_adjoint)),
+        pressed_adjoint,
+    )

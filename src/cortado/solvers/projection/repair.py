@@ -1,0 +1,215 @@
+"""Density is repaired in positions alone, by Jacobi iterations from x', the positions after the shift:
+
+    lambda' = z if z > 0, else r z,   z = lambda + omega / 2 (n(x_k) - 1) / a,
+    x_k+1 = x' - (sum_j (lambda'_i + lambda'_j) g_ij + lambda'_i gamma_i) / m.
+
+Velocities stay as they are: in them a repair would be a force that acts once more in the next step. r of
+`cortado.solvers.projection.surroundings` lets low densities be repaired in the interior alone. g and a are those of
+the start of the step, n is that of the positions, over the neighbours of the start.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from cortado.device.bundles import bundle
+from cortado.device.kernels import Kernels
+from cortado.device.lanes import lane_functions
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.solvers.projection.sums import projection_sums
+from cortado.solvers.projection.surroundings import entries, weights_type
+from cortado.sph.density import density_sums
+
+
+@dataclass(frozen=True)
+class RepairKernels:
+    """Of one iteration."""
+
+    measure: Kernels
+    """lambda' from n(x_k)."""
+    move: Kernels
+    """x_k+1 from lambda'."""
+
+
+@cache
+def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKernels:
+    """In 2 or 3 dimensions."""
+    precision = discretisation.precision
+    real, vector, pair_of = precision.real, precision.vector, precision.pair
+    neighbourhood, weights4 = neighbourhood_type(precision), weights_type(precision)
+    sums, densities = projection_sums(discretisation), density_sums(discretisation)
+    push, push_tangent, push_back = sums.push, sums.push_tangent, sums.push_back
+    weights, weights_tangent, weights_adjoint = (
+        densities.weights,
+        densities.weights_tangent,
+        densities.weights_adjoint,
+    )
+    topic = f"projection_{dimension}d"
+    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
+    adjoint_module = discretisation.module(False, topic)
+    own = {name: kind for name, kind in entries(precision).items() if name in ("gamma", "a", "weights")}
+    seen, bars = bundle(**own), bundle(x=vector, m=real, **own)
+    LANES = discretisation.lanes
+    lane = lane_functions(precision, LANES).lane
+
+    @wp.kernel(module=module)
+    def measure(
+        s: neighbourhood,
+        omega: real,
+        of: seen,
+        x_now: wp.array(dtype=vector),
+        c_in: wp.array(dtype=real),
+        # out
+        c_out: wp.array(dtype=real),
+        excess: wp.array(dtype=real),
+        error: wp.array(dtype=pair_of),
+    ):
+        """``c`` is lambda, ``excess`` n - 1, and ``error`` the compression, twice (for a sum and a maximum)."""
+        i = s.first + wp.tid() // LANES
+        total = weights(i, x_now, s)
+        if lane() > 0:
+            return
+        over = s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - real(1.0)
+        z = c_in[i] + real(0.5) * omega * over / of.a[i]
+        if z < real(0.0):
+            z = of.weights[i][3] * z
+        compression = wp.max(over, real(0.0))
+        c_out[i] = z
+        excess[i] = over
+        error[i] = pair_of(compression, compression)
+
+    @wp.kernel(module=tangent_module, enable_backward=False)
+    def measure_tangent(
+        s: neighbourhood,
+        omega: real,
+        of: seen,
+        dot: seen,
+        x_now: wp.array(dtype=vector),
+        x_now_dot: wp.array(dtype=vector),
+        c_in: wp.array(dtype=real),
+        c_in_dot: wp.array(dtype=real),
+        excess: wp.array(dtype=real),
+        # out
+        c_out_dot: wp.array(dtype=real),
+    ):
+        i = s.first + wp.tid() // LANES
+        total = weights_tangent(i, x_now, x_now_dot, s)
+        if lane() > 0:
+            return
+        per = real(0.5) * omega / of.a[i]
+        z = c_in[i] + per * excess[i]
+        z_dot = c_in_dot[i] + per * (s.volume * total - dot.a[i] / of.a[i] * excess[i])
+        if z < real(0.0):
+            z_dot = of.weights[i][3] * z_dot + dot.weights[i][3] * z
+        c_out_dot[i] = z_dot
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def measure_adjoint(
+        s: neighbourhood,
+        x_now: wp.array(dtype=vector),
+        n_now_bar: wp.array(dtype=real),
+        # out
+        x_now_bar: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        total = weights_adjoint(i, x_now, n_now_bar, s)
+        if lane() > 0:
+            return
+        x_now_bar[i] = s.volume * total
+
+    @wp.kernel(module=module)
+    def move(
+        s: neighbourhood,
+        x: wp.array(dtype=vector),
+        m: wp.array(dtype=real),
+        gamma: wp.array(dtype=vector),
+        c: wp.array(dtype=real),
+        x_moved: wp.array(dtype=vector),
+        # out
+        x_now: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        total = push(i, x, c, s)
+        if lane() > 0:
+            return
+        x_now[i] = x_moved[i] - (total + c[i] * gamma[i]) / m[i]
+
+    @wp.kernel(module=tangent_module, enable_backward=False)
+    def move_tangent(
+        s: neighbourhood,
+        x: wp.array(dtype=vector),
+        m: wp.array(dtype=real),
+        gamma: wp.array(dtype=vector),
+        c: wp.array(dtype=real),
+        x_moved: wp.array(dtype=vector),
+        x_now: wp.array(dtype=vector),
+        dot: bundle(x=vector, m=real, gamma=vector, c=real, x_moved=vector),
+        # out
+        x_now_dot: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        total = push_tangent(i, x, dot.x, c, dot.c, s)
+        if lane() > 0:
+            return
+        change = total + dot.c[i] * gamma[i] + c[i] * dot.gamma[i]
+        x_now_dot[i] = dot.x_moved[i] - (change + dot.m[i] * (x_now[i] - x_moved[i])) / m[i]
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def begin_adjoint(
+        m: wp.array(dtype=real),
+        x_now: wp.array(dtype=vector),
+        x_moved: wp.array(dtype=vector),
+        x_now_bar: wp.array(dtype=vector),
+        # in and out
+        m_bar: wp.array(dtype=real),
+        x_moved_bar: wp.array(dtype=vector),
+        # out
+        f: wp.array(dtype=vector),
+    ):
+        """Of a particle's own part in x_k+1; f is the adjoint of the sum."""
+        i = wp.tid()
+        bar = x_now_bar[i]
+        x_moved_bar[i] = x_moved_bar[i] + bar
+        m_bar[i] = m_bar[i] + wp.dot(bar, x_moved[i] - x_now[i]) / m[i]
+        f[i] = -bar / m[i]
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def move_adjoint(
+        s: neighbourhood,
+        omega: real,
+        x: wp.array(dtype=vector),
+        of: seen,
+        c_in: wp.array(dtype=real),
+        c_out: wp.array(dtype=real),
+        excess: wp.array(dtype=real),
+        f: wp.array(dtype=vector),
+        # in and out: at first that of lambda', at last that of lambda
+        c_bar: wp.array(dtype=real),
+        bar: bars,
+        # out
+        n_now_bar: wp.array(dtype=real),
+    ):
+        """Of the sum, and of lambda' by n."""
+        i = s.first + wp.tid() // LANES
+        by_c, x_part = push_back(i, x, c_out, f, s)
+        if lane() > 0:
+            return
+        a = of.a[i]
+        per = real(0.5) * omega / a
+        z_bar = c_bar[i] + by_c + wp.dot(of.gamma[i], f[i])
+        z = c_in[i] + per * excess[i]
+        if z < real(0.0):
+            no = real(0.0)
+            bar.weights[i] = bar.weights[i] + weights4(no, no, no, z * z_bar)
+            z_bar = of.weights[i][3] * z_bar
+        bar.gamma[i] = bar.gamma[i] + c_out[i] * f[i]
+        bar.a[i] = bar.a[i] - per * excess[i] / a * z_bar
+        bar.x[i] = bar.x[i] + x_part
+        n_now_bar[i] = per * z_bar
+        c_bar[i] = z_bar
+
+    return RepairKernels(
+        Kernels(measure, measure_tangent, measure_adjoint),
+        Kernels(move, move_tangent, (begin_adjoint, move_adjoint)),
+    )

@@ -1,0 +1,271 @@
+"""Particles of the interior are shifted to where they are fewer (Lind et al. 2012; Skillen, Lind, Stansby and Rogers
+2013), at a rate that follows the velocity gradient, so that a fluid at rest is not stirred:
+
+    delta = -20 dt |grad v| s^2 u P grad C,   grad C = sum_j (1 + (V W_ij / (V W(s)))^4 / 5) g_ij + gamma / 2,
+
+softly bounded by 0.1 s. P takes out the direction of the surface, g + gamma / 2, and u of
+`cortado.solvers.projection.surroundings` is 0 at surfaces. Velocities stay as they are: with a correction by
+(delta . grad) v the fluid gains energy. The new position is x + dt v + delta.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.bundles import bundle
+from cortado.device.kernels import Kernels
+from cortado.device.lanes import lane_functions
+from cortado.device.precision import Precision
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.pair_sums import fluid_sum
+from cortado.solvers.projection.surroundings import entries, surrounding_functions, weights_type
+from cortado.sph.moment_functions import matrix_type
+
+RATE = 20.0
+"""How fast particles are shifted."""
+CROWDED = 0.2
+"""How much more pairs count that are close (Monaghan 2000)."""
+FARTHEST = 0.1
+"""In spacings: how far a particle is shifted in a step, at most."""
+SURFACE = 0.03
+"""|g| s below which the direction of a surface is not known."""
+SLOWEST = 1e-6
+"""Velocity gradient [1 / s] that is added to that of the fluid, in squares: at rest |grad v| has a derivative."""
+
+
+@dataclass(frozen=True)
+class ShiftFunctions:
+    """Warp functions of one particle."""
+
+    shift: Any
+    """delta of A, the sum of g_ij in grad C, M, g, gamma, u, dt and s."""
+    back: Any
+    """For an adjoint of delta, those of all but s."""
+
+
+@cache
+def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftFunctions:
+    """In 2 or 3 dimensions, in a Warp module. A is sum_j v_ij g_ij^T."""
+    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    inverse = surrounding_functions(precision, dimension, module).inverse
+    per_time, farthest = wp.constant(real(RATE)), wp.constant(real(FARTHEST))
+    surface, slowest = wp.constant(real(SURFACE**2)), wp.constant(real(SLOWEST**2))
+
+    @wp.func
+    def shift(
+        A: matrix, crowd: vector, M: matrix, g: vector, gamma: vector, u: real, dt: real, spacing: real
+    ) -> vector:
+        G = A * inverse(M)
+        rate = wp.sqrt(wp.ddot(G, G) + slowest)
+        out, slope = g + real(0.5) * gamma, crowd + real(0.5) * gamma
+        square = wp.dot(out, out) + surface / (spacing * spacing)
+        along = slope - (wp.dot(out, slope) / square) * out
+        wish = (-per_time * dt * rate * spacing * spacing * u) * along
+        most = farthest * spacing
+        return wish / wp.sqrt(real(1.0) + wp.dot(wish, wish) / (most * most))
+
+    @wp.func(module=module)
+    def work(
+        A: matrix,
+        crowd: vector,
+        M: matrix,
+        g: vector,
+        gamma: vector,
+        u: real,
+        dt: real,
+        spacing: real,
+        bar: vector,
+    ) -> real:
+        return wp.dot(shift(A, crowd, M, g, gamma, u, dt, spacing), bar)
+
+    @wp.func(module=module)
+    def back(
+        A: matrix,
+        crowd: vector,
+        M: matrix,
+        g: vector,
+        gamma: vector,
+        u: real,
+        dt: real,
+        spacing: real,
+        bar: vector,
+    ):
+        by_A, by_crowd, by_M, by_g, by_gamma, by_u, by_dt, _s, _bar = wp.grad(work)(
+            A, crowd, M, g, gamma, u, dt, spacing, bar
+        )
+        return by_A, by_crowd, real(0.5) * (by_M + wp.transpose(by_M)), by_g, by_gamma, by_u, by_dt
+
+    return ShiftFunctions(shift, back)
+
+
+@cache
+def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
+    """The kernels of the new positions; the adjoint are two, that of a particle's own and that of its sums."""
+    precision = discretisation.precision
+    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    neighbourhood, weights4 = neighbourhood_type(precision), weights_type(precision)
+    pair = pair_functions(discretisation)
+    weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product
+    topic = f"projection_{dimension}d"
+    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
+    adjoint_module = discretisation.module(False, topic)
+    shift_of = shift_functions(precision, dimension, module).shift
+    along = shift_functions(precision, dimension, tangent_module).back
+    back = shift_functions(precision, dimension, adjoint_module).back
+    own = {name: kind for name, kind in entries(precision).items() if name in ("M", "g", "gamma", "weights")}
+    seen, bars = bundle(**own), bundle(x=vector, time_step=real, **own)
+    kept = bundle(A=matrix, crowd=vector)
+    crowded = wp.constant(real(CROWDED))
+    LANES = discretisation.lanes
+    lane = lane_functions(precision, LANES).lane
+
+    @fluid_sum(discretisation)
+    def crowding(x_ij: vector, v_ij: vector, nearest: real, s: neighbourhood) -> tuple[vector, vector, vector, vector]:
+        g = s.volume * gradient(x_ij, s)
+        near = s.volume * weight(x_ij, s) / nearest
+        square = near * near
+        return v_ij[0] * g, v_ij[1] * g, v_ij[2] * g, (real(1.0) + crowded * square * square) * g
+
+    @fluid_sum(discretisation, ahead=False)
+    def crowding_tangent(
+        x_ij: vector, x_dot_ij: vector, v_ij: vector, v_dot_ij: vector, nearest: real, s: neighbourhood
+    ) -> tuple[vector, vector, vector, vector]:
+        g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
+        near = s.volume * weight(x_ij, s) / nearest
+        square = near * near
+        more = real(4.0) * crowded * square * near * wp.dot(g, x_dot_ij) / nearest
+        return (
+            v_dot_ij[0] * g + v_ij[0] * g_dot,
+            v_dot_ij[1] * g + v_ij[1] * g_dot,
+            v_dot_ij[2] * g + v_ij[2] * g_dot,
+            (real(1.0) + crowded * square * square) * g_dot + more * g,
+        )
+
+    @fluid_sum(discretisation)
+    def crowding_back(
+        x_ij: vector,
+        v_ij: vector,
+        A_bar_i: matrix,
+        A_bar_j: matrix,
+        crowd_bar_ij: vector,
+        nearest: real,
+        s: neighbourhood,
+    ) -> tuple[vector, vector]:
+        """What v and x are given."""
+        g = s.volume * gradient(x_ij, s)
+        near = s.volume * weight(x_ij, s) / nearest
+        square, both = near * near, A_bar_i + A_bar_j
+        more = real(4.0) * crowded * square * near * wp.dot(g, crowd_bar_ij) / nearest
+        pulled = wp.transpose(both) * v_ij + (real(1.0) + crowded * square * square) * crowd_bar_ij
+        return both * g, s.volume * hessian_product(x_ij, pulled, s) + more * g
+
+    @wp.kernel(module=module)
+    def new_positions(
+        s: neighbourhood,
+        nearest: real,
+        spacing: real,
+        time_step: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        v_new: wp.array(dtype=vector),
+        of: seen,
+        # out
+        kept: kept,
+        x_moved: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        row_x, row_y, row_z, crowd = crowding(i, x, v_new, nearest, s)
+        if lane() > 0:
+            return
+        dt, A = time_step[i // s.particles], wp.matrix_from_rows(row_x, row_y, row_z)
+        delta = shift_of(A, crowd, of.M[i], of.g[i], of.gamma[i], of.weights[i][2], dt, spacing)
+        kept.A[i] = A
+        kept.crowd[i] = crowd
+        x_moved[i] = x[i] + dt * v_new[i] + delta
+
+    @wp.kernel(module=tangent_module, enable_backward=False)
+    def new_positions_tangent(
+        s: neighbourhood,
+        nearest: real,
+        spacing: real,
+        time_step: wp.array(dtype=real),
+        time_step_dot: wp.array(dtype=real),
+        x: wp.array(dtype=vector),
+        v_new: wp.array(dtype=vector),
+        of: seen,
+        kept: kept,
+        dot: bundle(x=vector, v_new=vector, **own),
+        # out
+        x_moved_dot: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        row_x, row_y, row_z, crowd_dot = crowding_tangent(i, x, dot.x, v_new, dot.v_new, nearest, s)
+        if lane() > 0:
+            return
+        member = i // s.particles
+        dt, A_dot = time_step[member], wp.matrix_from_rows(row_x, row_y, row_z)
+        total = dot.x[i] + dt * dot.v_new[i] + time_step_dot[member] * v_new[i]
+        for k in range(3):
+            unit = vector()
+            unit[k] = real(1.0)
+            by_A, by_crowd, by_M, by_g, by_gamma, by_u, by_dt = along(
+                kept.A[i], kept.crowd[i], of.M[i], of.g[i], of.gamma[i], of.weights[i][2], dt, spacing, unit
+            )
+            entry = wp.ddot(by_A, A_dot) + wp.dot(by_crowd, crowd_dot) + wp.ddot(by_M, dot.M[i])
+            entry += wp.dot(by_g, dot.g[i]) + wp.dot(by_gamma, dot.gamma[i]) + by_u * dot.weights[i][2]
+            total += (entry + by_dt * time_step_dot[member]) * unit
+        x_moved_dot[i] = total
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def own_adjoint(
+        particles: int,
+        spacing: real,
+        time_step: wp.array(dtype=real),
+        v_new: wp.array(dtype=vector),
+        of: seen,
+        kept: kept,
+        x_moved_bar: wp.array(dtype=vector),
+        # in and out
+        v_new_bar: wp.array(dtype=vector),
+        bar: bars,
+        # out
+        A_bar: wp.array(dtype=matrix),
+        crowd_bar: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        dt, moved = time_step[i // particles], x_moved_bar[i]
+        by_A, by_crowd, by_M, by_g, by_gamma, by_u, by_dt = back(
+            kept.A[i], kept.crowd[i], of.M[i], of.g[i], of.gamma[i], of.weights[i][2], dt, spacing, moved
+        )
+        no = real(0.0)
+        A_bar[i] = by_A
+        crowd_bar[i] = by_crowd
+        bar.M[i] = bar.M[i] + by_M
+        bar.g[i] = bar.g[i] + by_g
+        bar.gamma[i] = bar.gamma[i] + by_gamma
+        bar.weights[i] = bar.weights[i] + weights4(no, no, by_u, no)
+        bar.x[i] = bar.x[i] + moved
+        bar.time_step[i] = bar.time_step[i] + by_dt + wp.dot(moved, v_new[i])
+        v_new_bar[i] = v_new_bar[i] + dt * moved
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def sums_adjoint(
+        s: neighbourhood,
+        nearest: real,
+        x: wp.array(dtype=vector),
+        v_new: wp.array(dtype=vector),
+        A_bar: wp.array(dtype=matrix),
+        crowd_bar: wp.array(dtype=vector),
+        # in and out
+        v_new_bar: wp.array(dtype=vector),
+        x_bar: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        v_part, x_part = crowding_back(i, x, v_new, A_bar, crowd_bar, nearest, s)
+        if lane() > 0:
+            return
+        v_new_bar[i] = v_new_bar[i] + v_part
+        x_bar[i] = x_bar[i] + x_part
+
+    return Kernels(new_positions, new_positions_tangent, (own_adjoint, sums_adjoint))

@@ -1,0 +1,16 @@
+"""The velocity projection as a `Solver`: its steps, forward, and their derivatives."""
+
+from cortado.particles.state import Parameters
+from cortado.solvers.projection.derivatives import ProjectionAdjoint, ProjectionTangent
+from cortado.solvers.projection.steps import ProjectionSteps
+from cortado.solvers.solver import StepAdjoint, StepTangent
+
+
+class Projection(ProjectionSteps):
+    """Incompressible SPH by a projection that pushes and pulls; see `Solver`."""
+
+    def tangent(self, parameters_dot: Parameters) -> StepTangent:
+        return ProjectionTangent(self, parameters_dot)
+
+    def adjoint(self, steps: int) -> StepAdjoint:
+        return ProjectionAdjoint(self, steps)

@@ -1,0 +1,193 @@
+"""A step of the projection: pressures that make velocities free of divergence, a shift, and the repair of density.
+
+`ProjectionSteps.step` overwrites its iterates; `ProjectionSteps.replay` keeps them all, for
+`cortado.solvers.projection.derivatives`.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import warp as wp
+from numpy.typing import NDArray
+
+from cortado.particles.fields import Entry, StateField
+from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.state import Parameters, State
+from cortado.solvers.loop import IterationLog, Loop, LoopLimits
+from cortado.solvers.particles import ParticleSolver, ParticleSystem
+from cortado.solvers.projection.constants import ProjectionConstants
+from cortado.solvers.projection.pressure import PressureKernels, pressure_kernels
+from cortado.solvers.projection.repair import RepairKernels, repair_kernels
+from cortado.solvers.projection.shifting import shift_kernels
+from cortado.solvers.projection.surroundings import entries, surrounding_kernels
+from cortado.solvers.projection.velocity import VelocityKernels, velocity_kernels
+from cortado.solvers.solver import Counts
+from cortado.sph.moment_functions import matrix_type
+from cortado.sph.parts import StepContext
+
+IMPULSE = "pressure_impulse"
+"""The name of k = dt p in a state."""
+
+
+@dataclass(frozen=True)
+class ProjectionKernels:
+    """The kernels that only the projection needs."""
+
+    surroundings: Any
+    velocity: VelocityKernels
+    pressure: PressureKernels
+    shift: Any
+    repair: RepairKernels
+
+    @classmethod
+    def of(cls, discretisation: Discretisation, dimension: int) -> "ProjectionKernels":
+        """In 2 or 3 dimensions."""
+        own = discretisation, dimension
+        return cls(
+            surrounding_kernels(*own),
+            velocity_kernels(*own),
+            pressure_kernels(*own),
+            shift_kernels(*own),
+            repair_kernels(*own),
+        )
+
+
+class ProjectionSteps(ParticleSolver):
+    """The steps of one set of particles, forward."""
+
+    topic = "projection"
+    density_power = 0
+    carried_fields = (StateField(IMPULSE, "Pa s", Entry.NUMBER),)
+
+    def __init__(self, system: ParticleSystem, constants: ProjectionConstants, iterations: int, repairs: int):
+        """Of so many iterations of the pressure and of the repair of density in every step."""
+        super().__init__(system)
+        self.constants, self.iterations, self.repairs = constants, iterations, repairs
+        self.kernels = ProjectionKernels.of(self.discretisation, system.walled.dimension)
+        self.around = self.new_arrays(**entries(self.layout.precision))
+        """Of the neighbourhoods, see `cortado.solvers.projection.surroundings`."""
+        matrix, real, vector = (
+            matrix_type(self.layout.precision),
+            self.layout.precision.real,
+            self.layout.precision.vector,
+        )
+        self.kept = self.new_arrays(A=matrix, crowd=vector)
+        """Sums of the shift."""
+        kinds = {"u": vector, "d": real, "y": real, "k": real}
+        self._iterate_kinds, self._repair_kinds = kinds, {"x_now": vector, "c": real, "excess": real}
+        self.iterates = [self.new_arrays(**self._iterate_kinds)]
+        """u = v* - D^T y / m, the divergence of u, y and k before each iteration; the last has y = k of all of them."""
+        self.repaired = [self.new_arrays(**self._repair_kinds)]
+        """x_k, lambda and n - 1 before each repair."""
+        self.x_star, self.v_star, self.v_new, self.x_moved = (self.vectors() for _ in range(4))
+        self.momenta = momenta(iterations)
+        limits = (LoopLimits(count, count, 0.0, 0.0) for count in (iterations, repairs))
+        names = ("iterations", "divergence_errors"), ("repairs", "density_errors")
+        self.loops = tuple(
+            Loop(limit, self.layout, self.launch, *name) for limit, name in zip(limits, names, strict=True)
+        )
+
+    def new_arrays(self, **kinds: Any) -> dict[str, wp.array]:
+        """Arrays (n,) of zeros by name, of Warp types."""
+        size, device = self.layout.all_particles, self.device
+        return {name: wp.zeros(size, dtype=kind, device=device) for name, kind in kinds.items()}
+
+    @cached_property
+    def relaxed(self) -> dict[str, float]:
+        """Constants of the iterations, as kernels call them."""
+        return {"omega": self.constants.relaxation, "least": self.constants.least_diagonal}
+
+    @cached_property
+    def shifted(self) -> dict[str, float]:
+        """Constants of the shift, as kernels call them."""
+        return {"nearest": self.constants.nearest_weight, "spacing": self.constants.spacing}
+
+    def step(self, state: State, new_state: State, parameters: Parameters, log: IterationLog) -> None:
+        context = self.begin(state, parameters)
+        projection, repair = self.loops
+        projection.run(lambda k: self.iterate(context, k, 0, 0))
+        self.move(context, 0)
+        repair.run(lambda k: self.mend(context, 0, 0))
+        self._finish(context, 0, 0, new_state)
+        self.end_step(self.repaired[0]["x_now"], self.v_new, new_state, log)
+
+    def reserve(self, counts: Counts) -> None:
+        iterations, repairs = counts
+        while len(self.iterates) <= iterations:
+            self.iterates.append(self.new_arrays(**self._iterate_kinds))
+        while len(self.repaired) <= repairs:
+            self.repaired.append(self.new_arrays(**self._repair_kinds))
+
+    def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
+        self.reserve(counts)
+        iterations, repairs = counts
+        context = self.begin(state, parameters)
+        for k in range(iterations):
+            self.iterate(context, k, k, k + 1)
+        self.move(context, iterations)
+        for k in range(repairs):
+            self.mend(context, k, k + 1)
+
+    def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
+        iterations, repairs = counts
+        self._finish(self.context(parameters), iterations, repairs, new_state)
+
+    def sorted_pressures(self) -> NDArray:
+        time_steps = self.parameters["time_step"].numpy().repeat(self.layout.particles)
+        found: NDArray = self.iterates[0]["k"].numpy() / time_steps
+        return found
+
+    @property
+    def parameters(self) -> Parameters:
+        """Those of the last step."""
+        assert self._context is not None
+        return self._context.parameters
+
+    def begin(self, state: State, parameters: Parameters) -> StepContext:
+        """Everything but the pressure, and the first one."""
+        context, kernels, first = self.sort(state, parameters), self.kernels, self.iterates[0]
+        context.launch(kernels.surroundings.forward, self.around, self.relaxed)
+        predicted = {"x_star": self.x_star, "v_star": self.v_star}
+        context.launch(self.integration.predict, acceleration=self.accelerate(context), **predicted)
+        started = {"k": first["k"], "y": first["y"], "k_before": self.carried[IMPULSE]}
+        context.launch(kernels.pressure.start.forward, self.around, started)
+        return context
+
+    def iterate(self, context: StepContext, k: int, before: int, after: int) -> None:
+        """Iteration k, from the iterates of one slot to those of another."""
+        kernels, at, new = self.kernels, self.iterates[before], self.iterates[after]
+        context.launch(kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star)
+        out = {"k_out": new["k"], "y_out": new["y"], "error": self.loops[0].errors}
+        context.launch(kernels.pressure.update.forward, self.around, at, self.relaxed, out, beta=self.momenta[k])
+
+    def move(self, context: StepContext, last: int) -> None:
+        """The new velocities, by the k of a slot, and the positions that they and the shift lead to."""
+        kernels, k = self.kernels, self.iterates[last]["k"]
+        new = {"v_new": self.v_new, "x_moved": self.x_moved}
+        context.launch(kernels.velocity.velocity.forward, self.around, v_star=self.v_star, y=k, u=self.v_new)
+        context.launch(kernels.shift.forward, self.around, self.kept, self.shifted, new)
+        wp.copy(self.repaired[0]["x_now"], self.x_moved)
+        self.repaired[0]["c"].zero_()
+
+    def mend(self, context: StepContext, before: int, after: int) -> None:
+        """A repair, from the positions of one slot to those of another."""
+        kernels, at, new = self.kernels.repair, self.repaired[before], self.repaired[after]
+        measured = {"x_now": at["x_now"], "c_in": at["c"], "c_out": new["c"], "excess": at["excess"]}
+        context.launch(kernels.measure.forward, self.around, self.relaxed, measured, error=self.loops[1].errors)
+        moved = {"c": new["c"], "x_moved": self.x_moved, "x_now": new["x_now"]}
+        context.launch(kernels.move.forward, self.around, moved)
+
+    def _finish(self, context: StepContext, iterations: int, repairs: int, new_state: State) -> None:
+        ends = {IMPULSE: self.iterates[iterations]["k"]}
+        self.unsort(context, self.repaired[repairs]["x_now"], self.v_new, new_state, **ends)
+
+
+def momenta(iterations: int) -> list[float]:
+    """beta of so many iterations (Nesterov 1983): (t - 1) / t', t' = (1 + sqrt(1 + 4 t^2)) / 2, from t = 1."""
+    found, t = [], 1.0
+    for _ in range(iterations):
+        later = 0.5 * (1.0 + (1.0 + 4.0 * t * t) ** 0.5)
+        found.append((t - 1.0) / later)
+        t = later
+    return found

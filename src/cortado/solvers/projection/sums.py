@@ -1,0 +1,198 @@
+"""Sums over neighbours of the projection, with their derivatives; g_ij = V grad W_ij.
+
+Three of them do most of the work, forward and back, as each is the transpose of another or of itself: the force of
+pressures, the spread of velocities, and the push of numbers.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.pair_sums import fluid_sum, pair_sum
+from cortado.sph.moment_functions import matrix_type
+
+
+@dataclass(frozen=True)
+class ProjectionSums:
+    """Warp functions. A matrix comes as its three rows; a symmetric one as its diagonal and its entries yz, xz, xy."""
+
+    moments: Any
+    """M = -sum g_ij x_ij^T, Q = sum g_ij g_ij^T / m_j, g = sum g_ij, and of walls gamma = sum w_b g_ib and
+    nu = V sum w_b W_ib."""
+    moments_tangent: Any
+    moments_back: Any
+    """What adjoints of the moments give to x and m."""
+    force: Any
+    """sum (k_i L_i + k_j L_j) g_ij"""
+    force_tangent: Any
+    force_back: Any
+    """For adjoints f of the force: the rows of sum f_ij g_ij^T, and what x is given."""
+    spread: Any
+    """The rows of sum v_ij g_ij^T."""
+    spread_tangent: Any
+    spread_back: Any
+    """For an adjoint d_i of L_i : sum v_ij g_ij^T: what v is given, what x is, and the rows of the spread again."""
+    push: Any
+    """sum (c_i + c_j) g_ij"""
+    push_tangent: Any
+    push_back: Any
+    """For adjoints f of the push: sum g_ij . f_ij, and what x is given."""
+
+
+@cache
+def projection_sums(discretisation: Discretisation) -> ProjectionSums:
+    """Of a discretisation."""
+    real, vector = discretisation.precision.real, discretisation.precision.vector
+    neighbourhood, matrix = neighbourhood_type(discretisation.precision), matrix_type(discretisation.precision)
+    pair = pair_functions(discretisation)
+    weight, slope, gradient, hessian_product = pair.weight, pair.slope, pair.gradient, pair.hessian_product
+
+    @wp.func
+    def cross_terms(a: vector, b: vector) -> vector:
+        """Entries yz, xz and xy of a b^T."""
+        return vector(a[1] * b[2], a[0] * b[2], a[0] * b[1])
+
+    def wall_moments(x_ij: vector, s: neighbourhood) -> tuple[vector, vector, vector, vector, vector, vector, real]:
+        gone = vector()
+        return gone, gone, gone, gone, gone, s.volume * gradient(x_ij, s), s.volume * weight(x_ij, s)
+
+    @pair_sum(discretisation, wall_moments)
+    def moments(
+        x_ij: vector, m_j: real, s: neighbourhood
+    ) -> tuple[vector, vector, vector, vector, vector, vector, real]:
+        g = s.volume * gradient(x_ij, s)
+        q = g / m_j
+        return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(q, g), cross_terms(q, g), g, vector(), real(0.0)
+
+    def wall_moments_tangent(
+        x_ij: vector, x_dot_ij: vector, s: neighbourhood
+    ) -> tuple[vector, vector, vector, vector, vector, vector, real]:
+        gone, change = vector(), s.volume * hessian_product(x_ij, x_dot_ij, s)
+        return gone, gone, gone, gone, gone, change, s.volume * wp.dot(gradient(x_ij, s), x_dot_ij)
+
+    @pair_sum(discretisation, wall_moments_tangent, ahead=False)
+    def moments_tangent(
+        x_ij: vector, x_dot_ij: vector, m_j: real, m_dot_j: real, s: neighbourhood
+    ) -> tuple[vector, vector, vector, vector, vector, vector, real]:
+        g = s.volume * gradient(x_ij, s)
+        g_dot = s.volume * hessian_product(x_ij, x_dot_ij, s)
+        per = real(1.0) / m_j
+        q, q_dot = per * g, per * (g_dot - (per * m_dot_j) * g)
+        return (
+            -wp.cw_mul(g_dot, x_ij) - wp.cw_mul(g, x_dot_ij),
+            -cross_terms(g_dot, x_ij) - cross_terms(g, x_dot_ij),
+            wp.cw_mul(q_dot, g) + wp.cw_mul(q, g_dot),
+            cross_terms(q_dot, g) + cross_terms(q, g_dot),
+            g_dot,
+            vector(),
+            real(0.0),
+        )
+
+    def wall_moments_back(x_ij: vector, gamma_bar_i: vector, nu_bar_i: real, s: neighbourhood) -> tuple[vector, real]:
+        change = hessian_product(x_ij, gamma_bar_i, s) + nu_bar_i * gradient(x_ij, s)
+        return s.volume * change, real(0.0)
+
+    @pair_sum(discretisation, wall_moments_back)
+    def moments_back(
+        x_ij: vector,
+        m_i: real,
+        m_j: real,
+        M_bar_i: matrix,
+        M_bar_j: matrix,
+        Q_bar_i: matrix,
+        Q_bar_j: matrix,
+        g_bar_ij: vector,
+        gamma_bar_i: vector,
+        nu_bar_i: real,
+        s: neighbourhood,
+    ) -> tuple[vector, real]:
+        """M_bar and Q_bar are symmetric."""
+        g = s.volume * gradient(x_ij, s)
+        stretch = (M_bar_i + M_bar_j) * x_ij
+        both = Q_bar_i * g / m_j + Q_bar_j * g / m_i
+        x_part = hessian_product(x_ij, real(2.0) * both + g_bar_ij - stretch, s) - slope(x_ij, s) * stretch
+        return s.volume * x_part, -wp.dot(g, Q_bar_j * g) / (m_i * m_i)
+
+    @fluid_sum(discretisation)
+    def force(x_ij: vector, k_i: real, k_j: real, L_i: matrix, L_j: matrix, s: neighbourhood) -> vector:
+        g = s.volume * gradient(x_ij, s)
+        return k_i * (L_i * g) + k_j * (L_j * g)
+
+    @fluid_sum(discretisation, ahead=False)
+    def force_tangent(
+        x_ij: vector,
+        x_dot_ij: vector,
+        k_i: real,
+        k_j: real,
+        k_dot_i: real,
+        k_dot_j: real,
+        L_i: matrix,
+        L_j: matrix,
+        L_dot_i: matrix,
+        L_dot_j: matrix,
+        s: neighbourhood,
+    ) -> vector:
+        g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
+        own = L_i * (k_dot_i * g + k_i * g_dot) + k_i * (L_dot_i * g)
+        return own + L_j * (k_dot_j * g + k_j * g_dot) + k_j * (L_dot_j * g)
+
+    @fluid_sum(discretisation)
+    def force_back(
+        x_ij: vector, k_i: real, k_j: real, L_i: matrix, L_j: matrix, f_ij: vector, s: neighbourhood
+    ) -> tuple[vector, vector, vector, vector]:
+        g = s.volume * gradient(x_ij, s)
+        pulled = k_i * (L_i * f_ij) + k_j * (L_j * f_ij)
+        return f_ij[0] * g, f_ij[1] * g, f_ij[2] * g, s.volume * hessian_product(x_ij, pulled, s)
+
+    @fluid_sum(discretisation)
+    def spread(x_ij: vector, v_ij: vector, s: neighbourhood) -> tuple[vector, vector, vector]:
+        g = s.volume * gradient(x_ij, s)
+        return v_ij[0] * g, v_ij[1] * g, v_ij[2] * g
+
+    @fluid_sum(discretisation, ahead=False)
+    def spread_tangent(
+        x_ij: vector, x_dot_ij: vector, v_ij: vector, v_dot_ij: vector, s: neighbourhood
+    ) -> tuple[vector, vector, vector]:
+        g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
+        return (
+            v_dot_ij[0] * g + v_ij[0] * g_dot,
+            v_dot_ij[1] * g + v_ij[1] * g_dot,
+            v_dot_ij[2] * g + v_ij[2] * g_dot,
+        )
+
+    @fluid_sum(discretisation)
+    def spread_back(
+        x_ij: vector, v_ij: vector, d_i: real, d_j: real, L_i: matrix, L_j: matrix, s: neighbourhood
+    ) -> tuple[vector, vector, vector, vector, vector]:
+        g = s.volume * gradient(x_ij, s)
+        pushed = d_i * (L_i * v_ij) + d_j * (L_j * v_ij)
+        v_part = d_i * (L_i * g) + d_j * (L_j * g)
+        return v_part, s.volume * hessian_product(x_ij, pushed, s), v_ij[0] * g, v_ij[1] * g, v_ij[2] * g
+
+    @fluid_sum(discretisation)
+    def push(x_ij: vector, c_i: real, c_j: real, s: neighbourhood) -> vector:
+        return ((c_i + c_j) * s.volume) * gradient(x_ij, s)
+
+    @fluid_sum(discretisation, ahead=False)
+    def push_tangent(
+        x_ij: vector, x_dot_ij: vector, c_i: real, c_j: real, c_dot_i: real, c_dot_j: real, s: neighbourhood
+    ) -> vector:
+        change = (c_dot_i + c_dot_j) * gradient(x_ij, s) + (c_i + c_j) * hessian_product(x_ij, x_dot_ij, s)
+        return s.volume * change
+
+    @fluid_sum(discretisation)
+    def push_back(x_ij: vector, c_i: real, c_j: real, f_ij: vector, s: neighbourhood) -> tuple[real, vector]:
+        return (
+            s.volume * wp.dot(gradient(x_ij, s), f_ij),
+            ((c_i + c_j) * s.volume) * hessian_product(x_ij, f_ij, s),
+        )
+
+    return ProjectionSums(
+        *(moments, moments_tangent, moments_back),
+        *(force, force_tangent, force_back),
+        *(spread, spread_tangent, spread_back),
+        *(push, push_tangent, push_back),
+    )

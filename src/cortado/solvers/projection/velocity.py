@@ -1,0 +1,151 @@
+"""The velocity that pressures leave of a predicted one, v* - D^T y / m: see `cortado.solvers.projection.pressure`."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.bundles import bundle
+from cortado.device.kernels import Kernels
+from cortado.device.lanes import lane_functions
+from cortado.device.precision import Precision
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.solvers.projection.sums import projection_sums
+from cortado.solvers.projection.surroundings import entries
+from cortado.sph.moment_functions import matrix_type
+
+
+@dataclass(frozen=True)
+class VelocityKernels:
+    """Of the velocity."""
+
+    velocity: Kernels
+    """Its adjoint goes on from f = -u_bar / m of all particles."""
+    end_adjoint: wp.Kernel
+    """From the adjoint of the last velocity of a step to that of v* and to f."""
+    time_adjoint: wp.Kernel
+    """What v* = v + dt a gives to the adjoint of dt."""
+
+
+@cache
+def symmetric_part(precision: Precision) -> Any:
+    """The Warp function of the symmetric part of a matrix, given its rows."""
+    vector, real, matrix = precision.vector, precision.real, matrix_type(precision)
+
+    @wp.func
+    def symmetric(row_x: vector, row_y: vector, row_z: vector) -> matrix:
+        A = wp.matrix_from_rows(row_x, row_y, row_z)
+        return real(0.5) * (A + wp.transpose(A))
+
+    return symmetric
+
+
+@cache
+def velocity_kernels(discretisation: Discretisation, dimension: int) -> VelocityKernels:
+    """In 2 or 3 dimensions."""
+    precision = discretisation.precision
+    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
+    force, force_tangent, force_back = sums.force, sums.force_tangent, sums.force_back
+    symmetric, topic = symmetric_part(precision), f"projection_{dimension}d"
+    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
+    adjoint_module = discretisation.module(False, topic)
+    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma")}
+    seen, bars = bundle(**own), bundle(x=vector, **own)
+    LANES = discretisation.lanes
+    lane = lane_functions(precision, LANES).lane
+
+    @wp.kernel(module=module)
+    def velocity(
+        s: neighbourhood,
+        x: wp.array(dtype=vector),
+        m: wp.array(dtype=real),
+        y: wp.array(dtype=real),
+        L: wp.array(dtype=matrix),
+        gamma: wp.array(dtype=vector),
+        v_star: wp.array(dtype=vector),
+        # out
+        u: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        total = force(i, x, y, L, s)
+        if lane() > 0:
+            return
+        u[i] = v_star[i] - (total + y[i] * gamma[i]) / m[i]
+
+    @wp.kernel(module=tangent_module, enable_backward=False)
+    def velocity_tangent(
+        s: neighbourhood,
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        m: wp.array(dtype=real),
+        m_dot: wp.array(dtype=real),
+        y: wp.array(dtype=real),
+        y_dot: wp.array(dtype=real),
+        of: seen,
+        dot: seen,
+        v_star: wp.array(dtype=vector),
+        v_star_dot: wp.array(dtype=vector),
+        u: wp.array(dtype=vector),
+        # out
+        u_dot: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        total = force_tangent(i, x, x_dot, y, y_dot, of.L, dot.L, s)
+        if lane() > 0:
+            return
+        change = total + y_dot[i] * of.gamma[i] + y[i] * dot.gamma[i]
+        u_dot[i] = v_star_dot[i] - (change + m_dot[i] * (u[i] - v_star[i])) / m[i]
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def velocity_adjoint(
+        s: neighbourhood,
+        x: wp.array(dtype=vector),
+        y: wp.array(dtype=real),
+        of: seen,
+        f: wp.array(dtype=vector),
+        # in and out
+        y_bar: wp.array(dtype=real),
+        bar: bars,
+    ):
+        """From f = -u_bar / m of all particles."""
+        i = s.first + wp.tid() // LANES
+        row_x, row_y, row_z, x_part = force_back(i, x, y, of.L, f, s)
+        if lane() > 0:
+            return
+        A = symmetric(row_x, row_y, row_z)
+        y_bar[i] = y_bar[i] + wp.ddot(of.L[i], A) + wp.dot(of.gamma[i], f[i])
+        bar.L[i] = bar.L[i] + y[i] * A
+        bar.gamma[i] = bar.gamma[i] + y[i] * f[i]
+        bar.x[i] = bar.x[i] + x_part
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def end_adjoint(
+        m: wp.array(dtype=real),
+        v_star: wp.array(dtype=vector),
+        u: wp.array(dtype=vector),
+        u_bar: wp.array(dtype=vector),
+        # in and out
+        v_bar: wp.array(dtype=vector),
+        m_bar: wp.array(dtype=real),
+        # out
+        f: wp.array(dtype=vector),
+    ):
+        i = wp.tid()
+        bar = u_bar[i]
+        v_bar[i] = v_bar[i] + bar
+        m_bar[i] = m_bar[i] + wp.dot(bar, v_star[i] - u[i]) / m[i]
+        f[i] = -bar / m[i]
+
+    @wp.kernel(module=adjoint_module, enable_backward=False)
+    def time_adjoint(
+        acceleration: wp.array(dtype=vector),
+        v_bar: wp.array(dtype=vector),
+        # in and out
+        time_step_bar: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        time_step_bar[i] = time_step_bar[i] + wp.dot(v_bar[i], acceleration[i])
+
+    return VelocityKernels(Kernels(velocity, velocity_tangent, velocity_adjoint), end_adjoint, time_adjoint)

@@ -1,0 +1,80 @@
+"""The second moment M = -V sum_j grad W_ij x_ij^T of a particle's neighbours, whose inverse corrects gradients (Bonet
+and Lok 1999), and how full the neighbourhood is by it.
+
+With the invariants of M, I_2 and I_3, fullness is H = 3 I_3 / I_2, in the plane 2 det M / tr M: 1 inside, about 0.6 at
+a flat surface, and 0 where neighbours lie on a line or are missing.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.precision import Precision
+
+
+@cache
+def matrix_type(precision: Precision) -> Any:
+    """The Warp type of 3 x 3 matrices."""
+    return wp.types.matrix(shape=(3, 3), dtype=precision.real)
+
+
+@dataclass(frozen=True)
+class MomentFunctions:
+    """Warp functions of one particle."""
+
+    whole: Any
+    """M, invertible in the plane too, from its diagonal and its entries yz, xz and xy."""
+    change: Any
+    """The same of a tangent of M, and of any symmetric matrix."""
+    fullness: Any
+    """H"""
+    inverse: Any
+    """M^-1, by cofactors."""
+    smoothstep: Any
+    """0 below a first number, 1 above a second one, and a cubic between them."""
+
+
+@cache
+def moment_functions(precision: Precision, dimension: int) -> MomentFunctions:
+    """Of a precision in 2 or 3 dimensions."""
+    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    plane, tiny = wp.constant(real(float(dimension == 2))), wp.constant(real(1e-12))
+
+    @wp.func
+    def change(diagonal: vector, others: vector) -> matrix:
+        x, y, z = others[0], others[1], others[2]
+        return matrix(diagonal[0], z, y, z, diagonal[1], x, y, x, diagonal[2])
+
+    @wp.func
+    def whole(diagonal: vector, others: vector) -> matrix:
+        """In the plane M_zz is 1, which changes none of what lies in it."""
+        return change(diagonal + vector(real(0.0), real(0.0), plane), others)
+
+    @wp.func
+    def fullness(M: matrix) -> real:
+        """tiny covers particles without neighbours, where H is 0."""
+        product = M[0, 0] * M[1, 1] + M[1, 1] * M[2, 2] + M[2, 2] * M[0, 0]
+        I_2 = product - M[0, 1] * M[0, 1] - M[1, 2] * M[1, 2] - M[0, 2] * M[0, 2]
+        I_3 = wp.determinant(M)
+        return (real(3.0) - plane) * I_3 / (I_2 - plane * I_3 + tiny)
+
+    @wp.func
+    def inverse(M: matrix) -> matrix:
+        """The derivative of the determinant by M must not be 0."""
+        a = M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1]
+        b = M[0, 2] * M[2, 1] - M[0, 1] * M[2, 2]
+        c = M[0, 1] * M[1, 2] - M[0, 2] * M[1, 1]
+        e = M[0, 0] * M[2, 2] - M[0, 2] * M[2, 0]
+        f = M[0, 2] * M[1, 0] - M[0, 0] * M[1, 2]
+        h = M[0, 0] * M[1, 1] - M[0, 1] * M[1, 0]
+        per = real(1.0) / (M[0, 0] * a + M[1, 0] * b + M[2, 0] * c)
+        return per * matrix(a, b, c, b, e, f, c, f, h)
+
+    @wp.func
+    def smoothstep(value: real, first: real, second: real) -> real:
+        t = wp.clamp((value - first) / (second - first), real(0.0), real(1.0))
+        return t * t * (real(3.0) - real(2.0) * t)
+
+    return MomentFunctions(whole, change, fullness, inverse, smoothstep)

@@ -1,0 +1,111 @@
+"""Slow twin of a step of the projection: all pairs, NumPy, straight from the equations of `docs/projection.md`."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+import reference
+
+
+def between(H, first, second):
+    t = np.clip((H - first) / (second - first), 0.0, 1.0)
+    return 3 * t**2 - 2 * t**3
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Of a scene without forces but gravity."""
+
+    kernel: object
+    support: float
+    volume: float
+    spacing: float
+    walls: np.ndarray
+    wall_weights: np.ndarray
+    periods: np.ndarray
+    iterations: int
+    repairs: int
+
+    def pairs(self, x, y):
+        """Separations (n, m, d), and V W and V grad W of them."""
+        d = x.shape[1]
+        apart = x[:, None] - y[None, :]
+        turns = np.where(self.periods > 0, np.round(apart / np.where(self.periods > 0, self.periods, 1)), 0)
+        apart = apart - turns * self.periods
+        q = np.sqrt((apart**2).sum(-1)) / self.support
+        sigma = self.kernel.normalisation(d, self.support)
+        W = self.volume * sigma * reference.value(self.kernel.name, q)
+        a = self.volume * sigma / self.support**2 * reference.slope(self.kernel.name, q)
+        return apart, W, a[..., None] * apart
+
+    def density(self, x):
+        W, wall = self.pairs(x, x)[1], self.pairs(x, self.walls)[1]
+        return W.sum(1) + wall @ self.wall_weights
+
+    def constants(self, d):
+        """omega and a_0 of the lattice."""
+        reach, steps = np.arange(-5, 6) * self.spacing, np.linspace(0, np.pi / self.spacing, 25)
+        lattice, waves = (np.stack(np.meshgrid(*[a] * d, indexing="ij"), -1).reshape(-1, d) for a in (reach, steps))
+        g = replace(self, periods=np.zeros(d)).pairs(np.zeros((1, d)), lattice)[2][0]
+        square = (g**2).sum()
+        return 1 / (1.05 * ((np.sin(waves @ lattice.T) @ g) ** 2).sum(1).max() / square), square
+
+    def step(self, x, v_star, before, m, dt):
+        """Positions, velocities and k after the step, from predicted velocities and the k of the step before."""
+        (n, d), (apart, W, g) = x.shape, self.pairs(x, x)
+        _, wall_W, wall_g = self.pairs(x, self.walls)
+        density = self.density(x)
+        gamma, nu = np.einsum("b,iba->ia", self.wall_weights, wall_g), wall_W @ self.wall_weights
+        total = g.sum(1)
+        M = -np.einsum("ija,ijb->iab", g, apart)
+        if d == 2:
+            H = 2 * np.linalg.det(M) / (np.trace(M, axis1=1, axis2=2) + 1e-12)
+        else:
+            squares = (np.trace(M, axis1=1, axis2=2) ** 2 - np.trace(M @ M, axis1=1, axis2=2)) / 2
+            H = 3 * np.linalg.det(M) / (squares + 1e-12)
+        B = 1 / (1 + (nu / 0.05) ** 4)
+        full, tension = between(H, 0.1, 0.5), between(H, 0.1, 0.5) * B
+        inverse = 1.05 * np.linalg.inv(M + 0.05 * np.eye(d))
+        L = np.eye(d) + (between(H, 0.2, 0.5) * B)[:, None, None] * (inverse - np.eye(d))
+        omega, square = self.constants(d)
+        own = np.einsum("iab,ib->ia", L, total) + gamma
+        a = ((own**2).sum(1) + 0.05 * square) / m
+        a += (np.einsum("iab,ijb->ija", L, g) ** 2).sum(-1) @ (1 / m)
+
+        def force(k):
+            pull = k[:, None, None] * L
+            return np.einsum("iab,ijb->ia", pull, g) + np.einsum("jab,ijb->ia", pull, g) + k[:, None] * gamma
+
+        def divergence(v):
+            apart = v[:, None] - v[None, :]
+            return np.einsum("iab,ija,ijb->i", L, apart, g) + (gamma * v).sum(1)
+
+        wanted = (1 - full) * np.maximum(1 - density, 0) / dt
+        k = y = full * before
+        t = 1.0
+        for _ in range(self.iterations):
+            D = divergence(v_star - force(y) / m[:, None])
+            up, down = y + omega * (D - wanted) / a, y + omega * D / a
+            new = np.where(up > 0, up, np.where(down < 0, tension * down, 0))
+            later = (1 + np.sqrt(1 + 4 * t * t)) / 2
+            y, k, t = new + (t - 1) / later * (new - k), new, later
+        v = v_star - force(k) / m[:, None]
+        moved = x + dt * v + self.shift(v, W, g, total, gamma, inverse, H, dt)
+        now, c = moved, np.zeros(n)
+        low = between(H, 0.8, 0.95) * B
+        for _ in range(self.repairs):
+            z = c + omega / 2 * (self.density(now) - 1) / a
+            c = np.where(z > 0, z, low * z)
+            now = moved - (((c[:, None] + c[None, :])[..., None] * g).sum(1) + c[:, None] * gamma) / m[:, None]
+        return now, v, k
+
+    def shift(self, v, W, g, total, gamma, inverse, H, dt):
+        s, d = self.spacing, v.shape[1]
+        gradient = np.einsum("ija,ijb,ibc->iac", v[:, None] - v[None, :], g, inverse)
+        rate = np.sqrt((gradient**2).sum((1, 2)) + 1e-12)
+        near = self.volume * self.kernel.weight(np.array([s]), d, self.support)[0]
+        slope = ((1 + 0.2 * (W / near) ** 4)[..., None] * g).sum(1) + gamma / 2
+        out = total + gamma / 2
+        along = slope - out * ((out * slope).sum(1) / ((out**2).sum(1) + (0.03 / s) ** 2))[:, None]
+        wish = -20 * dt * (rate * s**2 * between(H, 0.5, 0.8))[:, None] * along
+        return wish / np.sqrt(1 + (wish**2).sum(1) / (0.1 * s) ** 2)[:, None]

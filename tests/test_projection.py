@@ -1,0 +1,150 @@
+"""The projection against its slow twin, its derivatives against one another and differences, and what it promises."""
+
+import numpy as np
+import pytest
+
+from cortado import InputError, Problem, Simulation, gradients, losses
+from reference_projection import Projection
+from scenes import jet, plane, plane_of_three, pour, scene, two_layers
+
+SOLVER = {"kind": "projection", "time_step": 0.002}
+PERIODIC = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]}
+C2 = {"spacing": 0.05, "support": 2.6, "kernel": "wendland_c2"}
+CASES = {
+    "plane": lambda: plane(solver=SOLVER),
+    "space": lambda: scene(solver=SOLVER, discretisation=C2),
+    "periodic": lambda: plane(solver=SOLVER, container=PERIODIC),
+    "three phases": lambda: plane_of_three(solver=SOLVER, mixture={"mobility": 0.0}),
+}
+
+
+def thrown(simulation, seed=3):
+    """Positions and velocities of a state with scatter in both."""
+    random, x, v = np.random.default_rng(seed), simulation.positions, simulation.velocities
+    spacing = simulation.scene.discretisation.spacing
+    inwards = 0.02 * spacing + 0.1 * spacing * random.random(x.shape)
+    return {"initial_positions": x + inwards, "initial_velocities": v + 0.5 * random.standard_normal(v.shape)}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_step_is_that_of_the_twin(case):
+    """Three steps without viscosity, the second and third from pressures of the one before."""
+    made = CASES[case]()
+    made = made.replaced(*(f"phase[{number}].viscosity=0" for number in range(len(made.phase))))
+    simulation = Simulation(made, precision="float64")
+    solver, d, given = simulation.solver, simulation.dimension, thrown(simulation)
+    search, lattice = solver.search, solver.lattice
+    walls = search.wall_positions.numpy()[:, :d], search.wall_weights.numpy()
+    twin = Projection(
+        *(solver.discretisation.smoothing, lattice.support, lattice.volume, made.discretisation.spacing),
+        *walls,
+        np.array(made.container.periods(d)[1]),
+        iterations=8,
+        repairs=3,
+    )
+    gravity, dt = np.array(made.forces.gravity), 0.002
+    m = simulation.state()["reference_density"]
+    run = simulation.run(3, given)
+    x, v, k = given["initial_positions"], given["initial_velocities"], np.zeros(len(m))
+    for step in range(1, 4):
+        x, v, k = twin.step(x, v + dt * gravity, k, m, dt)
+        for found, wanted in ((run.positions[step], x), (run.velocities[step], v)):
+            np.testing.assert_allclose(found, wanted, rtol=1e-10, atol=1e-11)
+        np.testing.assert_allclose(run.others["pressure_impulse"][step], k, rtol=1e-8, atol=1e-9)
+    assert (k > 0.0).any() and (k < 0.0).any()
+
+
+DERIVED = {
+    **CASES,
+    "mixture": lambda: two_layers(solver=SOLVER),
+    "nozzle": lambda: jet(solver=SOLVER),
+    "nozzle in space": lambda: pour(solver=SOLVER),
+    "surface tension": lambda: plane(solver=SOLVER, forces={"gravity": [0.0, -9.81], "surface_tension": 3.0}),
+    "thick": lambda: plane(
+        solver={**SOLVER, "time_step": 0.005},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 50.0}],
+        forces={"gravity": [0.0, -9.81], "viscosity": "stress", "viscous_solve": "implicit"},
+    ),
+}
+
+
+def problem_of(make, steps=8, **options):
+    simulation = Simulation(make(), **{"precision": "float64", **options})
+    target = simulation.positions + 0.05 * np.sin(np.arange(simulation.positions.size)).reshape(
+        -1, simulation.dimension
+    )
+    goals = {5: losses.FinalPositions(target), steps: losses.FinalPositions(target)}
+    return Problem(simulation, steps, losses.Frames(goals))
+
+
+def direction(values, seed=1):
+    random = np.random.default_rng(seed)
+    return {name: np.abs(value).max() * random.standard_normal(value.shape) for name, value in values.items()}
+
+
+@pytest.mark.parametrize("case", DERIVED)
+def test_reverse_mode_is_forward_mode_is_the_limit_of_differences(case):
+    problem = problem_of(DERIVED[case])
+    simulation = problem.simulation
+    names = ["gravity", "viscosity", "rest_density", "time_step"]
+    at = {name: np.array(value) for name, value in simulation.parameters().items() if name in names}
+    if simulation.scene.emitter is None:
+        at |= thrown(simulation)
+    _, gradient = problem.value_and_gradient(at)
+    for name, along in direction(at).items():
+        slope = problem.tangent(at, {name: along})
+        scale = np.abs(gradient[name] * along).sum()
+        assert abs(np.sum(gradient[name] * along) - slope) < 1e-11 * scale, name
+        errors = []
+        for step in 10.0 ** np.arange(-7.0, -2.4, 0.5):
+            ends = [problem.value({**at, name: at[name] + sign * step * along}) for sign in (1.0, -1.0)]
+            errors.append(abs((ends[0] - ends[1]) / (2.0 * step) - slope) / scale)
+        assert min(errors) < 1e-6, (name, errors)
+
+
+def test_in_float32_the_gradient_is_near_that_of_float64():
+    single, double = (problem_of(CASES["plane"], precision=name) for name in ("float32", "float64"))
+    at = {"gravity": np.array([0.4, -9.0])}
+    wanted = double.value_and_gradient(at)[1]["gravity"]
+    found = single.value_and_gradient(at)[1]["gravity"]
+    np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=2e-3 * np.abs(wanted).max())
+    along = np.array([1.0, -2.0])
+    assert single.tangent(at, {"gravity": along}) == pytest.approx(np.sum(found * along), rel=2e-3)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_a_run_goes_on_bit_for_bit_and_has_the_same_bits_twice(precision):
+    simulation = Simulation(plane(solver=SOLVER), precision=precision)
+    whole = simulation.run(20)
+    assert simulation.run(20).positions.tobytes() == whole.positions.tobytes()
+    rest = simulation.run(9, state=simulation.run(11).last_state)
+    for name in ("positions", "velocities"):
+        assert getattr(rest, name).tobytes() == getattr(whole, name)[11:].tobytes()
+    gradients_twice = [
+        problem_of(CASES["plane"], precision=precision).value_and_gradient({"viscosity": 0.05}) for _ in "12"
+    ]
+    assert gradients_twice[0][1]["viscosity"].tobytes() == gradients_twice[1][1]["viscosity"].tobytes()
+
+
+def test_each_scene_of_a_batch_is_that_run_alone():
+    tilts = np.array([[[0.0, -9.81]], [[3.0, -9.0]], [[-2.0, -9.5]]])
+    batch = problem_of(CASES["plane"], batch=3)
+    alone = problem_of(CASES["plane"])
+    values, found = batch.value_and_gradient({"gravity": tilts})
+    for value, gradient, tilt in zip(values, found["gravity"], tilts, strict=True):
+        one, wanted = alone.value_and_gradient({"gravity": tilt[0]})
+        assert value == one and gradient.tobytes() == wanted["gravity"].tobytes()
+
+
+@pytest.mark.parametrize("estimator", [gradients.Tape(), gradients.FrozenGeometry()])
+def test_what_has_no_derivative_of_it_says_so(estimator):
+    with pytest.raises(InputError, match=r'solver.kind "projection" has no '):
+        problem_of(CASES["plane"]).value_and_gradient({"gravity": np.array([0.0, -9.81])}, estimator)
+
+
+def test_a_scene_without_pressure_has_nothing_to_project():
+    forces = {"gravity": [0.0, -9.81], "pressure": False}
+    free = Simulation(plane(solver=SOLVER, forces=forces)).run(10).positions[-1]
+    assert (
+        free.tobytes() == Simulation(plane(solver={"time_step": 0.002}, forces=forces)).run(10).positions[-1].tobytes()
+    )
