@@ -88,7 +88,7 @@ class Projection:
             up, down = y + omega * (D - wanted) / a, y + omega * D / a
             new = np.where(up > 0, up, np.where(down < 0, tension * down, 0))
             later = (1 + np.sqrt(1 + 4 * t * t)) / 2
-            y, k, t = new + (t - 1) / later * (new - k), new, later
+            y, k, t = new + (t - 1) / later * (new - k), new, later  # y of the last one is not used
         v = v_star - force(k) / m[:, None]
         moved = x + dt * v + self.shift(v, W, g, total, gamma, inverse, H, dt)
         now, c = moved, np.zeros(n)

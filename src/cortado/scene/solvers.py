@@ -49,9 +49,9 @@ class ProjectionSolver(SolverTable):
 
     kind: Literal["projection"]
     """Name of the algorithm."""
-    iterations: Annotated[int, count(1, 1_000)] = 8
+    iterations: Annotated[int, count(1, 1_000)] = 5
     """Iterations of the pressure in every step, each from that of the step before."""
-    repairs: Annotated[int, count(1, 1_000)] = 3
+    repairs: Annotated[int, count(1, 1_000)] = 2
     """Iterations in every step that bring positions back to the rest density."""
 
 

@@ -88,6 +88,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._around = named({name: wp.zeros_like(array) for name, array in solver.around.items()}, "bar")
         self._kept = named({name: wp.zeros_like(array) for name, array in solver.kept.items()}, "bar")
         self._x_now_bar, self._x_moved_bar, self._v_new_bar, self._f = (solver.vectors() for _ in range(4))
+        pull = solver.new_arrays(T=solver.pull.dtype, S=solver.pull.dtype)
+        self._pull, self._push = pull["T"], pull["S"]
         self._m_unused, self._k_before_bar, self._n_now_bar = (solver.numbers() for _ in range(3))
         self._k_bar, self._y_bar, self._c_bar, self._d_bar = (solver.numbers() for _ in range(4))
 
@@ -164,15 +166,15 @@ class ProjectionAdjoint(ParticleAdjoint):
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
         """Of the new velocities and of the iterations, to the adjoints of v* and of the first k."""
         solver, kernels, velocity = self._solver, self._solver.kernels.pressure, self._solver.kernels.velocity
-        last = {"u": solver.v_new, "u_bar": self._v_new_bar, "v_star": solver.v_star, "f": self._f}
-        context.launch(velocity.end_adjoint, *known, last)
-        context.launch(
-            velocity.velocity.adjoint, *known, y=solver.iterates[iterations]["k"], y_bar=self._k_bar, f=self._f
-        )
+        last = {"u": solver.v_new, "u_bar": self._v_new_bar, "v_star": solver.v_star}
+        steps = {"f": self._f, "T": self._pull, "S": self._push}
+        context.launch(velocity.end_adjoint, *known, last, steps, y=solver.iterates[iterations]["k"])
+        first = {"y": solver.iterates[iterations]["k"], "y_bar": self._k_bar}
+        context.launch(velocity.velocity.adjoint, *known, steps, first)
         clamp, divergence = kernels.update.adjoint
-        steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar}
+        steps |= {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar}
         for k in reversed(range(iterations)):
             at = solver.iterates[k]
             context.launch(clamp, *known, at, solver.relaxed, steps, beta=solver.momenta[k])
-            context.launch(divergence, *known, at, steps, v_star=solver.v_star, f=self._f)
-            context.launch(velocity.velocity.adjoint, *known, at, steps, f=self._f)
+            context.launch(divergence, *known, at, steps, v_star=solver.v_star)
+            context.launch(velocity.velocity.adjoint, *known, at, steps)

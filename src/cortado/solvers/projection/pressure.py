@@ -25,7 +25,7 @@ from cortado.device.lanes import lane_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries, weights_type
-from cortado.solvers.projection.velocity import symmetric_part
+from cortado.sph.moment_functions import matrix_type, moment_functions
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,9 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     precision = discretisation.precision
     real, vector, pair_of = precision.real, precision.vector, precision.pair
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
-    symmetric = symmetric_part(precision)
-    spread, spread_tangent, spread_back = sums.spread, sums.spread_tangent, sums.spread_back
+    matrix, symmetric = matrix_type(precision), moment_functions(precision, dimension).change
+    divergence, divergence_tangent = sums.divergence, sums.divergence_tangent
+    divergence_back = sums.divergence_back
     topic = f"projection_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
@@ -68,12 +69,15 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     def start(
         k_before: wp.array(dtype=real),
         weights: wp.array(dtype=weights4),
+        L: wp.array(dtype=matrix),
         # out
         k: wp.array(dtype=real),
         y: wp.array(dtype=real),
+        T: wp.array(dtype=matrix),
     ):
         i = wp.tid()
         first = weights[i][1] * k_before[i]
+        T[i] = first * L[i]
         k[i] = first
         y[i] = first
 
@@ -121,16 +125,17 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         # out
         k_out: wp.array(dtype=real),
         y_out: wp.array(dtype=real),
+        T: wp.array(dtype=matrix),
         error: wp.array(dtype=pair_of),
     ):
         """``error``: the divergence that is not wanted, times the time step, twice (for a sum and a maximum). The
-        divergence is written to ``at``."""
+        divergence is written to ``at``; T is y' L."""
         i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z = spread(i, x, at.u, s)
+        total = divergence(i, x, at.u, of.L, s)
         if lane() > 0:
             return
         dt = time_step[i // s.particles]
-        D = wp.ddot(of.L[i], wp.matrix_from_rows(row_x, row_y, row_z)) + wp.dot(of.gamma[i], at.u[i])
+        D = total + wp.dot(of.gamma[i], at.u[i])
         b = wanted(n[i], of.weights[i][1], dt)
         per = omega / of.a[i]
         up = at.y[i] + per * (D - b)
@@ -146,8 +151,10 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         elif not (up <= real(0.0)):  # NaN, which must not be hidden
             new = up
         at.d[i] = D
-        y_out[i] = new + beta * (new - at.k[i])  # before k, which may be the same array
+        later = new + beta * (new - at.k[i])  # before k, which may be the same array
         k_out[i] = new
+        y_out[i] = later
+        T[i] = later * of.L[i]
         error[i] = pair_of(dt * wp.abs(left), dt * wp.abs(left))
 
     @wp.kernel(module=tangent_module, enable_backward=False)
@@ -169,15 +176,12 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         y_out_dot: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z = spread_tangent(i, x, x_dot, at.u, dot.u, s)
-        own_x, own_y, own_z = spread(i, x, at.u, s)
+        total = divergence_tangent(i, x, x_dot, at.u, dot.u, of.L, dot.L, s)
         if lane() > 0:
             return
         member = i // s.particles
         dt = time_step[member]
-        D_dot = wp.ddot(of.L[i], wp.matrix_from_rows(row_x, row_y, row_z))
-        D_dot += wp.ddot(dot.L[i], wp.matrix_from_rows(own_x, own_y, own_z))
-        D_dot += wp.dot(of.gamma[i], dot.u[i]) + wp.dot(dot.gamma[i], at.u[i])
+        D_dot = total + wp.dot(of.gamma[i], dot.u[i]) + wp.dot(dot.gamma[i], at.u[i])
         D, full = at.d[i], of.weights[i][1]
         b = wanted(n[i], full, dt)
         b_dot = -b * time_step_dot[member] / dt
@@ -211,7 +215,10 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         bar: bars,
         # out
         d_bar: wp.array(dtype=real),
+        S: wp.array(dtype=matrix),
+        T: wp.array(dtype=matrix),
     ):
+        """S is d_bar L, and T is y L."""
         i = wp.tid()
         dt = time_step[i // particles]
         D, full, a = at.d[i], of.weights[i][1], of.a[i]
@@ -239,6 +246,8 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         k_bar[i] = -beta * y_bar[i]
         y_bar[i] = z_bar
         d_bar[i] = per * z_bar
+        S[i] = (per * z_bar) * of.L[i]
+        T[i] = at.y[i] * of.L[i]
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def divergence_adjoint(
@@ -247,8 +256,10 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         m: wp.array(dtype=real),
         v_star: wp.array(dtype=vector),
         u: wp.array(dtype=vector),
+        g: wp.array(dtype=vector),
         of: seen,
         d_bar: wp.array(dtype=real),
+        S: wp.array(dtype=matrix),
         # in and out
         bar: bars,
         # out
@@ -256,11 +267,11 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     ):
         """From that of D to f = -u_bar / m, and to that of v*, of which u = v* - ... is made."""
         i = s.first + wp.tid() // LANES
-        u_part, x_part, row_x, row_y, row_z = spread_back(i, x, u, d_bar, of.L, s)
+        u_part, x_part, diagonal, others = divergence_back(i, x, u, S, s)
         if lane() > 0:
             return
-        u_bar = u_part + d_bar[i] * of.gamma[i]
-        bar.L[i] = bar.L[i] + d_bar[i] * symmetric(row_x, row_y, row_z)
+        u_bar = u_part + S[i] * g[i] + d_bar[i] * of.gamma[i]
+        bar.L[i] = bar.L[i] + d_bar[i] * symmetric(diagonal, others)
         bar.gamma[i] = bar.gamma[i] + d_bar[i] * u[i]
         bar.x[i] = bar.x[i] + x_part
         bar.v[i] = bar.v[i] + u_bar

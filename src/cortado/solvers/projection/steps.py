@@ -72,6 +72,8 @@ class ProjectionSteps(ParticleSolver):
             self.layout.precision.real,
             self.layout.precision.vector,
         )
+        self.pull = self.new_arrays(T=matrix)["T"]
+        """y L of the present iteration."""
         self.kept = self.new_arrays(A=matrix, crowd=vector)
         """Sums of the shift."""
         kinds = {"u": vector, "d": real, "y": real, "k": real}
@@ -150,22 +152,22 @@ class ProjectionSteps(ParticleSolver):
         context.launch(kernels.surroundings.forward, self.around, self.relaxed)
         predicted = {"x_star": self.x_star, "v_star": self.v_star}
         context.launch(self.integration.predict, acceleration=self.accelerate(context), **predicted)
-        started = {"k": first["k"], "y": first["y"], "k_before": self.carried[IMPULSE]}
+        started = {"k": first["k"], "y": first["y"], "T": self.pull, "k_before": self.carried[IMPULSE]}
         context.launch(kernels.pressure.start.forward, self.around, started)
         return context
 
     def iterate(self, context: StepContext, k: int, before: int, after: int) -> None:
         """Iteration k, from the iterates of one slot to those of another."""
         kernels, at, new = self.kernels, self.iterates[before], self.iterates[after]
-        context.launch(kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star)
-        out = {"k_out": new["k"], "y_out": new["y"], "error": self.loops[0].errors}
+        context.launch(kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star, T=self.pull)
+        out = {"k_out": new["k"], "y_out": new["y"], "T": self.pull, "error": self.loops[0].errors}
         context.launch(kernels.pressure.update.forward, self.around, at, self.relaxed, out, beta=self.momenta[k])
 
     def move(self, context: StepContext, last: int) -> None:
         """The new velocities, by the k of a slot, and the positions that they and the shift lead to."""
-        kernels, k = self.kernels, self.iterates[last]["k"]
+        kernels, at = self.kernels, {"y": self.iterates[last]["y"], "T": self.pull}
         new = {"v_new": self.v_new, "x_moved": self.x_moved}
-        context.launch(kernels.velocity.velocity.forward, self.around, v_star=self.v_star, y=k, u=self.v_new)
+        context.launch(kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star, u=self.v_new)
         context.launch(kernels.shift.forward, self.around, self.kept, self.shifted, new)
         wp.copy(self.repaired[0]["x_now"], self.x_moved)
         self.repaired[0]["c"].zero_()
@@ -184,10 +186,11 @@ class ProjectionSteps(ParticleSolver):
 
 
 def momenta(iterations: int) -> list[float]:
-    """beta of so many iterations (Nesterov 1983): (t - 1) / t', t' = (1 + sqrt(1 + 4 t^2)) / 2, from t = 1."""
+    """beta of so many iterations (Nesterov 1983): (t - 1) / t', t' = (1 + sqrt(1 + 4 t^2)) / 2, from t = 1; 0 in the
+    last, so that y is k at the end."""
     found, t = [], 1.0
     for _ in range(iterations):
         later = 0.5 * (1.0 + (1.0 + 4.0 * t * t) ** 0.5)
         found.append((t - 1.0) / later)
         t = later
-    return found
+    return [*found[:-1], 0.0]

@@ -1,7 +1,7 @@
 """Sums over neighbours of the projection, with their derivatives; g_ij = V grad W_ij.
 
-Three of them do most of the work, forward and back, as each is the transpose of another or of itself: the force of
-pressures, the spread of velocities, and the push of numbers.
+The force of pressures and the divergence of velocities are each other's transpose, and do most of the work, forward
+and back.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from cortado.sph.moment_functions import matrix_type
 
 @dataclass(frozen=True)
 class ProjectionSums:
-    """Warp functions. A matrix comes as its three rows; a symmetric one as its diagonal and its entries yz, xz, xy."""
+    """Warp functions. A symmetric matrix comes as its diagonal and its entries yz, xz and xy."""
 
     moments: Any
     """M = -sum g_ij x_ij^T, Q = sum g_ij g_ij^T / m_j, g = sum g_ij, and of walls gamma = sum w_b g_ib and
@@ -26,15 +26,17 @@ class ProjectionSums:
     moments_back: Any
     """What adjoints of the moments give to x and m."""
     force: Any
-    """sum (k_i L_i + k_j L_j) g_ij"""
+    """sum_j T_j g_ij, for T = k L, which T_i g_i completes."""
     force_tangent: Any
+    """Of sum_j (k_i L_i + k_j L_j) g_ij."""
     force_back: Any
-    """For adjoints f of the force: the rows of sum f_ij g_ij^T, and what x is given."""
-    spread: Any
-    """The rows of sum v_ij g_ij^T."""
-    spread_tangent: Any
-    spread_back: Any
-    """For an adjoint d_i of L_i : sum v_ij g_ij^T: what v is given, what x is, and the rows of the spread again."""
+    """For adjoints f of the force: the symmetric part of sum f_ij g_ij^T, and what x is given."""
+    divergence: Any
+    """L_i : sum_j v_ij g_ij^T"""
+    divergence_tangent: Any
+    divergence_back: Any
+    """For an adjoint d of the divergence and S = d L: what v is given but for S_i g_i, what x is, and the symmetric
+    part of sum v_ij g_ij^T."""
     push: Any
     """sum (c_i + c_j) g_ij"""
     push_tangent: Any
@@ -54,6 +56,11 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
     def cross_terms(a: vector, b: vector) -> vector:
         """Entries yz, xz and xy of a b^T."""
         return vector(a[1] * b[2], a[0] * b[2], a[0] * b[1])
+
+    @wp.func
+    def even_terms(a: vector, b: vector) -> vector:
+        """Entries yz, xz and xy of (a b^T + b a^T) / 2."""
+        return real(0.5) * (cross_terms(a, b) + cross_terms(b, a))
 
     def wall_moments(x_ij: vector, s: neighbourhood) -> tuple[vector, vector, vector, vector, vector, vector, real]:
         gone = vector()
@@ -117,9 +124,8 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         return s.volume * x_part, -wp.dot(g, Q_bar_j * g) / (m_i * m_i)
 
     @fluid_sum(discretisation)
-    def force(x_ij: vector, k_i: real, k_j: real, L_i: matrix, L_j: matrix, s: neighbourhood) -> vector:
-        g = s.volume * gradient(x_ij, s)
-        return k_i * (L_i * g) + k_j * (L_j * g)
+    def force(x_ij: vector, T_j: matrix, s: neighbourhood) -> vector:
+        return T_j * (s.volume * gradient(x_ij, s))
 
     @fluid_sum(discretisation, ahead=False)
     def force_tangent(
@@ -141,36 +147,36 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
 
     @fluid_sum(discretisation)
     def force_back(
-        x_ij: vector, k_i: real, k_j: real, L_i: matrix, L_j: matrix, f_ij: vector, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector]:
+        x_ij: vector, T_i: matrix, T_j: matrix, f_ij: vector, s: neighbourhood
+    ) -> tuple[vector, vector, vector]:
         g = s.volume * gradient(x_ij, s)
-        pulled = k_i * (L_i * f_ij) + k_j * (L_j * f_ij)
-        return f_ij[0] * g, f_ij[1] * g, f_ij[2] * g, s.volume * hessian_product(x_ij, pulled, s)
+        pulled = (T_i + T_j) * f_ij
+        return wp.cw_mul(f_ij, g), even_terms(f_ij, g), s.volume * hessian_product(x_ij, pulled, s)
 
     @fluid_sum(discretisation)
-    def spread(x_ij: vector, v_ij: vector, s: neighbourhood) -> tuple[vector, vector, vector]:
-        g = s.volume * gradient(x_ij, s)
-        return v_ij[0] * g, v_ij[1] * g, v_ij[2] * g
+    def divergence(x_ij: vector, v_ij: vector, L_i: matrix, s: neighbourhood) -> real:
+        return s.volume * wp.dot(v_ij, L_i * gradient(x_ij, s))
 
     @fluid_sum(discretisation, ahead=False)
-    def spread_tangent(
-        x_ij: vector, x_dot_ij: vector, v_ij: vector, v_dot_ij: vector, s: neighbourhood
-    ) -> tuple[vector, vector, vector]:
-        g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
-        return (
-            v_dot_ij[0] * g + v_ij[0] * g_dot,
-            v_dot_ij[1] * g + v_ij[1] * g_dot,
-            v_dot_ij[2] * g + v_ij[2] * g_dot,
-        )
+    def divergence_tangent(
+        x_ij: vector,
+        x_dot_ij: vector,
+        v_ij: vector,
+        v_dot_ij: vector,
+        L_i: matrix,
+        L_dot_i: matrix,
+        s: neighbourhood,
+    ) -> real:
+        g, g_dot = gradient(x_ij, s), hessian_product(x_ij, x_dot_ij, s)
+        return s.volume * (wp.dot(v_dot_ij, L_i * g) + wp.dot(v_ij, L_dot_i * g + L_i * g_dot))
 
     @fluid_sum(discretisation)
-    def spread_back(
-        x_ij: vector, v_ij: vector, d_i: real, d_j: real, L_i: matrix, L_j: matrix, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector, vector]:
+    def divergence_back(
+        x_ij: vector, v_ij: vector, S_i: matrix, S_j: matrix, s: neighbourhood
+    ) -> tuple[vector, vector, vector, vector]:
         g = s.volume * gradient(x_ij, s)
-        pushed = d_i * (L_i * v_ij) + d_j * (L_j * v_ij)
-        v_part = d_i * (L_i * g) + d_j * (L_j * g)
-        return v_part, s.volume * hessian_product(x_ij, pushed, s), v_ij[0] * g, v_ij[1] * g, v_ij[2] * g
+        pushed, moved = (S_i + S_j) * v_ij, wp.cw_mul(v_ij, g)
+        return S_j * g, s.volume * hessian_product(x_ij, pushed, s), moved, even_terms(v_ij, g)
 
     @fluid_sum(discretisation)
     def push(x_ij: vector, c_i: real, c_j: real, s: neighbourhood) -> vector:
@@ -193,6 +199,6 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
     return ProjectionSums(
         *(moments, moments_tangent, moments_back),
         *(force, force_tangent, force_back),
-        *(spread, spread_tangent, spread_back),
+        *(divergence, divergence_tangent, divergence_back),
         *(push, push_tangent, push_back),
     )

@@ -2,18 +2,16 @@
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import warp as wp
 
 from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
-from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
-from cortado.sph.moment_functions import matrix_type
+from cortado.sph.moment_functions import matrix_type, moment_functions
 
 
 @dataclass(frozen=True)
@@ -29,26 +27,13 @@ class VelocityKernels:
 
 
 @cache
-def symmetric_part(precision: Precision) -> Any:
-    """The Warp function of the symmetric part of a matrix, given its rows."""
-    vector, real, matrix = precision.vector, precision.real, matrix_type(precision)
-
-    @wp.func
-    def symmetric(row_x: vector, row_y: vector, row_z: vector) -> matrix:
-        A = wp.matrix_from_rows(row_x, row_y, row_z)
-        return real(0.5) * (A + wp.transpose(A))
-
-    return symmetric
-
-
-@cache
 def velocity_kernels(discretisation: Discretisation, dimension: int) -> VelocityKernels:
     """In 2 or 3 dimensions."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
     force, force_tangent, force_back = sums.force, sums.force_tangent, sums.force_back
-    symmetric, topic = symmetric_part(precision), f"projection_{dimension}d"
+    symmetric, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
     own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma")}
@@ -62,17 +47,19 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         x: wp.array(dtype=vector),
         m: wp.array(dtype=real),
         y: wp.array(dtype=real),
-        L: wp.array(dtype=matrix),
+        T: wp.array(dtype=matrix),
+        g: wp.array(dtype=vector),
         gamma: wp.array(dtype=vector),
         v_star: wp.array(dtype=vector),
         # out
         u: wp.array(dtype=vector),
     ):
+        """T is y L."""
         i = s.first + wp.tid() // LANES
-        total = force(i, x, y, L, s)
+        total = force(i, x, T, s)
         if lane() > 0:
             return
-        u[i] = v_star[i] - (total + y[i] * gamma[i]) / m[i]
+        u[i] = v_star[i] - (total + T[i] * g[i] + y[i] * gamma[i]) / m[i]
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def velocity_tangent(
@@ -103,18 +90,19 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         s: neighbourhood,
         x: wp.array(dtype=vector),
         y: wp.array(dtype=real),
+        T: wp.array(dtype=matrix),
         of: seen,
         f: wp.array(dtype=vector),
         # in and out
         y_bar: wp.array(dtype=real),
         bar: bars,
     ):
-        """From f = -u_bar / m of all particles."""
+        """From f = -u_bar / m of all particles; T is y L."""
         i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z, x_part = force_back(i, x, y, of.L, f, s)
+        diagonal, others, x_part = force_back(i, x, T, f, s)
         if lane() > 0:
             return
-        A = symmetric(row_x, row_y, row_z)
+        A = symmetric(diagonal, others)
         y_bar[i] = y_bar[i] + wp.ddot(of.L[i], A) + wp.dot(of.gamma[i], f[i])
         bar.L[i] = bar.L[i] + y[i] * A
         bar.gamma[i] = bar.gamma[i] + y[i] * f[i]
@@ -124,18 +112,22 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     def end_adjoint(
         m: wp.array(dtype=real),
         v_star: wp.array(dtype=vector),
+        y: wp.array(dtype=real),
+        L: wp.array(dtype=matrix),
         u: wp.array(dtype=vector),
         u_bar: wp.array(dtype=vector),
         # in and out
         v_bar: wp.array(dtype=vector),
         m_bar: wp.array(dtype=real),
         # out
+        T: wp.array(dtype=matrix),
         f: wp.array(dtype=vector),
     ):
         i = wp.tid()
         bar = u_bar[i]
         v_bar[i] = v_bar[i] + bar
         m_bar[i] = m_bar[i] + wp.dot(bar, v_star[i] - u[i]) / m[i]
+        T[i] = y[i] * L[i]
         f[i] = -bar / m[i]
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
