@@ -31,6 +31,7 @@ VALIDATION = {
     "test_surface_tension",
     "test_validation",
     "test_validation_mixture",
+    "test_validation_projection",
     "test_validation_rayleigh_taylor",
     "test_validation_rheology",
     "test_validation_viscosity",

@@ -243,17 +243,17 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     ),
     (
         "## Time steps: `[solver]`",
-        "In each step the pressure is computed by iterations, until the fluid is compressed by no more than a "
-        "tolerance. A time step beyond the limit of stability is warned of. These are the keys of PCISPH, which every "
-        "scene has that does not say otherwise. With another `kind`, the name of a solver that an installed package "
-        "registers, the table has `kind`, `time_step` and the keys of that solver.",
+        "How the fluid is kept incompressible ([two ways](projection.md)). A time step beyond the limit of stability is "
+        "warned of. Every scene has PCISPH that does not say otherwise. With the name of a solver that an installed "
+        "package registers as `kind`, the table has `kind`, `time_step` and the keys of that solver.",
         (
             (
                 "PcisphSolver",
-                "",
+                "### PCISPH",
                 "[solver]\ntime_step = 0.002\nminimum_iterations = 3\nmaximum_iterations = 100\n"
                 "density_tolerance = 0.001",
             ),
+            ("ProjectionSolver", "### The projection", '[solver]\nkind = "projection"\ntime_step = 0.002'),
         ),
     ),
     (

@@ -27,6 +27,7 @@ class ProjectionTangent(ParticleTangent):
         super().__init__(solver, parameters_dot)
         self._solver: ProjectionSteps = solver
         self._around = named({name: wp.zeros_like(array) for name, array in solver.around.items()}, "dot")
+        self._pull = solver.new_arrays(T=solver.pull.dtype, T_dot=solver.pull.dtype)
         self._x_star_dot, self._v_star_dot, self._v_new_dot = (solver.vectors() for _ in range(3))
         self._u_dot, self._x_moved_dot, self._x_now_dot = (solver.vectors() for _ in range(3))
         self._k_dot, self._y_dot, self._c_dot = (solver.numbers() for _ in range(3))
@@ -67,16 +68,24 @@ class ProjectionTangent(ParticleTangent):
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
         """The iterations, and the new velocities."""
-        solver, kernels, velocity = self._solver, self._solver.kernels.pressure, self._solver.kernels.velocity
-        predicted = {"v_star": solver.v_star, "v_star_dot": self._v_star_dot}
+        solver, kernels = self._solver, self._solver.kernels.pressure
         for k in range(iterations):
             at = solver.iterates[k]
             change = {"u_dot": self._u_dot, "y_dot": self._y_dot, "k_dot": self._k_dot}
-            context.launch(velocity.velocity.tangent, *known, at, predicted, change)
+            self._pull_along(context, known, at["y"], self._y_dot, u=at["u"], u_dot=self._u_dot)
             new = {"k_out_dot": self._k_dot, "y_out_dot": self._y_dot, "beta": solver.momenta[k]}
             context.launch(kernels.update.tangent, *known, at, solver.relaxed, change, new)
-        last = {"y": solver.iterates[iterations]["k"], "y_dot": self._k_dot}
-        context.launch(velocity.velocity.tangent, *known, predicted, last, u=solver.v_new, u_dot=self._v_new_dot)
+        k = solver.iterates[iterations]["k"]
+        self._pull_along(context, known, k, self._k_dot, u=solver.v_new, u_dot=self._v_new_dot)
+
+    def _pull_along(
+        self, context: StepContext, known: tuple[Named, ...], y: wp.array, y_dot: wp.array, **velocity: wp.array
+    ) -> None:
+        """Of the velocity that is left by y."""
+        kernels, pull = self._solver.kernels.velocity, {**self._pull, "y": y, "y_dot": y_dot}
+        context.launch(kernels.pull_tangent, *known, pull)
+        predicted = {"v_star": self._solver.v_star, "v_star_dot": self._v_star_dot}
+        context.launch(kernels.velocity.tangent, *known, pull, predicted, **velocity)
 
 
 class ProjectionAdjoint(ParticleAdjoint):

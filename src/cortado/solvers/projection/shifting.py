@@ -18,15 +18,13 @@ from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.device.precision import Precision
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import fluid_sum
+from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries, surrounding_functions, weights_type
 from cortado.sph.moment_functions import matrix_type
 
 RATE = 20.0
 """How fast particles are shifted."""
-CROWDED = 0.2
-"""How much more pairs count that are close (Monaghan 2000)."""
 FARTHEST = 0.1
 """In spacings: how far a particle is shifted in a step, at most."""
 SURFACE = 0.03
@@ -106,8 +104,8 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, weights4 = neighbourhood_type(precision), weights_type(precision)
-    pair = pair_functions(discretisation)
-    weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product
+    sums = projection_sums(discretisation)
+    crowding, crowding_tangent, crowding_back = sums.crowding, sums.crowding_tangent, sums.crowding_back
     topic = f"projection_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
@@ -117,49 +115,8 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     own = {name: kind for name, kind in entries(precision).items() if name in ("M", "g", "gamma", "weights")}
     seen, bars = bundle(**own), bundle(x=vector, time_step=real, **own)
     kept = bundle(A=matrix, crowd=vector)
-    crowded = wp.constant(real(CROWDED))
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
-
-    @fluid_sum(discretisation)
-    def crowding(x_ij: vector, v_ij: vector, nearest: real, s: neighbourhood) -> tuple[vector, vector, vector, vector]:
-        g = s.volume * gradient(x_ij, s)
-        near = s.volume * weight(x_ij, s) / nearest
-        square = near * near
-        return v_ij[0] * g, v_ij[1] * g, v_ij[2] * g, (real(1.0) + crowded * square * square) * g
-
-    @fluid_sum(discretisation, ahead=False)
-    def crowding_tangent(
-        x_ij: vector, x_dot_ij: vector, v_ij: vector, v_dot_ij: vector, nearest: real, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector]:
-        g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
-        near = s.volume * weight(x_ij, s) / nearest
-        square = near * near
-        more = real(4.0) * crowded * square * near * wp.dot(g, x_dot_ij) / nearest
-        return (
-            v_dot_ij[0] * g + v_ij[0] * g_dot,
-            v_dot_ij[1] * g + v_ij[1] * g_dot,
-            v_dot_ij[2] * g + v_ij[2] * g_dot,
-            (real(1.0) + crowded * square * square) * g_dot + more * g,
-        )
-
-    @fluid_sum(discretisation)
-    def crowding_back(
-        x_ij: vector,
-        v_ij: vector,
-        A_bar_i: matrix,
-        A_bar_j: matrix,
-        crowd_bar_ij: vector,
-        nearest: real,
-        s: neighbourhood,
-    ) -> tuple[vector, vector]:
-        """What v and x are given."""
-        g = s.volume * gradient(x_ij, s)
-        near = s.volume * weight(x_ij, s) / nearest
-        square, both = near * near, A_bar_i + A_bar_j
-        more = real(4.0) * crowded * square * near * wp.dot(g, crowd_bar_ij) / nearest
-        pulled = wp.transpose(both) * v_ij + (real(1.0) + crowded * square * square) * crowd_bar_ij
-        return both * g, s.volume * hessian_product(x_ij, pulled, s) + more * g
 
     @wp.kernel(module=module)
     def new_positions(

@@ -10,9 +10,13 @@ from typing import Any
 
 import warp as wp
 
+from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import fluid_sum, pair_sum
+from cortado.particles.pair_sums import fluid_sum, wall_sum
 from cortado.sph.moment_functions import matrix_type
+
+CROWDED = 0.2
+"""How much more pairs count in a shift that are close (Monaghan 2000)."""
 
 
 @dataclass(frozen=True)
@@ -20,15 +24,18 @@ class ProjectionSums:
     """Warp functions. A symmetric matrix comes as its diagonal and its entries yz, xz and xy."""
 
     moments: Any
-    """M = -sum g_ij x_ij^T, Q = sum g_ij g_ij^T / m_j, g = sum g_ij, and of walls gamma = sum w_b g_ib and
-    nu = V sum w_b W_ib."""
+    """M = -sum g_ij x_ij^T, Q = sum g_ij g_ij^T / m_j and g = sum g_ij."""
     moments_tangent: Any
     moments_back: Any
     """What adjoints of the moments give to x and m."""
+    beside: Any
+    """gamma = sum w_b g_ib and nu = V sum w_b W_ib of walls."""
+    beside_tangent: Any
+    beside_back: Any
+    """What their adjoints give to x."""
     force: Any
     """sum_j T_j g_ij, for T = k L, which T_i g_i completes."""
     force_tangent: Any
-    """Of sum_j (k_i L_i + k_j L_j) g_ij."""
     force_back: Any
     """For adjoints f of the force: the symmetric part of sum f_ij g_ij^T, and what x is given."""
     divergence: Any
@@ -42,6 +49,11 @@ class ProjectionSums:
     push_tangent: Any
     push_back: Any
     """For adjoints f of the push: sum g_ij . f_ij, and what x is given."""
+    crowding: Any
+    """The rows of sum v_ij g_ij^T, and sum (1 + (V W_ij / V W(s))^4 / 5) g_ij, for V W(s) ``nearest``."""
+    crowding_tangent: Any
+    crowding_back: Any
+    """For adjoints A of the first, as matrices, and of the second: what v and x are given."""
 
 
 @cache
@@ -50,6 +62,7 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, matrix = neighbourhood_type(discretisation.precision), matrix_type(discretisation.precision)
     pair = pair_functions(discretisation)
+    crowded = wp.constant(real(CROWDED))
     weight, slope, gradient, hessian_product = pair.weight, pair.slope, pair.gradient, pair.hessian_product
 
     @wp.func
@@ -62,28 +75,17 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         """Entries yz, xz and xy of (a b^T + b a^T) / 2."""
         return real(0.5) * (cross_terms(a, b) + cross_terms(b, a))
 
-    def wall_moments(x_ij: vector, s: neighbourhood) -> tuple[vector, vector, vector, vector, vector, vector, real]:
-        gone = vector()
-        return gone, gone, gone, gone, gone, s.volume * gradient(x_ij, s), s.volume * weight(x_ij, s)
-
-    @pair_sum(discretisation, wall_moments)
-    def moments(
-        x_ij: vector, m_j: real, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector, vector, vector, real]:
+    @fluid_sum(discretisation)
+    def moments(x_ij: vector, m_j: real, s: neighbourhood) -> tuple[vector, vector, vector, vector, vector]:
         g = s.volume * gradient(x_ij, s)
         q = g / m_j
-        return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(q, g), cross_terms(q, g), g, vector(), real(0.0)
+        return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(q, g), cross_terms(q, g), g
 
-    def wall_moments_tangent(
-        x_ij: vector, x_dot_ij: vector, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector, vector, vector, real]:
-        gone, change = vector(), s.volume * hessian_product(x_ij, x_dot_ij, s)
-        return gone, gone, gone, gone, gone, change, s.volume * wp.dot(gradient(x_ij, s), x_dot_ij)
-
-    @pair_sum(discretisation, wall_moments_tangent, ahead=False)
+    @tangent_of(moments)
+    @fluid_sum(discretisation, ahead=False)
     def moments_tangent(
         x_ij: vector, x_dot_ij: vector, m_j: real, m_dot_j: real, s: neighbourhood
-    ) -> tuple[vector, vector, vector, vector, vector, vector, real]:
+    ) -> tuple[vector, vector, vector, vector, vector]:
         g = s.volume * gradient(x_ij, s)
         g_dot = s.volume * hessian_product(x_ij, x_dot_ij, s)
         per = real(1.0) / m_j
@@ -94,15 +96,9 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
             wp.cw_mul(q_dot, g) + wp.cw_mul(q, g_dot),
             cross_terms(q_dot, g) + cross_terms(q, g_dot),
             g_dot,
-            vector(),
-            real(0.0),
         )
 
-    def wall_moments_back(x_ij: vector, gamma_bar_i: vector, nu_bar_i: real, s: neighbourhood) -> tuple[vector, real]:
-        change = hessian_product(x_ij, gamma_bar_i, s) + nu_bar_i * gradient(x_ij, s)
-        return s.volume * change, real(0.0)
-
-    @pair_sum(discretisation, wall_moments_back)
+    @fluid_sum(discretisation)
     def moments_back(
         x_ij: vector,
         m_i: real,
@@ -112,8 +108,6 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         Q_bar_i: matrix,
         Q_bar_j: matrix,
         g_bar_ij: vector,
-        gamma_bar_i: vector,
-        nu_bar_i: real,
         s: neighbourhood,
     ) -> tuple[vector, real]:
         """M_bar and Q_bar are symmetric."""
@@ -123,27 +117,26 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         x_part = hessian_product(x_ij, real(2.0) * both + g_bar_ij - stretch, s) - slope(x_ij, s) * stretch
         return s.volume * x_part, -wp.dot(g, Q_bar_j * g) / (m_i * m_i)
 
+    @wall_sum(discretisation)
+    def beside(x_ij: vector, s: neighbourhood) -> tuple[vector, real]:
+        return s.volume * gradient(x_ij, s), s.volume * weight(x_ij, s)
+
+    @wall_sum(discretisation)
+    def beside_tangent(x_ij: vector, x_dot_ij: vector, s: neighbourhood) -> tuple[vector, real]:
+        return s.volume * hessian_product(x_ij, x_dot_ij, s), s.volume * wp.dot(gradient(x_ij, s), x_dot_ij)
+
+    @wall_sum(discretisation)
+    def beside_back(x_ij: vector, gamma_bar_i: vector, nu_bar_i: real, s: neighbourhood) -> vector:
+        return s.volume * (hessian_product(x_ij, gamma_bar_i, s) + nu_bar_i * gradient(x_ij, s))
+
     @fluid_sum(discretisation)
     def force(x_ij: vector, T_j: matrix, s: neighbourhood) -> vector:
         return T_j * (s.volume * gradient(x_ij, s))
 
+    @tangent_of(force)
     @fluid_sum(discretisation, ahead=False)
-    def force_tangent(
-        x_ij: vector,
-        x_dot_ij: vector,
-        k_i: real,
-        k_j: real,
-        k_dot_i: real,
-        k_dot_j: real,
-        L_i: matrix,
-        L_j: matrix,
-        L_dot_i: matrix,
-        L_dot_j: matrix,
-        s: neighbourhood,
-    ) -> vector:
-        g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
-        own = L_i * (k_dot_i * g + k_i * g_dot) + k_i * (L_dot_i * g)
-        return own + L_j * (k_dot_j * g + k_j * g_dot) + k_j * (L_dot_j * g)
+    def force_tangent(x_ij: vector, x_dot_ij: vector, T_j: matrix, T_dot_j: matrix, s: neighbourhood) -> vector:
+        return s.volume * (T_dot_j * gradient(x_ij, s) + T_j * hessian_product(x_ij, x_dot_ij, s))
 
     @fluid_sum(discretisation)
     def force_back(
@@ -157,6 +150,7 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
     def divergence(x_ij: vector, v_ij: vector, L_i: matrix, s: neighbourhood) -> real:
         return s.volume * wp.dot(v_ij, L_i * gradient(x_ij, s))
 
+    @tangent_of(divergence)
     @fluid_sum(discretisation, ahead=False)
     def divergence_tangent(
         x_ij: vector,
@@ -182,6 +176,7 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
     def push(x_ij: vector, c_i: real, c_j: real, s: neighbourhood) -> vector:
         return ((c_i + c_j) * s.volume) * gradient(x_ij, s)
 
+    @tangent_of(push)
     @fluid_sum(discretisation, ahead=False)
     def push_tangent(
         x_ij: vector, x_dot_ij: vector, c_i: real, c_j: real, c_dot_i: real, c_dot_j: real, s: neighbourhood
@@ -196,9 +191,51 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
             ((c_i + c_j) * s.volume) * hessian_product(x_ij, f_ij, s),
         )
 
+    @fluid_sum(discretisation)
+    def crowding(x_ij: vector, v_ij: vector, nearest: real, s: neighbourhood) -> tuple[vector, vector, vector, vector]:
+        g = s.volume * gradient(x_ij, s)
+        near = s.volume * weight(x_ij, s) / nearest
+        square = near * near
+        return v_ij[0] * g, v_ij[1] * g, v_ij[2] * g, (real(1.0) + crowded * square * square) * g
+
+    @tangent_of(crowding)
+    @fluid_sum(discretisation, ahead=False)
+    def crowding_tangent(
+        x_ij: vector, x_dot_ij: vector, v_ij: vector, v_dot_ij: vector, nearest: real, s: neighbourhood
+    ) -> tuple[vector, vector, vector, vector]:
+        g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
+        near = s.volume * weight(x_ij, s) / nearest
+        square = near * near
+        more = real(4.0) * crowded * square * near * wp.dot(g, x_dot_ij) / nearest
+        return (
+            v_dot_ij[0] * g + v_ij[0] * g_dot,
+            v_dot_ij[1] * g + v_ij[1] * g_dot,
+            v_dot_ij[2] * g + v_ij[2] * g_dot,
+            (real(1.0) + crowded * square * square) * g_dot + more * g,
+        )
+
+    @fluid_sum(discretisation)
+    def crowding_back(
+        x_ij: vector,
+        v_ij: vector,
+        A_bar_i: matrix,
+        A_bar_j: matrix,
+        crowd_bar_ij: vector,
+        nearest: real,
+        s: neighbourhood,
+    ) -> tuple[vector, vector]:
+        g = s.volume * gradient(x_ij, s)
+        near = s.volume * weight(x_ij, s) / nearest
+        square, both = near * near, A_bar_i + A_bar_j
+        more = real(4.0) * crowded * square * near * wp.dot(g, crowd_bar_ij) / nearest
+        pulled = wp.transpose(both) * v_ij + (real(1.0) + crowded * square * square) * crowd_bar_ij
+        return both * g, s.volume * hessian_product(x_ij, pulled, s) + more * g
+
     return ProjectionSums(
         *(moments, moments_tangent, moments_back),
+        *(beside, beside_tangent, beside_back),
         *(force, force_tangent, force_back),
         *(divergence, divergence_tangent, divergence_back),
         *(push, push_tangent, push_back),
+        *(crowding, crowding_tangent, crowding_back),
     )

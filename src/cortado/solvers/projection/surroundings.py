@@ -152,6 +152,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
     moments, moments_tangent, moments_back = sums.moments, sums.moments_tangent, sums.moments_back
+    beside, beside_tangent, beside_back = sums.beside, sums.beside_tangent, sums.beside_back
     topic = f"projection_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
@@ -175,7 +176,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         of: around,
     ):
         i = s.first + wp.tid() // LANES
-        diagonal, others, square, mixed, g, gamma, nu = moments(i, x, m, s)
+        diagonal, others, square, mixed, g = moments(i, x, m, s)
+        gamma, nu = beside(i, x, s)
         if lane() > 0:
             return
         M, Q = whole(diagonal, others), change(square, mixed)
@@ -203,7 +205,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     ):
         """Put together of the gradients of each entry."""
         i = s.first + wp.tid() // LANES
-        diagonal, others, square, mixed, g_i_dot, gamma_i_dot, nu_i_dot = moments_tangent(i, x, x_dot, m, m_dot, s)
+        diagonal, others, square, mixed, g_i_dot = moments_tangent(i, x, x_dot, m, m_dot, s)
+        gamma_i_dot, nu_i_dot = beside_tangent(i, x, x_dot, s)
         if lane() > 0:
             return
         M_i_dot, Q_i_dot = change(diagonal, others), change(square, mixed)
@@ -269,10 +272,11 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         m_bar: wp.array(dtype=real),
     ):
         i = s.first + wp.tid() // LANES
-        x_part, m_part = moments_back(i, x, m, bar.M, bar.Q, bar.g, bar.gamma, bar.nu, s)
+        x_part, m_part = moments_back(i, x, m, bar.M, bar.Q, bar.g, s)
+        wall_part = beside_back(i, x, bar.gamma, bar.nu, s)
         if lane() > 0:
             return
-        x_bar[i] = x_bar[i] + x_part
+        x_bar[i] = x_bar[i] + x_part + wall_part
         m_bar[i] = m_bar[i] + m_part
 
     return Kernels(surroundings, surroundings_tangent, (own_adjoint, sums_adjoint))

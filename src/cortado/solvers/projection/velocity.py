@@ -20,6 +20,8 @@ class VelocityKernels:
 
     velocity: Kernels
     """Its adjoint goes on from f = -u_bar / m of all particles."""
+    pull_tangent: wp.Kernel
+    """Comes before the tangent of the velocity."""
     end_adjoint: wp.Kernel
     """From the adjoint of the last velocity of a step to that of v* and to f."""
     time_adjoint: wp.Kernel
@@ -38,6 +40,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     adjoint_module = discretisation.module(False, topic)
     own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma")}
     seen, bars = bundle(**own), bundle(x=vector, **own)
+    pulled = bundle(y=real, T=matrix, g=vector, gamma=vector)
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
 
@@ -62,16 +65,29 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         u[i] = v_star[i] - (total + T[i] * g[i] + y[i] * gamma[i]) / m[i]
 
     @wp.kernel(module=tangent_module, enable_backward=False)
+    def pull_tangent(
+        y: wp.array(dtype=real),
+        y_dot: wp.array(dtype=real),
+        L: wp.array(dtype=matrix),
+        L_dot: wp.array(dtype=matrix),
+        # out
+        T: wp.array(dtype=matrix),
+        T_dot: wp.array(dtype=matrix),
+    ):
+        """T = y L, and its tangent."""
+        i = wp.tid()
+        T[i] = y[i] * L[i]
+        T_dot[i] = y_dot[i] * L[i] + y[i] * L_dot[i]
+
+    @wp.kernel(module=tangent_module, enable_backward=False)
     def velocity_tangent(
         s: neighbourhood,
         x: wp.array(dtype=vector),
         x_dot: wp.array(dtype=vector),
         m: wp.array(dtype=real),
         m_dot: wp.array(dtype=real),
-        y: wp.array(dtype=real),
-        y_dot: wp.array(dtype=real),
-        of: seen,
-        dot: seen,
+        of: pulled,
+        dot: pulled,
         v_star: wp.array(dtype=vector),
         v_star_dot: wp.array(dtype=vector),
         u: wp.array(dtype=vector),
@@ -79,10 +95,11 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         u_dot: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        total = force_tangent(i, x, x_dot, y, y_dot, of.L, dot.L, s)
+        total = force_tangent(i, x, x_dot, of.T, dot.T, s)
         if lane() > 0:
             return
-        change = total + y_dot[i] * of.gamma[i] + y[i] * dot.gamma[i]
+        change = total + dot.T[i] * of.g[i] + of.T[i] * dot.g[i]
+        change += dot.y[i] * of.gamma[i] + of.y[i] * dot.gamma[i]
         u_dot[i] = v_star_dot[i] - (change + m_dot[i] * (u[i] - v_star[i])) / m[i]
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
@@ -140,4 +157,6 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         i = wp.tid()
         time_step_bar[i] = time_step_bar[i] + wp.dot(v_bar[i], acceleration[i])
 
-    return VelocityKernels(Kernels(velocity, velocity_tangent, velocity_adjoint), end_adjoint, time_adjoint)
+    return VelocityKernels(
+        Kernels(velocity, velocity_tangent, velocity_adjoint), pull_tangent, end_adjoint, time_adjoint
+    )
