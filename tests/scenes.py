@@ -10,8 +10,8 @@ from cortado import Scene
 def splash(**solver: Any) -> Scene:
     """125 particles that fall from rest and splash in a box (the report's gradient analysis)."""
     block = {"shape": "box", "lower": [0.0, 0.3, 0.0], "upper": [0.25, 0.55, 0.25], "phase": "water"}
-    times = {"time_step": 0.0021, "minimum_iterations": 5, "maximum_iterations": 5, **solver}
-    return scene(name="splash", fluid=[block], solver=times)
+    fixed = {} if "kind" in solver else {"minimum_iterations": 5, "maximum_iterations": 5}
+    return scene(name="splash", fluid=[block], solver={"time_step": 0.0021, **fixed, **solver})
 
 
 def scene(**changes: Any) -> Scene:

@@ -46,6 +46,8 @@ SCENES = {
     "two fluids": two_layers(),
     "three fluids": plane_of_three(),
     "stress": plane(forces={"gravity": [0.0, -9.81], "viscosity": "stress"}),
+    "projection": splash(kind="projection"),
+    "projection in the plane": plane_of_three(solver={"kind": "projection", "time_step": 0.002}),
     "implicit, with a law": plane(
         phase=[{**HONEY, "rheology": {"kind": "bingham", "yield_stress": 5.0, "regularisation": 0.5}}],
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "honey"}],
@@ -66,7 +68,7 @@ def test_the_same_as_the_cpu(made):
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("made", [splash(**TOLERANT), two_layers()], ids=["tolerance", "two fluids"])
+@pytest.mark.parametrize("made", [splash(**TOLERANT), two_layers(), SCENES["projection in the plane"]])
 def test_same_bits_twice(made, precision):
     for first, second in zip(*(evaluate(made, "cuda:0", precision) for _ in range(2)), strict=True):
         assert first.tobytes() == second.tobytes()
