@@ -147,7 +147,6 @@ SLOW_TESTS = {
         "test_any_number_of_threads_gives_the_same_bits",
     },
     "test_public_face": {
-        "test_what_documents_name_is_there_as_an_attribute_and_to_import",
         "test_types_are_checked_where_cortado_is_used",
     },
     "test_reference": {
