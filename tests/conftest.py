@@ -8,7 +8,9 @@ import math
 import shutil
 from importlib.util import find_spec
 
+import numpy as np
 import pytest
+from matplotlib.image import imsave
 
 from compiling_notice import without_compiling
 from cortado.cli import main
@@ -229,3 +231,17 @@ def cortado_command(capfd, monkeypatch):
         return code, out, without_compiling(err)
 
     return run
+
+
+@pytest.fixture
+def unrendered(request, monkeypatch):
+    """Figures are made, but saved as a white square: to render them takes longer than all else that such tests are
+    about, and is what tests/test_figures.py does. Tests that ask for `rendered` too have them as they are."""
+    if "rendered" not in request.fixturenames:
+        white = np.ones((4, 4, 3))
+        monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda _, file, **options: imsave(file, white))
+
+
+@pytest.fixture
+def rendered():
+    """Asks for figures as they are in a file whose tests have them `unrendered`."""
