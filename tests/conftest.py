@@ -4,6 +4,7 @@ A whole file is named, or tests of a file by their names. A test is slow if all 
 where a core was shared by about three processes; a few are left in the unit tier as nothing else there guards the same.
 """
 
+import gc
 import math
 import shutil
 from importlib.util import find_spec
@@ -19,6 +20,10 @@ from cortado.cli.subcommands import CORTADO
 WITHOUT_ENGINE = find_spec("cortado_reference") is None and shutil.which("c++") is None
 collect_ignore = ["test_reference.py", "test_study.py", "test_study_figures.py", "test_study_growth.py"]
 collect_ignore = collect_ignore if WITHOUT_ENGINE else []
+
+
+gc.set_threshold(100_000, 20, 20)
+"""Launches make so many small objects that looking for those in circles takes a tenth of the tests' time otherwise."""
 
 
 def pytest_report_header():
