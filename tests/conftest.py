@@ -4,11 +4,14 @@ A whole file is named, or tests of a file by their names. A test is slow if all 
 where a core was shared by about three processes; a few are left in the unit tier as nothing else there guards the same.
 """
 
+import gc
 import math
 import shutil
 from importlib.util import find_spec
 
+import numpy as np
 import pytest
+from matplotlib.image import imsave
 
 from compiling_notice import without_compiling
 from cortado.cli import main
@@ -17,6 +20,10 @@ from cortado.cli.subcommands import CORTADO
 WITHOUT_ENGINE = find_spec("cortado_reference") is None and shutil.which("c++") is None
 collect_ignore = ["test_reference.py", "test_study.py", "test_study_figures.py", "test_study_growth.py"]
 collect_ignore = collect_ignore if WITHOUT_ENGINE else []
+
+
+gc.set_threshold(100_000, 20, 20)
+"""Launches make so many small objects that looking for those in circles takes a tenth of the tests' time otherwise."""
 
 
 def pytest_report_header():
@@ -148,7 +155,6 @@ SLOW_TESTS = {
         "test_any_number_of_threads_gives_the_same_bits",
     },
     "test_public_face": {
-        "test_what_documents_name_is_there_as_an_attribute_and_to_import",
         "test_types_are_checked_where_cortado_is_used",
     },
     "test_reference": {
@@ -231,3 +237,17 @@ def cortado_command(capfd, monkeypatch):
         return code, out, without_compiling(err)
 
     return run
+
+
+@pytest.fixture
+def unrendered(request, monkeypatch):
+    """Figures are made, but saved as a white square: to render them takes longer than all else that such tests are
+    about, and is what tests/test_figures.py does. Tests that ask for `rendered` too have them as they are."""
+    if "rendered" not in request.fixturenames:
+        white = np.ones((4, 4, 3))
+        monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda _, file, **options: imsave(file, white))
+
+
+@pytest.fixture
+def rendered():
+    """Asks for figures as they are in a file whose tests have them `unrendered`."""

@@ -35,7 +35,7 @@ RUN_FILES, OPTIMISE_FILES = {*ALWAYS, "trajectory.vtkhdf"}, {*ALWAYS, "checkpoin
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch, unrendered):
     """A working directory with a scene and a task."""
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     (tmp_path / "task.toml").write_text(GOOD_TASK)
@@ -71,6 +71,7 @@ def metrics(run):
 # ---- run ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("rendered")
 def test_run_writes_its_folder(cortado_command, folder):
     code, out, err = cortado_command("run", "scene.toml", "--steps", 4, "--out", "dam")
     assert (code, err) == (0, "")
@@ -138,6 +139,7 @@ def test_steps_that_did_not_converge_are_mentioned(cortado_command):
     assert code == 0 and err.startswith("Warning: the pressure did not converge in ") and len(err.splitlines()) == 1
 
 
+@pytest.mark.usefixtures("rendered")
 def test_a_run_that_diverges_says_where_and_keeps_its_frames(cortado_command):
     fast = ["--set", "fluid.0.velocity=[10,25]"]
     code, out, err = cortado_command("run", "scene.toml", "--steps", 20, "--out", "dam", *fast)
@@ -278,6 +280,7 @@ def test_a_process_of_its_own_says_no_more_than_the_sentence(folder):
 # ---- optimise ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("rendered")
 def test_optimise_writes_its_folder(cortado_command, folder):
     code, out, err = cortado_command("optimise", "task.toml", "--out", "found")
     assert (code, err) == (0, "")
@@ -325,6 +328,7 @@ def test_a_search_of_a_long_run_that_comes_to_nothing_says_what_to_try(cortado_c
     assert ("The loss hardly fell: try an optimise.learning_rate that is 10 times as large" in report) is not told
 
 
+@pytest.mark.usefixtures("rendered")
 def test_a_search_that_ends_on_its_bounds_says_so(cortado_command):
     bounds = ["--set", "optimise.bounds.gravity=[[0.9,-9.9],[1.0,-9.7]]", "--set", "optimise.start.gravity=[0.95,-9.8]"]
     _, out, _ = cortado_command("optimise", "task.toml", "--out", "found", "--no-pictures", *bounds)
@@ -406,6 +410,7 @@ def test_a_target_that_diverges_is_named(cortado_command, folder):
     ],
     ids=["start over time", "target over time", "two parameters"],
 )
+@pytest.mark.usefixtures("rendered")
 def test_other_parameters_are_optimised_and_drawn(cortado_command, overrides):
     easy = ["optimise.check.loss_reduction=1", "optimise.check.parameter_error=100", "optimise.iterations=2"]
     options = [word for override in [*overrides, *easy] for word in ("--set", override)]
@@ -541,6 +546,7 @@ def test_a_folder_that_is_being_written_is_refused(cortado_command, command):
 
 
 @pytest.mark.parametrize("size", [400, 2000, 20_000])
+@pytest.mark.usefixtures("rendered")
 def test_a_run_on_a_full_disk_says_so(cortado_command, size):
     again = ["run", "scene.toml", "--out", "dam", "--steps", 20, "--overwrite"]
     with largest_file(size):
@@ -621,6 +627,7 @@ def test_a_run_is_rendered_as_its_scene_asks(cortado_command, folder):
     assert Trajectory.load(folder / "a" / "trajectory.vtkhdf").mass_fractions.shape[2] == 2
 
 
+@pytest.mark.usefixtures("rendered")
 def test_places_are_found_for_a_picture(cortado_command):
     Path("task.toml").write_text(PLANE_PICTURE)
     code, out, err = cortado_command("optimise", "task.toml", "--out", "found")
@@ -633,6 +640,7 @@ def test_places_are_found_for_a_picture(cortado_command):
     assert len(losses) == 5 and losses[-1] < losses[0]
 
 
+@pytest.mark.usefixtures("rendered")
 def test_a_cup_is_swung_until_it_looks_as_it_should(cortado_command):
     Path("task.toml").write_text(TINY_LATTE)
     code, out, err = cortado_command("optimise", "task.toml", "--out", "found")
@@ -690,6 +698,7 @@ def test_an_image_that_is_not_matched_fails_and_keeps_its_files(cortado_command)
     assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
 
 
+@pytest.mark.usefixtures("rendered")
 def test_an_optimisation_of_images_resumes_bit_for_bit(cortado_command, monkeypatch):
     Path("task.toml").write_text(TINY_LATTE)
     with monkeypatch.context() as patch:
@@ -757,6 +766,7 @@ def test_the_check_speaks_json(cortado_command):
 
 
 @pytest.mark.parametrize("loss", ["centre-of-mass", "image"])
+@pytest.mark.usefixtures("rendered")
 def test_the_check_writes_a_figure(cortado_command, folder, loss):
     code, out, err = cortado_command(
         *("gradients", "check", "scene.toml", "--steps", 2, "--loss", loss, "--out", "a/b"),
@@ -768,6 +778,7 @@ def test_the_check_writes_a_figure(cortado_command, folder, loss):
 
 
 @pytest.mark.parametrize("json_option", [[], ["--json"]])
+@pytest.mark.usefixtures("rendered")
 def test_a_planted_error_fails_the_check(cortado_command, monkeypatch, json_option):
     right = Problem.estimate
 

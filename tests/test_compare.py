@@ -25,7 +25,7 @@ def first(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def runs(first, tmp_path, monkeypatch):
+def runs(first, tmp_path, monkeypatch, unrendered):
     """Two runs of one scene that are equal."""
     shutil.copytree(first, tmp_path, dirs_exist_ok=True)
     shutil.copytree(first / "one", tmp_path / "other")

@@ -20,7 +20,7 @@ from scenes import plane, two_layers
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch, unrendered):
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -68,6 +68,7 @@ def test_a_schedule_is_told(capsys):
     assert "gravity changes until 0.2 s, and is constant from then on" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("rendered")
 def test_the_first_state_is_drawn(capsys):
     found = described(capsys, "scene.toml", "--picture", "a/first.png")
     picture = read_picture(found["picture"])

@@ -35,6 +35,12 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.fixture
+def without_pictures(monkeypatch):
+    """Runs draw none, which takes seconds: tests/test_shading.py is about them."""
+    monkeypatch.setattr("cortado.cli.commands.run_report.run_pictures", lambda *_: [])
+
+
 def assert_refused(result, *words):
     code, out, err = result
     assert (code, out) == (2, ""), err
@@ -75,8 +81,11 @@ def test_the_help_of_each_is_named_where_it_is_misused(name, cortado_command):
 # ---- new ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_a_new_scene_runs_at_once(cortado_command, dimension):
+@pytest.mark.parametrize(("dimension", "pictures"), [(2, True), (3, False)])
+def test_a_new_scene_runs_at_once(cortado_command, request, dimension, pictures):
+    """With its pictures in the plane."""
+    if not pictures:
+        request.getfixturevalue("without_pictures")
     code, out, err = cortado_command("new", "dam", "--dimension", dimension)
     assert (code, err) == (0, "") and "cortado run dam.toml" in out
     text = Path("dam.toml").read_text()
@@ -87,6 +96,7 @@ def test_a_new_scene_runs_at_once(cortado_command, dimension):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.usefixtures("without_pictures")
 def test_so_it_does_with_all_that_is_switched_off(cortado_command, folder, dimension):
     text = scene_text(Path("dam.toml"), dimension)
     Path("dam.toml").write_text(re.sub(r"^#(?=[a-z\[])", "", text, flags=re.MULTILINE))
@@ -245,11 +255,12 @@ def test_zsh_has_a_script(cortado_command):
     assert_refused(cortado_command("completion", "fish"), "'fish', but must be one of 'bash', 'zsh'")
 
 
-def test_quiet_says_nothing_but_what_was_asked_for(cortado_command, monkeypatch):
+def test_quiet_says_nothing_but_what_was_asked_for(cortado_command, monkeypatch, request):
     monkeypatch.setattr("cortado.files.progress.LINE_INTERVAL", 0.0)
     Path("scene.toml").write_text(TINY_SCENE)
     assert cortado_command("run", "scene.toml", "--steps", 2, "--quiet") == (0, "", "")
     assert Path("runs/run/report.html").exists()
+    request.getfixturevalue("without_pictures")  # from now on
     assert cortado_command("new", "dam", "--quiet") == (0, "", "")
     assert cortado_command("examples", "--quiet")[1] == cortado_command("examples")[1] != ""
     assert_refused(cortado_command("run", "scene.toml", "--quiet"), "already holds a run")

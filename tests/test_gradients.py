@@ -43,10 +43,18 @@ def disturbed(positions):
 ITERATIONS = {"fixed": {}, "tolerance": {"minimum_iterations": 2, "maximum_iterations": 40, "density_tolerance": 0.001}}
 
 
-@pytest.mark.parametrize("iterations", ITERATIONS)
-@pytest.mark.parametrize("steps", [50, 100, 200])
+WHAT = ("gravity", "gravity over time", "initial_positions", "initial_velocities", "viscosity")
+FIXED, TOLERANCE = ITERATIONS
+LONG = zip(WHAT, (FIXED, TOLERANCE, FIXED, TOLERANCE, FIXED), strict=True)
+"""Of 200 steps, each in one way to iterate, as those of 100 steps come in both."""
+
+
 @pytest.mark.parametrize(
-    "what", ["gravity", "gravity over time", "initial_positions", "initial_velocities", "viscosity"]
+    ("what", "steps", "iterations"),
+    [
+        *((what, 100, iterations) for what in WHAT for iterations in ITERATIONS),
+        *((what, 200, iterations) for what, iterations in LONG),
+    ],
 )
 def test_splash(what, steps, iterations):
     """From a start off the lattice, on which all particles without free surface have the rest density: many of them
@@ -61,7 +69,8 @@ def test_splash(what, steps, iterations):
     tangent = problem.tangent(point, directions)
     assert abs(adjoint - tangent) < 1e-10 * abs(tangent)
     limit = 1e-3 if steps == 200 else 1e-6  # at 200 steps chaos limits the difference
-    assert distance(problem.value, point, directions, tangent, decades(2.0, 11.0, apart=0.25), enough=limit) < limit
+    first = 4.5 if steps == 200 else 3.0  # chaos and curvature hide the limit of larger ones
+    assert distance(problem.value, point, directions, tangent, decades(first, 11.0, apart=0.25), enough=limit) < limit
 
 
 SHAPES = {

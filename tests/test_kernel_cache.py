@@ -1,8 +1,10 @@
 """A cache of kernels that cannot be written, and one with a damaged file; never that of whoever runs the tests."""
 
 import os
+import shutil
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 
@@ -27,38 +29,55 @@ else:
 """
 
 
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    path = tmp_path_factory.mktemp("program") / "twice.py"
+    path.write_text(KERNEL)
+    return path
+
+
+def run(program, cache, temporary):
+    """What the kernel prints, with this cache, and what it warns of."""
+    environment = {**os.environ, "WARP_CACHE_PATH": str(cache), "TMPDIR": str(temporary)}
+    done = subprocess.run([sys.executable, program], capture_output=True, env=environment, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout, done.stderr
+
+
+@pytest.fixture(scope="module")
+def compiled(program, tmp_path_factory):
+    """A cache that a run has filled."""
+    cache = tmp_path_factory.mktemp("compiled") / "cache"
+    out, err = run(program, cache, cache.parent)
+    assert out.startswith("6.0") and err == ""
+    return cache
+
+
 @pytest.fixture
-def twice(tmp_path):
-    """Runs the kernel with a cache: what it prints, and what it warns of."""
-    program = tmp_path / "twice.py"
-    program.write_text(KERNEL)
+def cache(compiled, tmp_path):
+    """The same, to be damaged."""
+    return shutil.copytree(compiled, tmp_path / "cache")
 
-    def run(cache):
-        environment = {**os.environ, "WARP_CACHE_PATH": str(cache), "TMPDIR": str(tmp_path)}
-        done = subprocess.run([sys.executable, program], capture_output=True, env=environment, text=True, timeout=120)
-        assert done.returncode == 0, done.stderr
-        return done.stdout, done.stderr
 
-    return run
+@pytest.fixture
+def twice(program, tmp_path):
+    return partial(run, program, temporary=tmp_path)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="object files are looked at on Linux")
 @pytest.mark.parametrize("damage", [lambda file: file[:-50], lambda file: b"noise" * 100, lambda file: b""])
-def test_a_damaged_kernel_is_compiled_again_elsewhere(twice, tmp_path, damage):
-    out, err = twice(tmp_path / "cache")
-    assert out.startswith("6.0") and err == ""
-    (file,) = (tmp_path / "cache").rglob("*.o")
+def test_a_damaged_kernel_is_compiled_again_elsewhere(twice, cache, damage):
+    (file,) = cache.rglob("*.o")
     file.write_bytes(damage(file.read_bytes()))
-    out, err = twice(tmp_path / "cache")
+    out, err = twice(cache)
     assert out.startswith("6.0") and len(err.splitlines()) == 1
     assert f"({file.parent.name} in it is damaged and should be deleted)" in err
 
 
-def test_a_damaged_note_of_a_kernel_is_said_in_a_sentence(twice, tmp_path):
-    twice(tmp_path / "cache")
-    (file,) = (tmp_path / "cache").rglob("*.meta")
+def test_a_damaged_note_of_a_kernel_is_said_in_a_sentence(twice, cache):
+    (file,) = cache.rglob("*.meta")
     file.write_bytes(file.read_bytes()[:100])
-    out, _ = twice(tmp_path / "cache")
+    out, _ = twice(cache)
     assert out.startswith(f"A compiled kernel in {file.parent.parent} cannot be used (") and len(out.splitlines()) == 1
     assert "delete that folder, or set the environment variable WARP_CACHE_PATH to another one." in out
 

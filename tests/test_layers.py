@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import cortado
+from module_graph import all_before, loaded_before, sources
 
 ROOT = Path(cortado.__file__).parent
 
@@ -69,6 +70,30 @@ def test_a_circle_of_packages_is_found(source):
     sources = {"upper.a": "from cortado.lower import b", "lower.b": source}
     with pytest.raises(CycleError, match="lower"):
         list(TopologicalSorter(above(sources)).static_order())
+
+
+def test_any_module_can_be_the_first_to_be_imported():
+    """As no module imports, as it is loaded, one that imports it."""
+    before = loaded_before(sources(ROOT))
+    list(TopologicalSorter(before).static_order())
+    assert {"cortado.errors", "cortado.gradients", "cortado.gradients.exact"} <= all_before(before, "cortado.problem")
+    assert len(before) > 300 and sum(map(len, before.values())) > 3 * len(before)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("from cortado.b import g", "from cortado.a import f"),
+        ("import cortado.b", "class B:\n    from cortado import a"),
+        ("from cortado import b", "try:\n    from cortado.a import f\nexcept ImportError:\n    pass"),
+    ],
+)
+def test_a_circle_of_modules_is_found(first, second):
+    found = {"cortado": "", "cortado.a": first, "cortado.b": second}
+    with pytest.raises(CycleError, match=r"cortado\.b"):
+        list(TopologicalSorter(loaded_before(found)).static_order())
+    for late in (f"def f():\n    {first}", f"if TYPE_CHECKING:\n    {first}"):
+        list(TopologicalSorter(loaded_before({**found, "cortado.a": late})).static_order())
 
 
 def test_nothing_but_the_command_line_imports_the_package_itself():

@@ -153,7 +153,7 @@ def test_any_number_of_threads_gives_the_same_bits(monkeypatch):
         assert simulation.solver.launch.parts == parts
         assert simulation.solver.launch.capturable == (parts == 1)
         simulation.solver.resize(8)
-        problem = Problem(simulation, 120, losses.FinalPositions(np.zeros_like(simulation.positions)))
+        problem = Problem(simulation, 40, losses.FinalPositions(np.zeros_like(simulation.positions)))
         point = {"gravity": np.array([0.5, -9.81, 0.2]), "initial_positions": simulation.positions, "viscosity": 0.05}
         loss, gradient = problem.value_and_gradient(point)
         tangent = problem.tangent(point, {"gravity": np.ones(3)})

@@ -185,21 +185,31 @@ def test_every_kernel_on_the_way_back_is_planted(monkeypatch):
     assert alone <= names and len(alone) > 15, alone - names
 
 
-@pytest.mark.parametrize(("precision", "every"), [("float32", 5), ("float64", 1)])
-def test_every_plant_is_found(copy, tmp_path, precision, every):
-    """In problems in float32, whose certificate is made in float64, a fifth of them."""
-    plants, request, answer = planted(copy), copy / "request.json", tmp_path / "answer.json"
+EVERY = {"float64": 1, "float32": 5}
+"""One of so many plants, by the precision of the problems that are certified."""
+
+
+@pytest.fixture(scope="module")
+def answers(copy):
+    """For every plant the scene that gives it away, by precision: from a process of its own, which imports the copy."""
+    plants, request, answer = planted(copy), copy / "request.json", copy / "answer.json"
     scenes = {name: {"scene": made.model_dump(mode="json"), "loss": loss} for name, (made, loss) in SCENES.items()}
-    chosen = list(range(0, len(plants), every))
-    request.write_text(json.dumps({"plants": chosen, "scenes": scenes, "precision": precision}))
+    chosen = {precision: list(range(0, len(plants), every)) for precision, every in EVERY.items()}
+    request.write_text(json.dumps({"plants": chosen, "scenes": scenes}))
     # Without -S an editable installation would be found before the copy.
     program = [sys.executable, "-S", str(Path(__file__).with_name("planting.py")), str(request), str(answer)]
     path = os.pathsep.join([str(copy), *site.getsitepackages()])
     environment = {"PYTHONPATH": path, "PATH": "", "HOME": str(Path.home())}
     subprocess.run(program, env=environment, check=True, timeout=1200)
-    found = json.loads(answer.read_text())
+    return json.loads(answer.read_text())
+
+
+@pytest.mark.parametrize("precision", EVERY)
+def test_every_plant_is_found(copy, answers, precision):
+    """In problems in float32, whose certificate is made in float64, a fifth of them."""
+    plants, found = planted(copy), answers[precision]
     hidden = [" | ".join(plants[int(number)]) for number, scene in found.items() if scene is None]
-    assert len(found) == len(chosen) and not hidden, "\n".join(hidden)
+    assert len(found) >= len(plants) / EVERY[precision] and not hidden, "\n".join(hidden)
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])

@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import re
+import shutil
 import warnings
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import cortado.runs.run_folder
 from bad_scenes import plane
 from bad_tasks import TINY_SCENE
 from cortado import Scene
+from cortado.cli import main
 from cortado.errors import InputError
 from cortado.files.atomic import unfinished
 from cortado.files.progress import track
@@ -359,12 +361,20 @@ NO_SCENES = {
 }
 
 
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder of a run."""
+    folder = tmp_path_factory.mktemp("finished")
+    (folder / "scene.toml").write_text(TINY_SCENE)
+    main(["run", str(folder / "scene.toml"), "--steps", "1", "--out", str(folder / "a"), "--no-pictures"])
+    return folder / "a"
+
+
 @pytest.fixture
-def run(tmp_path, monkeypatch, cortado_command):
+def run(tmp_path, monkeypatch, finished):
     """The scene of a run that is there."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene.toml").write_text(TINY_SCENE)
-    cortado_command("run", "scene.toml", "--steps", "1", "--out", "a", "--no-pictures")
+    shutil.copytree(finished, "a")
     return tmp_path / "a" / "scene.json"
 
 

@@ -211,8 +211,7 @@ ROUND_OFF = {"float32": 2e-5, "float64": 1e-11}
 CHAINED = {name: SCENES[name] for name in ("one fluid", "mixture", "schedule", "jet", "surface tension", "periodic")}
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("name", CHAINED)
+@pytest.mark.parametrize(("name", "precision"), zip(CHAINED, 3 * ("float32", "float64"), strict=True))
 def test_segments_chained_by_vjp_have_the_bits_of_one_run(name, precision):
     simulation = Simulation(CHAINED[name](), precision=precision)
     parameters = differentiated(simulation)

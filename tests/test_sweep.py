@@ -33,7 +33,7 @@ TASK = GOOD_TASK[: GOOD_TASK.index("[optimise.check]")]
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch, unrendered):
     """A working directory with a scene and a task."""
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     (tmp_path / "task.toml").write_text(TASK)
