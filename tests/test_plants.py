@@ -24,6 +24,11 @@ UNNAMED = {
     "sph.emitter_kernels": {"emitter_kernels.collect"},
     "sph.surface_stress": {"tension_functions.stress_derivative"},
     "sph.implicit_derivatives": {"implicit_kernels.weigh", "implicit_kernels.unweigh"},
+    "solvers.projection.shifting": {"shift_functions.back"},
+    "solvers.projection.sums": {
+        *("projection_sums.moments_back", "projection_sums.beside_back", "projection_sums.force_back"),
+        *("projection_sums.divergence_back", "projection_sums.push_back", "projection_sums.crowding_back"),
+    },
     "sph.packed": {"packing_kernels.add_number"},
     "sph.stress_functions": {"stress_functions.back"},
     "sph.stress_moments": {"moment_sums.moments_back", "moment_sums.wall_moments_back"},
@@ -56,6 +61,7 @@ ELSEWHERE = {
     "sph.pair": "the same",
     "sph.begin_adjoint": "for solvers from outside, as PCISPH has a kernel of its own: tests/test_solver.py",
     "sph.vorticity": "of a quantity, which no loss of these scenes sees: tests/test_quantities.py",
+    "solvers.projection.pressed": "of a quantity too: tests/test_quantities.py",
     "solvers.pcisph.frozen_pressure": "an estimator that is not exact: tests/test_estimators.py",
 }
 """Modules with functions of adjoints that no plant is in, and why."""
@@ -79,6 +85,7 @@ THICK = {
     "rheology": {"kind": "bingham", "yield_stress": 8.0, "regularisation": 0.5},
 }
 IMPLICIT = {"gravity": [1.0, -9.81], "viscosity": "stress", "viscous_solve": "implicit"}
+PROJECTION = {"kind": "projection", "time_step": 0.002}
 SOLVER = {"time_step": 0.002, "minimum_iterations": 3, "maximum_iterations": 3}
 
 
@@ -118,6 +125,15 @@ SCENES = {
         "everything",
     ),
     "stress": (small("stress"), "everything"),
+    "projection": (small("pairwise", solver=PROJECTION), "everything"),
+    "projection in the open": (
+        plane(
+            discretisation={"spacing": 0.05, "support": 2.6},  # second rows are neither full nor at the surface
+            fluid=[{"shape": "box", "lower": [0.2, 0.25], "upper": [0.55, 0.6], "phase": "water"}],
+            solver=PROJECTION,
+        ),
+        "positions",
+    ),
     "implicit": (
         small("stress", phase=[THICK], fluid=[{**POOL, "phase": "paste"}], emitter=None, forces=IMPLICIT),
         "positions",

@@ -10,6 +10,7 @@ from cortado.device.launching import add
 from cortado.particles.arrays import Fields
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
+from cortado.solvers.projection.pressed import pressed_adjoint_kernel
 from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
 from cortado.solvers.solver import Counts
 from cortado.sph.parts import StepContext
@@ -115,7 +116,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         state_bar.clear()
         self._begin(state_bar, parameters)
         own = {"k": solver.iterates[counts[0]]["k"], "p_bar": p_bar, "k_bar": self._k_bar}
-        solver.context(parameters).launch(solver.kernels.pressure.pressed_adjoint, *self.bar.named, own)
+        solver.context(parameters).launch(pressed_adjoint_kernel(solver.layout.precision), *self.bar.named, own)
         self._finish(counts, state_bar, parameters, fields_bar)
 
     def _begin(self, state_bar: State, parameters: Parameters) -> None:

@@ -36,8 +36,6 @@ class PressureKernels:
     """The first k of a step."""
     update: Kernels
     """k' and y'; its adjoint are two kernels, that of the clamp and that of D."""
-    pressed_adjoint: wp.Kernel
-    """From the adjoint of p = k / dt to those of k and dt."""
 
 
 @cache
@@ -278,23 +276,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         bar.m[i] = bar.m[i] + wp.dot(u_bar, v_star[i] - u[i]) / m[i]
         f[i] = -u_bar / m[i]
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    def pressed_adjoint(
-        particles: int,
-        time_step: wp.array(dtype=real),
-        k: wp.array(dtype=real),
-        p_bar: wp.array(dtype=real),
-        # in and out
-        k_bar: wp.array(dtype=real),
-        time_step_bar: wp.array(dtype=real),
-    ):
-        i = wp.tid()
-        dt = time_step[i // particles]
-        k_bar[i] = k_bar[i] + p_bar[i] / dt
-        time_step_bar[i] = time_step_bar[i] - k[i] / (dt * dt) * p_bar[i]
-
     return PressureKernels(
         Kernels(start, start_tangent, start_adjoint),
         Kernels(update, update_tangent, (clamp_adjoint, divergence_adjoint)),
-        pressed_adjoint,
     )
