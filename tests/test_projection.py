@@ -39,7 +39,7 @@ def test_a_step_is_that_of_the_twin(case):
         *(solver.discretisation.smoothing, lattice.support, lattice.volume, made.discretisation.spacing),
         *walls,
         np.array(made.container.periods(d)[1]),
-        iterations=5,
+        iterations=4,
         repairs=2,
     )
     gravity, dt = np.array(made.forces.gravity), 0.002

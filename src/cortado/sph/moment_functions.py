@@ -21,6 +21,39 @@ def matrix_type(precision: Precision) -> Any:
 
 
 @dataclass(frozen=True)
+class Symmetric:
+    """Symmetric matrices as six numbers, their diagonal and their entries yz, xz and xy: what a neighbour loads."""
+
+    kind: Any
+    """The Warp type."""
+    pack: Any
+    """The Warp function of a matrix."""
+    times: Any
+    """The Warp function of the product with a vector."""
+
+
+@cache
+def symmetric(precision: Precision) -> Symmetric:
+    """Of a precision."""
+    vector, matrix = precision.vector, matrix_type(precision)
+    six = wp.types.vector(length=6, dtype=precision.real)
+
+    @wp.func
+    def pack(M: matrix) -> six:
+        return six(M[0, 0], M[1, 1], M[2, 2], M[1, 2], M[0, 2], M[0, 1])
+
+    @wp.func
+    def times(M: six, v: vector) -> vector:
+        return vector(
+            M[0] * v[0] + M[5] * v[1] + M[4] * v[2],
+            M[5] * v[0] + M[1] * v[1] + M[3] * v[2],
+            M[4] * v[0] + M[3] * v[1] + M[2] * v[2],
+        )
+
+    return Symmetric(six, pack, times)
+
+
+@dataclass(frozen=True)
 class MomentFunctions:
     """Warp functions of one particle."""
 

@@ -25,7 +25,7 @@ from cortado.device.lanes import lane_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries, weights_type
-from cortado.sph.moment_functions import matrix_type, moment_functions
+from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,8 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     precision = discretisation.precision
     real, vector, pair_of = precision.real, precision.vector, precision.pair
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
-    matrix, symmetric = matrix_type(precision), moment_functions(precision, dimension).change
+    packed, matrix, whole = symmetric(precision), matrix_type(precision), moment_functions(precision, dimension).change
+    six, pack, times = packed.kind, packed.pack, packed.times
     divergence, divergence_tangent = sums.divergence, sums.divergence_tangent
     divergence_back = sums.divergence_back
     topic = f"projection_{dimension}d"
@@ -71,11 +72,11 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         # out
         k: wp.array(dtype=real),
         y: wp.array(dtype=real),
-        T: wp.array(dtype=matrix),
+        T: wp.array(dtype=six),
     ):
         i = wp.tid()
         first = weights[i][1] * k_before[i]
-        T[i] = first * L[i]
+        T[i] = first * pack(L[i])
         k[i] = first
         y[i] = first
 
@@ -123,7 +124,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         # out
         k_out: wp.array(dtype=real),
         y_out: wp.array(dtype=real),
-        T: wp.array(dtype=matrix),
+        T: wp.array(dtype=six),
         error: wp.array(dtype=pair_of),
     ):
         """``error``: the divergence that is not wanted, times the time step, twice (for a sum and a maximum). The
@@ -152,7 +153,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         later = new + beta * (new - at.k[i])  # before k, which may be the same array
         k_out[i] = new
         y_out[i] = later
-        T[i] = later * of.L[i]
+        T[i] = later * pack(of.L[i])
         error[i] = pair_of(dt * wp.abs(left), dt * wp.abs(left))
 
     @wp.kernel(module=tangent_module, enable_backward=False)
@@ -213,8 +214,8 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         bar: bars,
         # out
         d_bar: wp.array(dtype=real),
-        S: wp.array(dtype=matrix),
-        T: wp.array(dtype=matrix),
+        S: wp.array(dtype=six),
+        T: wp.array(dtype=six),
     ):
         """S is d_bar L, and T is y L."""
         i = wp.tid()
@@ -244,8 +245,8 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         k_bar[i] = -beta * y_bar[i]
         y_bar[i] = z_bar
         d_bar[i] = per * z_bar
-        S[i] = (per * z_bar) * of.L[i]
-        T[i] = at.y[i] * of.L[i]
+        S[i] = (per * z_bar) * pack(of.L[i])
+        T[i] = at.y[i] * pack(of.L[i])
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def divergence_adjoint(
@@ -257,7 +258,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         g: wp.array(dtype=vector),
         of: seen,
         d_bar: wp.array(dtype=real),
-        S: wp.array(dtype=matrix),
+        S: wp.array(dtype=six),
         # in and out
         bar: bars,
         # out
@@ -268,8 +269,8 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         u_part, x_part, diagonal, others = divergence_back(i, x, u, S, s)
         if lane() > 0:
             return
-        u_bar = u_part + S[i] * g[i] + d_bar[i] * of.gamma[i]
-        bar.L[i] = bar.L[i] + d_bar[i] * symmetric(diagonal, others)
+        u_bar = u_part + times(S[i], g[i]) + d_bar[i] * of.gamma[i]
+        bar.L[i] = bar.L[i] + d_bar[i] * whole(diagonal, others)
         bar.gamma[i] = bar.gamma[i] + d_bar[i] * u[i]
         bar.x[i] = bar.x[i] + x_part
         bar.v[i] = bar.v[i] + u_bar

@@ -23,7 +23,7 @@ from cortado.solvers.projection.shifting import shift_kernels
 from cortado.solvers.projection.surroundings import entries, surrounding_kernels
 from cortado.solvers.projection.velocity import VelocityKernels, velocity_kernels
 from cortado.solvers.solver import Counts
-from cortado.sph.moment_functions import matrix_type
+from cortado.sph.moment_functions import matrix_type, symmetric
 from cortado.sph.parts import StepContext
 
 IMPULSE = "pressure_impulse"
@@ -72,7 +72,7 @@ class ProjectionSteps(ParticleSolver):
             self.layout.precision.real,
             self.layout.precision.vector,
         )
-        self.pull = self.new_arrays(T=matrix)["T"]
+        self.pull = self.new_arrays(T=symmetric(self.layout.precision).kind)["T"]
         """y L of the present iteration."""
         self.kept = self.new_arrays(A=matrix, crowd=vector)
         """Sums of the shift."""

@@ -13,7 +13,7 @@ import warp as wp
 from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, wall_sum
-from cortado.sph.moment_functions import matrix_type
+from cortado.sph.moment_functions import matrix_type, symmetric
 
 CROWDED = 0.2
 """How much more pairs count in a shift that are close (Monaghan 2000)."""
@@ -62,6 +62,7 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, matrix = neighbourhood_type(discretisation.precision), matrix_type(discretisation.precision)
     pair = pair_functions(discretisation)
+    six, times = symmetric(discretisation.precision).kind, symmetric(discretisation.precision).times
     crowded = wp.constant(real(CROWDED))
     weight, slope, gradient, hessian_product = pair.weight, pair.slope, pair.gradient, pair.hessian_product
 
@@ -130,20 +131,18 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         return s.volume * (hessian_product(x_ij, gamma_bar_i, s) + nu_bar_i * gradient(x_ij, s))
 
     @fluid_sum(discretisation)
-    def force(x_ij: vector, T_j: matrix, s: neighbourhood) -> vector:
-        return T_j * (s.volume * gradient(x_ij, s))
+    def force(x_ij: vector, T_j: six, s: neighbourhood) -> vector:
+        return times(T_j, s.volume * gradient(x_ij, s))
 
     @tangent_of(force)
     @fluid_sum(discretisation, ahead=False)
-    def force_tangent(x_ij: vector, x_dot_ij: vector, T_j: matrix, T_dot_j: matrix, s: neighbourhood) -> vector:
-        return s.volume * (T_dot_j * gradient(x_ij, s) + T_j * hessian_product(x_ij, x_dot_ij, s))
+    def force_tangent(x_ij: vector, x_dot_ij: vector, T_j: six, T_dot_j: six, s: neighbourhood) -> vector:
+        return s.volume * (times(T_dot_j, gradient(x_ij, s)) + times(T_j, hessian_product(x_ij, x_dot_ij, s)))
 
     @fluid_sum(discretisation)
-    def force_back(
-        x_ij: vector, T_i: matrix, T_j: matrix, f_ij: vector, s: neighbourhood
-    ) -> tuple[vector, vector, vector]:
+    def force_back(x_ij: vector, T_i: six, T_j: six, f_ij: vector, s: neighbourhood) -> tuple[vector, vector, vector]:
         g = s.volume * gradient(x_ij, s)
-        pulled = (T_i + T_j) * f_ij
+        pulled = times(T_i + T_j, f_ij)
         return wp.cw_mul(f_ij, g), even_terms(f_ij, g), s.volume * hessian_product(x_ij, pulled, s)
 
     @fluid_sum(discretisation)
@@ -166,11 +165,11 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
 
     @fluid_sum(discretisation)
     def divergence_back(
-        x_ij: vector, v_ij: vector, S_i: matrix, S_j: matrix, s: neighbourhood
+        x_ij: vector, v_ij: vector, S_i: six, S_j: six, s: neighbourhood
     ) -> tuple[vector, vector, vector, vector]:
         g = s.volume * gradient(x_ij, s)
-        pushed, moved = (S_i + S_j) * v_ij, wp.cw_mul(v_ij, g)
-        return S_j * g, s.volume * hessian_product(x_ij, pushed, s), moved, even_terms(v_ij, g)
+        pushed, moved = times(S_i + S_j, v_ij), wp.cw_mul(v_ij, g)
+        return times(S_j, g), s.volume * hessian_product(x_ij, pushed, s), moved, even_terms(v_ij, g)
 
     @fluid_sum(discretisation)
     def push(x_ij: vector, c_i: real, c_j: real, s: neighbourhood) -> vector:

@@ -11,7 +11,7 @@ from cortado.device.lanes import lane_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries
-from cortado.sph.moment_functions import matrix_type, moment_functions
+from cortado.sph.moment_functions import matrix_type, moment_functions, symmetric
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,14 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
     force, force_tangent, force_back = sums.force, sums.force_tangent, sums.force_back
-    symmetric, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
+    packed = symmetric(precision)
+    six, pack, times = packed.kind, packed.pack, packed.times
+    whole, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
     own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma")}
     seen, bars = bundle(**own), bundle(x=vector, **own)
-    pulled = bundle(y=real, T=matrix, g=vector, gamma=vector)
+    pulled = bundle(y=real, T=six, g=vector, gamma=vector)
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
 
@@ -50,7 +52,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         x: wp.array(dtype=vector),
         m: wp.array(dtype=real),
         y: wp.array(dtype=real),
-        T: wp.array(dtype=matrix),
+        T: wp.array(dtype=six),
         g: wp.array(dtype=vector),
         gamma: wp.array(dtype=vector),
         v_star: wp.array(dtype=vector),
@@ -62,7 +64,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         total = force(i, x, T, s)
         if lane() > 0:
             return
-        u[i] = v_star[i] - (total + T[i] * g[i] + y[i] * gamma[i]) / m[i]
+        u[i] = v_star[i] - (total + times(T[i], g[i]) + y[i] * gamma[i]) / m[i]
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def pull_tangent(
@@ -71,13 +73,13 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         L: wp.array(dtype=matrix),
         L_dot: wp.array(dtype=matrix),
         # out
-        T: wp.array(dtype=matrix),
-        T_dot: wp.array(dtype=matrix),
+        T: wp.array(dtype=six),
+        T_dot: wp.array(dtype=six),
     ):
         """T = y L, and its tangent."""
         i = wp.tid()
-        T[i] = y[i] * L[i]
-        T_dot[i] = y_dot[i] * L[i] + y[i] * L_dot[i]
+        T[i] = y[i] * pack(L[i])
+        T_dot[i] = y_dot[i] * pack(L[i]) + y[i] * pack(L_dot[i])
 
     @wp.kernel(module=tangent_module, enable_backward=False)
     def velocity_tangent(
@@ -98,7 +100,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         total = force_tangent(i, x, x_dot, of.T, dot.T, s)
         if lane() > 0:
             return
-        change = total + dot.T[i] * of.g[i] + of.T[i] * dot.g[i]
+        change = total + times(dot.T[i], of.g[i]) + times(of.T[i], dot.g[i])
         change += dot.y[i] * of.gamma[i] + of.y[i] * dot.gamma[i]
         u_dot[i] = v_star_dot[i] - (change + m_dot[i] * (u[i] - v_star[i])) / m[i]
 
@@ -107,7 +109,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         s: neighbourhood,
         x: wp.array(dtype=vector),
         y: wp.array(dtype=real),
-        T: wp.array(dtype=matrix),
+        T: wp.array(dtype=six),
         of: seen,
         f: wp.array(dtype=vector),
         # in and out
@@ -119,7 +121,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         diagonal, others, x_part = force_back(i, x, T, f, s)
         if lane() > 0:
             return
-        A = symmetric(diagonal, others)
+        A = whole(diagonal, others)
         y_bar[i] = y_bar[i] + wp.ddot(of.L[i], A) + wp.dot(of.gamma[i], f[i])
         bar.L[i] = bar.L[i] + y[i] * A
         bar.gamma[i] = bar.gamma[i] + y[i] * f[i]
@@ -137,14 +139,14 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> Velocity
         v_bar: wp.array(dtype=vector),
         m_bar: wp.array(dtype=real),
         # out
-        T: wp.array(dtype=matrix),
+        T: wp.array(dtype=six),
         f: wp.array(dtype=vector),
     ):
         i = wp.tid()
         bar = u_bar[i]
         v_bar[i] = v_bar[i] + bar
         m_bar[i] = m_bar[i] + wp.dot(bar, v_star[i] - u[i]) / m[i]
-        T[i] = y[i] * L[i]
+        T[i] = y[i] * pack(L[i])
         f[i] = -bar / m[i]
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
