@@ -102,10 +102,12 @@ class Projection:
     def shift(self, v, W, g, total, gamma, inverse, H, dt):
         s, d = self.spacing, v.shape[1]
         gradient = np.einsum("ija,ijb,ibc->iac", v[:, None] - v[None, :], g, inverse)
-        rate = np.sqrt((gradient**2).sum((1, 2)) + 1e-12)
+        rate = 20 * (np.sqrt(dt**2 * (gradient**2).sum((1, 2)) + 1e-10) - 1e-5)
         near = self.volume * self.kernel.weight(np.array([s]), d, self.support)[0]
-        slope = ((1 + 0.2 * (W / near) ** 4)[..., None] * g).sum(1) + gamma / 2
+        close = (W / near) ** 4
+        slope = ((1 + 0.25 * close / (1 + close / 4))[..., None] * g).sum(1) + gamma / 2
         out = total + gamma / 2
         along = slope - out * ((out * slope).sum(1) / ((out**2).sum(1) + (0.03 / s) ** 2))[:, None]
-        wish = -20 * dt * (rate * s**2 * between(H, 0.5, 0.8))[:, None] * along
+        strength = rate / np.sqrt(1 + (rate / 0.5) ** 2)
+        wish = -(strength * s**2 * between(H, 0.5, 0.8))[:, None] * along
         return wish / np.sqrt(1 + (wish**2).sum(1) / (0.1 * s) ** 2)[:, None]

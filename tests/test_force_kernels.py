@@ -246,6 +246,11 @@ def test_some_particles_have_left_the_nozzle_and_some_have_not():
 ELSEWHERE = {
     "frozen_force_adjoint": "an estimator that is not exact: tests/test_estimators.py",
     "implicit_kernels": "of what comes before and after a solve: whole steps in tests/test_implicit_viscosity.py",
+    "surrounding_kernels": "of the projection: whole steps in tests/test_projection.py",
+    "velocity_kernels": "the same",
+    "shift_kernels": "the same",
+    "repair_kernels": "the same",
+    "pressed_adjoint_kernel": "of a quantity: tests/test_quantities.py",
     "phase_colour_kernels": "of pictures, by differences: tests/test_render.py",
     "colour_field_kernels": "the same",
     "absorption_kernels": "the same",

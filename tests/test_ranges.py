@@ -43,6 +43,7 @@ CASES = {
         container={"shape": "box", "lower": [0.0] * 3, "upper": [0.4, 0.6, 0.25], "slip": "no"},
     ),
     "forces of one's own": splash,
+    "the projection": lambda: two_layers(solver={"kind": "projection", "time_step": 0.0021}),
 }
 
 
@@ -108,6 +109,8 @@ def results(name) -> dict[str, bytes]:
     directions = {name: random.standard_normal(np.shape(value)) for name, value in point.items()}
     found = {"value": problem.value(point), "tangent": problem.tangent(point, directions)}
     for label, estimator in ESTIMATORS.items():
+        if label == "frozen geometry" and simulation.scene.solver.kind == "projection":  # which has no such derivative
+            continue
         _, gradient = problem.value_and_gradient(point, estimator)
         found |= {f"{label}, {name}": array for name, array in gradient.items()}
     seen = Problem(simulation, STEPS, Seen(simulation))
@@ -151,7 +154,8 @@ def once_and_cut(name):
 @pytest.mark.parametrize("name", CASES)
 def test_any_number_of_ranges_gives_the_same_bits(name):
     once, several, _ = once_and_cut(name)
-    assert all(any(once[what]) for what in ("value", "tangent", *(f"{e}, initial_velocities" for e in ESTIMATORS)))
+    estimates = [what for what in once if what.endswith(", initial_velocities")]
+    assert len(estimates) >= len(ESTIMATORS) and all(any(once[what]) for what in ("value", "tangent", *estimates))
     for found in several:
         assert [what for what in once if found[what] != once[what]] == []
 

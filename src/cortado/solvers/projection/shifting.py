@@ -1,11 +1,11 @@
 """Particles of the interior are shifted to where they are fewer (Lind et al. 2012; Skillen, Lind, Stansby and Rogers
 2013), at a rate that follows the velocity gradient, so that a fluid at rest is not stirred:
 
-    delta = -20 dt |grad v| s^2 u P grad C,   grad C = sum_j (1 + (V W_ij / (V W(s)))^4 / 5) g_ij + gamma / 2,
+    delta = -r s^2 u P grad C,   grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma / 2,   q_ij = (W_ij / W(s))^4,
 
-softly bounded by 0.1 s. P takes out the direction of the surface, g + gamma / 2, and u of
-`cortado.solvers.projection.surroundings` is 0 at surfaces. Velocities stay as they are: with a correction by
-(delta . grad) v the fluid gains energy. The new position is x + dt v + delta.
+with r = 20 dt |grad v|, softly at least 0 and at most 0.5, and |delta| softly at most 0.1 s. P takes out the direction
+of the surface, g + gamma / 2, and u of `cortado.solvers.projection.surroundings` is 0 at surfaces. Velocities stay as
+they are: with a correction by (delta . grad) v the fluid gains energy. The new position is x + dt v + delta.
 """
 
 from dataclasses import dataclass
@@ -25,12 +25,14 @@ from cortado.sph.moment_functions import matrix_type
 
 RATE = 20.0
 """How fast particles are shifted."""
+GREATEST = 0.5
+"""Of 20 dt |grad v|, softly: beyond it a shift goes too far, and its derivatives grow from step to step."""
 FARTHEST = 0.1
 """In spacings: how far a particle is shifted in a step, at most."""
 SURFACE = 0.03
 """|g| s below which the direction of a surface is not known."""
-SLOWEST = 1e-6
-"""Velocity gradient [1 / s] that is added to that of the fluid, in squares: at rest |grad v| has a derivative."""
+LEAST = 1e-5
+"""e in r = 20 (sqrt(q^2 + e^2) - e), q = dt |grad v|, which is 0 with a slope at rest."""
 
 
 @dataclass(frozen=True)
@@ -48,19 +50,22 @@ def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftF
     """In 2 or 3 dimensions, in a Warp module. A is sum_j v_ij g_ij^T."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     inverse = surrounding_functions(precision, dimension, module).inverse
-    per_time, farthest = wp.constant(real(RATE)), wp.constant(real(FARTHEST))
-    surface, slowest = wp.constant(real(SURFACE**2)), wp.constant(real(SLOWEST**2))
+    rate, greatest, least = (wp.constant(real(value)) for value in (RATE, GREATEST, LEAST))
+    farthest = wp.constant(real(FARTHEST))
+    surface = wp.constant(real(SURFACE**2))
 
     @wp.func
     def shift(
         A: matrix, crowd: vector, M: matrix, g: vector, gamma: vector, u: real, dt: real, spacing: real
     ) -> vector:
         G = A * inverse(M)
-        rate = wp.sqrt(wp.ddot(G, G) + slowest)
+        turned = dt * dt * wp.ddot(G, G)
+        strength = rate * turned / (wp.sqrt(turned + least * least) + least)
         out, slope = g + real(0.5) * gamma, crowd + real(0.5) * gamma
         square = wp.dot(out, out) + surface / (spacing * spacing)
         along = slope - (wp.dot(out, slope) / square) * out
-        wish = (-per_time * dt * rate * spacing * spacing * u) * along
+        strength = strength / wp.sqrt(real(1.0) + (strength / greatest) * (strength / greatest))
+        wish = (-strength * spacing * spacing * u) * along
         most = farthest * spacing
         return wish / wp.sqrt(real(1.0) + wp.dot(wish, wish) / (most * most))
 

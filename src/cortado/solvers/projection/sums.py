@@ -15,8 +15,9 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, 
 from cortado.particles.pair_sums import fluid_sum, wall_sum
 from cortado.sph.moment_functions import matrix_type, symmetric
 
-CROWDED = 0.2
-"""How much more pairs count in a shift that are close (Monaghan 2000)."""
+CROWDED = 0.25
+"""R: how much more pairs count in a shift that are close (Monaghan 2000), boundedly: unbounded, the derivative of the
+shift is so steep among clumped particles that gradients of a splash grow by ten orders more."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,8 @@ class ProjectionSums:
     push_back: Any
     """For adjoints f of the push: sum g_ij . f_ij, and what x is given."""
     crowding: Any
-    """The rows of sum v_ij g_ij^T, and sum (1 + (V W_ij / V W(s))^4 / 5) g_ij, for V W(s) ``nearest``."""
+    """The rows of sum v_ij g_ij^T, and sum (1 + R q / (1 + q / 4)) g_ij with q = (W_ij / W(s))^4, for V W(s)
+    ``nearest``."""
     crowding_tangent: Any
     crowding_back: Any
     """For adjoints A of the first, as matrices, and of the second: what v and x are given."""
@@ -190,12 +192,23 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
             ((c_i + c_j) * s.volume) * hessian_product(x_ij, f_ij, s),
         )
 
+    @wp.func
+    def closeness(near: real) -> real:
+        """1 + R q / (1 + q / 4) with q = near^4."""
+        q = near * near * near * near
+        return real(1.0) + crowded * q / (real(1.0) + real(0.25) * q)
+
+    @wp.func
+    def closeness_derivative(near: real) -> real:
+        q = near * near * near * near
+        part = real(1.0) + real(0.25) * q
+        return real(4.0) * crowded * near * near * near / (part * part)
+
     @fluid_sum(discretisation)
     def crowding(x_ij: vector, v_ij: vector, nearest: real, s: neighbourhood) -> tuple[vector, vector, vector, vector]:
         g = s.volume * gradient(x_ij, s)
         near = s.volume * weight(x_ij, s) / nearest
-        square = near * near
-        return v_ij[0] * g, v_ij[1] * g, v_ij[2] * g, (real(1.0) + crowded * square * square) * g
+        return v_ij[0] * g, v_ij[1] * g, v_ij[2] * g, closeness(near) * g
 
     @tangent_of(crowding)
     @fluid_sum(discretisation, ahead=False)
@@ -204,13 +217,12 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
     ) -> tuple[vector, vector, vector, vector]:
         g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
         near = s.volume * weight(x_ij, s) / nearest
-        square = near * near
-        more = real(4.0) * crowded * square * near * wp.dot(g, x_dot_ij) / nearest
+        more = closeness_derivative(near) * wp.dot(g, x_dot_ij) / nearest
         return (
             v_dot_ij[0] * g + v_ij[0] * g_dot,
             v_dot_ij[1] * g + v_ij[1] * g_dot,
             v_dot_ij[2] * g + v_ij[2] * g_dot,
-            (real(1.0) + crowded * square * square) * g_dot + more * g,
+            closeness(near) * g_dot + more * g,
         )
 
     @fluid_sum(discretisation)
@@ -223,11 +235,10 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         nearest: real,
         s: neighbourhood,
     ) -> tuple[vector, vector]:
-        g = s.volume * gradient(x_ij, s)
+        g, both = s.volume * gradient(x_ij, s), A_bar_i + A_bar_j
         near = s.volume * weight(x_ij, s) / nearest
-        square, both = near * near, A_bar_i + A_bar_j
-        more = real(4.0) * crowded * square * near * wp.dot(g, crowd_bar_ij) / nearest
-        pulled = wp.transpose(both) * v_ij + (real(1.0) + crowded * square * square) * crowd_bar_ij
+        more = closeness_derivative(near) * wp.dot(g, crowd_bar_ij) / nearest
+        pulled = wp.transpose(both) * v_ij + closeness(near) * crowd_bar_ij
         return both * g, s.volume * hessian_product(x_ij, pulled, s) + more * g
 
     return ProjectionSums(
