@@ -20,6 +20,18 @@ def matrix_type(precision: Precision) -> Any:
     return wp.types.matrix(shape=(3, 3), dtype=precision.real)
 
 
+@cache
+def cross_terms_function(precision: Precision) -> Any:
+    """The Warp function of the entries yz, xz and xy of a b^T, given a and b."""
+    vector = precision.vector
+
+    @wp.func
+    def cross_terms(a: vector, b: vector) -> vector:
+        return vector(a[1] * b[2], a[0] * b[2], a[0] * b[1])
+
+    return cross_terms
+
+
 @dataclass(frozen=True)
 class Symmetric:
     """Symmetric matrices as six numbers, their diagonal and their entries yz, xz and xy: what a neighbour loads."""

@@ -9,7 +9,7 @@ import warp as wp
 from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import rubbing_sum
-from cortado.sph.moment_functions import matrix_type
+from cortado.sph.moment_functions import cross_terms_function, matrix_type
 from cortado.sph.stress_functions import fluidity_function
 from cortado.sph.wall_contact import contact_functions
 
@@ -37,11 +37,7 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
     hold, hold_gradient = contact.hold, contact.hold_gradient
     summed = rubbing_sum(discretisation, sticks)
     fluidity, matrix = fluidity_function(precision), matrix_type(precision)
-
-    @wp.func
-    def cross_terms(a: vector, b: vector) -> vector:
-        """Entries yz, xz and xy of a b^T."""
-        return vector(a[1] * b[2], a[0] * b[2], a[0] * b[1])
+    cross_terms = cross_terms_function(precision)
 
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:

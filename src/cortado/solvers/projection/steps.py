@@ -63,16 +63,13 @@ class ProjectionSteps(ParticleSolver):
     def __init__(self, system: ParticleSystem, constants: ProjectionConstants, iterations: int, repairs: int):
         """Of so many iterations of the pressure and of the repair of density in every step."""
         super().__init__(system)
-        self.constants, self.iterations, self.repairs = constants, iterations, repairs
+        self.constants = constants
         self.kernels = ProjectionKernels.of(self.discretisation, system.walled.dimension)
-        self.around = self.new_arrays(**entries(self.layout.precision))
+        self.around = self.new_arrays(**entries(system.layout.precision))
         """Of the neighbourhoods, see `cortado.solvers.projection.surroundings`."""
-        matrix, real, vector = (
-            matrix_type(self.layout.precision),
-            self.layout.precision.real,
-            self.layout.precision.vector,
-        )
-        self.pull = self.new_arrays(T=symmetric(self.layout.precision).kind)["T"]
+        precision = self.layout.precision
+        matrix, real, vector = matrix_type(precision), precision.real, precision.vector
+        self.pull = self.new_arrays(T=symmetric(precision).kind)["T"]
         """y L of the present iteration."""
         self.kept = self.new_arrays(A=matrix, crowd=vector)
         """Sums of the shift."""

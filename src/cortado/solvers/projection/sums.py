@@ -13,7 +13,7 @@ import warp as wp
 from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import fluid_sum, wall_sum
-from cortado.sph.moment_functions import matrix_type, symmetric
+from cortado.sph.moment_functions import cross_terms_function, matrix_type, symmetric
 
 CROWDED = 0.25
 """R: how much more pairs count in a shift that are close (Monaghan 2000), boundedly: unbounded, the derivative of the
@@ -64,14 +64,10 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, matrix = neighbourhood_type(discretisation.precision), matrix_type(discretisation.precision)
     pair = pair_functions(discretisation)
-    six, times = symmetric(discretisation.precision).kind, symmetric(discretisation.precision).times
+    packed, cross_terms = symmetric(discretisation.precision), cross_terms_function(discretisation.precision)
+    six, times = packed.kind, packed.times
     crowded = wp.constant(real(CROWDED))
     weight, slope, gradient, hessian_product = pair.weight, pair.slope, pair.gradient, pair.hessian_product
-
-    @wp.func
-    def cross_terms(a: vector, b: vector) -> vector:
-        """Entries yz, xz and xy of a b^T."""
-        return vector(a[1] * b[2], a[0] * b[2], a[0] * b[1])
 
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:
