@@ -22,6 +22,8 @@ class Projection:
     spacing: float
     walls: np.ndarray
     wall_weights: np.ndarray
+    feet: np.ndarray
+    """From wall particles to the surface."""
     periods: np.ndarray
     iterations: int
     repairs: int
@@ -55,7 +57,9 @@ class Projection:
         (n, d), (apart, W, g) = x.shape, self.pairs(x, x)
         _, wall_W, wall_g = self.pairs(x, self.walls)
         density = self.density(x)
-        gamma, nu = np.einsum("b,iba->ia", self.wall_weights, wall_g), wall_W @ self.wall_weights
+        normal = self.feet / np.linalg.norm(self.feet, axis=1, keepdims=True)
+        gamma = np.einsum("b,iba,ba,bc->ic", self.wall_weights, wall_g, normal, normal)
+        nu = wall_W @ self.wall_weights
         total = g.sum(1)
         M = -np.einsum("ija,ijb->iab", g, apart)
         if d == 2:
@@ -64,10 +68,16 @@ class Projection:
             squares = (np.trace(M, axis1=1, axis2=2) ** 2 - np.trace(M @ M, axis1=1, axis2=2)) / 2
             H = 3 * np.linalg.det(M) / (squares + 1e-12)
         B = 1 / (1 + (nu / 0.05) ** 4)
-        full, tension = between(H, 0.1, 0.5), between(H, 0.1, 0.5) * B
+        tension = between(H, 0.1, 0.5) * B
         inverse = 1.05 * np.linalg.inv(M + 0.05 * np.eye(d))
-        L = np.eye(d) + (between(H, 0.2, 0.5) * B)[:, None, None] * (inverse - np.eye(d))
         omega, square = self.constants(d)
+        N = gamma[:, :, None] * gamma[:, None, :]
+        N = N / ((gamma**2).sum(1) + 0.01 * 0.05 * square)[:, None, None]
+        across = (np.eye(d) - N) @ M @ N
+        C = 1.05 / ((M * N).sum((1, 2)) + 0.05)[:, None, None] * (across + across.transpose(0, 2, 1))
+        B, full = B[:, None, None], between(H, 0.1, 0.5)
+        L = np.eye(d) + between(H, 0.2, 0.5)[:, None, None] * (B * (inverse - np.eye(d)) - (1 - B) * C)
+        B = B[:, 0, 0]
         own = np.einsum("iab,ib->ia", L, total) + gamma
         a = ((own**2).sum(1) + 0.05 * square) / m
         a += (np.einsum("iab,ijb->ija", L, g) ** 2).sum(-1) @ (1 / m)

@@ -1,9 +1,9 @@
 """Values of a wrong type, given to whatever a user may call: a sentence each, and never a bare error of Python's."""
 
 import inspect
-import os
 from functools import cache
 from pathlib import Path
+from tempfile import mkdtemp
 
 import numpy as np
 import pytest
@@ -23,13 +23,13 @@ WRONG = {
     "a list": [],
     "a table": {},
     "an object": object(),
-    "a folder": os.getcwd(),
+    "a folder": mkdtemp(),
     "no number": float("nan"),
     "an array": np.zeros(3),
     "bytes": b"x",
     "a table of a truth": {True: 1},
     "a table of nothing": {"gravity": None},
-    "a path": Path.cwd(),
+    "a path": Path(mkdtemp()),
     "a letter": "x",
     "a large number": 10**12,
     "no finite number": float("inf"),

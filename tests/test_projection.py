@@ -34,7 +34,7 @@ def test_a_step_is_that_of_the_twin(case):
     simulation = Simulation(made, precision="float64")
     solver, d, given = simulation.solver, simulation.dimension, thrown(simulation)
     search, lattice = solver.search, solver.lattice
-    walls = search.wall_positions.numpy()[:, :d], search.wall_weights.numpy()
+    walls = search.wall_positions.numpy()[:, :d], search.wall_weights.numpy(), search.wall_feet.numpy()[:, :d]
     twin = Projection(
         *(solver.discretisation.smoothing, lattice.support, lattice.volume, made.discretisation.spacing),
         *walls,
@@ -57,7 +57,7 @@ def test_a_step_is_that_of_the_twin(case):
 DERIVED = {
     **CASES,
     "mixture": lambda: two_layers(solver=SOLVER),
-    "nozzle": lambda: jet(solver=SOLVER),
+    "nozzle": lambda: jet(solver=SOLVER, forces={"gravity": [0.7, -9.81]}),
     "nozzle in space": lambda: pour(solver=SOLVER),
     "surface tension": lambda: plane(solver=SOLVER, forces={"gravity": [0.0, -9.81], "surface_tension": 3.0}),
     "thick": lambda: plane(

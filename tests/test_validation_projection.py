@@ -2,7 +2,9 @@
 
 import pytest
 
+from falling_jets import falling_jet
 from projected_flows import dam_break, elliptical_drop, hung_block, rotating_patch, taylor_green
+from sloping_films import sloping_film
 
 PCISPH = {"kind": "pcisph", "minimum_iterations": 3, "maximum_iterations": 60, "density_tolerance": 0.001}
 
@@ -34,6 +36,28 @@ def test_an_ellipse_of_fluid_is_drawn_out_as_it_must():
     """Monaghan (1994)."""
     assert abs(elliptical_drop(36) - 1.0).max() < 0.01
     assert abs(elliptical_drop(36, solver=PCISPH) - 1.0).max() > 0.05
+
+
+def test_so_is_a_ball():
+    assert abs(elliptical_drop(14, 3) - 1.0).max() < 0.02
+
+
+@pytest.mark.parametrize("viscosity", [0.0, 5.0])
+def test_a_jet_that_falls_is_drawn_out_and_keeps_together(viscosity):
+    """Its width is that of continuity where it is 1.5 to 3 times as fast as at first."""
+    width, gap, joined = falling_jet(7, 2, viscosity)
+    assert abs(width - 1.0).max() < 0.05 and gap < 1.5 and joined == 1.0
+
+
+def test_pushed_alone_a_jet_falls_apart():
+    width, gap, joined = falling_jet(7, 2, solver=PCISPH)
+    assert width.max() > 2.0 and gap > 2.0 and joined < 0.6
+
+
+def test_a_film_flows_down_a_gentle_slope():
+    """At a slope of 1 %; particles that are only pushed stick to the wall and to one another."""
+    assert sloping_film(0.01, 10)[0] == pytest.approx(1.0, abs=0.05)
+    assert sloping_film(0.01, 10, solver=PCISPH)[0] < 0.9
 
 
 def test_nothing_hangs_from_a_lid():

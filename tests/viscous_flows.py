@@ -14,6 +14,10 @@ from cortado.particles.state import State
 
 KERNELS = {"cubic_spline": 2.0, "wendland_c2": 2.6, "wendland_c4": 3.0}
 """Their supports in spacings."""
+SOLVERS = {
+    "pcisph": {"kind": "pcisph", "density_tolerance": 0.001, "maximum_iterations": 10},
+    "projection": {"kind": "projection"},
+}
 NU = 0.1
 """Kinematic viscosity [m2/s]."""
 DENSITY = 1000.0
@@ -123,6 +127,7 @@ class Channel:
     kernel: str = "cubic_spline"
     form: str = "stress"
     pressure: bool = True
+    solver: str = "pcisph"
     time: float = 0.3 / NU
     """[s]"""
 
@@ -165,7 +170,7 @@ class Channel:
             [Body(band, push=self.push, low=self.low, high=1.0 - self.low)],
             container={"periodic": [True, False], "slip": "no"},
             forces={"pressure": self.pressure},
-            solver={"time_step": self.time / steps, "density_tolerance": 0.001, "maximum_iterations": 10},
+            solver={"time_step": self.time / steps, **SOLVERS[self.solver]},
         )
         y = one.positions[:, 1]
         v = np.column_stack([self.exact(y), np.zeros(len(y))])

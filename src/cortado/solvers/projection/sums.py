@@ -116,17 +116,24 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         x_part = hessian_product(x_ij, real(2.0) * both + g_bar_ij - stretch, s) - slope(x_ij, s) * stretch
         return s.volume * x_part, -wp.dot(g, Q_bar_j * g) / (m_i * m_i)
 
-    @wall_sum(discretisation)
-    def beside(x_ij: vector, s: neighbourhood) -> tuple[vector, real]:
-        return s.volume * gradient(x_ij, s), s.volume * weight(x_ij, s)
+    @wp.func
+    def normal_part(a: vector, foot: vector) -> vector:
+        """Of a vector, along the normal of a wall at a particle of it."""
+        return (wp.dot(a, foot) / wp.dot(foot, foot)) * foot
 
     @wall_sum(discretisation)
-    def beside_tangent(x_ij: vector, x_dot_ij: vector, s: neighbourhood) -> tuple[vector, real]:
-        return s.volume * hessian_product(x_ij, x_dot_ij, s), s.volume * wp.dot(gradient(x_ij, s), x_dot_ij)
+    def beside(x_ij: vector, foot: vector, s: neighbourhood) -> tuple[vector, real]:
+        return s.volume * normal_part(gradient(x_ij, s), foot), s.volume * weight(x_ij, s)
 
     @wall_sum(discretisation)
-    def beside_back(x_ij: vector, gamma_bar_i: vector, nu_bar_i: real, s: neighbourhood) -> vector:
-        return s.volume * (hessian_product(x_ij, gamma_bar_i, s) + nu_bar_i * gradient(x_ij, s))
+    def beside_tangent(x_ij: vector, x_dot_ij: vector, foot: vector, s: neighbourhood) -> tuple[vector, real]:
+        change = s.volume * normal_part(hessian_product(x_ij, x_dot_ij, s), foot)
+        return change, s.volume * wp.dot(gradient(x_ij, s), x_dot_ij)
+
+    @wall_sum(discretisation)
+    def beside_back(x_ij: vector, gamma_bar_i: vector, nu_bar_i: real, foot: vector, s: neighbourhood) -> vector:
+        push = hessian_product(x_ij, normal_part(gamma_bar_i, foot), s)
+        return s.volume * (push + nu_bar_i * gradient(x_ij, s))
 
     @fluid_sum(discretisation)
     def force(x_ij: vector, T_j: six, s: neighbourhood) -> vector:

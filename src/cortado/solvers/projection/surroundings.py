@@ -8,7 +8,8 @@ beside walls:
     f = S(0.1, 0.5)          how full it is: how much of the last step's pressure is taken on,
     u = S(0.5, 0.8)          how much it is shifted,
     r = S(0.8, 0.95) B       how much of a low density is repaired,
-    L = I + c (1.05 (M + 0.05 I)^-1 - I), c = S(0.2, 0.5) B,   which corrects gradients,
+    L = I + c (B (1.05 (M + 0.05 I)^-1 - I) - (1 - B) C), c = S(0.2, 0.5),   which corrects gradients,
+    C = 1.05 (P M N + N M P) / (M : N + 0.05), N = gamma gamma^T / (gamma^2 + 0.01 a_0 / 20), P = I - N,
     a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m         the diagonal of the projection's matrix.
 """
 
@@ -32,6 +33,8 @@ WALLED = 0.05
 """nu at which a wall halves tension, correction and the repair of low densities."""
 REGULAR = 0.05
 """What is added to the diagonal of M before it is inverted."""
+DIRECTION = 0.01
+"""In parts of 0.05 a_0: gamma^2 below which the direction of a wall is not known."""
 
 
 @cache
@@ -54,7 +57,7 @@ class SurroundingFunctions:
     weights: Any
     """(sigma, f, u, r) of M and nu."""
     correction: Any
-    """L of M and nu."""
+    """L of M, gamma, nu and 0.05 a_0."""
     inverse: Any
     """1.05 (M + 0.05 I)^-1"""
     diagonal: Any
@@ -70,7 +73,7 @@ def surrounding_functions(precision: Precision, dimension: int, module: Any) -> 
     own = moment_functions(precision, dimension)
     fullness, invert, smoothstep = own.fullness, own.inverse, own.smoothstep
     weights4 = weights_type(precision)
-    regular, walled = wp.constant(real(REGULAR)), wp.constant(real(WALLED))
+    regular, walled, direction = (wp.constant(real(value)) for value in (REGULAR, WALLED, DIRECTION))
     (t_0, t_1), (c_0, c_1) = (tuple(wp.constant(real(value)) for value in ends) for ends in (TENSION, CORRECTED))
     (u_0, u_1), (r_0, r_1) = (tuple(wp.constant(real(value)) for value in ends) for ends in (SHIFTED, REPAIRED))
 
@@ -96,9 +99,17 @@ def surrounding_functions(precision: Precision, dimension: int, module: Any) -> 
         return weights4(full * B, full, smoothstep(H, u_0, u_1), smoothstep(H, r_0, r_1) * B)
 
     @wp.func
-    def correction(M: matrix, nu: real) -> matrix:
-        c = smoothstep(fullness(M), c_0, c_1) * away(nu)
-        return unit() + c * (inverse(M) - unit())
+    def leaning(M: matrix, gamma: vector, least: real) -> matrix:
+        """C"""
+        N = wp.outer(gamma, gamma) / (wp.dot(gamma, gamma) + direction * least)
+        across = M * N - N * M * N
+        return (real(1.0) + regular) / (wp.ddot(M, N) + regular) * (across + wp.transpose(across))
+
+    @wp.func
+    def correction(M: matrix, gamma: vector, nu: real, least: real) -> matrix:
+        c, B = smoothstep(fullness(M), c_0, c_1), away(nu)
+        beside = (real(1.0) - B) * leaning(M, gamma, least)
+        return unit() + c * (B * (inverse(M) - unit()) - beside)
 
     @wp.func
     def diagonal(L: matrix, Q: matrix, g: vector, gamma: vector, m: real, least: real) -> real:
@@ -119,7 +130,7 @@ def surrounding_functions(precision: Precision, dimension: int, module: Any) -> 
         a_bar: real,
         weights_bar: weights4,
     ) -> real:
-        L = correction(M, nu)
+        L = correction(M, gamma, nu, least)
         total = wp.ddot(L, L_bar) + wp.dot(weights(M, nu), weights_bar)
         return total + a_bar * diagonal(L, Q, g, gamma, m, least)
 
@@ -181,7 +192,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         if lane() > 0:
             return
         M, Q = whole(diagonal, others), change(square, mixed)
-        L = correction_of(M, nu)
+        L = correction_of(M, gamma, nu, least)
         of.M[i] = M
         of.Q[i] = Q
         of.g[i] = g

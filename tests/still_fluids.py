@@ -1,0 +1,59 @@
+"""Fluids at rest in a tank: water, and light fluid over heavy fluid."""
+
+import numpy as np
+
+from projected_flows import C2, PROJECTION, box, simulated
+
+GRAVITY = 9.81
+TANK = {"container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.8, 1.4]}, "forces": {"gravity": [0.0, -GRAVITY]}}
+
+
+def still_water(deep, time=2.5, time_step=0.001, solver=PROJECTION, discretisation=C2, device="cpu"):
+    """A metre of water, so many particles deep: the rms of the speed in the last fifth of the time [m/s], the rms
+    errors of the mean pressure over g H of all particles and of those that are 3 spacings and more away from walls and
+    surface, and the mean height over that at first."""
+    spacing = 1.0 / deep
+    simulation = simulated(
+        spacing,
+        precision="float32",
+        discretisation=discretisation,
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
+        fluid=[box([0.0, 0.0], [0.8, 1.0])],
+        solver={**solver, "time_step": time_step},
+        device=device,
+        **TANK,
+    )
+    steps = round(time / time_step)
+    run = simulation.run(steps, record_every=max(steps // 500, 1), record=["pressure"])
+    late = run.times > 0.8 * time
+    x, p = run.positions[late].mean(axis=0), run.quantities["pressure"][late].mean(axis=0)
+    depth = len(x) * spacing**2 / 0.8
+    error = p / (1000.0 * GRAVITY * depth) - (depth - x[:, 1]) / depth
+    edge = 3.0 * spacing
+    inner = (x[:, 0] > edge) & (x[:, 0] < 0.8 - edge) & (x[:, 1] > edge) & (x[:, 1] < depth - edge)
+    speed = np.sqrt((run.velocities[late] ** 2).sum(axis=2).mean())
+    level = run.positions[-1, :, 1].mean() / run.positions[0, :, 1].mean()
+    return float(speed), float(np.sqrt((error**2).mean())), float(np.sqrt((error[inner] ** 2).mean())), float(level)
+
+
+def two_layers(ratio, time_step, deep=40, time=2.0, solver=PROJECTION, discretisation=C2, device="cpu"):
+    """Light fluid over one so many times as heavy, half a metre each: the rms of the speed within 4 spacings of where
+    they meet in the second half of the time, over sqrt(g H)."""
+    spacing = 1.0 / deep
+    densities = {"heavy": 1000.0, "light": 1000.0 / ratio}
+    bodies = [box([0.0, 0.0], [0.8, 0.5]) | {"phase": "heavy"}, box([0.0, 0.5], [0.8, 1.0]) | {"phase": "light"}]
+    simulation = simulated(
+        spacing,
+        precision="float32",
+        discretisation=discretisation,
+        phase=[{"name": n, "rest_density": rho, "viscosity": 1e-6 * rho} for n, rho in densities.items()],
+        fluid=bodies,
+        solver={**solver, "time_step": time_step},
+        device=device,
+        **TANK,
+    )
+    steps = round(time / time_step)
+    run = simulation.run(steps, record_every=max(steps // 200, 1))
+    late = run.times > 0.5 * time
+    near = np.abs(run.positions[late][:, :, 1] - 0.5) < 4.0 * spacing
+    return float(np.sqrt((run.velocities[late] ** 2).sum(axis=2)[near].mean()) / np.sqrt(GRAVITY))

@@ -1,0 +1,90 @@
+"""How near is the projection to flows that are known? ``python validation/projection.py [--device cuda] [--only jet]``
+prints a line for each case of `docs/projection.md` and more, some of which take minutes on one core."""
+
+import argparse
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from cortado.errors import CortadoWarning
+from falling_jets import falling_jet
+from projected_flows import dam_break, elliptical_drop, hung_block, kolmogorov, rotating_patch, taylor_green
+from sloping_films import sloping_film
+from still_fluids import still_water, two_layers
+from viscous_flows import Channel
+
+Case = Callable[[str], object]
+
+
+def channel(across: int, reynolds: float, low: float) -> Case:
+    return lambda _: Channel(across, reynolds, low, "wendland_c2", solver="projection").run()
+
+
+CASES: dict[str, Case] = {
+    "vortices 32, 46, Re 100: energy, velocity": lambda _: [taylor_green(n, 100.0) for n in (32, 46)],
+    "vortices 32, Re 10": lambda _: taylor_green(32, 10.0, 0.1),
+    "wave of shear in space, 32": lambda device: kolmogorov(32, device=device),
+    "ellipse 36": lambda device: elliptical_drop(36, device=device),
+    "ball drawn out, 36": lambda device: elliptical_drop(36, 3, device=device),
+    "square that turns, 36, 72: pieces, corner, energy, momentum": lambda device: [
+        rotating_patch(n, device=device) for n in (36, 72)
+    ],
+    **{
+        f"jet, {'slot' if d == 2 else 'round'}, {n} across, {mu:g} Pa s: width at 1.5, 2, 2.5, 3; gap; in one piece": (
+            lambda device, d=d, n=n, mu=mu: falling_jet(n, d, mu, device=device)
+        )
+        for d in (2, 3)
+        for n in (7, 14)
+        for mu in (0.0, 5.0)
+    },
+    **{
+        f"film {n} deep, slope {slope:g}: flow; in sixths of the time": (
+            lambda device, n=n, slope=slope: sloping_film(slope, n, device=device)
+        )
+        for n in (16, 32)
+        for slope in (0.1, 0.01, 0.001, 0.0003)
+    },
+    **{
+        f"{'Couette' if low else 'Poiseuille'}, {n} across, Re {re:g}": channel(n, re, low)
+        for n in (20, 40)
+        for low in (0.0, 0.45)
+        for re in (0.1, 1.0, 10.0, 100.0)
+    },
+    "block under a lid: fall": lambda _: hung_block(),
+    "dam break, steps of 0.5, 1, 2, 3 ms: energy, compression": lambda _: [
+        dam_break(time_step=step) for step in (0.0005, 0.001, 0.002, 0.003)
+    ],
+    **{
+        f"water at rest, {n} deep: speed; pressure, inner; level": (
+            lambda device, n=n: still_water(n, 10.0, device=device)
+        )
+        for n in (20, 40)
+    },
+    **{
+        f"layers, ratio {ratio}, steps of 1 ms: speed": (lambda device, r=ratio: two_layers(r, 0.001, device=device))
+        for ratio in (2, 10, 100, 1000)
+    },
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", default="cpu", help="as Warp names it")
+    parser.add_argument("--only", default="", help="cases whose names begin so")
+    given = parser.parse_args()
+    warnings.simplefilter("ignore", CortadoWarning)
+    np.set_printoptions(precision=4, suppress=True)
+    chosen = {name: case for name, case in CASES.items() if name.startswith(given.only)}
+    for number, (name, case) in enumerate(chosen.items(), 1):
+        begun = time.perf_counter()
+        found = case(given.device)
+        print(f"[{number}/{len(chosen)}] {name}: {found} ({time.perf_counter() - begun:.0f} s)", flush=True)
+
+
+if __name__ == "__main__":
+    main()
