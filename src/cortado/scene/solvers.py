@@ -13,9 +13,8 @@ from cortado.scene.tables import Table
 OWN = ("pcisph", "projection")
 """The kinds that are Cortado's own."""
 COURANT = 0.2
-"""The Courant number of a scene that gives none. Dams, drops, jets and layers of a few hundred to a few thousand
-particles, in the plane and in space, came to rest with it; with 0.25 steps of a jet did not converge, and with 0.5 most
-of them were lost."""
+"""The Courant number of a scene that gives none. With it PCISPH took 600 steps of seven scenes, dams, a drop, a jet and
+layers of 64 to 600 particles, in the plane and in space; with 0.3 it lost one of them, with 0.4 four."""
 
 
 class SolverTable(Table):
