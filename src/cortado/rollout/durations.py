@@ -25,9 +25,10 @@ ROOM = 4
 def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, values: Mapping[str, Any]) -> int:
     """The number of steps of a run, which has either so many or reaches a time [s] with them; where they are chosen, as
     many as there is room for. Raises `InputError`."""
-    if (steps is None) == (time is None):
-        found = "are both left out" if steps is None else "are both given"
-        raise InputError(f"steps and time {found}, but one of them must say how long the run is.")
+    if steps is None and time is None:
+        raise InputError("steps is left out, but must be given where no time says how long the run is.")
+    if steps is not None and time is not None:
+        raise InputError("time is given, but must be left out, as steps says how long the run is.")
     if time is None:
         assert steps is not None
         return check_steps(steps)
