@@ -245,8 +245,8 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         "## Time steps: `[solver]`",
         "How the fluid is kept incompressible ([two ways](projection.md)). A time step beyond the limit of stability "
         'is warned of; with `time_step = "auto"` it is [chosen before each step](steps.md#steps-that-are-chosen). '
-        "Every scene has PCISPH that does not say otherwise. With the name of a solver that an installed package registers "
-        "as `kind`, the table has the first four keys below and those of that solver.",
+        "Every scene has PCISPH that does not say otherwise. With the name of a solver that an installed package "
+        "registers as `kind`, the table has the first four keys below and those of that solver.",
         (
             (
                 "PcisphSolver",
