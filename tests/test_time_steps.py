@@ -117,6 +117,10 @@ def test_a_run_that_goes_on_has_the_bits_of_one_that_did_not_stop(kind, precisio
         assert rest.positions.tobytes() == whole.positions[20:].tobytes()
         assert rest.times.tobytes() == whole.times[20:].tobytes()
         assert sizes_of(rest).tobytes() == sizes_of(whole)[20:].tobytes()
+        middle = rest[3:11].last_state
+        assert (middle.clock.steps, middle.clock.time_step) == (30, sizes_of(whole)[29])
+        on_device = simulation.step(simulation.on_device(middle), steps=10)
+        assert simulation.on_host(on_device)["positions"].tobytes() == whole.positions[40].tobytes()
 
 
 @pytest.mark.parametrize("made", ["plane", "layers", "jet", *COURSES])
