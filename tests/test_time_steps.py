@@ -1,6 +1,9 @@
 """Time steps that are chosen before each step, recorded, and taken again as they were."""
 
+import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from cortado.scene.stability import chosen_limits, is_implicit, viscous_limit
 from cortado.sensors import PressureProbe
 from scenes import jet, plane, two_layers
 
+EXAMPLES = Path(__file__).parents[1] / "examples"
 STEPS = 24
 CHOSEN = {"time_step": "auto"}
 SOLVERS = {"pcisph": {}, "projection": {"kind": "projection"}}
@@ -326,6 +330,31 @@ def test_what_cannot_be_is_said_in_a_sentence(tmp_path):
             call()
 
 
+@pytest.mark.parametrize(
+    "words, what",
+    [
+        (
+            ["sweep", "scene.toml", "--set", "solver.courant=0.1,0.2", "--steps", "3"],
+            'solver.time_step is "auto", but must be a number of seconds for a sweep.',
+        ),
+        (
+            ["optimise", "task.toml", "--set", "solver.time_step=auto"],
+            "solver.time_step is 'auto', but must be a number of seconds in a task, whose runs are compared",
+        ),
+        (
+            ["gradients", "check", "scene.toml", "--steps", "3"],
+            "but must be a number of seconds for a certificate, whose differences would not hold chosen ones.",
+        ),
+    ],
+)
+def test_commands_that_need_a_fixed_step_say_so(cortado_command, tmp_path, monkeypatch, words, what):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(SCENE)
+    shutil.copy(EXAMPLES / "recover_gravity_small.toml", "task.toml")
+    code, _, err = cortado_command(*words)
+    assert code == 2 and what in err and len(err.strip().splitlines()) == 1
+
+
 def test_the_reference_engine_refuses_steps_that_are_chosen():
     reference = pytest.importorskip("cortado_reference")
     with pytest.raises(InputError, match='is "auto", but must be a number of seconds for the ref'):
@@ -375,6 +404,32 @@ def run_command(cortado_command, tmp_path):
     """Runs the scene into the folder "out"."""
     (tmp_path / "scene.toml").write_text(SCENE)
     return lambda *words: cortado_command("run", tmp_path / "scene.toml", "--out", tmp_path / "out", *words)
+
+
+def test_a_run_whose_steps_become_too_short_says_so(monkeypatch):
+    monkeypatch.setattr("cortado.rollout.durations.expected_steps", lambda scene, time: 3)
+    with pytest.warns(cortado.CortadoWarning, match="the run ended at 0.1.* s, before the time that was asked for"):
+        run = Simulation(drop(CHOSEN)).run(time=10.0)
+    assert len(run.converged) == 12
+
+
+@pytest.mark.parametrize(
+    "words, limit, size",
+    [
+        ((), "depth", 0.0214),
+        (("fluid.0.velocity=[2.0, 0.0]",), "speed", 0.005),
+        (("forces.viscosity=pairwise", "phase.water.viscosity=500"), "viscosity", 0.000497),
+        (("solver.greatest_time_step=0.003",), "greatest_time_step", 0.003),
+    ],
+)
+def test_describe_says_which_limit_decides_the_first_step(cortado_command, tmp_path, words, limit, size):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    sets = [word for one in words for word in ("--set", one)]
+    code, out, _ = cortado_command("describe", tmp_path / "scene.toml", *sets)
+    assert code == 0 and f"chosen before each step: the first is {size:.3g} s, by {limit}; limits: {limit}" in out
+    found = json.loads(cortado_command("describe", tmp_path / "scene.toml", "--json", *sets)[1])
+    assert (found["time_step_chosen_by"], found["simulated_time_s"]) == (limit, None)
+    assert found["time_step_s"] == pytest.approx(size, rel=1e-2)
 
 
 def test_the_command_runs_until_a_time(run_command, tmp_path):
