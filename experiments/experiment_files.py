@@ -56,6 +56,8 @@ def _scene(value: Any, file: str) -> Scene:
         scene = scene_from_dict(merged(read_toml(base), changes), os.fspath(base))
     else:
         scene = scene_from_dict(changes, file)
+    if scene.solver.chooses:
+        raise SceneError(file, "scene.solver.time_step", "auto", "a number of seconds, as experiments count steps")
     if scene.schedule.courses:
         raise SceneError(file, "scene.schedule", Words("given"), "left out, as experiments say what gravity is")
     return scene

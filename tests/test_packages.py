@@ -161,7 +161,7 @@ def force(*lines):
             solver('kind = "dfsph"'),
             r'solver.kind is .dfsph., but must be "pcisph" or "projection", or a name .*"falling", "remembering"',
         ),
-        (solver("rate = 0.1"), r"solver.rate is not a key of \[solver\]; its keys are kind, time_step, minimum_iter"),
+        (solver("rate = 0.1"), r"solver.rate is not a key of \[solver\]; its keys are kind, time_step, courant"),
         (solver('kind = "remembering"', "minimum_iterations = 2"), r"solver.minimum_iterations is not a key .* rate\."),
         (
             solver('kind = "remembering"').replace("0.002", "-1.0"),

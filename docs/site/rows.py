@@ -30,7 +30,9 @@ def _row(key: str, field: Schema, needed: bool, link: tuple[str, str] | None) ->
     number = value.get("items", value)
     number = number.get("items", number)  # of a list of lists
     unit = {"-": ""}.get(number.get("unit", ""), number.get("unit", ""))
-    kind, meaning = link or (_kind(value), _meaning(key, field, unit))
+    words = [one["const"] for one in field.get("anyOf", ()) if "const" in one and one is not value]
+    kinds = " or ".join([_kind(value), *(f'`"{word}"`' for word in words)]) if link is None else ""
+    kind, meaning = link or (kinds, _meaning(key, field, unit))
     cells = (f"`{key}`", kind, unit, _range(number), _default(field, needed), meaning)
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 

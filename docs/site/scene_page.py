@@ -244,8 +244,9 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     (
         "## Time steps: `[solver]`",
         "How the fluid is kept incompressible ([two ways](projection.md)). A time step beyond the limit of stability "
-        "is warned of. Every scene has PCISPH that does not say otherwise. With the name of a solver that an installed "
-        "package registers as `kind`, the table has `kind`, `time_step` and the keys of that solver.",
+        'is warned of; with `time_step = "auto"` it is [chosen before each step](steps.md#steps-that-are-chosen). '
+        "Every scene has PCISPH that does not say otherwise. With the name of a solver that an installed package "
+        "registers as `kind`, the table has the first four keys below and those of that solver.",
         (
             (
                 "PcisphSolver",

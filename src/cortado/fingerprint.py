@@ -23,7 +23,8 @@ def fingerprint_of(simulation: Simulation, steps: int, loss: Any, states: Sequen
     checksums = [f"{name} {sha256(content).hexdigest()[:16]}" for name, content in parts.items()]
     for state in states:
         fields = b"".join(np.asarray(state[name]).tobytes() for name in sorted(state.fields))
-        checksums.append(f"state {sha256(fields + repr(state.clock).encode()).hexdigest()[:16]}")
+        clock = repr(state.clock) + (f" {state.clock.time_step!r}" if state.clock.time_step else "")
+        checksums.append(f"state {sha256(fields + clock.encode()).hexdigest()[:16]}")
     energies = f"free energy {energy.name} {energy.curvature}"
     own = {"forces": simulation.forces, "solver": [simulation.own_solver] if simulation.own_solver else []}
     told = [f"{what} {text}" for what, makers in own.items() if (text := parts_fingerprint(makers, simulation))]

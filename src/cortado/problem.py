@@ -77,7 +77,7 @@ class Problem:
         self.simulation, self.steps, self.loss, self.state = simulation, check_steps(steps, least=0), loss, state
         self.memory_budget = whole_number("memory_budget", memory_budget, 0)
         self._states = [one.fixed() for one in one_for_each(state, simulation.batch)]
-        self._losses = LossesByStep(loss, self.steps)
+        self._losses = LossesByStep(loss, self.steps, simulation.scene.solver.chooses)
         self._space = ParameterSpace(simulation, self.steps)
         self._rollout = Rollout(simulation.solver, self.steps, self.memory_budget)
         self._derivatives: dict[AdjointEstimator, BackwardStep] = {}

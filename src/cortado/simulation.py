@@ -11,7 +11,7 @@ from weakref import WeakSet
 
 import numpy as np
 
-from cortado.arrays import check_steps, whole_number
+from cortado.arrays import whole_number
 from cortado.device.compiling import begin_headers
 from cortado.device.driver import device_named
 from cortado.device.kernel_cache import start_warp
@@ -24,6 +24,7 @@ from cortado.fixed import fixed
 from cortado.particles.state import State
 from cortado.pictures.notebook import with_picture
 from cortado.pictures.particle_sets import particles
+from cortado.rollout.durations import end_after, expected_frames, steps_of_run
 from cortado.rollout.outcome import trouble
 from cortado.rollout.parameter_checks import check_sizes
 from cortado.rollout.parameter_space import ParameterSpace
@@ -174,15 +175,17 @@ class Simulation(Stepping, Measuring, Picturing):
     @in_turn
     def run(
         self,
-        steps: int,
+        steps: int | None = None,
         controls: Mapping[str, Any] | None = None,
         record_every: int = 1,
         state: RestartState | Sequence[RestartState] | None = None,
         record: Sequence[str] = (),
         sensors: Mapping[str, Sensor] | None = None,
+        time: float | None = None,
     ) -> Trajectory:
         """Run from the scene's first state and return the frames, the first and the last state included; of a batch a
-        `TrajectoryBatch`.
+        `TrajectoryBatch`. ``time`` [s], in the place of ``steps``: as many steps as it takes, the last of which ends
+        then or later.
 
         ``controls={"gravity": (d,) or (steps, d)}`` [m / s2] replaces the scene's gravity, its schedule included; so
         does any other parameter of `Problem`. With ``state``, the ``last_state`` of an earlier trajectory of the same
@@ -193,7 +196,7 @@ class Simulation(Stepping, Measuring, Picturing):
         when the pressure did not converge; raises `DivergedError` when a particle is
         lost, where a batch warns, and goes on without the scene.
         """
-        return self.collect(self.rollout(steps, controls, state), record_every, record, sensors)
+        return self.collect(self.rollout(steps, controls, state, time), record_every, record, sensors)
 
     @in_turn
     def collect(
@@ -206,14 +209,14 @@ class Simulation(Stepping, Measuring, Picturing):
         """Run a rollout forward and return its frames; warnings and errors as of `run`."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
-        parts = frame_parts(2 + rollout.steps // record_every, numbers, self.precision.bytes)
+        parts = frame_parts(expected_frames(rollout, record_every), numbers, self.precision.bytes)
         require(parts, "take a larger record_every or fewer steps")
         watch = Watch(self, rollout, record, sensors)
         steps, frames, looks = [0], [self.frame(rollout.initial)], [watch.frame(0, rollout.initial)]
         watch.step(0, rollout.initial)
 
         def keep(step: int, state: State) -> None:
-            if step % record_every == 0 or step == rollout.steps:
+            if step % record_every == 0 or rollout.is_last(step):
                 steps.append(step)
                 frames.append(self.frame(state))
                 looks.append(watch.frame(step, state))
@@ -244,18 +247,20 @@ class Simulation(Stepping, Measuring, Picturing):
     @in_turn
     def rollout(
         self,
-        steps: int,
+        steps: int | None = None,
         controls: Mapping[str, Any] | None = None,
         state: RestartState | Sequence[RestartState] | None = None,
+        time: float | None = None,
     ) -> Rollout:
-        """A rollout that is ready to go forward from the scene's first state; see `run` for ``controls`` and
-        ``state``."""
-        rollout = Rollout(self.solver, check_steps(steps))
+        """A rollout that is ready to go forward from the scene's first state; see `run` for its arguments."""
+        given = {} if controls is None else controls
+        rollout = Rollout(self.solver, steps_of_run(self, steps, time, given))
         space = ParameterSpace(self, rollout.steps)
-        values = space.checked({} if controls is None else controls)
+        values = space.checked(given)
         states = one_for_each(state, self.batch)
         space.check_restarts(states, values)
         space.begin(rollout, values, states=states)
+        end_after(rollout, time)
         return rollout
 
     def batch_of(self, size: int) -> "Simulation":

@@ -81,6 +81,7 @@ class Simulation:
                 "scene has a schedule, but must leave it out for the reference engine, which takes a gravity for each "
                 "step by controls."
             )
+        scene.solver.fixed_time_step("the reference engine")
         if precision not in precisions():
             raise InputError(f"precision is {shown(precision)}, but must be one of {', '.join(precisions())}.")
         self.scene, self.precision = scene, precision
@@ -219,7 +220,7 @@ class Simulation:
 
     def _history(self, raw: Any, parameters: Mapping[str, Any]) -> History:
         """What a run with these parameters recorded; raises `DivergedError` if a particle was lost."""
-        time_step = self.scene.solver.time_step
+        time_step = self.scene.solver.fixed_time_step("the reference engine")
         history = None if raw.bad_step >= 0 else History.of(raw, self.positions.shape, time_step)
         lost = self._lost(history) if history else (raw.bad_step + 1, raw.bad_particle, "was lost", 0)
         if lost:

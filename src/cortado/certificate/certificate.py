@@ -158,6 +158,7 @@ def certify(
     problem = _problem(problem, steps)
     if problem.simulation.batch is not None:
         raise InputError("What is certified is a batch, but must be one scene: they all have the same derivatives.")
+    problem.simulation.scene.solver.fixed_time_step("a certificate, whose differences would not hold chosen ones")
     problem = in_float64(problem)
     chosen, random = checked_parameters(problem, parameters), np.random.default_rng(seed)
     history, values = LossHistory(problem), everything(problem, chosen)

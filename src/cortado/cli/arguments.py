@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from math import inf
 from pathlib import Path
 from typing import Annotated
 
@@ -18,10 +19,26 @@ Precision = Annotated[str, arg(help='"float32" or "float64".')]
 Json = Annotated[bool, arg(help="Print JSON for machines.", help_behavior_hint="")]
 
 
+STEPS = 200
+"""Of a run that is not said to be longer or shorter."""
+
+
 def require_at_least(least: int, value: int, option: str) -> None:
     """Raises `InputError` for a value that is smaller, with the option's name in the sentence."""
     if value < least:
         raise InputError(f"{option} is {value}, but must be at least {least}.")
+
+
+def steps_or_time(steps: int | None, time: float | None) -> int | None:
+    """The number of steps, `STEPS` if neither was given; None with a time [s]. Raises `InputError` for both, and for a
+    time that is none."""
+    if time is None:
+        return STEPS if steps is None else steps
+    if steps is not None:
+        raise InputError("--time is given, but must be left out, as --steps says how long the scene is simulated.")
+    if not 0.0 < time < inf:
+        raise InputError(f"--time is {time:g}, but must be a number of seconds greater than 0.")
+    return None
 
 
 def as_text(options: Sequence[str]) -> list[str]:

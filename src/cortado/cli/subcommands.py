@@ -17,6 +17,7 @@ from cortado.cli.arguments import (
     as_text,
     command_line,
     require_at_least,
+    steps_or_time,
 )
 from cortado.cli.command import Work, command
 from cortado.cli.gradient_commands import gradients
@@ -85,7 +86,8 @@ def describe(
 @command(app)
 def run(
     scene: Scene,
-    steps: int = 200,
+    steps: int | None = None,
+    time: float | None = None,
     out: Path = Path("runs/run"),
     overrides: Overrides = (),
     device: Device = "cpu",
@@ -99,7 +101,8 @@ def run(
 
     Args:
         scene: The scene file.
-        steps: Number of time steps.
+        steps: Number of time steps; 200 if neither they nor a time are given.
+        time: Seconds that the scene is simulated, in the place of steps: the last step ends then or later.
         out: Folder of the run.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
         record_every: Steps from one frame of the trajectory to the next.
@@ -108,12 +111,13 @@ def run(
         record: A quantity of the particles for the trajectory, such as pressure or vorticity; may be given again.
     """
     require_at_least(1, record_every, "--record-every")
+    steps = steps_or_time(steps, time)
     from cortado.cli.commands.run import run_scene
 
     words, told = as_text(overrides), command_line()
     wanted = as_text(record)
     return partial(
-        run_scene, scene, steps, out, words, device, precision, record_every, overwrite, told, pictures, wanted
+        run_scene, scene, steps, out, words, device, precision, record_every, overwrite, told, pictures, wanted, time
     )
 
 

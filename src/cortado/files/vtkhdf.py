@@ -34,7 +34,7 @@ class TrajectoryWriter:
 
     Args:
         path: the file, replaced when it exists.
-        times: (frames,) [s] of the frames that will come.
+        times: (frames,) [s] of the frames that will come, as far as it is known.
         particles: n.
         dimension: 2 or 3; in 2-D the stored points have z = 0.
         precision: of the stored positions, velocities and scalars.
@@ -106,6 +106,7 @@ class TrajectoryWriter:
         velocities: ArrayLike,
         *,
         step: int | None = None,
+        time: float | None = None,
         others: Mapping[str, ArrayLike] | None = None,
         **scalars: ArrayLike,
     ) -> None:
@@ -115,6 +116,7 @@ class TrajectoryWriter:
             positions: (n, d) [m]
             velocities: (n, d) [m/s]
             step: number of steps taken so far; the number of this frame when left out.
+            time: [s] of this frame, where it is another than was announced.
             others: exactly those given at construction.
             scalars: (n,) each, and vectors (n, d), exactly those named at construction.
 
@@ -145,11 +147,14 @@ class TrajectoryWriter:
             if array.shape != first.shape:
                 raise InputError(f"Expected {name} of shape {first.shape}, found {array.shape}.")
             rows[f"cortado/states/{name}"] = array.tobytes()
-        checksum = _frame_checksum(self._frames_checksum, self._layout.times[frame], number, rows.values())
+        moment = self._layout.times[frame] if time is None else np.float64(time)
+        checksum = _frame_checksum(self._frames_checksum, moment, number, rows.values())
         with self._refusal():
             for name, row in rows.items():
                 self._write(name, frame * len(row), row)
             self._write("cortado/frame_steps", 8 * frame, number.tobytes())
+            if time is not None:
+                self._write("VTKHDF/Steps/Values", 8 * frame, moment.tobytes())
             self._write("VTKHDF/Steps/PartOffsets", 8 * frame, struct.pack("<q", WRITTEN))
             self._write("cortado/progress", 0, struct.pack("<II", frame + 1, checksum))
             if frame == 0:

@@ -140,7 +140,7 @@ class FileLayout:
         places = {
             name: _reserve(vtk.file, name, (frames * particles, *row), self.dtype) for name, row in self.rows.items()
         }
-        return places | {"VTKHDF/Steps/PartOffsets": series["PartOffsets"].id.get_offset()}
+        return places | {f"VTKHDF/Steps/{name}": series[name].id.get_offset() for name in ("Values", "PartOffsets")}
 
 
 def frames_seed(

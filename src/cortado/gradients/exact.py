@@ -83,6 +83,7 @@ class _TapeStep:
     def step(self, state: State, counts: Counts, bar: State) -> None:
         self._before.assign(state)
         self.solver.follow(self._given)
+        wp.copy(self._own["time_step"], self._parameters["time_step"])  # of this step, where it is chosen
         tape = wp.Tape()
         try:
             self._back(tape, counts, bar)

@@ -15,9 +15,15 @@ from cortado.particles.state import State
 class LossesByStep(Mapping[int, Loss]):
     """The losses by the number of steps before the states that they judge."""
 
-    def __init__(self, loss: Any, steps: int):
+    def __init__(self, loss: Any, steps: int, chosen: bool = False):
         """``loss`` of the state after all ``steps``, or `Frames` of several. Raises `InputError` for what is no loss,
-        and for frames that a run of so many steps does not have."""
+        for frames that a run of so many steps does not have, and where the steps are ``chosen`` for frames at times of
+        their own."""
+        if chosen and getattr(loss, "time_step", None) is not None:
+            raise InputError(
+                f"loss is a {type(loss).__name__} of steps of {loss.time_step:g} s, but must be one of numbers of "
+                'steps, as solver.time_step is "auto".'
+            )
         by_step = loss.losses if isinstance(loss, Frames) else {steps: loss}
         for step in by_step:
             if step not in range(steps + 1):

@@ -136,7 +136,7 @@ class Parameters(Arrays):
 
     @property
     def written(self) -> Mapping[str, np.ndarray]:
-        """What `set` has written, by name."""
+        """What `set` has written, by name; `set_row` writes to it."""
         return dict(self._written)
 
     def set(self, values: Mapping[str, Any]) -> None:
@@ -153,6 +153,16 @@ class Parameters(Arrays):
                 array.assign(table)
             else:
                 array.assign(np.broadcast_to(given, array.shape))
+
+    def set_row(self, row: int, values: Mapping[str, np.ndarray]) -> None:
+        """Write one row of parameters over time, (members, d) vectors or (members,) numbers, all of whose rows `set`
+        has written."""
+        for name, value in values.items():
+            self._written[name][:, row] = value
+            vectors = np.reshape(value, (len(value), -1))
+            given = padded(vectors) if hasattr(self[name].dtype, "_shape_") else vectors
+            for member, own in enumerate(given):
+                self[name][member][row : row + 1].assign(own.reshape(1, -1) if own.size > 1 else own)
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,7 @@ class DeviceStates(HostStates):
         space.check_restarts(state.scenes, values)
         space.begin(rollout, values, varied, state.scenes)
         rollout.initial.assign(state.arrays)
+        rollout.step_sizes.begin_at(rollout.initial)
 
     def state(self, rollout: Rollout, state: State, steps: int) -> DeviceState:
         """As `HostStates.state`, in arrays of its own."""

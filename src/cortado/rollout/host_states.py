@@ -118,4 +118,4 @@ def time_of(what: str, given: Values, state: State) -> np.ndarray:
 def clocks_after(rollout: Rollout, steps: int) -> list[Clock]:
     """Of each scene of a rollout, after so many steps."""
     each = zip(rollout.clocks, rollout.time_steps.tolist(), strict=True)
-    return [Clock(clock.steps + steps, float(clock.times(np.array(steps), size))) for clock, size in each]
+    return [clock.after(steps, size) for clock, size in each]

@@ -15,8 +15,19 @@ def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
     converged = rollout.diagnostics["converged"]
     if not converged.all():
         yield not_converged_sentence(converged, scene)
+    if early := early_sentence(rollout):
+        yield early
     if rollout.lost:
         yield lost_sentence(rollout.lost, rollout.solver.layout.members)
+
+
+def early_sentence(rollout: Rollout) -> str | None:
+    """What to say of a run that has not reached its time; None where it has, or where it has a number of steps."""
+    last, end = rollout.clocks[0].after(rollout.taken, 0.0), rollout.step_sizes.end
+    if rollout.lost or not np.isfinite(end) or last.time >= end:
+        return None
+    found = f"the run ended at {last.time:.4g} s, before the time that was asked for, as steps became as short as"
+    return f"{found} {last.time_step:.2g} s: go on from its last state, or try a larger spacing."
 
 
 def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:

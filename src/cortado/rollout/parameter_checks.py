@@ -40,6 +40,11 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
             place = place_in_words(positions[particle])
             raise InputError(f"parameter initial_positions has particle {particle} at {place}, outside the container.")
         _check_room(positions[:free], spacing)
+    if scene.solver.chooses and np.ndim(values.get("nozzle_path", 0.0)) == 2:
+        raise InputError(
+            "parameter nozzle_path has a row for each step, but must be one place where time steps are chosen: move "
+            "the nozzle by the table [schedule], whose times do not depend on the steps."
+        )
     if "nozzle_path" in values and scene.emitter is not None:
         path, opening = np.atleast_2d(values["nozzle_path"]), scene.emitter.opening(spacing) - scene.emitter.outlet
         for step in outside(scene, (path[:, None] + opening).reshape(-1, scene.dimension))[:1] // len(opening):
@@ -52,6 +57,8 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
 def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | None:
     """What to say of a time step beyond limits of stability under these parameters, of which the least counts that was
     not told; None if there is nothing. All of them are told then."""
+    if scene.solver.time_step == "auto":
+        return None
     time_step = float(values.get("time_step", scene.solver.time_step))
     broken = [(name, limit) for name, limit in broken_limits(scene, values, time_step) if name not in told]
     if not broken:

@@ -9,11 +9,13 @@ import numpy as np
 from cortado.device.threads import WARP
 from cortado.errors import CortadoWarning, InputError, shown
 from cortado.particles.state import Parameters, State
+from cortado.rollout.choosing import begin_choosing
 from cortado.rollout.first_positions import FirstPositions
 from cortado.rollout.parameter_checks import check_places, check_sizes, unstable_sentence
 from cortado.rollout.restarts import check_state, origin_of
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
+from cortado.rollout.step_bounds import greatest_step
 from cortado.scene.parameters.known import TIME
 from cortado.scene.parameters.parameter import Role
 from cortado.scene.parameters.registry import names
@@ -109,6 +111,8 @@ class ParameterSpace:
             rollout.initial.assign(simulation.initial)
         firsts = [dict(state.fields) for state in states] or [self._one.first(own) for own in members]
         rollout.initial.set(self._together(firsts))
+        if simulation.scene.solver.chooses:
+            members = [{**own, "time_step": np.array(greatest_step(simulation.scene, own))} for own in members]
         if (simulation.scene.schedule.courses or self._known.courses) and len(members) < len(rollout.clocks):
             members = members * len(rollout.clocks)  # each at its own time
         clocks = rollout.clocks if len(members) > 1 else rollout.clocks[:1]
@@ -134,6 +138,8 @@ class ParameterSpace:
             )
         several = len(simulation.scene.phase) > 1
         rollout.substeps = max(*substeps, 1) if "mobility" in varied and several else max(substeps)
+        if simulation.scene.solver.chooses:
+            begin_choosing(rollout, simulation.scene, self._one, each)
 
     def check_restarts(self, states: Sequence[RestartState], values: Arrays) -> None:
         """Whether states, one for each scene, are of this simulation, and ``values`` go with them; raises

@@ -97,6 +97,8 @@ def _check_clock(clock: Clock) -> None:
         raise InputError(f"state clock has {shown(clock.steps)} steps, but must have a whole number of at least 0.")
     if not 0.0 <= as_one_number("state clock time", clock.time) < np.inf:
         raise InputError(f"state clock is at {shown(clock.time)} s, but must be at a finite time of at least 0 s.")
+    if not 0.0 <= as_one_number("state clock time_step", clock.time_step) < np.inf:
+        raise InputError(f"state clock has a step of {shown(clock.time_step)} s, but must have a finite one, or 0.")
 
 
 def _check_origin(found: Origin, wanted: Origin) -> None:

@@ -20,36 +20,19 @@ from cortado.device.threads import WARP, Turn, in_turn
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Parameters, State, StateSeries
 from cortado.rollout.checkpoints import Checkpoints, checkpoint_interval
+from cortado.rollout.chunks import chunk_length
 from cortado.rollout.counted import require_counted
+from cortado.rollout.divergence import diverged
 from cortado.rollout.evaluation import Pending, PutAside
+from cortado.rollout.step_sizes import FixedSteps, StepSizes
 from cortado.scene.restart import Clock, Origin
-from cortado.solvers.containment import Lost
 from cortado.solvers.solver import Counts, Solver, StepTangent
 
-CHUNK = 64
-"""Steps between two looks of the host, at most."""
-FILLED = {"cpu": 32_000, "cuda": 16_000_000}
-"""Particles in the steps of a chunk, beyond which a look of the host costs hardly anything beside them."""
 MEMORY_BUDGET = 8 * 2**30
 """Bytes of checkpoints; beyond it states are kept less often and recomputed on the way back."""
 
 Observer = Callable[[int, State], None]
 """Is given the number of a state and the state, which later steps overwrite."""
-
-
-OF_AN_EVALUATION = (
-    "clocks",
-    "origins",
-    "substeps",
-    "advice",
-    "lost",
-    "goes_on",
-    "evaluation",
-    "_checkpoints",
-    "_kept",
-    "_run",
-)
-"""Attributes of a rollout that are replaced, and not overwritten, from one evaluation to the next."""
 
 
 class BackwardStep(Protocol):
@@ -97,15 +80,17 @@ class Rollout:
         after the step before means nothing."""
         self.log = solver.new_log(steps)
         """What the solver noted of the steps of the last forward run."""
+        self.step_sizes: StepSizes = FixedSteps()
+        """How long the steps are; in a scene that chooses them others, which a `ParameterSpace` makes."""
+        self.taken = 0
+        """The steps of the last forward run: all of them, unless it ended before."""
         state_bytes = sum(self.initial[f.name].capacity for f in self.initial.fields if not f.is_constant)
         self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
         self._checkpoints = Checkpoints(self.initial, self._interval)
         self._spare: list[StateSeries] = []
         """Those of earlier runs that nobody will come back to, for the next run that keeps states."""
         self._buffer, self._bar = self.initial.following(), self.initial.like()
-        particles = max(solver.layout.all_particles, 1)
-        filled = FILLED["cpu" if self._device.is_cpu else "cuda"] // particles
-        length = max(min(CHUNK, filled, steps), 1)
+        length = chunk_length(steps, solver.layout.all_particles, self._device)
         self._series = StateSeries(self.initial, length)
         self._chunk = [self._series.state(k) for k in range(length)]
         """The states of the last chunk."""
@@ -126,7 +111,12 @@ class Rollout:
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
         """(steps,) by name, in a batch (steps, batch), of the steps of the last forward run: see `StepLog`."""
-        return self.log.diagnostics
+        found = self.log.diagnostics
+        return {**found, **self.step_sizes.diagnostics(len(found["converged"]))}
+
+    def is_last(self, step: int) -> bool:
+        """Whether the state after so many steps, which was observed, is the last one of the run."""
+        return step == self.steps or self.step_sizes.is_end(step)
 
     @property
     def turn(self) -> Turn:
@@ -148,7 +138,7 @@ class Rollout:
 
     def put_aside(self) -> PutAside:
         """What the next evaluation overwrites."""
-        return PutAside(self, OF_AN_EVALUATION)
+        return PutAside(self)
 
     @in_turn
     def bring_back(self, aside: PutAside) -> None:
@@ -160,30 +150,33 @@ class Rollout:
 
     @in_turn
     def forward(self, observe: Observer | None = None, keep: bool = True) -> State:
-        """Run all steps and return the last state, which the next run overwrites. ``observe`` is given every state;
-        ``keep`` checkpoints for a way back. Raises `DivergedError` after the good states were observed; a batch goes on
-        without the scenes that have ``lost`` a particle."""
+        """Run all steps, or those up to the end of its time, and return the last state, which the next run overwrites.
+        ``observe`` is given every state; ``keep`` checkpoints for a way back. Raises `DivergedError` after the good
+        states were observed; a batch goes on without the scenes that have ``lost`` a particle."""
         self._kept = self._run = -1
         self._spare += self._checkpoints.release()
         self._checkpoints = Checkpoints(self.initial, self._interval)
         self.lost = {}
-        state, step = self.initial, 0
+        state, step, ended = self.initial, 0, False
         self.solver.set_substeps(self.substeps)
         self._forget_stale_graphs()
         if self.steps > 0:
             compile_ahead(self.solver, self._device)
         self.solver.reset()
         try:
-            while step < self.steps:
-                last = min(step + len(self._chunk), self.steps)
+            while step < self.steps and not ended:
+                last = min(step + min(len(self._chunk), self.step_sizes.longest_chunk), self.steps)
                 chunk = self._advance(state, step, last)
                 if self.solver.make_room():
                     self._forget_stale_graphs()
                     self.solver.reset(step)
                     continue
-                lost = self.solver.containment.lost()
+                end, ended = self.step_sizes.read(step, last)
+                chunk = chunk[: end - step]
+                lost = {b: one for b, one in self.solver.containment.lost().items() if one.step < end}
                 for b in lost.keys() - self.lost.keys():
-                    self.lost[b] = self._diverged(b, lost[b], chunk[lost[b].step - step])
+                    state_then = chunk[lost[b].step - step]
+                    self.lost[b] = diverged(self.solver, b, lost[b], state_then, self.advice(b))
                 stops = bool(lost) and self.solver.layout.batch is None
                 for number, new_state in enumerate(chunk[: lost[0].step - step] if stops else chunk, step + 1):
                     if observe is not None:
@@ -193,8 +186,9 @@ class Rollout:
                 if stops:
                     step = lost[0].step + 1
                     raise self.lost[0]
-                state, step = chunk[-1], last
+                state, step = chunk[-1], end
         finally:
+            self.taken = step
             self.log.read(step)
         self._run = self.evaluation
         if keep:
@@ -204,6 +198,7 @@ class Rollout:
     def _advance(self, state: State, first: int, last: int) -> list[State]:
         """Take the steps from one to another and return the states after them, which the next chunk overwrites."""
         self.solver.step_number.fill_(first)
+        self.step_sizes.seek(first)
         self._buffer.assign(state)
         length = last - first
         if is_new := length not in self._chunks:
@@ -218,6 +213,7 @@ class Rollout:
         state = self._buffer
         for new_state in self._chunk[:length]:
             self.solver.step(state, new_state, self.parameters, self.log)
+            self.step_sizes.choose(new_state)
             state = new_state
 
     def _forget_stale_graphs(self) -> None:
@@ -228,18 +224,6 @@ class Rollout:
         self._chunks: dict[int, CapturedGraph] = {}
         """Graphs by their number of steps."""
         self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
-
-    def _diverged(self, member: int, lost: Lost, state: State) -> DivergedError:
-        containment, particle = self.solver.containment, member * self.solver.layout.particles + lost.particle
-        position = state.positions.numpy()[particle][: containment.walled.dimension]
-        imprecise = ", or float64 for fluid that flies that far" if containment.is_imprecise(position) else ""
-        return DivergedError(
-            step=lost.step + 1,
-            particle=lost.particle,
-            advice=f"{self.advice(member)}{imprecise}",
-            where=containment.where(position),
-            others=lost.others,
-        )
 
     # ---- derivatives ---------------------------------------------------------------------------------------------
 
@@ -270,8 +254,7 @@ class Rollout:
                 observe(n, self._bar)
             if n > 0:
                 self._buffer.assign(self._checkpoints.state(n - 1, self._replayed))
-                self.solver.step_number.fill_(n - 1)
-                self._step_back(derivative, self.log.seek(n - 1))
+                self._step_back(derivative, self._seek(n - 1))
         return self._bar
 
     def _step_back(self, derivative: BackwardStep, counts: Counts) -> None:
@@ -298,8 +281,7 @@ class Rollout:
         state.assign(self.initial)
         observe(0, dot)
         for n in range(self.steps):
-            counts = self.log.seek(n)
-            solver.step_number.fill_(n)
+            counts = self._seek(n)
             solver.replay(state, self.parameters, counts)
             derivative.step(counts, dot, self.parameters)
             solver.write_state(counts, self.parameters, state)
@@ -313,8 +295,13 @@ class Rollout:
 
     def _replayed(self, n: int, state: State) -> State:
         """The state after state n, computed once more."""
-        counts, new_state = self.log.seek(n), self.initial.following()
-        self.solver.step_number.fill_(n)
+        counts, new_state = self._seek(n), self.initial.following()
         self.solver.replay(state, self.parameters, counts)
         self.solver.write_state(counts, self.parameters, new_state)
         return new_state
+
+    def _seek(self, step: int) -> Counts:
+        """Make the solver ready to take a step again, from 0."""
+        self.solver.step_number.fill_(step)
+        self.step_sizes.seek(step)
+        return self.log.seek(step)

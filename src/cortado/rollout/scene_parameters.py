@@ -89,15 +89,16 @@ class SceneParameters:
         """The values, with gravity instead of a tilt."""
         return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values
 
-    def _courses(self, values: Arrays) -> dict[str, Changing]:
+    def courses(self, values: Arrays) -> dict[str, Changing]:
         """Those of the schedule, and of forces, that act: a gravity or a tilt that is given replaces either."""
         replaced = {"gravity", "tilt"} if not values.keys().isdisjoint(("gravity", "tilt")) else set()
         courses = {**self._simulation.scene.schedule.courses, **self._known.courses}
         return {name: course for name, course in courses.items() if name not in values and name not in replaced}
 
     def _times(self, name: str, values: Arrays, clock: Clock | None = None) -> NDArray:
-        """(steps,) [s] when the rows of a scheduled parameter are."""
-        time_step = float(values.get("time_step", self._simulation.scene.solver.time_step))
+        """(steps,) [s] when the rows of a scheduled parameter are; of steps that are chosen, the clock has recorded
+        it."""
+        time_step = float(values.get("time_step", self.values["time_step"]))
         return (clock or Clock()).times(self._moments(name), time_step)
 
     def _moments(self, name: str) -> NDArray:
@@ -108,7 +109,7 @@ class SceneParameters:
         """The derivatives of `scheduled` with respect to the time step, or to the time of the clock, with a row for
         each step."""
         found = {}
-        for name, course in self._courses(values).items():
+        for name, course in self.courses(values).items():
             times, moments = self._times(name, values, clock), self._moments(name)
             slopes = np.ones_like(moments) if of_clock else moments
             rates = course.rates(times) * (slopes[:, None] if self._known[name].rank else slopes)
@@ -121,8 +122,14 @@ class SceneParameters:
     def scheduled(self, values: Arrays, clock: Clock | None = None) -> Arrays:
         """What the scene's schedule says of the steps after a clock, with a row for each, in the place of what is not
         among the ``values``: gravity, also where it is a tilt that is scheduled, and the nozzle's path."""
-        rows = {name: course.at(self._times(name, values, clock)) for name, course in self._courses(values).items()}
+        rows = {name: course.at(self._times(name, values, clock)) for name, course in self.courses(values).items()}
         return {name: value for name, value in self.upright(rows).items() if name in self._known.run}
+
+    def scheduled_at(self, values: Arrays, time: float, size: float) -> Arrays:
+        """The same for one step, which begins at a time and is so long [s], without an axis for it."""
+        courses = self.courses(values)
+        rows = {name: course.at(np.array([time + self._known[name].moment * size])) for name, course in courses.items()}
+        return {name: value[0] for name, value in self.upright(rows).items() if name in self._known.run}
 
     def run(self, values: Arrays) -> Arrays:
         """What steps depend on, by the upright ``values``, and the scene's for what is not among them: parameters over

@@ -52,11 +52,13 @@ def append_frame(
     frame: Mapping[str, NDArray[Any]],
     step: int,
     quantities: Mapping[str, NDArray[Any]] | None = None,
+    time: float | None = None,
 ) -> None:
-    """Write the fields of a frame, after so many steps, with its quantities, to a file of `frame_writer`."""
+    """Write the fields of a frame, after so many steps, with its quantities, to a file of `frame_writer`; its ``time``
+    [s] where that was not known."""
     fractions = frame["mass_fractions"].T if "mass_fractions" in frame else ()
     scalars = {**dict(zip(fraction_names(len(fractions)), fractions, strict=True)), **(quantities or {})}
-    writer.append(frame["positions"], frame["velocities"], step=step, others=_others(frame), **scalars)
+    writer.append(frame["positions"], frame["velocities"], step=step, time=time, others=_others(frame), **scalars)
 
 
 def _others(frame: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

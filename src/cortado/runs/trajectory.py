@@ -98,8 +98,12 @@ class Trajectory:
     """(frames, n) or (frames, n, k) by name: those that were recorded, such as ``density``"""
     sensors: Mapping[str, Readings] = field(default_factory=dict)
     """what sensors have read in every step, by their names; it is not in files"""
+    begun: int | None = None
+    """[-] steps taken before the first one of the ``diagnostics``; those of the first frame if left out"""
 
     def __post_init__(self) -> None:
+        if self.begun is None and len(self.steps):
+            object.__setattr__(self, "begun", int(self.steps[0]))
         frames = {len(self.times), len(self.steps), len(self.positions), len(self.velocities)}
         steps = {name: len(column) for name, column in self.diagnostics.items()}
         if self.positions.ndim != 3 or self.positions.shape != self.velocities.shape or len(frames) > 1:
@@ -236,7 +240,9 @@ class Trajectory:
             raise InputError("The trajectory has no frame, but must have one to go on from.")
         last = {**{name: array[-1] for name, array in self._fields.items()}, **self.constants}
         own = {name: array.copy() for name, array in last.items()}
-        return RestartState(own, Clock(int(self.steps[-1]), float(self.times[-1])), self.origin)
+        taken = self.diagnostics.get("time_steps", np.zeros(0))[: int(self.steps[-1]) - (self.begun or 0)]
+        size = float(taken[-1]) if len(taken) else 0.0
+        return RestartState(own, Clock(int(self.steps[-1]), float(self.times[-1]), size), self.origin)
 
     def save(self, path: str | Path) -> None:
         """Writes a VTKHDF file, which ParaView opens; a file of that name is replaced.

@@ -15,6 +15,7 @@ from cortado.scene.model import SceneTables
 from cortado.scene.overlaps import check_distinct, check_overlaps
 from cortado.scene.parameters.registry import BY_NAME
 from cortado.scene.sentences import point_in_words
+from cortado.scene.stability import chosen_limits
 
 MOST_PARTICLES = 2e8
 FURTHEST = 1e9
@@ -45,6 +46,13 @@ def check_scene(scene: SceneTables) -> None:
         _check_outlet(scene, scene.emitter)
     check_overlaps(_bodies(scene), scene.container.periods(scene.dimension)[1], spacing)
     _check_schedule(scene)
+
+
+def check_bounded(scene: SceneTables) -> None:
+    """A time step that is chosen is bounded also where the fluid rests."""
+    if not np.isfinite(min(chosen_limits(scene).values())):
+        wanted = "given, as nothing else bounds the time step of this scene where the fluid rests"
+        raise field_error(("solver", "greatest_time_step"), MISSING, wanted)
 
 
 def _bodies(scene: SceneTables) -> list[tuple[FieldPath, FluidBody]]:

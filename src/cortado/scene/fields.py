@@ -12,7 +12,7 @@ from numbers import Real
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import Field, GetCoreSchemaHandler
+from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from cortado.errors import Words
@@ -70,6 +70,26 @@ class OneOf:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.literal_schema(list(self.names))
+
+
+@dataclass(frozen=True)
+class OrWord:
+    """A number, or a word that says how it is found."""
+
+    number: Any
+    """Of `quantity`."""
+    word: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        number = handler.generate_schema(Annotated[float, self.number])
+        as_it_is = core_schema.plain_serializer_function_ser_schema(lambda value: value)
+        return core_schema.no_info_wrap_validator_function(self._checked, number, serialization=as_it_is)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"anyOf": [handler(schema), {"const": self.word, "type": "string"}]}
+
+    def _checked(self, value: Any, number: Any) -> Any:
+        return value if isinstance(value, str) and value == self.word else number(value)
 
 
 Item = TypeVar("Item")

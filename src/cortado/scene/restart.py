@@ -21,11 +21,37 @@ class Clock:
     """Steps taken."""
     time: float = 0.0
     """[s]"""
+    time_step: float = field(default=0.0, repr=False)
+    """Length of the step that led to the state, if it was chosen: the next one is hardly longer [s]; else 0."""
 
     def times(self, steps: NDArray, time_step: float) -> NDArray:
         """(frames,) [s] after so many steps more of ``time_step`` [s]; of the same size they are those of one run, bit
         for bit."""
         return (self.time - self.steps * time_step) + (self.steps + steps) * time_step
+
+    def after(self, steps: int, time_step: float) -> "Clock":
+        """The clock of the state so many steps later."""
+        return Clock(self.steps + steps, float(self.times(np.array(steps), time_step)))
+
+
+@dataclass(frozen=True)
+class RecordedClock(Clock):
+    """That of the first state of a run whose time steps were chosen, and recorded."""
+
+    recorded: NDArray = field(default_factory=lambda: np.zeros(1), repr=False, compare=False)
+    """(steps + 1,) when each state was [s]; the states that the run did not come to have no meaning."""
+    sizes: NDArray = field(default_factory=lambda: np.zeros(0), repr=False, compare=False)
+    """(steps,) [s]"""
+
+    def times(self, steps: NDArray, time_step: float) -> NDArray:
+        """(frames,) [s] after so many steps more; ``time_step`` does not matter. Within a step time goes on evenly."""
+        return np.interp(steps, np.arange(len(self.recorded)), self.recorded)
+
+    def after(self, steps: int, time_step: float) -> Clock:
+        """As `Clock.after`."""
+        if steps == 0:
+            return Clock(self.steps, self.time, self.time_step)
+        return Clock(self.steps + steps, float(self.recorded[steps]), float(self.sizes[steps - 1]))
 
 
 @dataclass(frozen=True)

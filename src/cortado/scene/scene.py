@@ -13,7 +13,7 @@ from typing import Any, Self
 from pydantic import model_validator
 
 from cortado.errors import CortadoWarning, InputError, SceneError, shown
-from cortado.scene.checks import check_scene
+from cortado.scene.checks import check_bounded, check_scene
 from cortado.scene.model import OTHER_TABLES, SceneTables
 from cortado.scene.sentences import sentences
 from cortado.scene.stability import broken_limit
@@ -35,7 +35,9 @@ class Scene(SceneTables):
                 found = f"the rest_density of {phase.name} is {phase.rest_density:g} kg/m3"
                 warnings.warn(f"{found}, less than any liquid has: is it in g/cm3?", CortadoWarning, stacklevel=2)
         time_step = self.solver.time_step
-        if broken := broken_limit(self, {}, time_step):
+        if time_step == "auto":
+            check_bounded(self)
+        elif broken := broken_limit(self, {}, time_step):
             found = f"solver.time_step is {time_step:g} s, but the limit of stability is about {broken[1]:.3g} s"
             warnings.warn(f"{found}, which comes from {broken[0]}.", CortadoWarning, stacklevel=2)
         if wrong := wall_sentence(self):
@@ -55,8 +57,11 @@ class Scene(SceneTables):
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
-        """What results depend on: not [picture] and [[sensor]], nor an empty [[force]]."""
-        aside = {"picture", "sensor"} if self.force else {"picture", "sensor", "force"}
+        """What results depend on: not [picture] and [[sensor]], nor an empty [[force]], nor how a time step is chosen
+        that is fixed."""
+        aside: dict[str, Any] = {"picture": True, "sensor": True}
+        aside |= {} if self.force else {"force": True}
+        aside |= {} if self.solver.chooses else {"solver": {"courant", "greatest_time_step"}}
         return json.dumps(self.model_dump(mode="json", exclude=aside), indent=2)
 
     @classmethod

@@ -83,8 +83,9 @@ def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | i
         else:
             part = part["items"] if isinstance(step, int) else part["properties"][step]
             path.append(step)
-        if "anyOf" in part:  # a value, or nothing
-            part = part["anyOf"][0]
+        if "anyOf" in part:  # a value, or nothing; a number, or a word
+            value, other = part["anyOf"]
+            part = {**value, "word": other["const"]} if "const" in other else value
         part = _whole(part)
         if "$ref" in part:
             part = whole["$defs"][part["$ref"].rpartition("/")[2]]
@@ -106,6 +107,8 @@ def wanted(schema: Schema, name: str = "") -> str:
             return _any_of(names)
         case {"const": constant}:
             return _any_of([constant])
+        case {"type": "number", "word": word}:
+            return f'{_limits(schema)} or "{word}"'
         case {"type": "number"}:
             return _limits(schema)
         case {"type": "integer", "minimum": least, "maximum": most}:

@@ -33,6 +33,22 @@ def stability_limit(scene: SceneTables, values: Arrays | None = None) -> float:
     return min(stability_limits(scene, values).values())
 
 
+def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
+    """What bounds the time steps of a scene that chooses them, whatever the speed of the fluid, by what it is of [s]:
+    the `standing_limits` and the key ``greatest_time_step``. A gravity among the ``values`` bounds each step by itself
+    (`gravity_limits`), so that here the scene's counts."""
+    own = {name: value for name, value in (values or {}).items() if name != "gravity"}
+    found = standing_limits(scene, own)
+    greatest = scene.solver.greatest_time_step
+    return found if greatest is None else {**found, "greatest_time_step": greatest}
+
+
+def longest_step(scene: SceneTables) -> float:
+    """The time step [s]; in a scene that chooses it, what it is at most."""
+    size = scene.solver.time_step
+    return min(chosen_limits(scene).values()) if size == "auto" else size
+
+
 def broken_limit(scene: SceneTables, values: Arrays, time_step: float) -> tuple[str, float] | None:
     """The smallest of the `stability_limits`, what it is of and the limit [s], if a time step is beyond it."""
     return next(iter(broken_limits(scene, values, time_step)), None)
@@ -47,7 +63,9 @@ def broken_limits(scene: SceneTables, values: Arrays, time_step: float) -> list[
 
 def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> str:
     """What to try where a run diverged with parameters that replace the scene's: with the limit that its time step [s]
-    breaks, if any."""
+    breaks, if any. A time step that is chosen breaks none."""
+    if scene.solver.chooses:
+        return "try a smaller solver.courant or solver.greatest_time_step, or more pressure iterations"
     broken = broken_limit(scene, values, time_step)
     if broken is None:
         return f"try a smaller time step than {time_step:g} s, or more pressure iterations"
@@ -76,26 +94,48 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     counts.
     """
     values = values or {}
-    support, gravity = scene.discretisation.support_radius, np.atleast_2d(values.get("gravity", _gravity(scene)))
-    strength = float(np.linalg.norm(gravity, axis=1).max())
-    lower, upper = _extent(scene)
+    gravity, (lower, upper) = np.atleast_2d(values.get("gravity", _gravity(scene))), _extent(scene)
     speed = _first_speed(scene, values) + sqrt(2.0 * float((np.abs(gravity) @ (upper - lower)).max()))
-    courant = 0.4 * support / speed if speed > 0.0 else inf
-    force = 0.25 * sqrt(support / strength) if strength > 0.0 else inf
+    courant = 0.4 * scene.discretisation.support_radius / speed if speed > 0.0 else inf
+    return {"speed": courant, **standing_limits(scene, values)}
+
+
+def standing_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
+    """Those of the `stability_limits` [s] that do not depend on how fast the fluid is."""
+    viscous = inf if is_implicit(scene) else viscous_limit(scene, values)
+    own = {**_other_limits(scene, values), "viscosity": viscous}
+    return {name: own[name] for name in ("gravity", "depth", "viscosity", *own)}
+
+
+def gravity_limits(scene: SceneTables, gravity: Points) -> dict[str, Points]:
+    """Those of the `stability_limits` (k,) [s] that gravity (k, d) [m/s2] sets, each of its rows for itself."""
+    strength = np.linalg.norm(gravity, axis=1)
+    with np.errstate(divide="ignore"):
+        force = 0.25 * np.sqrt(scene.discretisation.support_radius / strength)
+    return {"gravity": force, "depth": _depth_limits(scene, gravity)}
+
+
+def _other_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
+    """The `standing_limits` [s] without that of viscosity."""
+    gravity = np.atleast_2d(values.get("gravity", _gravity(scene)))
+    of_gravity = {name: float(limits.min()) for name, limits in gravity_limits(scene, gravity).items()}
     optional = {
         p.name.replace("_", " "): p.longest_step(scene, values)
         for p in PARAMETERS
         if p.is_optional and p.present(scene)
     }
-    depth, viscous = _depth_limit(scene, gravity), inf if is_implicit(scene) else viscous_limit(scene, values)
-    return {"speed": courant, "gravity": force, "depth": depth, "viscosity": viscous, **optional}
+    return {**of_gravity, **optional}
 
 
 def is_implicit(scene: SceneTables) -> bool:
     """Whether the viscous force is a stress that acts as velocities are at the end of a step."""
     if scene.forces.viscosity != "stress" or scene.forces.viscous_solve == "explicit":
         return False
-    return scene.forces.viscous_solve == "implicit" or scene.solver.time_step > viscous_limit(scene, {})
+    if scene.forces.viscous_solve == "implicit":
+        return True
+    size = scene.solver.time_step
+    longest = min(_other_limits(scene, {}).values()) if size == "auto" else size
+    return longest > viscous_limit(scene, {})
 
 
 def _gravity(scene: SceneTables) -> Points:
@@ -136,18 +176,21 @@ def viscous_limit(scene: SceneTables, values: Arrays) -> float:
     return part * 2.0 * density / (viscosity * greatest)
 
 
-def _depth_limit(scene: SceneTables, gravity: Points) -> float:
-    """``gravity``: (k, d) [m/s2], of which the one that allows least counts."""
-    if not scene.forces.pressure or not gravity.any() or not scene.fluid:
-        return inf
+def _depth_limits(scene: SceneTables, gravity: Points) -> Points:
+    """(k,) [s] of gravity (k, d) [m/s2], infinite where it is 0."""
+    limits = np.full(len(gravity), inf)
+    acts = gravity.any(axis=1)
+    if not scene.forces.pressure or not acts.any() or not scene.fluid:
+        return limits
     cut = scene.discretisation
     extents = np.array([fluid.extent(cut.spacing) for fluid in scene.fluid])
     covered = np.array([_covered(extents[:, :, axis], cut.spacing) for axis in range(scene.dimension)])
-    pulls = np.abs(gravity[gravity.any(axis=1)])
+    pulls = np.abs(gravity[acts])
     along = pulls * covered
     upright = np.take_along_axis(along, pulls.argmax(axis=1)[:, None], axis=1)[:, 0]
     depths = 0.5 * (upright + along.sum(axis=1)) / np.sqrt(np.linalg.norm(pulls, axis=1))  # times sqrt(|g|)
-    return float(DEPTH_FACTORS[cut.kernel] * 0.5 * cut.support * cut.spacing**1.5 / depths.max())
+    limits[acts] = DEPTH_FACTORS[cut.kernel] * 0.5 * cut.support * cut.spacing**1.5 / depths
+    return limits
 
 
 def _covered(ends: Points, spacing: float) -> float:

@@ -97,9 +97,11 @@ def _other_steps(settings: list[dict[str, Any]], scenes: list[dict[str, Any]]) -
     """What to say of the metrics of two runs, of which line k is at another time in each; empty where it is at the
     same."""
     steps = [_table(scene.get("solver")).get("time_step") for scene in scenes]
-    if steps[0] == steps[1] or any(table["kind"] != "run" for table in settings):
+    same = steps[0] == steps[1] and (steps[0] != "auto" or scenes[0] == scenes[1])
+    if same or any(table["kind"] != "run" for table in settings):
         return {}
-    return {"unlike": f"time steps of {steps[0]} s and {steps[1]} s cannot be compared one by one"}
+    words = ["a length that is chosen" if step == "auto" else f"{step} s" for step in steps]
+    return {"unlike": f"time steps of {words[0]} and {words[1]} cannot be compared one by one"}
 
 
 def _metrics(one: RunFolder, other: RunFolder) -> dict[str, Any]:

@@ -23,11 +23,13 @@ from cortado.pictures.painter import colours_of
 from cortado.rollout.rollout import MEMORY_BUDGET, Rollout
 from cortado.scene.in_words import vector
 from cortado.scene.scene import Scene, load_scene
-from cortado.scene.stability import is_implicit, stability_limits, viscous_limit
+from cortado.scene.stability import chosen_limits, is_implicit, stability_limits, viscous_limit
 from cortado.scene.toml import read_toml
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 
+SAME = 1e-6
+"""Relative: a time step that is rounded to float32 is the same."""
 FIRST, MOST, ENOUGH = 4, 100, 0.5
 """Steps that are timed: a few, or more if they are fast, until they take so many seconds together."""
 
@@ -83,7 +85,7 @@ def describe_scene(
 def _described(simulation: Simulation, steps: int) -> dict[str, Any]:
     scene = simulation.scene
     of_phase = Counter(np.argmax(simulation.mass_fractions, axis=1).tolist())
-    limits, ends = stability_limits(scene), scene.container.extent()
+    (size, limits, chosen_by), ends = _time_step(simulation), scene.container.extent()
     found: dict[str, Any] = {
         "name": scene.name,
         "dimension": scene.dimension,
@@ -96,16 +98,31 @@ def _described(simulation: Simulation, steps: int) -> dict[str, Any]:
         "mass_of_phase_kg": _masses(simulation),
         "gravity_m_s2": list(scene.forces.gravity),
         "spacing_m": scene.discretisation.spacing,
-        "time_step_s": scene.solver.time_step,
+        "time_step_s": size,
+        "time_step_chosen_by": chosen_by,
         "time_step_limits_s": {name: limit if math.isfinite(limit) else None for name, limit in limits.items()},
         "viscosity": _viscosity(scene),
         "scheduled_until_s": {name: course.times[-1] for name, course in scene.schedule.courses.items()},
         "device": str(simulation.device),
         "precision": simulation.precision.name,
         "steps": steps,
-        "simulated_time_s": steps * scene.solver.time_step,
+        "simulated_time_s": steps * size if chosen_by is None else None,
     }
     return {**found, **_memory(simulation, steps), **_expected(simulation, steps)}
+
+
+def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
+    """The time step [s], its limits by what they are of [s], and by which of them it is chosen: the first step then;
+    None of one that is fixed."""
+    scene = simulation.scene
+    if scene.solver.time_step != "auto":
+        return scene.solver.time_step, stability_limits(scene), None
+    first = simulation.rollout(1).step_sizes.of_step(0)
+    assert first is not None
+    size, limits = float(first[0]), chosen_limits(scene)
+    if size < min(limits.values()) * (1.0 - SAME):
+        limits["speed"] = size
+    return size, limits, min(limits, key=lambda name: limits[name])
 
 
 def _viscosity(scene: Scene) -> str:
@@ -169,12 +186,18 @@ def _as_text(found: dict[str, Any]) -> str:
     least = min(limits.values(), default=math.inf)
     by_name = ", ".join(f"{name} {limit:.3g}" for name, limit in sorted(limits.items(), key=lambda item: item[1]))
     beyond = " (beyond it: the run may diverge)" if found["time_step_s"] > least * (1.0 + 1e-9) else ""
+    chosen = found["time_step_chosen_by"]
     allowed = f"stable up to about {least:.3g} s{beyond}; limits: {by_name}" if limits else "nothing limits it"
     rows = [
         ("particles", f"{found['particles']} of fluid ({phases}{waiting}), {found['wall_particles']} of walls"),
         ("spacing", f"{found['spacing_m']:g} m, in {found['dimension']}-D"),
         ("size", _size(found)),
-        ("time step", f"{found['time_step_s']:g} s; {allowed}"),
+        (
+            "time step",
+            f"chosen before each step: the first is {found['time_step_s']:.3g} s, by {chosen}; limits: {by_name}"
+            if chosen
+            else f"{found['time_step_s']:g} s; {allowed}",
+        ),
         ("viscosity", found["viscosity"]),
         (
             "memory",
@@ -209,10 +232,12 @@ def _size(found: dict[str, Any]) -> str:
 def _time(found: dict[str, Any]) -> str:
     if "diverged" in found:
         return f"unknown. {found['diverged']}"
+    seconds = found["simulated_time_s"]
+    motion = "" if seconds is None else f", {seconds:g} s of motion"
     return (
         f"{found['milliseconds_per_step']:.3g} ms a step on {found['device']} in {found['precision']}, without what is "
         f"recorded (mean of the first {found['measured_steps']} steps; later ones may take more pressure iterations); "
-        f"{found['steps']} steps, {found['simulated_time_s']:g} s of motion: about {found['expected_seconds']:.2g} s"
+        f"{found['steps']} steps{motion}: about {found['expected_seconds']:.2g} s"
     )
 
 

@@ -63,7 +63,7 @@ viscosity = "stress"                # or "none"; "pairwise" and "laminar" are th
 #surface_tension = 0.07             # N/m
 
 [solver]
-time_step = 0.002                   # s; `cortado describe` says what limits it
+time_step = 0.002                   # s; `cortado describe` says what limits it; "auto" chooses it before each step
 minimum_iterations = 3              # of the pressure, in every step
 maximum_iterations = 50
 density_tolerance = 0.01            # the average compression at which they end

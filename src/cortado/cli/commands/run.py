@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import check_steps
 from cortado.cli.commands.run_report import write_run_report
 from cortado.cli.commands.run_summary import RunSummary
 from cortado.device.compiling import compile_ahead
@@ -18,11 +17,14 @@ from cortado.files.folder_lock import locked
 from cortado.files.interruption import keeping
 from cortado.files.progress import announce, track
 from cortado.particles.state import State
-from cortado.rollout.outcome import not_converged_sentence
+from cortado.rollout.durations import expected_frames, expected_of
+from cortado.rollout.outcome import early_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout
 from cortado.runs.frame_file import append_frame, frame_writer
 from cortado.runs.report import Section
 from cortado.runs.run_folder import RunFolder
+from cortado.runs.trajectory import Trajectory
+from cortado.scene.restart import Clock
 from cortado.scene.scene import load_scene
 from cortado.simulation import Simulation
 from cortado.watching import Watch
@@ -30,7 +32,7 @@ from cortado.watching import Watch
 
 def run_scene(
     scene_file: Path,
-    steps: int,
+    steps: int | None,
     out: Path,
     overrides: list[str],
     device: str,
@@ -40,18 +42,21 @@ def run_scene(
     command: list[str],
     pictures: bool = False,
     record: Sequence[str] = (),
+    seconds: float | None = None,
 ) -> str:
-    """Run a scene, ``record`` quantities of its particles in every frame, write its folder, shaded ``pictures`` too if
-    wished, and return a sentence that says where the
-    results are."""
+    """Run a scene, for so many ``steps`` or ``seconds``, ``record`` quantities of its particles in every frame, write
+    its folder, shaded ``pictures`` too if wished, and return a sentence that says where the results are."""
     scene = load_scene(scene_file, overrides)
     simulation = Simulation(scene, device, precision)
-    rollout = simulation.rollout(check_steps(steps))
+    rollout = simulation.rollout(steps, time=seconds)
     numbers = simulation.numbers_in_frame(components=3)  # as in the file
-    frames = frame_parts(2 + steps // record_every, numbers, simulation.precision.bytes)
+    frames = frame_parts(expected_frames(rollout, record_every), numbers, simulation.precision.bytes)
     require(frames, "take a larger --record-every or fewer steps")
     watch = Watch(simulation, rollout, record)
-    noted: dict[str, Any] = {"device": str(simulation.device), "settings": run_settings(steps, precision, record_every)}
+    asked = run_settings(rollout.steps if steps is None else steps, precision, record_every)
+    if np.isfinite(rollout.step_sizes.end):
+        asked = {**asked, "steps": None, "time": seconds}
+    noted: dict[str, Any] = {"device": str(simulation.device), "settings": asked}
     with locked(out):
         folder = RunFolder.create(out, scene.to_json(), command, overwrite=overwrite, **noted)
         with keeping(lambda: f"the frames so far are in {folder.trajectory}" if folder.trajectory.exists() else ""):
@@ -59,6 +64,8 @@ def run_scene(
     converged = rollout.diagnostics["converged"]
     if not converged.all():
         warnings.warn(not_converged_sentence(converged, scene), CortadoWarning, stacklevel=2)
+    if early := early_sentence(rollout):
+        warnings.warn(early, CortadoWarning, stacklevel=2)
     return f"The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
 
 
@@ -82,6 +89,8 @@ def _compute(
             simulation, rollout, folder, Section("What came out", failures=[error]), pictures, watch.readings()
         )
         raise told from error
+    if rollout.taken < rollout.steps:  # the file has room for frames that never came
+        Trajectory.load(folder.trajectory).save(folder.trajectory)
     summary = RunSummary.of(simulation, rollout, last, time.perf_counter() - begun)
     announce(str(summary))
     folder.write_result(**_for_machines(simulation, rollout), **summary.for_machines(), failures=[])
@@ -104,20 +113,21 @@ def _write_trajectory(
     simulation: Simulation, rollout: Rollout, folder: RunFolder, record_every: int, watch: Watch
 ) -> State:
     """Run, with a frame for every so many steps; returns the last state."""
-    steps = rollout.steps
+    steps, clock, size = rollout.steps, rollout.clocks[0], float(rollout.time_steps[0])
     recorded = np.array([*range(0, steps, record_every), steps])
-    times, first = rollout.clocks[0].times(recorded, rollout.time_steps[0]), simulation.frame(rollout.initial)
+    times, first = Clock(clock.steps, clock.time).times(recorded, size), simulation.frame(rollout.initial)
     constants, origin = simulation.constants(rollout), rollout.origins[0]
     with (
         frame_writer(
             folder.trajectory, times, first, constants, steps, rollout.diagnostics, origin, watch.names
         ) as writer,
-        track(steps, "run") as advance,
+        track(expected_of(rollout), "run") as advance,
     ):
 
         def observe(step: int, state: State) -> None:
-            if step % record_every == 0 or step == steps:
-                append_frame(writer, simulation.frame(state), step, watch.frame(step, state))
+            if step % record_every == 0 or rollout.is_last(step):
+                when = float(clock.times(np.array(step), size))
+                append_frame(writer, simulation.frame(state), step, watch.frame(step, state), when)
             watch.step(step, state)
             advance()
 

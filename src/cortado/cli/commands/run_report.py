@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cortado.cli.commands.run_summary import simulated, sizes_in_words
 from cortado.files.interruption import keeping
 from cortado.files.terminal import say
 from cortado.files.video import MOST_FRAMES, write_video
@@ -103,8 +104,11 @@ def _sensors(read: Mapping[str, Readings], folder: RunFolder) -> Section:
 
 def _asked(simulation: Simulation, rollout: Rollout) -> list[str]:
     """The run in words."""
-    scene, step = simulation.scene, float(rollout.time_steps[0])
+    scene = simulation.scene
+    step = float(rollout.time_steps[0])
     length = f"{rollout.steps} steps of {step:g} s, {rollout.steps * step:.4g} s of fluid"
+    if scene.solver.chooses:
+        length = f"{rollout.taken} steps of {sizes_in_words(rollout)}, {simulated(rollout):.4g} s of fluid"
     wall = f" Walls are made of {len(simulation.walls)} particles." if len(simulation.walls) else ""
     substeps = f" Each step has {rollout.substeps} substeps of diffusion." if rollout.substeps else ""
     where = f"{simulation.precision.name} on {simulation.device}"

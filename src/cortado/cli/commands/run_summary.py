@@ -42,13 +42,29 @@ class Energy:
         )
 
 
+def simulated(rollout: Rollout) -> float:
+    """How long the fluid of a rollout was simulated in its last forward run [s]."""
+    clock, size = rollout.clocks[0], float(rollout.time_steps[0])
+    return clock.after(rollout.taken, size).time - clock.time
+
+
+def sizes_in_words(rollout: Rollout) -> str:
+    """How long the steps of the last forward run were."""
+    chosen = rollout.step_sizes.diagnostics(rollout.taken).get("time_steps")
+    if chosen is None or not len(chosen):
+        return f"{float(rollout.time_steps[0]):g} s"
+    return f"{chosen.min():.3g} to {chosen.max():.3g} s"
+
+
 @dataclass(frozen=True)
 class RunSummary:
     """Of a run that has gone through all of its steps."""
 
     steps: int
-    time_step: float
-    """[s]"""
+    time: float
+    """That was simulated [s]."""
+    sizes: str
+    """How long steps were, in words."""
     seconds: float
     """That the steps took, with what was recorded of them."""
     first: Energy
@@ -65,17 +81,18 @@ class RunSummary:
     @classmethod
     def of(cls, simulation: Simulation, rollout: Rollout, last: State, seconds: float) -> "RunSummary":
         """``last``: the state at the end."""
-        solver, found = rollout.solver, None
+        solver, taken, found = rollout.solver, rollout.taken, None
         if isinstance(solver, ParticleSolver):
             densities = solver.densities(last, rollout.parameters)
             found = float(densities.min()), float(densities.max())
         return cls(
-            steps=rollout.steps,
-            time_step=float(rollout.time_steps[0]),
+            steps=taken,
+            time=simulated(rollout),
+            sizes=sizes_in_words(rollout),
             seconds=seconds,
             first=Energy.of(simulation, rollout, rollout.initial, 0),
-            last=Energy.of(simulation, rollout, last, rollout.steps - 1),
-            turned=bool(np.ptp(rollout.parameters["gravity"].numpy()[0], axis=0).any()),
+            last=Energy.of(simulation, rollout, last, taken - 1),
+            turned=bool(np.ptp(rollout.parameters["gravity"].numpy()[0, :taken], axis=0).any()),
             densities=found,
             spilt=_spilt(simulation, last),
             particles=simulation.free_particles,
@@ -102,7 +119,7 @@ class RunSummary:
         densities = zip(("least", "greatest"), self.densities or (), strict=False)
         return [
             ("steps", self.steps, ""),
-            ("simulated time", f"{self.steps * self.time_step:.4g}", "s"),
+            ("simulated time", f"{self.time:.4g}", "s"),
             ("time that a step took", f"{self.milliseconds:.3g}", "ms"),
             ("time that all steps took", f"{self.seconds:.3g}", "s"),
             *energies,
@@ -113,7 +130,7 @@ class RunSummary:
     def __str__(self) -> str:
         last = self.last
         text = (
-            f"{self.steps} steps of {self.time_step:g} s in {self.seconds:.3g} s, {self.milliseconds:.3g} ms a step; "
+            f"{self.steps} steps of {self.sizes} in {self.seconds:.3g} s, {self.milliseconds:.3g} ms a step; "
             f"energy {last.total:.4g} J (kinetic {last.kinetic:.3g}, potential {last.potential:.3g}), at the start "
             f"{self.first.total:.4g} J"
         )

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cortado.arrays import check_steps
+from cortado.cli.arguments import STEPS
 from cortado.cli.commands.executor import HERE, Where
 from cortado.cli.commands.optimise import optimise_task, search_settings
 from cortado.cli.commands.run import run_scene, run_settings
@@ -22,8 +23,6 @@ from cortado.scene.scene import load_scene
 from cortado.scene.toml import read_toml
 from cortado.words import counted
 
-STEPS = 200
-"""Of a scene, where nothing else is asked for."""
 SAME_TIME = 1e-9
 """Relative: times that differ by less are the same."""
 
@@ -190,7 +189,7 @@ def _time_step(file: Path, combination: Combination) -> float:
     """Of a scene [s]; warnings come when it is run."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
-        return load_scene(file, combination.overrides).solver.time_step
+        return load_scene(file, combination.overrides).solver.fixed_time_step("a sweep")
 
 
 def _record_every(steps: int) -> int:

@@ -11,6 +11,7 @@ from cortado.cli.viewer.window import Shown, Window
 from cortado.errors import CortadoError, CortadoWarning
 from cortado.pictures.painter import colours_of
 from cortado.scene.restart import RestartState
+from cortado.scene.stability import longest_step
 from cortado.simulation import Simulation
 
 SHOWN = 1.0 / 100.0
@@ -27,7 +28,7 @@ class LiveView:
 
     def __init__(self, simulation: Simulation, port: int):
         scene, self.simulation = simulation.scene, simulation
-        self.steps = max(round(SHOWN / scene.solver.time_step), 1)
+        self.steps = max(round(SHOWN / longest_step(scene)), 1)
         """Between two pictures."""
         own = own_fields(simulation.initial.numpy(simulation.dimension), simulation.particles)
         units = {field.name: field.unit for field in simulation.initial.fields if field.name in own}

@@ -14,6 +14,7 @@ from cortado.losses.loss import ADJOINT_FIELDS, by_field
 from cortado.rollout.rollout import Rollout
 from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene
+from cortado.scene.stability import longest_step
 from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 
@@ -78,7 +79,7 @@ def pull_on_height(
     @cache
     def pull() -> np.ndarray:
         made = simulation()
-        steps = max(round(AHEAD / made.scene.solver.time_step), 1)
+        steps = max(round(AHEAD / longest_step(made.scene)), 1)
         loss = CentreOfMassAlong(upwards(made.scene), state["reference_density"])
         return pull_of(made, made.rollout(steps, controls, state), loss)
 

@@ -47,6 +47,9 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
     scene = scene_from_dict(data, file)
     if not any(key in data for key in TaskTables.model_fields):
         raise SceneError(file, "problem", MISSING, "a table; a scene without one is run by cortado run")
+    if scene.solver.chooses:
+        wanted = "a number of seconds in a task, whose runs are compared step by step"
+        raise SceneError(file, "solver.time_step", "auto", wanted)
     known = _known(scene, file)
     names = (*offered(scene), *(p.name for p in known.own if p.role is not Role.CLOCK))
     try:

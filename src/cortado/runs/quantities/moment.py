@@ -49,7 +49,10 @@ class Moment:
         """A state of a rollout's present evaluation, after so many steps. After the last one the parameters are still
         those of the last step."""
         row = min(step, max(rollout.steps - 1, 0))
-        return cls(state, row_of(rollout, rollout.parameters.written, row), rollout.substeps, row, evaluator)
+        parameters, size = row_of(rollout, rollout.parameters.written, row), rollout.step_sizes.of_step(row)
+        if size is not None:
+            parameters["time_step"] = size
+        return cls(state, parameters, rollout.substeps, row, evaluator)
 
     @property
     def lattice(self) -> Lattice:
@@ -74,6 +77,9 @@ class Moment:
 
 
 def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
-    """What was written of parameters for all steps of a rollout, of those over time one row."""
+    """What was written of parameters for all steps of a rollout, of those over time one row, in arrays of its own."""
     over_time = rollout.solver.layout.known.over_time
-    return {name: value[:, row : row + 1] if name in over_time else np.asarray(value) for name, value in values.items()}
+    return {
+        name: value[:, row : row + 1].copy() if name in over_time else np.asarray(value)
+        for name, value in values.items()
+    }

@@ -152,7 +152,14 @@ PARAMETERS = (
     ),
     _optional("surface_tension", "N/m", "tension of the free surface", "cortado.sph.surface_tension", _capillary_step),
     Parameter(
-        "time_step", "s", "length of a step", Axis.SCALAR, lambda s: s.scene.solver.time_step, range=Range.POSITIVE
+        "time_step",
+        "s",
+        "length of a step",
+        Axis.SCALAR,
+        lambda s: s.scene.solver.time_step,
+        range=Range.POSITIVE,
+        present=lambda scene: not scene.solver.chooses,
+        absent='chooses its time steps, by solver.time_step = "auto", and derivatives hold them constant',
     ),
     Parameter(
         "mobility",

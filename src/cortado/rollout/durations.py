@@ -1,0 +1,77 @@
+"""How many steps a run of so many seconds takes."""
+
+from collections.abc import Mapping
+from math import ceil
+from typing import Any
+
+import numpy as np
+
+from cortado.arrays import as_numbers, as_one_number, check_steps
+from cortado.errors import InputError
+from cortado.rollout.parameter_space import ParameterSpace
+from cortado.rollout.rollout import Rollout
+from cortado.rollout.scene_parameters import Simulated
+from cortado.rollout.step_sizes import ChosenSteps
+from cortado.scene.scene import Scene
+from cortado.scene.solvers import COURANT
+from cortado.scene.stability import chosen_limits, stability_limits
+
+SAME = 1e-9
+"""Relative: a time that so little is missing of has been reached."""
+ROOM = 4
+"""There is room for so many times the steps that fluid takes which falls through the whole container all the time."""
+
+
+def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, values: Mapping[str, Any]) -> int:
+    """The number of steps of a run, which has either so many or reaches a time [s] with them; where they are chosen, as
+    many as there is room for. Raises `InputError`."""
+    if steps is None and time is None:
+        raise InputError("steps is left out, but must be given where no time says how long the run is.")
+    if steps is not None and time is not None:
+        raise InputError("time is given, but must be left out, as steps says how long the run is.")
+    if time is None:
+        assert steps is not None
+        return check_steps(steps)
+    check_time("time", time)
+    if not simulation.scene.solver.chooses:
+        given = values.get("time_step") if isinstance(values, Mapping) else None
+        sizes = as_numbers("parameter time_step", simulation.scene.solver.time_step if given is None else given)
+        shortest = float(sizes.min(initial=np.inf))
+        return check_steps(max(ceil(time / shortest * (1.0 - SAME)), 1)) if 0.0 < shortest < np.inf else 1
+    if simulation.batch is not None:
+        raise InputError(
+            "time is given, but must be left out of a batch that chooses its time steps, whose scenes do not reach it "
+            "together: give steps."
+        )
+    ParameterSpace(simulation, 0).checked(values)  # a row for each step has no meaning: nobody knows how many there are
+    return check_steps(ROOM * expected_steps(simulation.scene, time))
+
+
+def expected_frames(rollout: Rollout, record_every: int) -> int:
+    """How many frames a run has, with one for every so many steps."""
+    return 2 + expected_of(rollout) // record_every
+
+
+def expected_of(rollout: Rollout) -> int:
+    """How many steps of a rollout are to be expected: all of them, unless it ends at a time."""
+    return rollout.steps // ROOM if np.isfinite(rollout.step_sizes.end) else rollout.steps
+
+
+def expected_steps(scene: Scene, time: float) -> int:
+    """How many steps [s] fluid would take that falls through the whole container all the time."""
+    courant = COURANT if scene.solver.courant is None else scene.solver.courant
+    limit = stability_limits(scene)["speed"] * courant * 0.5 / 0.4  # which is of 0.4 support radii
+    return max(ceil(time / min(*chosen_limits(scene).values(), limit)), 1)
+
+
+def end_after(rollout: Rollout, time: float | None) -> None:
+    """Have a rollout that chooses its steps end with the first state so much later than its first [s]."""
+    if time is not None and isinstance(rollout.step_sizes, ChosenSteps):
+        rollout.step_sizes.end_after(time * (1.0 - SAME))
+
+
+def check_time(what: str, time: object) -> None:
+    """Raises `InputError` for what is no length of time."""
+    number = as_one_number(what, time)
+    if not 0.0 < number < np.inf:
+        raise InputError(f"{what} is {number:g}, but must be a number of seconds greater than 0.")

@@ -1,0 +1,213 @@
+"""How long the steps of a rollout are: fixed, or chosen on the device before each, recorded, and taken again so."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import inf
+from typing import Protocol
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from cortado.device.launching import sum_and_maximum
+from cortado.particles.state import Parameters, State
+from cortado.rollout.step_size_kernels import step_size_kernels
+from cortado.scene.restart import Clock, RecordedClock
+from cortado.solvers.solver import Solver
+
+GROWTH = 1.1
+"""A step is at most so many times as long as the one before."""
+
+Fill = Callable[[int, NDArray, NDArray], None]
+"""Writes what is scheduled for a step, given its number, and when it begins and how long it is, (members,) [s]."""
+
+
+@dataclass(frozen=True)
+class RecordedSizes:
+    """What was chosen in one evaluation, which alone writes to it."""
+
+    sizes: NDArray
+    """(steps + 1, members) of each step, and of the one that would follow [s]."""
+    times: NDArray
+    """(steps + 1, members) of each state [s]."""
+
+
+class StepSizes(Protocol):
+    """How long the steps of a rollout are."""
+
+    longest_chunk: int
+    """Steps that may be taken before the host looks."""
+    end: float
+    """When the run is to end at the latest [s]; infinite where it has all of its steps."""
+
+    def begin_at(self, state: State) -> None:
+        """The length of the first step, from a state."""
+
+    def choose(self, state: State) -> None:
+        """The length of the step after a state, whose number the solver has counted: launches alone."""
+
+    def seek(self, step: int) -> None:
+        """Have the solver take a step, from 0, as long as it was chosen."""
+
+    def read(self, first: int, last: int) -> tuple[int, bool]:
+        """Read the steps behind the first of these states, up to the one after the last. Returns the last state that
+        belongs to the run, and whether the run ends with it."""
+
+    def is_end(self, step: int) -> bool:
+        """Whether the run ends with the state after so many steps, which was read."""
+
+    def of_step(self, step: int) -> NDArray | None:
+        """(members,) the length of a step, once the state before it was read [s]; None where it is a parameter."""
+
+    def diagnostics(self, steps: int) -> dict[str, NDArray]:
+        """(steps,) by name, in a batch (steps, batch), of the first steps of the last run."""
+
+    def recorded(self) -> RecordedSizes | None:
+        """What the next evaluation overwrites."""
+
+    def assign(self, recorded: RecordedSizes | None) -> None:
+        """Hold what another evaluation has recorded."""
+
+
+class FixedSteps:
+    """All steps of a scene are as long as its parameter says."""
+
+    longest_chunk = 2**31
+    end = inf
+
+    def begin_at(self, state: State) -> None:
+        """See `StepSizes`."""
+
+    def choose(self, state: State) -> None:
+        """See `StepSizes`."""
+
+    def seek(self, step: int) -> None:
+        """See `StepSizes`."""
+
+    def read(self, first: int, last: int) -> tuple[int, bool]:
+        """See `StepSizes`."""
+        return last, False
+
+    def is_end(self, step: int) -> bool:
+        """See `StepSizes`."""
+        return False
+
+    def of_step(self, step: int) -> None:
+        """See `StepSizes`."""
+
+    def diagnostics(self, steps: int) -> dict[str, NDArray]:
+        """See `StepSizes`."""
+        return {}
+
+    def recorded(self) -> None:
+        """See `StepSizes`."""
+
+    def assign(self, recorded: RecordedSizes | None) -> None:
+        """See `StepSizes`."""
+
+
+class ChosenSteps:
+    """Each step is as long as the state before it allows, scene by scene: see `choose` of `step_size_kernels`.
+
+    The greatest speed is a maximum, so that the same bits come whatever the order; nothing else is read of a state, and
+    the step before is in its clock, so that a run that goes on has the steps of one that did not stop.
+    """
+
+    def __init__(self, solver: Solver, parameters: Parameters, steps: int, length: float):
+        """``length``: how far a particle may move in a step [m]."""
+        layout, device, real = solver.layout, solver.device, solver.layout.precision.real
+        shape = (steps + 1, layout.members)
+        self._solver, self._parameters, self._length = solver, parameters, length
+        self._kernels = step_size_kernels(layout.precision)
+        self._squares = wp.zeros(layout.all_particles, dtype=layout.precision.pair, device=device)
+        self._greatest = sum_and_maximum(layout.particles, layout.precision, device, layout.members)
+        self._sizes = wp.zeros(shape, dtype=real, device=device)
+        self._times = wp.zeros(shape, dtype=wp.float64, device=device)
+        self._bounds = wp.zeros((max(steps, 1), layout.members), dtype=real, device=device)
+        self._first = wp.zeros(layout.members, dtype=real, device=device)
+        self._read = RecordedSizes(np.zeros(shape), np.zeros(shape))
+        self._fill: Fill | None = None
+        self.end = inf
+        self.longest_chunk = FixedSteps.longest_chunk
+
+    def begin(self, clocks: Sequence[Clock], bounds: NDArray, fill: Fill | None) -> list[Clock]:
+        """Before a run: ``bounds`` (steps, members) of its steps [s]; ``fill`` where something is scheduled, so that
+        the host has to know each step. Returns the clocks of the first states, which know the times of those that
+        will be read."""
+        self._bounds.assign(bounds)
+        self._first.assign([clock.time_step for clock in clocks])
+        self._times[0].assign([clock.time for clock in clocks])
+        self._fill, self.end = fill, inf
+        self.longest_chunk = FixedSteps.longest_chunk if fill is None else 1
+        found = self._read = RecordedSizes(np.zeros(self._sizes.shape), np.zeros(self._times.shape))
+        own = zip(clocks, found.times.T, found.sizes.T, strict=True)
+        return [RecordedClock(c.steps, c.time, c.time_step, times, sizes) for c, times, sizes in own]
+
+    def begin_at(self, state: State) -> None:
+        """See `StepSizes`."""
+        self._solver.step_number.fill_(0)
+        self.choose(state)
+        self._look(0, 0)
+
+    def end_after(self, duration: float) -> None:
+        """The run, of a single scene, ends with the first state that is so much later than its first [s]."""
+        self.end = float(self._read.times[0, 0]) + duration
+
+    def choose(self, state: State) -> None:
+        """See `StepSizes`."""
+        launch, kernels = self._solver.launch, self._kernels
+        launch(kernels.speeds, v=state.velocities, squares=self._squares)
+        launch(
+            kernels.choose,
+            length=self._length,
+            growth=GROWTH,
+            greatest=self._greatest(self._squares),
+            bounds=self._bounds,
+            first=self._first,
+            step=self._solver.step_number,
+            times=self._times,
+            sizes=self._sizes,
+            time_step=self._parameters["time_step"],
+            threads=self._solver.layout.members,
+        )
+
+    def seek(self, step: int) -> None:
+        """See `StepSizes`."""
+        wp.copy(self._parameters["time_step"], self._sizes[step])
+
+    def read(self, first: int, last: int) -> tuple[int, bool]:
+        """See `StepSizes`."""
+        self._look(first + 1, last)
+        past = np.flatnonzero(self._read.times[first + 1 : last + 1, 0] >= self.end)
+        return (first + 1 + int(past[0]), True) if len(past) else (last, False)
+
+    def is_end(self, step: int) -> bool:
+        """See `StepSizes`."""
+        return bool(self._read.times[step, 0] >= self.end)
+
+    def _look(self, first: int, last: int) -> None:
+        """Read the lengths of these steps, and when they begin; write what is scheduled for the last."""
+        for found, array in ((self._read.sizes, self._sizes), (self._read.times, self._times)):
+            found[first : last + 1] = array[first : last + 1].numpy()
+        if self._fill is not None and last < len(self._bounds):
+            self._fill(last, self._read.times[last], self._read.sizes[last])
+
+    def of_step(self, step: int) -> NDArray:
+        """See `StepSizes`."""
+        return self._read.sizes[step].copy()
+
+    def diagnostics(self, steps: int) -> dict[str, NDArray]:
+        """See `StepSizes`."""
+        found = self._read.sizes[:steps]
+        return {"time_steps": found[:, 0] if self._solver.layout.batch is None else found}
+
+    def recorded(self) -> RecordedSizes:
+        """See `StepSizes`."""
+        return self._read
+
+    def assign(self, recorded: RecordedSizes | None) -> None:
+        """See `StepSizes`."""
+        assert recorded is not None
+        self._read = recorded
+        self._sizes.assign(recorded.sizes)
+        self._times.assign(recorded.times)

@@ -1,0 +1,460 @@
+"""Time steps that are chosen before each step, recorded, and taken again as they were."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado import InputError, SceneError, Simulation, Trajectory
+from cortado.scene.restart import Clock
+from cortado.scene.stability import chosen_limits, is_implicit, viscous_limit
+from cortado.sensors import PressureProbe
+from scenes import jet, plane, two_layers
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+STEPS = 24
+CHOSEN = {"time_step": "auto"}
+SOLVERS = {"pcisph": {}, "projection": {"kind": "projection"}}
+PRECISIONS = ["float32", "float64"]
+COURSES = {
+    "gravity": (plane, {"times": [0.0, 0.1], "values": [[0.0, -9.81], [4.0, -9.0]]}),
+    "tilt": (plane, {"times": [0.0, 0.1], "values": [[0.0], [15.0]]}),
+    "nozzle_path": (jet, {"times": [0.0, 0.1], "values": [[0.3, 0.26], [0.33, 0.26]]}),
+}
+
+
+def drop(solver, **changes):
+    """A block in the plane, off the lattice's axes, that falls and moves sideways."""
+    block = {"shape": "box", "lower": [0.1, 0.1], "upper": [0.5, 0.5], "velocity": [0.4, -0.3], "phase": "water"}
+    return plane(fluid=[block], solver=solver, **changes)
+
+
+def chosen_and_fixed(kind="pcisph", precision="float64"):
+    """A scene that chooses its steps, and the same with steps that are given."""
+    own = SOLVERS[kind]
+    return (Simulation(drop({**own, **step}), precision=precision) for step in (CHOSEN, {"time_step": 0.001}))
+
+
+def sizes_of(run):
+    return run.diagnostics["time_steps"]
+
+
+# ---- the choice --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", SOLVERS)
+def test_steps_are_as_long_as_the_speed_lets_them(kind):
+    scene = plane(solver={**SOLVERS[kind], **CHOSEN, "courant": 0.15})
+    run = Simulation(scene, precision="float64").run(80)
+    sizes, bound = sizes_of(run), min(chosen_limits(scene).values())
+    speeds = np.linalg.norm(run.velocities, axis=2).max(axis=1)[:-1]
+    length = 0.15 * 0.5 * scene.discretisation.support_radius
+    with np.errstate(divide="ignore"):
+        wanted = np.minimum(bound, length / speeds)
+    wanted[1:] = np.minimum(wanted[1:], 1.1 * sizes[:-1])
+    np.testing.assert_allclose(sizes, wanted, rtol=1e-12)
+    assert sizes[0] == bound and sizes.min() < 0.5 * bound  # at rest, and where it is fast
+    np.testing.assert_array_equal(run.times, np.concatenate([[0.0], np.cumsum(sizes)]))
+    short = replace(run[:1].last_state, clock=Clock(time_step=1e-4))
+    grown = sizes_of(Simulation(scene, precision="float64").run(3, state=short))
+    np.testing.assert_allclose(grown, 1e-4 * 1.1 ** np.arange(1, 4), rtol=1e-12)
+
+
+def test_a_fall_that_no_fixed_step_of_its_first_size_survives():
+    with pytest.warns(cortado.CortadoWarning, match="limit of stability"):
+        fixed = plane(solver={"time_step": min(chosen_limits(plane(solver=CHOSEN)).values())})
+    with pytest.raises(cortado.DivergedError):
+        Simulation(fixed).run(60)
+    run = Simulation(plane(solver=CHOSEN)).run(time=1.0)
+    assert run.times[-2] < 1.0 <= run.times[-1] and run.not_converged == 0
+    assert np.isfinite(run.positions).all() and np.ptp(run.positions[-1][:, 0]) > 0.6  # it lies on the floor
+
+
+def test_honey_is_bounded_by_its_viscosity():
+    made = plane(solver=CHOSEN, phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 400.0}])
+    thick = made.replaced('forces.viscosity="pairwise"')
+    limit = viscous_limit(thick, {})
+    simulation = Simulation(thick, precision="float64")
+    np.testing.assert_array_equal(sizes_of(simulation.run(5)), np.full(5, limit))
+    np.testing.assert_allclose(sizes_of(simulation.run(5, {"viscosity": 800.0})), 0.5 * limit, rtol=1e-12)
+    assert is_implicit(made) and not is_implicit(made.replaced("phase.water.viscosity=0.05"))
+    assert sizes_of(Simulation(made).run(2))[0] > 5.0 * limit  # at the end of a step it bears any
+
+
+def test_each_row_of_a_gravity_bounds_its_own_step():
+    simulation = Simulation(drop({**CHOSEN, "greatest_time_step": 0.004}), precision="float64")
+    gravity = np.array([[0.0, -9.81], [0.0, -9000.0], [0.0, 0.0]])
+    first, second, third = sizes_of(simulation.run(3, {"gravity": gravity}))
+    assert first == 0.004 and second < 0.001 and second < third <= 1.1 * second
+    assert sizes_of(simulation.run(2, {"gravity": [0.0, 0.0]}))[0] == 0.004
+
+
+# ---- the same bits -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("kind", SOLVERS)
+def test_fixed_steps_of_the_same_lengths_have_the_same_bits(kind, precision):
+    chosen, fixed = chosen_and_fixed(kind, precision)
+    run, state = chosen.run(STEPS), fixed.state()
+    for k, size in enumerate(sizes_of(run)):
+        state = fixed.step(state, {"time_step": size})
+        assert state["positions"].tobytes() == run.positions[k + 1].tobytes()
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("kind", SOLVERS)
+def test_a_run_that_goes_on_has_the_bits_of_one_that_did_not_stop(kind, precision, tmp_path):
+    simulation, _ = chosen_and_fixed(kind, precision)
+    whole, first = simulation.run(40), simulation.run(20, record_every=3)
+    first.save(tmp_path / "first.vtkhdf")
+    stepped = simulation.step(simulation.step(simulation.state(), steps=13), steps=7)
+    device = simulation.on_host(simulation.step(simulation.on_device(), steps=20))
+    loaded = Trajectory.load(tmp_path / "first.vtkhdf")
+    for state in (first.last_state, loaded.last_state, loaded[2:].last_state, whole[3:21].last_state, stepped, device):
+        assert (state.clock.time, state.clock.time_step) == (whole.times[20], sizes_of(whole)[19])
+        rest = simulation.run(20, state=state)
+        assert rest.positions.tobytes() == whole.positions[20:].tobytes()
+        assert rest.times.tobytes() == whole.times[20:].tobytes()
+        assert sizes_of(rest).tobytes() == sizes_of(whole)[20:].tobytes()
+        middle = rest[3:11].last_state
+        assert (middle.clock.steps, middle.clock.time_step) == (30, sizes_of(whole)[29])
+        on_device = simulation.step(simulation.on_device(middle), steps=10)
+        assert simulation.on_host(on_device)["positions"].tobytes() == whole.positions[40].tobytes()
+
+
+@pytest.mark.parametrize("made", ["plane", "layers", "jet", *COURSES])
+def test_a_scene_of_a_batch_has_the_bits_of_its_single_run(made):
+    maker, course = COURSES.get(made, ({"plane": drop, "layers": two_layers, "jet": jet}.get(made), None))
+    scene = maker(solver=CHOSEN, **({"schedule": {made: course}} if course else {}))
+    each = [{"viscosity": np.full(len(scene.phase), 0.05 * (b + 1))} for b in range(2)]
+    each = [{"viscosity": one["viscosity"] if len(scene.phase) > 1 else one["viscosity"][0]} for one in each]
+    values = {"viscosity": np.stack([one["viscosity"] for one in each])}
+    single = Simulation(scene)
+    for own, found in zip(each, Simulation(scene, batch=2).run(STEPS, values), strict=True):
+        wanted = single.run(STEPS, own)
+        assert found.positions.tobytes() == wanted.positions.tobytes()
+        assert (
+            found.times.tobytes() == wanted.times.tobytes() and sizes_of(found).tobytes() == sizes_of(wanted).tobytes()
+        )
+        rest = single.run(STEPS - 9, own, state=wanted[:10].last_state)
+        assert rest.positions.tobytes() == wanted.positions[9:].tobytes()
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_a_schedule_is_read_at_the_true_times(name):
+    maker, course = COURSES[name]
+    scene = maker(solver=CHOSEN, schedule={name: course})
+    run = Simulation(scene, precision="float64").run(STEPS)
+    fixed = Simulation(maker(solver={"time_step": 0.001}), precision="float64")
+    state = fixed.state()
+    for time, size in zip(run.times, sizes_of(run), strict=False):
+        at = time + (1.0 if name == "nozzle_path" else 0.5) * size
+        state = fixed.step(state, {name: getattr(scene.schedule, name).at(np.array([at]))[0], "time_step": size})
+    assert state["positions"].tobytes() == run.positions[-1].tobytes()
+
+
+def test_a_lost_scene_leaves_the_others_as_they_are():
+    batch, single = (Simulation(drop({**CHOSEN, "courant": 0.4}), batch=size) for size in (2, None))
+    velocities = np.stack([np.full_like(single.velocities, 30.0), single.velocities])
+    with pytest.warns(cortado.CortadoWarning, match="1 of 2 scenes of the batch were lost"):
+        found = batch.run(STEPS, {"initial_velocities": velocities})
+    assert list(found.lost) == [1] and len(sizes_of(found[1])) == STEPS
+    wanted = single.run(STEPS, {"initial_velocities": velocities[0]})
+    assert found[0].positions.tobytes() == wanted.positions.tobytes()
+    with pytest.raises(cortado.DivergedError, match=r"try a smaller solver\.courant"):
+        single.run(STEPS)
+
+
+def test_quantities_and_sensors_are_of_the_step_that_follows():
+    simulation, fixed = chosen_and_fixed()
+    probe = {"probe": PressureProbe([0.3, 0.05])}
+    run = simulation.run(STEPS, record=["pressure"], sensors=probe)
+    assert run.sensors["probe"].times.tobytes() == run.times.tobytes()
+    for k in (0, 5, STEPS - 1):
+        state = run[: k + 1].last_state
+        wanted = simulation.quantity("pressure", state)
+        assert run.quantity("pressure")[k].tobytes() == wanted.tobytes()
+        held = replace(state, clock=replace(state.clock, time_step=0.0))
+        assert wanted.tobytes() == fixed.quantity("pressure", held, {"time_step": sizes_of(run)[k]}).tobytes()
+
+
+# ---- derivatives -------------------------------------------------------------------------------------------------
+
+
+class Spread:
+    """A loss of last positions and velocities."""
+
+    def value(self, end):
+        return float((end.positions**2).mean() + 0.1 * (end.velocities**2).mean())
+
+    def adjoint(self, end):
+        return 2.0 * end.positions / end.positions.size, 0.2 * end.velocities / end.velocities.size
+
+
+def parameters_of(simulation, scheduled):
+    rng = np.random.default_rng(3)
+    values = {"viscosity": 0.05, "initial_velocities": simulation.velocities + 0.0}
+    along = {"viscosity": 0.03, "initial_velocities": 0.3 * rng.normal(size=simulation.velocities.shape)}
+    if not scheduled:
+        values["gravity"], along["gravity"] = np.array([0.2, -9.81]), np.array([0.5, 0.3])
+    return values, along
+
+
+@pytest.mark.parametrize("scheduled", [False, True])
+def test_the_gradient_is_the_limit_of_differences_with_the_steps_held(scheduled):
+    course = {"schedule": {"gravity": COURSES["gravity"][1]}} if scheduled else {}
+    iterations = {"minimum_iterations": 5, "maximum_iterations": 5}
+    chosen, fixed = (
+        Simulation(drop({**iterations, **step}, **course), precision="float64")
+        for step in (CHOSEN, {"time_step": 0.001})
+    )
+    values, along = parameters_of(chosen, scheduled)
+    problem = cortado.Problem(chosen, STEPS, Spread())
+    loss, gradient = problem.value_and_gradient(values)
+    sizes = problem.diagnostics["time_steps"]
+    times = np.concatenate([[0.0], np.cumsum(sizes)])
+
+    def held(by):
+        moved = {name: value + by * along[name] for name, value in values.items()}
+        state = fixed.state({"initial_velocities": moved.pop("initial_velocities")})
+        for size, time in zip(sizes, times, strict=False):
+            middle = np.array([time + 0.5 * size])
+            course = {"gravity": chosen.scene.schedule.gravity.at(middle)[0]} if scheduled else {}
+            state = fixed.step(state, {**moved, **course, "time_step": size})
+        return Spread().value(replace_fields(state))
+
+    assert held(0.0) == loss
+    reverse = sum(float((gradient[name] * along[name]).sum()) for name in along)
+    assert abs((held(1e-6) - held(-1e-6)) / 2e-6 - reverse) < 1e-6 * abs(reverse)
+    assert abs(problem.tangent(values, along) - reverse) < 1e-10 * abs(reverse)
+
+
+def replace_fields(state):
+    """A state as a loss sees it."""
+    return type("End", (), {"positions": state["positions"], "velocities": state["velocities"]})
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("kind", SOLVERS)
+def test_a_backward_pass_goes_through_the_recorded_steps(kind, precision):
+    """It has the bits of one through fixed steps of these lengths, whatever is kept and what comes in between."""
+    chosen, fixed = chosen_and_fixed(kind, precision)
+    stepper, states, residuals = chosen.stepper(8), [chosen.state()], []
+    for _ in range(3):
+        state, residual = stepper.step(states[-1], {"viscosity": 0.07})
+        states.append(state)
+        residuals.append(residual)
+    sizes = sizes_of(chosen.run(STEPS, {"viscosity": 0.07}))
+    up = bar = {"positions": np.random.default_rng(0).normal(size=states[0]["positions"].shape)}
+    for residual in reversed(residuals):
+        bar, _ = stepper.vjp(residual, bar)
+    begun, state = [], fixed.state()
+    for size in sizes:
+        begun.append(state)
+        state = fixed.step(state, {"viscosity": 0.07, "time_step": size})
+    held = up
+    for state, size in zip(reversed(begun), reversed(sizes), strict=True):
+        held, _ = fixed.vjp(state, {"viscosity": 0.07, "time_step": size}, held)
+    assert np.abs(held["velocities"]).max() > 0.0
+    assert held["velocities"].tobytes() == bar["velocities"].tobytes()
+    first = {"viscosity": 0.07, "initial_velocities": chosen.velocities}
+    gradients = [
+        cortado.Problem(chosen, STEPS, Spread(), memory_budget=budget).value_and_gradient(first, gradient=gradient)[1]
+        for budget, gradient in ((2**30, None), (0, None))
+    ]
+    assert gradients[0]["initial_velocities"].tobytes() == gradients[1]["initial_velocities"].tobytes()
+    velocities = np.random.default_rng(1).normal(size=up["positions"].shape)
+    end = stepper.jvp(residuals[0], {"velocities": velocities})
+    before, _ = stepper.vjp(residuals[0], up)
+    forward, reverse = (end["positions"] * up["positions"]).sum(), (before["velocities"] * velocities).sum()
+    assert abs(forward - reverse) < {"float32": 1e-4, "float64": 1e-10}[precision] * abs(reverse)
+
+
+def test_warps_tape_goes_through_the_recorded_steps():
+    simulation, _ = chosen_and_fixed()
+    problem = cortado.Problem(simulation, STEPS, Spread())
+    found = [
+        problem.value_and_gradient({"viscosity": 0.05}, gradient=gradient)[1]["viscosity"]
+        for gradient in (cortado.gradients.Exact(), cortado.gradients.Tape())
+    ]
+    assert found[0] == pytest.approx(found[1], rel=1e-8)
+
+
+# ---- what is refused ---------------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_is_said_in_a_sentence(tmp_path):
+    simulation = Simulation(drop(CHOSEN))
+    held = "time_step is given, but must be left out, as the scene chooses its time steps, .* hold them constant"
+    series = cortado.losses.Series(PressureProbe([0.3, 0.1]), [0.0, 0.1], [0.0, 1.0], 0.001)
+    rows = np.tile(jet().emitter.outlet, (3, 1))
+    for call, error, what in [
+        (
+            lambda: plane(solver={"time_step": "fast"}),
+            SceneError,
+            'time_step is .fast., but must be a finite number, .* or "auto"',
+        ),
+        (
+            lambda: plane(solver={"time_step": 0.001, "courant": 0.2}),
+            SceneError,
+            "courant is 0.2, but must be left out",
+        ),
+        (lambda: plane(solver={**CHOSEN, "courant": 1.5}), SceneError, "courant is 1.5, but must be"),
+        (
+            lambda: plane(solver=CHOSEN, forces={"gravity": [0.0, 0.0], "viscosity": "none"}),
+            SceneError,
+            "greatest_time_step is missing, but must be given, as nothing else bounds",
+        ),
+        (lambda: simulation.run(3, {"time_step": 0.001}), InputError, held),
+        (lambda: simulation.jvp(simulation.state(), {}, {}, {"time_step": 1.0}), InputError, held),
+        (lambda: cortado.Problem(simulation, 3, Spread()).tangent({}, {"time_step": 1.0}), InputError, held),
+        (lambda: cortado.Problem(simulation, 90, series), InputError, "loss is a Series of steps of 0.001 s"),
+        (lambda: cortado.certify(simulation, ["viscosity"], steps=3), InputError, "seconds for a certificate"),
+        (
+            lambda: Simulation(jet(solver=CHOSEN)).run(3, {"nozzle_path": rows}),
+            InputError,
+            "nozzle_path has a row for each step, but must be one place where time steps are chosen",
+        ),
+        (lambda: simulation.run(), InputError, "steps is left out, but must be given where no time"),
+        (lambda: simulation.run(3, time=1.0), InputError, "time is given, but must be left out, as steps says"),
+        (lambda: simulation.run(time=-1.0), InputError, "time is -1, but must be a number of seconds greater than 0"),
+        (lambda: simulation.run(time=1.0, controls={"gravity": np.zeros((9, 2))}), InputError, r"but must be \(2,\)"),
+        (lambda: Simulation(drop(CHOSEN), batch=2).run(time=1.0), InputError, "time is given, but must be left out"),
+    ]:
+        with pytest.raises(error, match=what):
+            call()
+
+
+@pytest.mark.parametrize(
+    "words, what",
+    [
+        (
+            ["sweep", "scene.toml", "--set", "solver.courant=0.1,0.2", "--steps", "3"],
+            'solver.time_step is "auto", but must be a number of seconds for a sweep.',
+        ),
+        (
+            ["optimise", "task.toml", "--set", "solver.time_step=auto"],
+            "solver.time_step is 'auto', but must be a number of seconds in a task, whose runs are compared",
+        ),
+        (
+            ["gradients", "check", "scene.toml", "--steps", "3"],
+            "but must be a number of seconds for a certificate, whose differences would not hold chosen ones.",
+        ),
+    ],
+)
+def test_commands_that_need_a_fixed_step_say_so(cortado_command, tmp_path, monkeypatch, words, what):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(SCENE)
+    shutil.copy(EXAMPLES / "recover_gravity_small.toml", "task.toml")
+    code, _, err = cortado_command(*words)
+    assert code == 2 and what in err and len(err.strip().splitlines()) == 1
+
+
+def test_the_reference_engine_refuses_steps_that_are_chosen():
+    reference = pytest.importorskip("cortado_reference")
+    with pytest.raises(InputError, match='is "auto", but must be a number of seconds for the ref'):
+        reference.Simulation(drop(CHOSEN, forces={"gravity": [0.0, -9.81], "viscosity": "pairwise"}))
+
+
+# ---- a time in the place of steps --------------------------------------------------------------------------------
+
+
+def test_a_run_of_so_many_seconds():
+    chosen, fixed = chosen_and_fixed(precision="float32")
+    run = chosen.run(time=0.1, record_every=7)
+    steps = int(run.steps[-1])
+    assert run.times[-1] >= 0.1 > run.times[-1] - sizes_of(run)[-1] and len(run.converged) == steps
+    assert run.positions.tobytes() == chosen.run(steps, record_every=7).positions.tobytes()
+    on = chosen.run(time=0.02, state=run.last_state)
+    assert on.times[0] == run.times[-1] and on.times[-1] >= run.times[-1] + 0.02
+    assert [len(fixed.run(time=time)) - 1 for time in (0.0104, 0.011, 0.0111)] == [11, 11, 12]
+    assert len(fixed.run(time=0.01, controls={"time_step": 0.002})) == 6
+
+
+SCENE = """
+name = "drop"
+dimension = 2
+[discretisation]
+spacing = 0.05
+[[phase]]
+name = "water"
+rest_density = 1000.0
+viscosity = 0.05
+[[fluid]]
+shape = "box"
+lower = [0.0, 0.1]
+upper = [0.3, 0.4]
+phase = "water"
+[container]
+shape = "box"
+lower = [0.0, 0.0]
+upper = [0.6, 0.6]
+[solver]
+time_step = "auto"
+"""
+
+
+@pytest.fixture
+def run_command(cortado_command, tmp_path):
+    """Runs the scene into the folder "out"."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    return lambda *words: cortado_command("run", tmp_path / "scene.toml", "--out", tmp_path / "out", *words)
+
+
+def test_a_run_whose_steps_become_too_short_says_so(monkeypatch):
+    monkeypatch.setattr("cortado.rollout.durations.expected_steps", lambda scene, time: 3)
+    with pytest.warns(cortado.CortadoWarning, match="the run ended at 0.1.* s, before the time that was asked for"):
+        run = Simulation(drop(CHOSEN)).run(time=10.0)
+    assert len(run.converged) == 12
+
+
+@pytest.mark.parametrize(
+    "words, limit, size",
+    [
+        ((), "depth", 0.0214),
+        (("fluid.0.velocity=[2.0, 0.0]",), "speed", 0.005),
+        (("forces.viscosity=pairwise", "phase.water.viscosity=500"), "viscosity", 0.000497),
+        (("solver.greatest_time_step=0.003",), "greatest_time_step", 0.003),
+    ],
+)
+def test_describe_says_which_limit_decides_the_first_step(cortado_command, tmp_path, words, limit, size):
+    (tmp_path / "scene.toml").write_text(SCENE)
+    sets = [word for one in words for word in ("--set", one)]
+    code, out, _ = cortado_command("describe", tmp_path / "scene.toml", *sets)
+    assert code == 0 and f"chosen before each step: the first is {size:.3g} s, by {limit}; limits: {limit}" in out
+    found = json.loads(cortado_command("describe", tmp_path / "scene.toml", "--json", *sets)[1])
+    assert (found["time_step_chosen_by"], found["simulated_time_s"]) == (limit, None)
+    assert found["time_step_s"] == pytest.approx(size, rel=1e-2)
+
+
+def test_the_command_runs_until_a_time(run_command, tmp_path):
+    code, out, _ = run_command("--time", "0.1", "--record-every", "4", "--no-pictures")
+    assert code == 0 and " steps of 0.0" in out
+    found = Trajectory.load(tmp_path / "out" / "trajectory.vtkhdf")
+    wanted = Simulation(tmp_path / "scene.toml").run(time=0.1, record_every=4)
+    assert found.times.tobytes() == wanted.times.tobytes() and found.positions.tobytes() == wanted.positions.tobytes()
+    assert sizes_of(found).tobytes() == sizes_of(wanted).tobytes()
+    on = Simulation(tmp_path / "scene.toml").run(3, state=found.last_state)
+    assert on.positions[0].tobytes() == found.positions[-1].tobytes() and on.times[0] == found.times[-1]
+
+
+@pytest.mark.parametrize(
+    "words, what",
+    [
+        (["--time", "-1"], "--time is -1, but must be a number of seconds greater than 0."),
+        (["--time", "nan"], "--time is nan, but must be a number of seconds greater than 0."),
+        (["--time", "inf"], "--time is inf, but must be a number of seconds greater than 0."),
+        (["--time", "soon"], "--time is 'soon', but must be a number"),
+        (["--steps", "many"], "--steps is 'many', but must be a whole number"),
+        (["--time", "1", "--steps", "3"], "--time is given, but must be left out, as --steps says how long"),
+    ],
+)
+def test_a_time_that_is_none_is_refused(run_command, tmp_path, words, what):
+    code, _, err = run_command(*words)
+    assert code == 2 and what in err and len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
