@@ -8,6 +8,7 @@ from typing import Annotated
 from tyro.conf import Positional, UseAppendAction, arg
 
 from cortado.errors import InputError
+from cortado.scene.toml import read_toml
 
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Flag = Annotated[bool, arg(help_behavior_hint="")]
@@ -22,6 +23,12 @@ def require_at_least(least: int, value: int, option: str) -> None:
     """Raises `InputError` for a value that is smaller, with the option's name in the sentence."""
     if value < least:
         raise InputError(f"{option} is {value}, but must be at least {least}.")
+
+
+def require_toml(file: Path, overrides: Sequence[str] = ()) -> None:
+    """Raises `SceneError` for a file that cannot be read, or for overrides of what it has not: at once, as what a
+    command imports after that takes a second."""
+    read_toml(file, overrides)
 
 
 def as_text(options: Sequence[str]) -> list[str]:
