@@ -11,6 +11,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+import warp as wp
 from matplotlib.image import imsave
 
 from compiling_notice import without_compiling
@@ -24,6 +25,11 @@ collect_ignore = collect_ignore if WITHOUT_ENGINE else []
 
 gc.set_threshold(100_000, 20, 20)
 """Launches make so many small objects that looking for those in circles takes a tenth of the tests' time otherwise."""
+
+
+wp.config.cpu_compiler_flags = "-march=native"
+"""With LLVM's own limits for what it inlines: by Warp's, kernels take a third longer to compile, which only many
+particles repay. Processes that tests start compile as users' do, with the same bits where tests compare them."""
 
 
 def pytest_report_header():

@@ -293,6 +293,7 @@ if __name__ == "__main__":
     import warp as wp
 
     wp.config.log_level = wp.LOG_ERROR
+    wp.config.cpu_compiler_flags = "-march=native"  # as in conftest.py
     request = json.loads(Path(sys.argv[1]).read_text())
     import cortado
 
