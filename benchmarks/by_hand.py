@@ -85,9 +85,9 @@ class Caller:
         text += "    if lane() > 0:\n        return\n"
         text += "".join(f"    out_{n}[i] = r_{n}\n" for n in range(len(results)))
         exec(text, known)
-        module = wp.get_module(f"cortado_call_{re.sub('[^a-z_0-9]+', '_', name)}_{d.precision.name}")
-        module.options["enable_backward"] = False
-        self._kernel = wp.Kernel(known["call"], key="call", module=module, source=text)
+        self.module = wp.get_module(f"cortado_call_{re.sub('[^a-z_0-9]+', '_', name)}_{d.precision.name}")
+        self.module.options["enable_backward"] = False
+        self._kernel = wp.Kernel(known["call"], key="call", module=self.module, source=text)
 
     def outputs(self, x: wp.array) -> list[wp.array]:
         """Room for the results."""

@@ -9,6 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, UseAppendAction, arg
 
 from cortado.errors import InputError
+from cortado.scene.toml import read_toml
 
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Flag = Annotated[bool, arg(help_behavior_hint="")]
@@ -39,6 +40,12 @@ def steps_or_time(steps: int | None, time: float | None) -> int | None:
     if not 0.0 < time < inf:
         raise InputError(f"--time is {time:g}, but must be a number of seconds greater than 0.")
     return None
+
+
+def require_toml(file: Path, overrides: Sequence[str] = ()) -> None:
+    """Raises `SceneError` for a file that cannot be read, or for overrides of what it has not: at once, as what a
+    command imports after that takes a second."""
+    read_toml(file, overrides)
 
 
 def as_text(options: Sequence[str]) -> list[str]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tyro.extras import SubcommandApp
 
-from cortado.cli.arguments import Device, Flag, Overrides, Scene, as_text, require_at_least
+from cortado.cli.arguments import Device, Flag, Overrides, Scene, as_text, require_at_least, require_toml
 from cortado.cli.command import Work, command
 
 gradients = SubcommandApp()
@@ -38,7 +38,8 @@ def check(
         seed: Of the random directions.
     """
     require_at_least(0, seed, "--seed")
+    words = as_text(overrides)
+    require_toml(scene, words)
     from cortado.cli.commands.check import check_scene
 
-    words = as_text(overrides)
     return partial(check_scene, scene, steps, parameters, loss, perturbation, out, words, device, json, seed)

@@ -14,7 +14,6 @@ from cortado.cli.parsing import Program, parsed
 from cortado.cli.shortage import shortage
 from cortado.cli.subcommands import CORTADO
 from cortado.cli.usage import usage_sentence
-from cortado.device.kernel_cache import complaint, start_warp
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError
 from cortado.files.interruption import Interrupted
 from cortado.files.terminal import say, tell, to_stdout
@@ -33,6 +32,8 @@ def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> 
             warnings.showwarning = _show_warning  # type: ignore[assignment]
             work = _understood(program, arguments)
             logging.getLogger("matplotlib").setLevel(logging.ERROR)  # where its folder cannot be written it goes on
+            from cortado.device.kernel_cache import start_warp  # with Warp, once the command is understood
+
             start_warp()
             text = work()
             if text:
@@ -47,7 +48,7 @@ def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> 
     except BrokenPipeError:
         sys.exit(BROKEN_PIPE)
     except Exception as error:
-        sentence = shortage(error) or complaint(error)
+        sentence = shortage(error) or _complaint(error)
         if sentence is None:
             raise
         sys.exit(_say(sentence, 1))
@@ -74,6 +75,12 @@ def _understood(program: Program, arguments: Sequence[str]) -> Work:
 def _say(error: BaseException | str, code: int) -> int:
     say(str(error))
     return code
+
+
+def _complaint(error: Exception) -> str | None:
+    from cortado.device.kernel_cache import complaint
+
+    return complaint(error)
 
 
 def _show_warning(message: Warning, category: type[Warning], *rest: object) -> None:

@@ -17,6 +17,7 @@ from cortado.cli.arguments import (
     as_text,
     command_line,
     require_at_least,
+    require_toml,
     steps_or_time,
 )
 from cortado.cli.command import Work, command
@@ -78,9 +79,11 @@ def describe(
         picture: Draw its first state into this PNG file.
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
     """
+    words = as_text(overrides)
+    require_toml(scene, words)
     from cortado.cli.commands.describe import describe_scene
 
-    return partial(describe_scene, scene, steps, as_text(overrides), device, precision, picture, json)
+    return partial(describe_scene, scene, steps, words, device, precision, picture, json)
 
 
 @command(app)
@@ -112,10 +115,10 @@ def run(
     """
     require_at_least(1, record_every, "--record-every")
     steps = steps_or_time(steps, time)
+    words, wanted, told = as_text(overrides), as_text(record), command_line()
+    require_toml(scene, words)
     from cortado.cli.commands.run import run_scene
 
-    words, told = as_text(overrides), command_line()
-    wanted = as_text(record)
     return partial(
         run_scene, scene, steps, out, words, device, precision, record_every, overwrite, told, pictures, wanted, time
     )
@@ -165,10 +168,12 @@ def optimise(
     """
     if resume and overwrite:
         raise InputError("--resume and --overwrite are both given, but only one of them can be meant.")
+    words, told = as_text(overrides), command_line()
+    require_toml(task, words)
     from cortado.cli.commands.executor import Where
     from cortado.cli.commands.optimise import optimise_task
 
-    where, words, told = Where(scheduler, workers), as_text(overrides), command_line()
+    where = Where(scheduler, workers)
     return partial(optimise_task, task, out, words, device, precision, resume, overwrite, told, where, pictures)
 
 
@@ -242,10 +247,12 @@ def sweep(
         scheduler: Address of a scheduler of Dask's, such as tcp://10.0.0.1:8786, whose workers compute.
         workers: Number of worker processes on this machine; on a GPU each has one of its own.
     """
+    combinations = as_text(sets)
+    require_toml(file)
     from cortado.cli.commands.executor import Where
     from cortado.cli.commands.sweep import run_sweep
 
-    return partial(run_sweep, file, as_text(sets), steps, time, out, device, precision, Where(scheduler, workers))
+    return partial(run_sweep, file, combinations, steps, time, out, device, precision, Where(scheduler, workers))
 
 
 @command(app, answers=True)

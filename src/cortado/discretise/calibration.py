@@ -53,6 +53,7 @@ RATE_LIMIT = 1.5
 the lattice."""
 
 
+@cache
 def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
     """By what factor one iteration with the prototype's delta overcorrects the worst pressure wave on the lattice.
 
