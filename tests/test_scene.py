@@ -440,3 +440,26 @@ def test_divergence_is_a_sentence():
     error = pickle.loads(pickle.dumps(DivergedError(step=3, particle=7, advice="try a smaller time step")))
     assert (error.step, error.particle, error.advice) == (3, 7, "try a smaller time step")
     assert_one_sentence(str(error))
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "kernel", "support"),
+    [
+        ("pcisph", {}, "cubic_spline", 2.0),
+        ("projection", {}, "wendland_c2", 2.6),
+        ("projection", {"support": 2.5}, "cubic_spline", 2.5),
+        ("projection", {"kernel": "cubic_spline"}, "cubic_spline", 2.0),
+    ],
+)
+def test_a_scene_that_names_no_kernel_has_that_of_its_solver(kind, given, kernel, support):
+    cut = {"spacing": 0.1, **given}
+    for discretisation in (cut, DiscretisationTable(**cut)):
+        scene = Scene(
+            **{
+                **plane().model_dump(mode="json"),
+                "discretisation": discretisation,
+                "solver": {"kind": kind, "time_step": 0.001},
+            }
+        )
+        assert (scene.discretisation.kernel, scene.discretisation.support) == (kernel, support)
+        assert Scene.from_json(scene.to_json()) == scene

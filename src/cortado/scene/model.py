@@ -3,9 +3,10 @@
 Vectors have as many components as the scene has dimensions. Whatever is wrong raises a `SceneError`, one sentence.
 """
 
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, ValidationInfo, create_model, field_validator
+from pydantic import Field, ValidationInfo, create_model, field_validator, model_validator
 
 from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import EmitterTable
@@ -19,7 +20,7 @@ from cortado.scene.render import Render
 from cortado.scene.rheology import AnyRheology
 from cortado.scene.schedule import Schedule
 from cortado.scene.sensors import AnySensor
-from cortado.scene.solvers import AnySolver
+from cortado.scene.solvers import AnySolver, smoothing_of
 from cortado.scene.tables import Table
 
 OTHER_TABLES = ("problem", "optimise")
@@ -34,7 +35,8 @@ class DiscretisationTable(Table):
     support: Annotated[float, quantity(ge=1.2, le=4.0)] = 2.0
     """Distance within which particles act on each other: support radius / spacing."""
     kernel: Literal["cubic_spline", "wendland_c2", "wendland_c4"] = "cubic_spline"
-    """Name of the smoothing kernel."""
+    """Name of the smoothing kernel. With the solver "projection" it is "wendland_c2", with a support of 2.6, if neither
+    is given."""
 
     @property
     def support_radius(self) -> float:
@@ -119,6 +121,19 @@ class SceneTables(Table):
     """How pictures are taken."""
     picture: Picture | None = None
     """How shaded pictures and films are made."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _choose_smoothing(cls, data: Any) -> Any:
+        """The kernel and the support that suit the solver, where neither is given."""
+        if not isinstance(data, Mapping):
+            return data
+        given, chosen = data.get("discretisation"), smoothing_of(data.get("solver"))
+        if isinstance(given, DiscretisationTable) and not given.model_fields_set & set(chosen):
+            return {**data, "discretisation": given.model_copy(update=chosen)}
+        if isinstance(given, Mapping) and not set(given) & set(chosen):
+            return {**data, "discretisation": {**given, **chosen}}
+        return data
 
     @field_validator("emitter", "container", "forces", "schedule", "render", "picture")
     @classmethod

@@ -1,7 +1,7 @@
 """The table [solver] of a scene: which algorithm takes a step, with the keys of that algorithm."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
@@ -80,6 +80,8 @@ class ProjectionSolver(SolverTable):
     """Iterations of the pressure in every step, each from that of the step before."""
     repairs: Annotated[int, count(1, 1_000)] = 2
     """Iterations in every step that bring positions back to the rest density."""
+    smoothing: ClassVar[Mapping[str, Any]] = {"kernel": "wendland_c2", "support": 2.6}
+    """What [discretisation] has if it names neither; `docs/projection.md` has the figures of each kernel."""
 
 
 class PackageSolver(SolverTable, PackageTable):
@@ -91,6 +93,11 @@ class PackageSolver(SolverTable, PackageTable):
     kind: Annotated[Text, Field(json_schema_extra={"not": {"enum": list(OWN)}})]
     """The name that the package gives it."""
     advice = f"{' or '.join(f'{chr(34)}{name}{chr(34)}' for name in OWN)}, or "
+
+
+def smoothing_of(solver: Any) -> Mapping[str, Any]:
+    """What a solver, or a table that will be one, wants in [discretisation] if neither kernel nor support is given."""
+    return ProjectionSolver.smoothing if _table_of(solver) == "ProjectionSolver" else {}
 
 
 def _table_of(solver: Any) -> str:
