@@ -74,6 +74,8 @@ class FixedForces(Table):
     where the time step is too long for the other."""
     pressure: Flag = True
     """Whether the fluid resists compression."""
+    surface_tension_form: Literal["automatic", "curvature", "pairwise"] = "automatic"
+    """Form of surface tension, if there is any."""
 
 
 _OPTIONAL: dict[str, Any] = {

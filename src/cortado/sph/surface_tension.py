@@ -19,7 +19,9 @@ from cortado.errors import CortadoWarning
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
 from cortado.scene.scene import Scene
-from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
+from cortado.sph.curvature_constants import CurvatureConstants
+from cortado.sph.curvature_tension import CurvatureTension
+from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 from cortado.sph.surface_normals import normal_kernels
 from cortado.sph.surface_stress import surface_tension_kernels
 
@@ -83,13 +85,25 @@ def tension_constants(spacing: float, support: float, volume: float, dimension: 
     return 1.0 / float(sums[0]), 1.0 / (RELAXED[dimension] * tension * volume)
 
 
-def force(setting: Setting) -> SurfaceTension:
+def force(setting: Setting) -> Force:
     """Surface tension in a scene that has it; warns where it is likely to tear the fluid apart."""
     scene, lattice = setting.scene, setting.lattice
     _check_support(scene)
+    if form_of(scene) == "curvature":
+        cut, smoothing = scene.discretisation, setting.discretisation.smoothing
+        constants = CurvatureConstants.of(smoothing, cut.spacing, lattice.support, scene.dimension)
+        return CurvatureTension(setting.discretisation, scene.dimension, constants, setting.layout)
     _check_viscosity(scene, setting.layout.particles)
     constants = tension_constants(scene.discretisation.spacing, lattice.support, lattice.volume, scene.dimension)
     return SurfaceTension(setting.discretisation, *constants, setting.layout)
+
+
+def form_of(scene: Scene) -> str:
+    """The form of surface tension of a scene, which follows from its solver if the scene leaves it open."""
+    form = scene.forces.surface_tension_form
+    if form != "automatic":
+        return str(form)
+    return "curvature" if scene.solver.kind == "projection" else "pairwise"
 
 
 def _check_support(scene: Scene) -> None:
