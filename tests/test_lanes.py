@@ -24,6 +24,7 @@ from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
 from cortado.sph.integration import integration_kernels
 from cortado.sph.pair_forces import laminar, pairwise
 from cortado.sph.stress_kernels import stress_kernels
+from cortado.sph.curvature_kernels import curvature_kernels
 from cortado.sph.surface_normals import normal_kernels
 from cortado.sph.surface_stress import surface_tension_kernels
 from cortado.sph.viscosity import viscosity_kernels
@@ -47,6 +48,7 @@ def test_few_particles_get_many_lanes_and_a_cpu_has_one():
 
 def kernels_of(discretisation):
     """Every kernel that is made for lanes; mixtures of two and of three phases."""
+    curved = curvature_kernels(discretisation, 3)
     mixtures = [
         diffusion_kernels(Diffusion(discretisation, *kinds))
         for kinds in ((2, DOUBLE_WELL, DEGENERATE), (3, MISCIBLE, CONSTANT))
@@ -63,6 +65,7 @@ def kernels_of(discretisation):
         density_ratio_kernels(discretisation),
         normal_kernels(discretisation),
         surface_tension_kernels(discretisation),
+        *(curved.colour, curved.normal, curved.bend),
         *(kernels for mixture in mixtures for kernels in (mixture.potential, mixture.flux)),
     ]
     kernels = [kernel for family in families for kernel in (family.forward, family.tangent, family.adjoint)]
@@ -73,7 +76,7 @@ def kernels_of(discretisation):
         filters.strength,
         filters.viscosity,
     ]
-    return [*alone, *kernels]
+    return [*alone, *kernels, curved.mean.forward, curved.mean.tangent, *curved.mean.adjoint]
 
 
 def compiles(module, folder):
