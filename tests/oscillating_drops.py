@@ -10,6 +10,7 @@ from cortado import Scene, Simulation
 from cortado.rollout.parameter_space import ParameterSpace
 
 C2 = {"kernel": "wendland_c2", "support": 2.6}
+CUBIC = {"kernel": "cubic_spline", "support": 2.0}
 C4 = {"kernel": "wendland_c4", "support": 3.0}
 PROJECTION = {"kind": "projection"}
 PCISPH = {"kind": "pcisph", "density_tolerance": 0.001, "maximum_iterations": 100}
@@ -59,7 +60,7 @@ class Drop:
         drawn=0.08,
         jitter=0.0,
         periods=2.0,
-        step=0.07,
+        step=0.2,
         slope=False,
         precision="float64",
         **forces,

@@ -3,11 +3,15 @@
 J is that of flat surfaces: a lattice is cut across an axis and across a diagonal of a plane. In a layer all particles
 are alike, so that the sums of a few layers are all that it takes.
 
-delta follows from discs and balls whose particles lie in concentric rings and shells, a spacing s apart. There the
-curvature is found `DEEP` below the surface, where it is greater, and w |q| adds up to 1 + `EXCESS` / R times J, as more
-of what surrounds a particle is outside of a curved surface: a force of sigma times the curvature as it is found would be
-(1 + EXCESS / R) / (1 - DEEP / R) times too strong. Both numbers are those of every kernel with a support of 2.5 spacings
-or more, within 0.05. In space, where the sum of both curvatures is found, delta is DEEP / 2 + EXCESS.
+What delta has to make up for was found on discs and balls whose particles lie in concentric rings and shells, a
+spacing apart (in spacings, for every kernel with a support of 2.5 spacings or more within 0.05): the curvature is found
+`DEEP` below the surface, where it is greater, and w |q| adds up to 1 + `EXCESS` / R times J, as more of what surrounds a
+particle is outside of a curved surface. With delta = DEEP / (d - 1) + EXCESS, d - 1 being the number of curvatures in
+the sum, the pressure in a drop is (d - 1) sigma / R. But the force acts `ACTS` below the surface, where a wave of the
+surface moves less: the square of the frequency of the mode n would be n ACTS / R too small in the plane, and (n + 1)
+ACTS / R in space. A smaller delta raises pressures, and twice as much the force that a change of the curvature makes.
+So ACTS d / (3 (d - 1)) is taken off: pressure and squared frequency of the mode 2 then err by as much, one to this side
+and one to that, by 0.5 / R in the plane and 0.75 / R in space, which gets less where particles are finer.
 """
 
 from dataclasses import dataclass
@@ -19,7 +23,7 @@ from cortado.discretise.calibration import lattice_offsets, rest_volume
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.sph.curvature_functions import CLEAR, FAINT
 
-DEEP, EXCESS = 1.05, 0.6
+DEEP, EXCESS, ACTS = 1.05, 0.6, 0.75
 """In spacings, see above."""
 
 
@@ -38,7 +42,8 @@ class CurvatureConstants:
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "CurvatureConstants":
         """On a lattice with a spacing [m], for a support radius [m]."""
         width = float(np.mean([_width(kernel, support / spacing, dimension, cut) for cut in ((1, 0), (1, 1))]))
-        return cls(spacing, width, spacing * (DEEP / (dimension - 1) + EXCESS))
+        shared = ACTS * dimension / (3.0 * (dimension - 1))
+        return cls(spacing, width, spacing * (DEEP / (dimension - 1) + EXCESS - shared))
 
 
 def _indicator(size: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from cortado.errors import CortadoWarning
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
 from cortado.scene.scene import Scene
+from cortado.scene.tension_form import tension_form
 from cortado.sph.curvature_constants import CurvatureConstants
 from cortado.sph.curvature_tension import CurvatureTension
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
@@ -89,21 +90,13 @@ def force(setting: Setting) -> Force:
     """Surface tension in a scene that has it; warns where it is likely to tear the fluid apart."""
     scene, lattice = setting.scene, setting.lattice
     _check_support(scene)
-    if form_of(scene) == "curvature":
+    if tension_form(scene) == "curvature":
         cut, smoothing = scene.discretisation, setting.discretisation.smoothing
         constants = CurvatureConstants.of(smoothing, cut.spacing, lattice.support, scene.dimension)
         return CurvatureTension(setting.discretisation, scene.dimension, constants, setting.layout)
     _check_viscosity(scene, setting.layout.particles)
     constants = tension_constants(scene.discretisation.spacing, lattice.support, lattice.volume, scene.dimension)
     return SurfaceTension(setting.discretisation, *constants, setting.layout)
-
-
-def form_of(scene: Scene) -> str:
-    """The form of surface tension of a scene, which follows from its solver if the scene leaves it open."""
-    form = scene.forces.surface_tension_form
-    if form != "automatic":
-        return str(form)
-    return "curvature" if scene.solver.kind == "projection" else "pairwise"
 
 
 def _check_support(scene: Scene) -> None:
