@@ -1,11 +1,13 @@
-"""Surface tension: a force of pairs (`cortado.sph.surface_stress`), its constants on a lattice, and where it holds.
+"""Surface tension, in two forms: by curvature (`cortado.sph.curvature_kernels`), and as a force of pairs
+(`cortado.sph.surface_stress`) with its constants on a lattice; and where they hold.
 
-N is the sum that makes |n| = 1 in the outermost layer of a lattice that is cut along an axis, and Gamma is the tension
-of that surface without it, times `RELAXED`.
+Of the force of pairs, N is the sum that makes |n| = 1 in the outermost layer of a lattice that is cut along an axis, and
+Gamma is the tension of that surface without it, times `RELAXED`.
 
 Forces of pairs are opposite, so that momentum is kept; as they are not along the pair, angular momentum is so only
-nearly. They are the gradient of no energy either: a fluid that has hardly any viscosity takes up energy from them, see
-`LEAST_VISCOSITY`. Walls have no part in it, as if there were air between: a surface meets them at 180 degrees.
+nearly. They are the gradient of no energy either, and that by curvature is not: a fluid that has hardly any viscosity
+takes up energy from them, see `LEAST_VISCOSITY`. Walls have no part in either, as if there were air between: a surface
+meets them at 180 degrees.
 """
 
 import warnings
@@ -29,8 +31,9 @@ from cortado.sph.surface_stress import surface_tension_kernels
 RELAXED = {2: 1.1, 3: 1.25}
 """By dimension: the tension of a surface that has flown over that of a cut lattice, measured in drops: see
 docs/discretisation.md."""
-LEAST_VISCOSITY = 0.05
-"""Over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid: drops of 16 to 64 particles across hold."""
+LEAST_VISCOSITY = {"pairwise": 0.05, "curvature": 0.05}
+"""By the form, over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid: drops of 16 to 64 particles
+across hold."""
 LEAST_SUPPORT = 1.8
 """In spacings: with 1.5, where a particle sees its nearest neighbours only, drops fall apart."""
 
@@ -90,11 +93,12 @@ def force(setting: Setting) -> Force:
     """Surface tension in a scene that has it; warns where it is likely to tear the fluid apart."""
     scene, lattice = setting.scene, setting.lattice
     _check_support(scene)
-    if tension_form(scene) == "curvature":
+    form = tension_form(scene)
+    _check_viscosity(scene, setting.layout.particles, LEAST_VISCOSITY[form])
+    if form == "curvature":
         cut, smoothing = scene.discretisation, setting.discretisation.smoothing
         constants = CurvatureConstants.of(smoothing, cut.spacing, lattice.support, scene.dimension)
         return CurvatureTension(setting.discretisation, scene.dimension, constants, setting.layout)
-    _check_viscosity(scene, setting.layout.particles)
     constants = tension_constants(scene.discretisation.spacing, lattice.support, lattice.volume, scene.dimension)
     return SurfaceTension(setting.discretisation, *constants, setting.layout)
 
@@ -110,11 +114,11 @@ def _check_support(scene: Scene) -> None:
         )
 
 
-def _check_viscosity(scene: Scene, particles: int) -> None:
+def _check_viscosity(scene: Scene, particles: int, part: float) -> None:
     spacing, tension, dimension = scene.discretisation.spacing, scene.forces.surface_tension, scene.dimension
     radius = spacing * (particles / (pi if dimension == 2 else 4.0 * pi / 3.0)) ** (1.0 / dimension)
     for phase in scene.phase:
-        least = LEAST_VISCOSITY * sqrt(phase.rest_density * tension * radius)
+        least = part * sqrt(phase.rest_density * tension * radius)
         viscosity = 0.0 if scene.forces.viscosity == "none" else phase.viscosity
         if viscosity < least:
             warnings.warn(
