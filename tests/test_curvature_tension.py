@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import cortado
-from cortado import Problem, Scene, Simulation, gradients, losses
+from cortado import CortadoWarning, Problem, Scene, Simulation, gradients, losses
 from cortado.discretise.smoothing import KERNELS
 from cortado.scene.stability import stability_limits
 from cortado.sph.curvature_constants import CurvatureConstants
@@ -200,23 +200,38 @@ def test_the_constants_do_not_depend_on_the_spacing_and_hardly_on_the_kernel():
             assert 0.42 < one.width < 0.47
 
 
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
 def test_a_scene_has_the_form_that_it_asks_for_or_that_of_its_solver():
     forces = {"gravity": [0.0, -9.81], "surface_tension": 3.0}
     kinds = {}
     for solver in (PROJECTION, PCISPH):
         for form in ("automatic", "curvature", "pairwise"):
-            made = Simulation(plane(solver=solver, forces={**forces, "surface_tension_form": form}))
+            made = Simulation(
+                plane(
+                    solver=solver,
+                    discretisation={"spacing": 0.05, **C2},
+                    forces={**forces, "surface_tension_form": form},
+                )
+            )
             kinds[solver["kind"], form] = [
                 type(force) for force in made.solver.forces if isinstance(force, (SurfaceTension, CurvatureTension))
             ]
     for solver, automatic in (("projection", CurvatureTension), ("pcisph", SurfaceTension)):
         assert kinds[solver, "automatic"] == [automatic]
         assert kinds[solver, "curvature"] == [CurvatureTension] and kinds[solver, "pairwise"] == [SurfaceTension]
+    narrow = Simulation(plane(solver=PROJECTION, forces=forces))  # with a support of 2
+    assert [type(force) for force in narrow.solver.forces if isinstance(force, CurvatureTension)] == []
 
 
 def test_steps_may_be_longer_by_curvature_in_a_projection():
     limits = [
-        stability_limits(plane(solver=solver, forces={"gravity": [0.0, -9.81], "surface_tension": 3.0}))
+        stability_limits(
+            plane(
+                solver=solver,
+                discretisation={"spacing": 0.05, **C2},
+                forces={"gravity": [0.0, -9.81], "surface_tension": 3.0},
+            )
+        )
         for solver in (PCISPH, PROJECTION)
     ]
     assert limits[1]["surface tension"] == pytest.approx(2.5 * limits[0]["surface tension"])
@@ -229,6 +244,11 @@ def test_a_fluid_with_hardly_any_viscosity_is_warned_of():
             warnings.simplefilter("always")
             loose(grid(8, 8), phase=water)
         assert any("viscosity of phase 'water'" in str(one.message) for one in found) == warned
+
+
+def test_a_narrow_support_is_warned_of():
+    with pytest.warns(CortadoWarning, match="support is 2, but surface tension needs at least 2.5"):
+        loose(grid(8, 8), discretisation=CUBIC)
 
 
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")

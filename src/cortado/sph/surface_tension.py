@@ -21,7 +21,7 @@ from cortado.errors import CortadoWarning
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
 from cortado.scene.scene import Scene
-from cortado.scene.tension_form import tension_form
+from cortado.scene.tension_form import LEAST_SUPPORT, tension_form
 from cortado.sph.curvature_constants import CurvatureConstants
 from cortado.sph.curvature_tension import CurvatureTension
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
@@ -32,10 +32,8 @@ RELAXED = {2: 1.1, 3: 1.25}
 """By dimension: the tension of a surface that has flown over that of a cut lattice, measured in drops: see
 docs/discretisation.md."""
 LEAST_VISCOSITY = {"pairwise": 0.05, "curvature": 0.05}
-"""By the form, over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid: drops of 16 to 64 particles
-across hold."""
-LEAST_SUPPORT = 1.8
-"""In spacings: with 1.5, where a particle sees its nearest neighbours only, drops fall apart."""
+"""By the form, over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid. Of pairs, drops of 16 to 64
+particles across hold; by curvature, those of 24 across lose energy with 0.03, and take it up with 0.02."""
 
 
 class SurfaceTension:
@@ -92,8 +90,8 @@ def tension_constants(spacing: float, support: float, volume: float, dimension: 
 def force(setting: Setting) -> Force:
     """Surface tension in a scene that has it; warns where it is likely to tear the fluid apart."""
     scene, lattice = setting.scene, setting.lattice
-    _check_support(scene)
     form = tension_form(scene)
+    _check_support(scene, LEAST_SUPPORT[form])
     _check_viscosity(scene, setting.layout.particles, LEAST_VISCOSITY[form])
     if form == "curvature":
         cut, smoothing = scene.discretisation, setting.discretisation.smoothing
@@ -103,11 +101,11 @@ def force(setting: Setting) -> Force:
     return SurfaceTension(setting.discretisation, *constants, setting.layout)
 
 
-def _check_support(scene: Scene) -> None:
+def _check_support(scene: Scene, least: float) -> None:
     support = scene.discretisation.support
-    if support < LEAST_SUPPORT:
+    if support < least:
         warnings.warn(
-            f"discretisation.support is {support:g}, but surface tension needs at least {LEAST_SUPPORT:g} to hold a "
+            f"discretisation.support is {support:g}, but surface tension needs at least {least:g} to hold a "
             "fluid together.",
             CortadoWarning,
             stacklevel=2,
