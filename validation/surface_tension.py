@@ -26,9 +26,9 @@ def row(name: str, slope: bool = False, **options) -> None:
     drop = Drop(slope=slope, **options)
     frequency, damping, rest = drop.fit()
     derivative = f"{drop.frequency_slope():.3f}" if slope else ""
-    late = drop.pressure[len(drop.time) // 2 :].mean()
+    late = f"{drop.pressure[len(drop.time) // 2 :].mean():.3f}" if drop.pressure.any() else ""
     drift = drop.drift.max() / drop.speed.max()
-    numbers = f"{frequency:.3f} | {damping:.3f} | {derivative} | {late:.3f} | {rest:.3f} | {drift:.0e}"
+    numbers = f"{frequency:.3f} | {damping:.3f} | {derivative} | {late} | {rest:.3f} | {drift:.0e}"
     print(f"| {name} | {numbers} | {time.perf_counter() - begun:.0f} s |", flush=True)
 
 
@@ -45,13 +45,14 @@ def main() -> None:
                 name = f"{number} across, {kernel}, turned by {turned:g}"
                 row(name, slope=True, across=number, turned=turned, discretisation=discretisation)
     row("24 across, C4, stirred", across=24, turned=20.0, jitter=0.1, discretisation=C4)
-    row("24 across, cubic", across=24, discretisation=CUBIC)
+    for support in (2.0, 2.6):
+        row(f"24 across, cubic, {support:g}", across=24, discretisation={**CUBIC, "support": support})
     row("24 across, C4, pairwise", across=24, discretisation=C4, form="pairwise", step=0.08)
     for form, discretisation in (("pairwise", CUBIC), ("curvature", CUBIC), ("curvature", C4)):
         name = f"24 across, {discretisation['kernel']}, {form}, PCISPH"
         row(name, across=24, form=form, discretisation=discretisation, solver=PCISPH, step=0.08)
-    for ohnesorge in (0.05, 0.02, 0.01):
-        row(f"24 across, C4, Oh {ohnesorge:g}", across=24, turned=20.0, ohnesorge=ohnesorge, discretisation=C4)
+    for ohnesorge in (0.05, 0.03, 0.02, 0.01):
+        row(f"24 across, C4, turned by 20, Oh {ohnesorge:g}", across=24, turned=20.0, ohnesorge=ohnesorge, discretisation=C4)
     row("space, 16 across, C2", across=16, dimension=3, discretisation=C2, ohnesorge=0.05)
     row("space, 16 across, C4", across=16, dimension=3, discretisation=C4, ohnesorge=0.05)
 
