@@ -89,7 +89,14 @@ class Drop:
                 dimension=d,
                 discretisation={"spacing": spacing, **discretisation},
                 phase=[{"name": "water", "rest_density": 1.0, "viscosity": ohnesorge * sqrt(self.radius)}],
-                fluid=[{"shape": "box", "lower": [0.0] * d, "upper": [len(x) * spacing] + [spacing] * (d - 1), "phase": "water"}],
+                fluid=[
+                    {
+                        "shape": "box",
+                        "lower": [0.0] * d,
+                        "upper": [len(x) * spacing] + [spacing] * (d - 1),
+                        "phase": "water",
+                    }
+                ],
                 forces={"gravity": [0.0] * d, "surface_tension": 1.0, "surface_tension_form": form, **forces},
                 solver={**solver, "time_step": time_step},
             ),

@@ -18,13 +18,13 @@ from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.pcisph.pressure import pressure_kernels
 from cortado.solvers.pcisph.pressure_force import pressure_force_kernels
 from cortado.solvers.pcisph.wall_relaxation import wall_kernels
+from cortado.sph.curvature_kernels import curvature_kernels
 from cortado.sph.density import density_kernels
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
 from cortado.sph.integration import integration_kernels
 from cortado.sph.pair_forces import laminar, pairwise
 from cortado.sph.stress_kernels import stress_kernels
-from cortado.sph.curvature_kernels import curvature_kernels
 from cortado.sph.surface_normals import normal_kernels
 from cortado.sph.surface_stress import surface_tension_kernels
 from cortado.sph.viscosity import viscosity_kernels

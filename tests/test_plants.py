@@ -157,7 +157,9 @@ SCENES = {
     "one phase": (small("pairwise", phase=[HONEY], fluid=[{**POOL, "phase": "honey"}], emitter=None), "positions"),
     "surface tension": (small("pairwise", forces={"gravity": [1.0, -9.81], "surface_tension": 3.0}), "everything"),
     "surface tension by curvature": (
-        small("pairwise", forces={"gravity": [1.0, -9.81], "surface_tension": 3.0, "surface_tension_form": "curvature"}),
+        small(
+            "pairwise", forces={"gravity": [1.0, -9.81], "surface_tension": 3.0, "surface_tension_form": "curvature"}
+        ),
         "everything",
     ),
     "a picture of the plane": (small("pairwise", render={"view": "plane", "resolution": [8, 12]}), "pyramid"),

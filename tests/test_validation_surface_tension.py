@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from oscillating_drops import C2, C4, Drop, exact_mode
 from cortado.sph.curvature_constants import CurvatureConstants
+from oscillating_drops import C2, C4, Drop, exact_mode
 
 pytestmark = pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
 

@@ -1,10 +1,10 @@
-"""How does a drop oscillate? ``python validation/surface_tension.py`` prints the table of `docs/discretisation.md`: drops
-in the plane, drawn out by 8 %, against the linear problem with viscosity, and a drop in space.
+"""How does a drop oscillate? ``python validation/surface_tension.py`` prints the table of `docs/discretisation.md`:
+drops in the plane, drawn out by 8 %, against the linear problem with viscosity, and drops in space.
 
-Numbers are over the exact ones: frequency and damping of the mode 2, the derivative of the frequency with respect to the
-surface tension by the tangent of two periods, and the pressure in the second half over (d - 1) sigma / R. The rest is
-the root mean square of what a damped oscillation leaves, over the first stretch; the drift is the greatest speed of the
-drop as a whole over the greatest root mean square of speeds.
+Numbers are over the exact ones: frequency and damping of the mode 2, the derivative of the frequency with respect to
+the surface tension by the tangent of two periods, and the pressure in the second half over (d - 1) sigma / R. The rest
+is the root mean square of what a damped oscillation leaves, over the first stretch; the drift is the greatest speed of
+the drop as a whole over the greatest root mean square of speeds.
 """
 
 import argparse
@@ -52,7 +52,13 @@ def main() -> None:
         name = f"24 across, {discretisation['kernel']}, {form}, PCISPH"
         row(name, across=24, form=form, discretisation=discretisation, solver=PCISPH, step=0.08)
     for ohnesorge in (0.05, 0.03, 0.02, 0.01):
-        row(f"24 across, C4, turned by 20, Oh {ohnesorge:g}", across=24, turned=20.0, ohnesorge=ohnesorge, discretisation=C4)
+        row(
+            f"24 across, C4, turned by 20, Oh {ohnesorge:g}",
+            across=24,
+            turned=20.0,
+            ohnesorge=ohnesorge,
+            discretisation=C4,
+        )
     row("space, 16 across, C2", across=16, dimension=3, discretisation=C2, ohnesorge=0.05)
     row("space, 16 across, C4", across=16, dimension=3, discretisation=C4, ohnesorge=0.05)
 

@@ -97,7 +97,11 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Cu
     @wp.func(module=module)
     def curvature_back(B: matrix, D: matrix, bar: real):
         by_B, by_D = wp.grad(curvature)(B, D)
-        return curvature(B, D), (real(0.5) * bar) * (by_B + wp.transpose(by_B)), (real(0.5) * bar) * (by_D + wp.transpose(by_D))
+        return (
+            curvature(B, D),
+            (real(0.5) * bar) * (by_B + wp.transpose(by_B)),
+            (real(0.5) * bar) * (by_D + wp.transpose(by_D)),
+        )
 
     @wp.func(module=module)
     def outermost(a: real, b: real, depth: real) -> real:

@@ -1,7 +1,8 @@
 """Surface tension by curvature: a force across the surface (the continuum surface force of Brackbill et al. 1992) with
 smoothed normals and a corrected curvature (Morris 2000; Zorilla et al. 2020).
 
-With g_ij = V grad W_ij, sums over the fluid and the particle itself, the spacing s and S(a, b) a smoothstep from a to b:
+With g_ij = V grad W_ij, sums over the fluid and the particle itself, the spacing s, and S(a, b) a smoothstep from a to
+b:
 
     g_i = sum_j g_ij,   z_i = V sum_j W_ij,   q_i = V sum_j W_ij g_j / z_i,
     w_i = S(0.03, 0.1) of s |q_i|,   e_i = q_i / |q_i|,
