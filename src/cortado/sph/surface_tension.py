@@ -33,7 +33,7 @@ RELAXED = {2: 1.1, 3: 1.25}
 docs/discretisation.md."""
 LEAST_VISCOSITY = {"pairwise": 0.05, "curvature": 0.05}
 """By the form, over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid. Of pairs, drops of 16 to 64
-particles across hold; by curvature, those of 24 across lose energy with 0.03, and take it up with 0.02."""
+particles across hold; by curvature, those of 24 and 48 across lose energy with it, but not all of them with 0.03."""
 
 
 class SurfaceTension:
