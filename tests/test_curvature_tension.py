@@ -105,6 +105,19 @@ def test_few_particles_have_a_force_and_derivatives(name):
 
 
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("name", FEW)
+def test_few_particles_have_a_gradient_in_a_projection(name, precision):
+    problem, point = problem_of(FEW[name], 3, precision=precision)
+    along = {key: 0.1 * np.random.default_rng(1).standard_normal(np.shape(value)) for key, value in point.items()}
+    _, gradient = problem.value_and_gradient(point)
+    assert all(np.isfinite(each).all() for each in gradient.values())
+    size = sum(np.abs(gradient[key] * along[key]).sum() for key in along)
+    reverse = sum((gradient[key] * along[key]).sum() for key in along)
+    assert abs(reverse - problem.tangent(point, along)) <= {"float64": 1e-12, "float32": 1e-4}[precision] * size
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
 def test_one_particle_a_pair_and_two_lines_feel_nothing():
     """A pair has a normal and no curvature; a straight line and a layer have the same fluid on both sides."""
     for name in ("one", "one in space", "a pair", "a pair in space", "two far apart"):
