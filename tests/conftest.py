@@ -41,6 +41,7 @@ VALIDATION = {
     "test_validation_projection",
     "test_validation_rayleigh_taylor",
     "test_validation_rheology",
+    "test_validation_surface_tension",
     "test_validation_viscosity",
 }
 """Files: physics against published data and closed forms, studies, walls that hold, and every plant."""

@@ -31,6 +31,10 @@ def tension(**changes: Any) -> Any:
     return scenes.plane(forces={"gravity": [0.0, -9.81], "surface_tension": 0.5, "viscosity": "pairwise"}, **changes)
 
 
+def curved_tension() -> Any:
+    return tension().replaced('forces.surface_tension_form="curvature"')
+
+
 def layers() -> Any:
     return scenes.two_layers(solver=FREE)
 
@@ -54,6 +58,7 @@ CASES: dict[str, tuple[Any, dict[str, Any], dict[str, Any]]] = {
         {"gravity": np.tile([0.0, -9.0, 0.0], (STEPS, 1))},
     ),
     "tension": (tension, {"surface_tension": RANDOM.uniform(0.1, 1.0, 3)}, {"gravity": [0.0, -9.0]}),
+    "tension by curvature": (curved_tension, {"surface_tension": RANDOM.uniform(0.1, 1.0, 3)}, {}),
     "tilt": (scenes.scene, {"tilt": RANDOM.uniform(-20.0, 20.0, (3, STEPS, 2))}, {}),
 }
 

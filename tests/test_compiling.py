@@ -112,6 +112,7 @@ TENSION = {"gravity": [0.0, -9.81], "viscosity": "laminar", "surface_tension": 0
 SCENES = {
     "one phase": plane(),
     "laminar, surface tension": plane(forces=TENSION),
+    "surface tension by curvature": plane(forces={**TENSION, "surface_tension_form": "curvature"}),
     "no pressure": plane(forces={"gravity": [0.0, -9.81], "pressure": False}),
     "two phases, an emitter": pour(),
 }

@@ -13,6 +13,8 @@ import test_kernels
 from cortado.forces import Body, Pair
 from cortado.particles.state import Layout
 from cortado.runs.quantities.formulas import circulation_kernels
+from cortado.sph.curvature_derivatives import curvature_adjoints, curvature_tangents
+from cortado.sph.curvature_kernels import curvature_kernels, entries
 from cortado.sph.emitter import Nozzle
 from cortado.sph.emitter_kernels import emitter_kernels, nozzle_type
 from cortado.sph.surface_normals import normal_kernels
@@ -57,6 +59,56 @@ class SurfaceTension(Operation):
             "x": found["x_bar"],
             "m": bar["m_bar"],
             "surface_tension": bar["surface_tension_bar"].sum(keepdims=True),
+            "acceleration_in": bars["acceleration"],
+        }
+
+
+class CurvatureTension(Operation):
+    """Its four sums, one after the other, and back."""
+
+    inputs, outputs = ("x", "m", "surface_tension", "acceleration_in"), ("acceleration",)
+    passed = ("acceleration_in",)
+
+    def __init__(self, cloud):
+        super().__init__(cloud)
+        d = cloud.dimension
+        self.kernels = curvature_kernels(DISCRETISATION, d)
+        made = DISCRETISATION, d, f"surface_curvature_{d}d"
+        self.tangents, self.adjoints = curvature_tangents(*made), curvature_adjoints(*made)
+        self.start["acceleration_in"] = self.start.pop("acceleration")
+        self.start["surface_tension"] = np.array([1.4])
+        self.given = {"s": self.s, "spacing": 0.3, "depth": 0.4, "per_width": 2.2}
+        kinds = {**entries(FLOAT64), "r": wp.vec3d}
+        self.empty = {name: np.zeros((N, *getattr(kind, "_shape_", ()))) for name, kind in kinds.items()}
+
+    def through(self, kernels, known):
+        """What is known after all of them."""
+        for kernel in kernels:
+            known = {**known, **launch(kernel, **known)}
+        return known
+
+    def known(self, values):
+        four = self.kernels.colour, self.kernels.normal, self.kernels.bend, self.kernels.mean
+        known = {**self.given, **values, **self.empty, "acceleration": VECTORS}
+        return self.through([one.forward for one in four], known)
+
+    def forward(self, values):
+        return self.known(values)
+
+    def tangent(self, values, dots):
+        change = {f"{name}_dot": value for name, value in self.empty.items()}
+        known = {**self.known(values), **change, **dotted(dots), "acceleration_dot": VECTORS}
+        return {"acceleration": self.through(self.tangents, known)["acceleration_dot"]}
+
+    def adjoint(self, values, bars):
+        change = {f"{name}_bar": value for name, value in self.empty.items()}
+        known = {**self.known(values), **change, **zeros("x_bar", "m_bar", "surface_tension_bar")}
+        colour, normal, bend, mean = self.adjoints
+        found = self.through((*mean, bend, normal, colour), {**known, "acceleration_bar": bars["acceleration"]})
+        return {
+            "x": found["x_bar"],
+            "m": found["m_bar"],
+            "surface_tension": found["surface_tension_bar"].sum(keepdims=True),
             "acceleration_in": bars["acceleration"],
         }
 
@@ -216,7 +268,7 @@ class Emitter(Operation):
         }
 
 
-OPERATIONS = [SurfaceTension, Circulation, WallSlope, OfOneFunction, PairOfOneFunction, Emitter]
+OPERATIONS = [SurfaceTension, CurvatureTension, Circulation, WallSlope, OfOneFunction, PairOfOneFunction, Emitter]
 check_transpose = test_kernels.test_adjoint_is_the_transpose_of_the_tangent
 check_differences = test_kernels.test_tangent_is_the_limit_of_central_differences
 check_bits = test_kernels.test_same_bits_twice

@@ -54,6 +54,11 @@ SCENES = {
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "honey"}],
         forces={"gravity": [0.0, -9.81], "viscosity": "stress", "viscous_solve": "implicit"},
     ),
+    "surface tension by curvature": plane(
+        phase=[HONEY],
+        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "honey"}],
+        forces={"gravity": [0.0, -9.81], "surface_tension": 3.0, "surface_tension_form": "curvature"},
+    ),
     "surface tension": plane(
         phase=[HONEY],
         fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.4], "phase": "honey"}],

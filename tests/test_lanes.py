@@ -18,6 +18,7 @@ from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
 from cortado.solvers.pcisph.pressure import pressure_kernels
 from cortado.solvers.pcisph.pressure_force import pressure_force_kernels
 from cortado.solvers.pcisph.wall_relaxation import wall_kernels
+from cortado.sph.curvature_kernels import curvature_kernels
 from cortado.sph.density import density_kernels
 from cortado.sph.diffusion import Diffusion, diffusion_kernels
 from cortado.sph.free_energy import CONSTANT, DEGENERATE, DOUBLE_WELL, MISCIBLE
@@ -47,6 +48,7 @@ def test_few_particles_get_many_lanes_and_a_cpu_has_one():
 
 def kernels_of(discretisation):
     """Every kernel that is made for lanes; mixtures of two and of three phases."""
+    curved = curvature_kernels(discretisation, 3)
     mixtures = [
         diffusion_kernels(Diffusion(discretisation, *kinds))
         for kinds in ((2, DOUBLE_WELL, DEGENERATE), (3, MISCIBLE, CONSTANT))
@@ -63,6 +65,7 @@ def kernels_of(discretisation):
         density_ratio_kernels(discretisation),
         normal_kernels(discretisation),
         surface_tension_kernels(discretisation),
+        *(curved.colour, curved.normal, curved.bend),
         *(kernels for mixture in mixtures for kernels in (mixture.potential, mixture.flux)),
     ]
     kernels = [kernel for family in families for kernel in (family.forward, family.tangent, family.adjoint)]
@@ -73,7 +76,7 @@ def kernels_of(discretisation):
         filters.strength,
         filters.viscosity,
     ]
-    return [*alone, *kernels]
+    return [*alone, *kernels, curved.mean.forward, curved.mean.tangent, curved.mean.adjoint[1]]
 
 
 def compiles(module, folder):

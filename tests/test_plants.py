@@ -22,6 +22,11 @@ ROOT = Path(cortado.__file__).parent
 UNNAMED = {
     "sph.integration": {"integration_kernels.collect_masses"},
     "sph.emitter_kernels": {"emitter_kernels.collect"},
+    "sph.curvature_functions": {"curvature_functions.normal_back"},
+    "sph.curvature_sums": {
+        *("curvature_sums.colour_back", "curvature_sums.average_back"),
+        *("curvature_sums.bend_back", "curvature_sums.mean_back"),
+    },
     "sph.surface_stress": {"tension_functions.stress_derivative"},
     "sph.implicit_derivatives": {"implicit_kernels.weigh", "implicit_kernels.unweigh"},
     "solvers.projection.shifting": {"shift_functions.back"},
@@ -47,6 +52,7 @@ SHARED = {
     "render.interpolation": {"interpolation_functions.trilinear_weight"},
     "solvers.pcisph.density_ratio_relaxation": {"density_ratio_kernels.excess_derivative"},
     "sph.free_energy": {"_double_well.hessian_product", "_miscible.hessian_product", "_degenerate.gradient"},
+    "sph.curvature_functions": {"curvature_functions.rise", "curvature_functions.curvature_back"},
     "sph.surface_normals": {"normal_kernels.change"},
     "sph.surface_stress": {"tension_functions.pull_derivative"},
     "sph.viscosity": {"viscosity_kernels.pair_viscosity_derivative"},
@@ -150,6 +156,15 @@ SCENES = {
     ),
     "one phase": (small("pairwise", phase=[HONEY], fluid=[{**POOL, "phase": "honey"}], emitter=None), "positions"),
     "surface tension": (small("pairwise", forces={"gravity": [1.0, -9.81], "surface_tension": 3.0}), "everything"),
+    "surface tension by curvature": (
+        plane(
+            discretisation={"spacing": 0.05, "support": 2.0},  # second rows are a part of the surface, not wholly
+            fluid=[{"shape": "box", "lower": [0.2, 0.25], "upper": [0.55, 0.6], "phase": "water"}],
+            forces={"gravity": [0.0, 0.0], "surface_tension": 100.0, "surface_tension_form": "curvature"},
+            solver=SOLVER,
+        ),
+        "positions",
+    ),
     "a picture of the plane": (small("pairwise", render={"view": "plane", "resolution": [8, 12]}), "pyramid"),
     "a picture of a volume": (VOLUME, "squares"),
 }

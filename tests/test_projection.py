@@ -60,6 +60,9 @@ DERIVED = {
     "nozzle": lambda: jet(solver=SOLVER, forces={"gravity": [0.7, -9.81]}),
     "nozzle in space": lambda: pour(solver=SOLVER),
     "surface tension": lambda: plane(solver=SOLVER, forces={"gravity": [0.0, -9.81], "surface_tension": 3.0}),
+    "surface tension in space": lambda: scene(
+        solver=SOLVER, discretisation=C2, forces={"gravity": [0.0, -9.81, 0.0], "surface_tension": 3.0}
+    ),
     "thick": lambda: plane(
         solver={**SOLVER, "time_step": 0.005},
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 50.0}],

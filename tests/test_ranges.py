@@ -37,6 +37,10 @@ CASES = {
         forces={"gravity": [0.0, -9.81, 0.0], "surface_tension": 0.5},
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 2.0}],
     ),
+    "surface tension by curvature": lambda: scene(
+        forces={"gravity": [0.0, -9.81, 0.0], "surface_tension": 0.5, "surface_tension_form": "curvature"},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 2.0}],
+    ),
     "implicit viscosity with a law, no slip": lambda: scene(
         forces={"gravity": [1.0, -9.81, 0.0], "viscosity": "stress", "viscous_solve": "implicit"},
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 20.0, "rheology": BINGHAM}],

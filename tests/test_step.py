@@ -13,6 +13,7 @@ from cortado.rollout.parameter_space import ParameterSpace
 from scenes import jet, plane, plane_of_three, pour, scatter, scene, two_layers
 from twins import emitter_twin, nozzle_of, tension_twin, twin
 
+CURVED = {"surface_tension_form": "curvature"}
 GRAVITY, STEPS, ITERATIONS = np.array([0.3, -9.81, 0.1]), 3, 5
 ONE = {"rest_density": 1000.0, "viscosity": 5.0, "time_step": 0.0021}
 """Parameters of the fluids."""
@@ -35,6 +36,16 @@ def tense_cube(**changes):
     forces = {"gravity": [0.0, -9.81, 0.0], "surface_tension": 15.0}
     phases = [{**phase.model_dump(), "viscosity": 5.0} for phase in two_layers().phase]
     return two_layers(**{"phase": phases, "forces": forces, **changes})
+
+
+def curved(**changes):
+    """A square that surface tension by curvature rounds."""
+    return tense(**{**changes, "forces": {**changes.get("forces", tense().forces.model_dump()), **CURVED}})
+
+
+def curved_cube(**changes):
+    """Two fluids in space with such a tension."""
+    return tense_cube(**{**changes, "forces": {**changes.get("forces", tense_cube().forces.model_dump()), **CURVED}})
 
 
 def point_of(simulation, seed=0):
@@ -131,6 +142,9 @@ CASES = [
     (plane_of_three, "cubic_spline", "laminar", "no"),
     (tense, "cubic_spline", "pairwise", "free"),
     (tense_cube, "wendland_c2", "pairwise", "no"),
+    (curved, "wendland_c4", "pairwise", "free"),
+    (curved_cube, "wendland_c2", "laminar", "no"),
+    (curved_cube, "cubic_spline", "pairwise", "free"),
     (jet, "cubic_spline", "pairwise", "free"),
     (pour, "wendland_c2", "laminar", "no"),
 ]

@@ -4,9 +4,12 @@ import numpy as np
 
 import reference
 from cortado.discretise.calibration import stress_control
+from cortado.sph.curvature_constants import CurvatureConstants
+from cortado.sph.curvature_tension import CurvatureTension
 from cortado.sph.emitter import Nozzle
 from cortado.sph.surface_tension import SurfaceTension, tension_constants
 from cortado.sph.viscosity import Viscosity
+from reference_curvature import Curvature
 from reference_stress import Stress
 
 
@@ -49,6 +52,10 @@ def stress_twin(simulation, walls, wall_weights):
 def tension_twin(simulation):
     """The slow twin of its surface tension; None without."""
     solver, scene = simulation.solver, simulation.scene
+    if any(isinstance(force, CurvatureTension) for force in solver.forces):
+        lattice, kernel, spacing = solver.lattice, solver.discretisation.smoothing, scene.discretisation.spacing
+        made = CurvatureConstants.of(kernel, spacing, lattice.support, scene.dimension)
+        return Curvature(kernel, lattice.support, lattice.volume, spacing, made.width, made.depth)
     if not any(isinstance(force, SurfaceTension) for force in solver.forces):
         return None
     lattice = solver.lattice

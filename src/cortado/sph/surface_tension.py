@@ -1,11 +1,13 @@
-"""Surface tension: a force of pairs (`cortado.sph.surface_stress`), its constants on a lattice, and where it holds.
+"""Surface tension, in two forms: by curvature (`cortado.sph.curvature_kernels`), and as a force of pairs
+(`cortado.sph.surface_stress`) with its constants on a lattice; and where they hold.
 
-N is the sum that makes |n| = 1 in the outermost layer of a lattice that is cut along an axis, and Gamma is the tension
-of that surface without it, times `RELAXED`.
+Of the force of pairs, N is the sum that makes |n| = 1 in the outermost layer of a lattice that is cut along an axis,
+and Gamma is the tension of that surface without it, times `RELAXED`.
 
 Forces of pairs are opposite, so that momentum is kept; as they are not along the pair, angular momentum is so only
-nearly. They are the gradient of no energy either: a fluid that has hardly any viscosity takes up energy from them, see
-`LEAST_VISCOSITY`. Walls have no part in it, as if there were air between: a surface meets them at 180 degrees.
+nearly. They are the gradient of no energy either, and that by curvature is not: a fluid that has hardly any viscosity
+takes up energy from them, see `LEAST_VISCOSITY`. Walls have no part in either, as if there were air between: a surface
+meets them at 180 degrees.
 """
 
 import warnings
@@ -19,17 +21,19 @@ from cortado.errors import CortadoWarning
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
 from cortado.scene.scene import Scene
-from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
+from cortado.scene.tension_form import LEAST_SUPPORT, tension_form
+from cortado.sph.curvature_constants import CurvatureConstants
+from cortado.sph.curvature_tension import CurvatureTension
+from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 from cortado.sph.surface_normals import normal_kernels
 from cortado.sph.surface_stress import surface_tension_kernels
 
 RELAXED = {2: 1.1, 3: 1.25}
 """By dimension: the tension of a surface that has flown over that of a cut lattice, measured in drops: see
 docs/discretisation.md."""
-LEAST_VISCOSITY = 0.05
-"""Over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid: drops of 16 to 64 particles across hold."""
-LEAST_SUPPORT = 1.8
-"""In spacings: with 1.5, where a particle sees its nearest neighbours only, drops fall apart."""
+LEAST_VISCOSITY = {"pairwise": 0.05, "curvature": 0.05}
+"""By the form, over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid. Of pairs, drops of 16 to 64
+particles across hold; by curvature, those of 24 and 48 across lose energy with it, but not all of them with 0.03."""
 
 
 class SurfaceTension:
@@ -83,31 +87,36 @@ def tension_constants(spacing: float, support: float, volume: float, dimension: 
     return 1.0 / float(sums[0]), 1.0 / (RELAXED[dimension] * tension * volume)
 
 
-def force(setting: Setting) -> SurfaceTension:
+def force(setting: Setting) -> Force:
     """Surface tension in a scene that has it; warns where it is likely to tear the fluid apart."""
     scene, lattice = setting.scene, setting.lattice
-    _check_support(scene)
-    _check_viscosity(scene, setting.layout.particles)
+    form = tension_form(scene)
+    _check_support(scene, LEAST_SUPPORT[form])
+    _check_viscosity(scene, setting.layout.particles, LEAST_VISCOSITY[form])
+    if form == "curvature":
+        cut, smoothing = scene.discretisation, setting.discretisation.smoothing
+        known = CurvatureConstants.of(smoothing, cut.spacing, lattice.support, scene.dimension)
+        return CurvatureTension(setting.discretisation, scene.dimension, known, setting.layout)
     constants = tension_constants(scene.discretisation.spacing, lattice.support, lattice.volume, scene.dimension)
     return SurfaceTension(setting.discretisation, *constants, setting.layout)
 
 
-def _check_support(scene: Scene) -> None:
+def _check_support(scene: Scene, least: float) -> None:
     support = scene.discretisation.support
-    if support < LEAST_SUPPORT:
+    if support < least:
         warnings.warn(
-            f"discretisation.support is {support:g}, but surface tension needs at least {LEAST_SUPPORT:g} to hold a "
+            f"discretisation.support is {support:g}, but surface tension needs at least {least:g} to hold a "
             "fluid together.",
             CortadoWarning,
             stacklevel=2,
         )
 
 
-def _check_viscosity(scene: Scene, particles: int) -> None:
+def _check_viscosity(scene: Scene, particles: int, part: float) -> None:
     spacing, tension, dimension = scene.discretisation.spacing, scene.forces.surface_tension, scene.dimension
     radius = spacing * (particles / (pi if dimension == 2 else 4.0 * pi / 3.0)) ** (1.0 / dimension)
     for phase in scene.phase:
-        least = LEAST_VISCOSITY * sqrt(phase.rest_density * tension * radius)
+        least = part * sqrt(phase.rest_density * tension * radius)
         viscosity = 0.0 if scene.forces.viscosity == "none" else phase.viscosity
         if viscosity < least:
             warnings.warn(

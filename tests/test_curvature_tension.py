@@ -1,0 +1,283 @@
+"""Surface tension by curvature: its constants, particles that are too few for a curvature, and what depends on it.
+
+Its kernels and whole steps: tests/test_force_kernels.py, tests/test_step.py. How drops oscillate:
+tests/test_validation_surface_tension.py."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado import CortadoWarning, Problem, Scene, Simulation, gradients, losses
+from cortado.discretise.smoothing import KERNELS
+from cortado.scene.stability import stability_limits
+from cortado.sph.curvature_constants import CurvatureConstants
+from cortado.sph.curvature_tension import CurvatureTension
+from cortado.sph.surface_tension import SurfaceTension
+from oscillating_drops import C2, C4, CUBIC
+from reference_curvature import Curvature
+from scenes import plane
+
+PROJECTION = {"kind": "projection", "time_step": 0.002}
+PCISPH = {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 3, "maximum_iterations": 3}
+
+
+def loose(points, precision="float64", discretisation=C2, solver=PROJECTION, tension=0.3, **tables):
+    """A simulation of particles a spacing of 0.1 apart, and a point that puts them at ``points`` [spacings]."""
+    x = 0.1 * np.asarray(points, dtype=np.float64)
+    n, d = x.shape
+    scene = Scene(
+        **{
+            "dimension": d,
+            "discretisation": {"spacing": 0.1, **discretisation},
+            "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 20.0}],
+            "fluid": [
+                {"shape": "box", "lower": [0.0] * d, "upper": [0.1 * n] + [0.1] * (d - 1), "phase": "water"},
+            ],
+            "forces": {"gravity": [0.0] * d, "surface_tension": tension, "surface_tension_form": "curvature"},
+            "solver": solver,
+            **tables,
+        }
+    )
+    simulation = Simulation(scene, precision=precision)
+    assert len(simulation.positions) == n
+    return simulation, {"initial_positions": x, "surface_tension": np.array(tension)}
+
+
+def stirred(points, size=0.1, seed=0):
+    points = np.asarray(points, dtype=np.float64)
+    return points + size * np.random.default_rng(seed).uniform(-1.0, 1.0, points.shape)
+
+
+def grid(*counts):
+    return np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, len(counts)).astype(float)
+
+
+FEW = {
+    "one": [[0.0, 0.0]],
+    "one in space": [[0.0, 0.0, 0.0]],
+    "a pair": [[0.0, 0.0], [0.9, 0.3]],
+    "a pair in space": [[0.0, 0.0, 0.0], [0.9, 0.3, 0.2]],
+    "two far apart": [[0.0, 0.0], [9.0, 0.0]],
+    "a line": grid(9, 1),
+    "a line in space": grid(9, 1, 1),
+    "a lone layer": grid(5, 5, 1),
+    "27": grid(3, 3, 3),
+    "a bent line": np.stack([np.arange(9.0), 0.05 * (np.arange(9.0) - 4.0) ** 2], axis=1),
+    "a stirred line": stirred(grid(9, 1)),
+    "a stirred layer": stirred(grid(5, 5, 1)),
+    "27, stirred": stirred(grid(3, 3, 3)),
+}
+
+
+def problem_of(points, steps=2, **options):
+    simulation, point = loose(points, **options)
+    target = point["initial_positions"] + 0.05 * np.sin(np.arange(point["initial_positions"].size)).reshape(
+        point["initial_positions"].shape
+    )
+    return Problem(simulation, steps, losses.FinalPositions(target)), point
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+@pytest.mark.parametrize("name", FEW)
+def test_few_particles_have_a_force_and_derivatives(name):
+    """That are finite, the same in both directions, and those of differences, on one side and on the other."""
+    problem, point = problem_of(FEW[name], solver=PCISPH)
+    along = {
+        "initial_positions": 0.1 * np.random.default_rng(1).standard_normal(point["initial_positions"].shape),
+        "surface_tension": np.array(0.1),
+    }
+    value, gradient = problem.value_and_gradient(point)
+    tangent = problem.tangent(point, along)
+    reverse = sum((gradient[key] * along[key]).sum() for key in along)
+    assert np.isfinite(value) and all(np.isfinite(each).all() for each in gradient.values())
+    size = sum(np.abs(gradient[key] * along[key]).sum() for key in along)
+    assert abs(reverse - tangent) <= 1e-12 * size
+
+    def moved(h):
+        return problem.value({key: point[key] + h * along[key] for key in along})
+
+    for h in (1e-4, 1e-5, 1e-6):
+        for one_side in (h, -h):
+            slope = (moved(1.5 * one_side) - moved(0.5 * one_side)) / one_side
+            assert abs(slope - tangent) <= (30.0 * h + 1e-9) * size + 1e-9 * abs(value) / h * 1e-6
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("name", FEW)
+def test_few_particles_have_a_gradient_in_a_projection(name, precision):
+    problem, point = problem_of(FEW[name], 3, precision=precision)
+    along = {key: 0.1 * np.random.default_rng(1).standard_normal(np.shape(value)) for key, value in point.items()}
+    _, gradient = problem.value_and_gradient(point)
+    assert all(np.isfinite(each).all() for each in gradient.values())
+    size = sum(np.abs(gradient[key] * along[key]).sum() for key in along)
+    reverse = sum((gradient[key] * along[key]).sum() for key in along)
+    assert abs(reverse - problem.tangent(point, along)) <= {"float64": 1e-12, "float32": 1e-4}[precision] * size
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_one_particle_a_pair_and_two_lines_feel_nothing():
+    """A pair has a normal and no curvature; a straight line and a layer have the same fluid on both sides."""
+    for name in ("one", "one in space", "a pair", "a pair in space", "two far apart"):
+        simulation, point = loose(FEW[name])
+        run = simulation.run(3, point)
+        assert np.abs(run.velocities[-1]).max() < 1e-12, name
+
+
+WALLS = {"shape": "box", "lower": [-0.05, -0.05], "upper": [4.2, 1.2]}
+PIECES = {
+    "plane": (stirred(grid(6, 6)), C2, {}),
+    "plane, at walls": (stirred(grid(6, 6)), C4, {"container": WALLS}),
+    "space": (stirred(grid(4, 4, 4)), C2, {}),
+    "cubic spline": (stirred(grid(6, 6)), CUBIC, {}),
+}
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+@pytest.mark.parametrize("solver", [PROJECTION, PCISPH], ids=["projection", "pcisph"])
+@pytest.mark.parametrize("name", PIECES)
+def test_reverse_mode_is_forward_mode_is_the_limit_of_differences(name, solver):
+    points, discretisation, tables = PIECES[name]
+    problem, point = problem_of(points, 3, discretisation=discretisation, solver=solver, tension=80.0, **tables)
+    random = np.random.default_rng(2)
+    point["initial_velocities"] = 0.3 * random.standard_normal(points.shape)  # nothing is at a corner of the pressure
+    along = {key: 0.03 * random.standard_normal(value.shape) for key, value in point.items()}
+    _, gradient = problem.value_and_gradient(point)
+    tangent = problem.tangent(point, along)
+    assert abs(sum((gradient[key] * along[key]).sum() for key in along) - tangent) <= 1e-11 * abs(tangent)
+    assert abs(gradient["surface_tension"]) > 1e-12
+
+    def slope(h):
+        more, less = ({key: point[key] + e * along[key] for key in point} for e in (h, -h))
+        return (problem.value(more) - problem.value(less)) / (2.0 * h)
+
+    errors = [abs(slope(h) - tangent) for h in (1e-4, 1e-5, 1e-6)]
+    assert min(errors) <= 1e-6 * abs(tangent)
+    if solver is PCISPH:
+        _, tape = problem.value_and_gradient(point, gradients.Tape())
+        for key in point:
+            np.testing.assert_allclose(tape[key], gradient[key], rtol=0.0, atol=1e-11 * np.abs(gradient[key]).max())
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_float32_follows_float64():
+    points, found = stirred(grid(8, 8)), {}
+    for precision in ("float64", "float32"):
+        problem, point = problem_of(points, 5, precision=precision, tension=8.0)
+        along = {"surface_tension": np.array(1.0), "initial_positions": np.ones_like(points)}
+        gradient = problem.value_and_gradient(point)[1]
+        reverse = sum((gradient[key] * along[key]).sum() for key in along)
+        found[precision] = np.r_[gradient["surface_tension"], problem.tangent(point, along)]
+        assert abs(reverse - problem.tangent(point, along)) < 2e-4 * abs(reverse)
+    np.testing.assert_allclose(found["float32"], found["float64"], rtol=2e-3)
+
+
+def disc(radius, turned):
+    """Particles of a drop in concentric rings, a spacing apart, the last ones half a spacing below its surface."""
+    rings = []
+    for n, r in enumerate(radius - 0.5 - np.arange(radius)):
+        m = int(np.rint(2.0 * np.pi * r))
+        a = 2.0 * np.pi * (np.arange(m) / m + 0.618 * n) + turned
+        rings.append(r * np.stack([np.cos(a), np.sin(a)], axis=1))
+    return np.concatenate(rings)
+
+
+@pytest.mark.parametrize("name", ["wendland_c2", "wendland_c4"])
+@pytest.mark.parametrize("radius", [12, 24])
+def test_the_pressure_of_a_drop_is_that_of_laplace(name, radius):
+    """The force adds up to sigma / R along the radius, but for what its depth takes, and not without the correction of
+    the curvature."""
+    support = {"wendland_c2": 2.6, "wendland_c4": 3.0}[name]
+    kernel = KERNELS[name]
+    made = CurvatureConstants.of(kernel, 1.0, support, 2)
+    volume = 1.0 / kernel.weight(np.linalg.norm(grid(9, 9) - 4.0, axis=1), 2, support).sum()
+    x = disc(radius, 0.3)
+    r = np.linalg.norm(x, axis=1)
+
+    def pressure(depth):
+        twin = Curvature(kernel, support, volume, 1.0, made.width, depth)
+        force = twin.acceleration(x, np.ones(len(x)), 1.0)
+        return -((force * x).sum(axis=1) / r**2).sum() / (2.0 * np.pi) * radius
+
+    assert abs(pressure(made.depth) - 1.0 - 0.5 / radius) < 0.03
+    assert pressure(0.0) > 1.0 + 1.4 / radius
+
+
+def test_the_constants_do_not_depend_on_the_spacing_and_hardly_on_the_kernel():
+    for name, support in (("wendland_c2", 2.6), ("wendland_c4", 3.0), ("cubic_spline", 2.5)):
+        for d in (2, 3):
+            one, small = (CurvatureConstants.of(KERNELS[name], s, support * s, d) for s in (1.0, 0.001))
+            assert abs(small.width - one.width) < 1e-9 and abs(small.depth - 0.001 * one.depth) < 1e-12
+            assert 0.42 < one.width < 0.47
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_a_scene_has_the_form_that_it_asks_for_or_that_of_its_solver():
+    forces = {"gravity": [0.0, -9.81], "surface_tension": 3.0}
+    kinds = {}
+    for solver in (PROJECTION, PCISPH):
+        for form in ("automatic", "curvature", "pairwise"):
+            made = Simulation(
+                plane(
+                    solver=solver,
+                    discretisation={"spacing": 0.05, **C2},
+                    forces={**forces, "surface_tension_form": form},
+                )
+            )
+            kinds[solver["kind"], form] = [
+                type(force) for force in made.solver.forces if isinstance(force, (SurfaceTension, CurvatureTension))
+            ]
+    for solver, automatic in (("projection", CurvatureTension), ("pcisph", SurfaceTension)):
+        assert kinds[solver, "automatic"] == [automatic]
+        assert kinds[solver, "curvature"] == [CurvatureTension] and kinds[solver, "pairwise"] == [SurfaceTension]
+    narrow = Simulation(plane(solver=PROJECTION, forces=forces))  # with a support of 2
+    assert [type(force) for force in narrow.solver.forces if isinstance(force, CurvatureTension)] == []
+
+
+def test_steps_may_be_longer_by_curvature_in_a_projection():
+    limits = [
+        stability_limits(
+            plane(
+                solver=solver,
+                discretisation={"spacing": 0.05, **C2},
+                forces={"gravity": [0.0, -9.81], "surface_tension": 3.0},
+            )
+        )
+        for solver in (PCISPH, PROJECTION)
+    ]
+    assert limits[1]["surface tension"] == pytest.approx(2.5 * limits[0]["surface tension"])
+
+
+def test_a_fluid_with_hardly_any_viscosity_is_warned_of():
+    for viscosity, warned in ((0.1, True), (2.0, False)):
+        water = [{"name": "water", "rest_density": 1000.0, "viscosity": viscosity}]
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            loose(grid(8, 8), phase=water)
+        assert any("viscosity of phase 'water'" in str(one.message) for one in found) == warned
+
+
+def test_a_narrow_support_is_warned_of():
+    with pytest.warns(CortadoWarning, match="support is 2, but surface tension needs at least 2.5"):
+        loose(grid(8, 8), discretisation=CUBIC)
+
+
+@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
+def test_drops_that_are_apart_do_not_feel_each_other():
+    one = stirred(grid(5, 5))
+    alone, point = loose(one)
+    both, together = loose(np.concatenate([one, one + [20.0, 3.0]]))
+    a, b = alone.run(5, point).velocities[-1], both.run(5, together).velocities[-1]
+    assert np.abs(a).max() > 1e-5
+    np.testing.assert_allclose(b[: len(one)], a, atol=1e-12)
+    np.testing.assert_allclose(b[len(one) :], a, atol=1e-12)
+
+
+def test_the_certificate():
+    points = stirred(grid(5, 5))
+    problem, point = problem_of(points, 4, tension=8.0)
+    point["initial_velocities"] = 0.3 * np.random.default_rng(3).standard_normal(points.shape)
+    certificate = cortado.certify(problem, point)
+    assert certificate.right and certificate.loss_changes["surface_tension"] > 0.0
