@@ -456,7 +456,7 @@ def test_a_scene_that_names_no_kernel_has_that_of_its_solver(kind, given, kernel
     for discretisation in (cut, DiscretisationTable(**cut)):
         scene = Scene(
             **{
-                **plane().model_dump(mode="json"),
+                **plane(),
                 "discretisation": discretisation,
                 "solver": {"kind": kind, "time_step": 0.001},
             }
