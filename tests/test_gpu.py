@@ -15,6 +15,8 @@ pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="there is no 
 
 GRAVITY = np.array([0.5, -9.81, 0.2])
 EXACT = gradients.Exact()
+FREE_FALL = 1e-22
+"""The round-off in the derivative with respect to the viscosity of a block that falls freely, which is 3e-15."""
 TOLERANT = {"minimum_iterations": 2, "maximum_iterations": 40, "density_tolerance": 1e-3}
 
 
@@ -86,7 +88,7 @@ def test_any_number_of_lanes_computes_the_same(name, lanes, monkeypatch):
     wanted = evaluate(SCENES[name], "cpu", steps=20)
     monkeypatch.setattr("cortado.solvers.build.lanes_for", lambda particles, device: lanes)
     for found, one in zip(evaluate(SCENES[name], "cuda:0", steps=20), wanted, strict=True):
-        assert np.linalg.norm(found - one) <= 1e-9 * np.linalg.norm(one)
+        assert np.linalg.norm(found - one) <= 1e-9 * np.linalg.norm(one) + FREE_FALL
 
 
 @pytest.mark.parametrize("estimator", [gradients.AdjointViscosity(), gradients.FrozenGeometry()], ids=repr)
