@@ -10,6 +10,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import brentq
 
 from cortado import Scene, Simulation
+from yielding_films import LAW, observed, steady_speeds
 
 PUSH, DENSITY = 1.0, 1000.0
 ACROSS = 40
@@ -76,3 +77,11 @@ def test_a_carreau_fluid_flows_between_plates_as_it_should():
     y, u = channel(viscosity, {"kind": "carreau", "relaxation_time": time, "flow_index": index}, speeds, 0.005, 100)
     assert u.mean() == pytest.approx(speeds(y).mean(), rel=0.005)
     assert DENSITY * PUSH / (12.0 * viscosity) < 0.3 * u.mean()
+
+
+def test_a_film_of_mud_flows_as_its_law_says():
+    """Down a slope of 4 %, on which a third of it is not sheared; without the yield stress it is twice as fast."""
+    found = observed(16, LAW, (0.04,))
+    assert found == pytest.approx(steady_speeds(0.04), rel=0.02)
+    without = observed(16, {**LAW, "herschel_bulkley.yield_stress": 0.0}, (0.04,))
+    assert (without > 1.5 * found).all()

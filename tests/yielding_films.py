@@ -1,0 +1,93 @@
+"""Films of mud, a Herschel-Bulkley fluid, that flow down slopes without slip, and what its law is found to be from
+them."""
+
+import numpy as np
+
+from cortado import Problem, Simulation
+from cortado.losses import CentreOfMass
+from projected_flows import C2, PROJECTION, box, simulated
+
+GRAVITY = 9.81
+DEPTH = 0.1
+"""[m]"""
+TIME = 1.0
+"""After which a film is looked at [s]; on gentle slopes it is steady then."""
+SLOPES = (0.04, 0.08, 0.3)
+LAW = {"viscosity": 40.0, "herschel_bulkley.flow_index": 0.6, "herschel_bulkley.yield_stress": 20.0}
+"""[Pa s^n], [-], [Pa]"""
+REGULARISATION = 2.0
+"""[s]"""
+
+
+def film(slope: float, deep: int) -> tuple[Simulation, int]:
+    """A film at rest, so many particles deep, and how many steps it takes."""
+    spacing, size = DEPTH / deep, np.sqrt(1.0 + slope**2)
+    steps = int(np.ceil(TIME / (0.2 * spacing / 1.2)))
+    law = {"kind": "herschel_bulkley", "flow_index": 0.6, "yield_stress": 20.0, "regularisation": REGULARISATION}
+    sides = {"lower": [0.0, 0.0], "upper": [8.0 * spacing, 1.5 * DEPTH], "periodic": [True, False]}
+    simulation = simulated(
+        spacing,
+        discretisation=C2,
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 40.0, "rheology": law}],
+        fluid=[box([0.0, 0.0], [8.0 * spacing, DEPTH])],
+        container={"shape": "box", **sides, "slip": "no"},
+        forces={"gravity": [GRAVITY * slope / size, -GRAVITY / size], "viscosity": "stress"},
+        solver={**PROJECTION, "time_step": TIME / steps},
+    )
+    return simulation, steps
+
+
+def speeds(velocities: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """(2,) the mean speed of all and of the uppermost eighth [m/s]."""
+    return np.array([velocities[:, 0].mean(), velocities[heights > 7.0 / 8.0 * DEPTH, 0].mean()])
+
+
+def observed(deep: int, law: dict[str, float], slopes: tuple[float, ...] = SLOPES) -> np.ndarray:
+    """(2 slopes,) [m/s]"""
+    found = []
+    for slope in slopes:
+        simulation, steps = film(slope, deep)
+        run = simulation.run(steps, law, record_every=steps)
+        found.append(speeds(run.velocities[-1], simulation.positions[:, 1]))
+    return np.concatenate(found)
+
+
+def sensitivities(deep: int, law: dict[str, float]) -> np.ndarray:
+    """(2 slopes, 3) derivatives of the logarithms of what is observed by those of the numbers of the law."""
+    rows = []
+    for slope in SLOPES:
+        simulation, steps = film(slope, deep)
+        problem, heights = Problem(simulation, steps, CentreOfMass(np.zeros(2))), simulation.positions[:, 1]
+        columns = []
+        for name, value in law.items():
+            tangents = []
+            end = problem.tangents(
+                law, {name: value}, lambda _, dot, to=tangents: to.append(dot.numpy(2)["velocities"]), [steps]
+            )
+            columns.append(speeds(tangents[-1], heights) / speeds(end[steps].velocities, heights))
+        rows.append(np.array(columns).T)
+    return np.concatenate(rows)
+
+
+def found_law(deep: int, target: np.ndarray, start: dict[str, float], iterations: int = 7) -> dict[str, float]:
+    """By Gauss and Newton from films so many particles deep; derivatives are taken in the first and the third step."""
+    law = dict(start)
+    for k in range(iterations):
+        if k in (0, 2):
+            slopes = sensitivities(deep, law)
+        change = np.linalg.lstsq(slopes, np.log(target / observed(deep, law)), rcond=None)[0]
+        law = {
+            name: law[name] * float(np.exp(part)) for name, part in zip(law, np.clip(change, -0.4, 0.4), strict=True)
+        }
+    return law
+
+
+def steady_speeds(slope: float) -> np.ndarray:
+    """(2,) of the closed form: the shear stress grows linearly downwards, and the law says how fast that shears."""
+    consistency, index, stress = LAW.values()
+    heights = (np.arange(2000) + 0.5) / 2000 * DEPTH
+    rates = np.geomspace(1e-8, 1e4, 20_000)
+    stresses = consistency * np.maximum(rates, 1e-3) ** (index - 1.0) * rates
+    stresses += stress * (1.0 - np.exp(-REGULARISATION * rates))
+    sheared = np.interp(1000.0 * GRAVITY * slope / np.sqrt(1.0 + slope**2) * (DEPTH - heights), stresses, rates)
+    return speeds(np.cumsum(sheared)[:, None] * (DEPTH / 2000), heights)
