@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cortado.errors import InputError
+from cortado.errors import InputError, SceneError
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.sampling import fluid_particles, period, wall_particles
 from cortado.scene.scene import Scene
@@ -188,3 +188,21 @@ def test_a_fluid_that_walls_leave_no_room_for_is_refused():
     layer = box([0.1, 0.1], [0.2, 0.15])
     with pytest.raises(InputError, match=r"fluid\.0 has no particle that is half a spacing, 0\.025 m, or more"):
         fluid_particles(scene_of(2, [layer], box([0.0, 0.11], [1.0, 1.0])))
+
+
+def test_a_first_lattice_can_be_jittered(tmp_path):
+    """Particles of bodies alone, not points of a file or those in a nozzle; the same in every run; it is computed with."""
+    points = tmp_path / "points.npy"
+    np.save(points, [[0.9, 0.1], [0.9, 0.3]])
+    bodies = [box([0.0, 0.0], [0.5, 0.5]), {"shape": "points", "file": str(points)}]
+    even = scene_of(2, bodies).replaced(
+        'emitter={phase="oil", outlet=[0.7, 1.0], radius=0.1, length=0.2, flow_rate=0.01}'
+    )
+    stirred = even.replaced("discretisation.jitter=0.2")
+    moves = discretise(stirred).fluid.positions - discretise(even).fluid.positions
+    assert np.abs(moves[:100]).max() <= 0.2 * SPACING and np.abs(moves[:100]).std() > 0.05 * SPACING
+    assert not moves[100:].any() and len(moves) > 102
+    assert discretise(stirred).fluid.positions.tobytes() == discretise(stirred).fluid.positions.tobytes()
+    assert stirred.computed_json() != even.computed_json() and "jitter" not in even.computed_json()
+    with pytest.raises(SceneError, match=r"discretisation.jitter is 0\.4, but must be at least 0 and at most 0"):
+        even.replaced("discretisation.jitter=0.4")

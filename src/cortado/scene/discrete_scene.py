@@ -109,6 +109,8 @@ def discretise(scene: Scene) -> DiscreteScene:
     at_rest = RestLattice(kernel, spacing, support)
     walls = _walls(scene, layers, at_rest)
     fluid = replace(fluid, positions=_packed(fluid, walls, at_rest, *period(scene)))
+    if scene.discretisation.jitter:
+        fluid = replace(fluid, positions=fluid.jittered(scene.discretisation.jitter * spacing))
     if any(isinstance(body, PointsFluid) for body in scene.fluid):
         crowding = crowding_of(fluid.positions, kernel, lattice.support, lattice.volume, period(scene))
         told = check_crowding(crowding, spacing, "the points of the fluid")

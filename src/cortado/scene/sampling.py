@@ -10,7 +10,7 @@ from cortado.discretise.shapes import Points
 from cortado.errors import InputError
 from cortado.scene.bodies import CutBody
 from cortado.scene.emitter import EmitterSample
-from cortado.scene.fluids import RoundFluid
+from cortado.scene.fluids import PointsFluid, RoundFluid
 from cortado.scene.scene import Scene
 
 
@@ -28,8 +28,15 @@ class FluidSample:
     """Those whose particles are to be packed, in the order of the particles."""
     is_packed: NDArray[np.bool_]
     """(n,) whether a particle is of one of these."""
+    is_placed: NDArray[np.bool_]
+    """(n,) whether somebody has said where a particle is: a point of a file, or one in a nozzle."""
     emitter: EmitterSample | None
     """The last of the particles once more, in the same order, as they are along the emitter; None without one."""
+
+    def jittered(self, most: float) -> Points:
+        """(n, d) [m] positions with each coordinate of particles that nobody has placed changed by up to ``most`` [m]."""
+        moves = np.random.default_rng(0).uniform(-most, most, self.positions.shape)
+        return np.where(self.is_placed[:, None], self.positions, self.positions + moves)
 
     @property
     def emitted(self) -> slice:
@@ -60,13 +67,14 @@ def fluid_particles(scene: Scene) -> FluidSample:
         velocities.append(emitted.velocities)
         phases.append(names.index(scene.emitter.phase))
         bodies.append(None)
-    sizes = [len(x) for x in positions]
+    sizes, nozzles = [len(x) for x in positions], len(positions) - len(scene.fluid)
     return FluidSample(
         positions=np.concatenate(positions),
         velocities=np.concatenate(velocities),
         phase=np.repeat(phases, sizes),
         bodies=tuple(body for body in bodies if body is not None),
         is_packed=np.repeat([body is not None for body in bodies], sizes),
+        is_placed=np.repeat([*(isinstance(fluid, PointsFluid) for fluid in scene.fluid), *[True] * nozzles], sizes),
         emitter=emitted,
     )
 

@@ -64,6 +64,23 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         """b"""
         return (real(1.0) - full) * wp.max(real(1.0) - n, real(0.0)) / dt
 
+    @wp.func
+    def parts(up: real, down: real):
+        """How much of the slopes of z+ and of sigma z- k' has: all of one of them, or half at a corner, the mean of both
+        sides. Fluid that moves as a whole is on the corner z+ = z- = 0 everywhere, and inside sigma is 1, so that there
+        is no corner but in this formula."""
+        rise, fall = real(0.0), real(0.0)
+        if up > real(0.0):
+            rise = real(1.0)
+        elif up == real(0.0):
+            rise = real(0.5)
+        if up <= real(0.0):
+            if down < real(0.0):
+                fall = real(1.0)
+            elif down == real(0.0):
+                fall = real(0.5)
+        return rise, fall
+
     @wp.kernel(module=module)
     def start(
         k_before: wp.array(dtype=real),
@@ -188,14 +205,11 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
             b_dot -= ((real(1.0) - full) * n_dot[i] + dot.weights[i][1] * (real(1.0) - n[i])) / dt
         per = omega / of.a[i]
         per_dot = -per * dot.a[i] / of.a[i]
-        up = at.y[i] + per * (D - b)
         down = at.y[i] + per * D
-        new = real(0.0)
-        if up > real(0.0):
-            new = dot.y[i] + per_dot * (D - b) + per * (D_dot - b_dot)
-        elif down < real(0.0):
-            change = dot.y[i] + per_dot * D + per * D_dot
-            new = dot.weights[i][0] * down + of.weights[i][0] * change
+        rise, fall = parts(at.y[i] + per * (D - b), down)
+        change = dot.y[i] + per_dot * D + per * D_dot
+        new = rise * (change - per_dot * b - per * b_dot)
+        new += fall * (dot.weights[i][0] * down + of.weights[i][0] * change)
         y_out_dot[i] = new + beta * (new - dot.k[i])  # before k, which may be the same array
         k_out_dot[i] = new
 
@@ -223,25 +237,19 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         D, full, a = at.d[i], of.weights[i][1], of.a[i]
         b = wanted(n[i], full, dt)
         per = omega / a
-        up = at.y[i] + per * (D - b)
         down = at.y[i] + per * D
+        rise, fall = parts(at.y[i] + per * (D - b), down)
         new_bar = k_bar[i] + (real(1.0) + beta) * y_bar[i]
-        z_bar, b_bar, gap, tension_bar = real(0.0), real(0.0), real(0.0), real(0.0)
-        if up > real(0.0):
-            z_bar = new_bar
-            b_bar = -per * new_bar
-            gap = D - b
-        elif down < real(0.0):
-            z_bar = of.weights[i][0] * new_bar
-            tension_bar = down * new_bar
-            gap = D
+        tension = of.weights[i][0]
+        z_bar, tension_bar = (rise + fall * tension) * new_bar, fall * down * new_bar
+        b_bar = -per * rise * new_bar
         full_bar = real(0.0)
         if n[i] < real(1.0):
             bar.n[i] = bar.n[i] - (real(1.0) - full) / dt * b_bar
             full_bar = -(real(1.0) - n[i]) / dt * b_bar
         bar.weights[i] = bar.weights[i] + weights4(tension_bar, full_bar, real(0.0), real(0.0))
         bar.time_step[i] = bar.time_step[i] - b / dt * b_bar
-        bar.a[i] = bar.a[i] - per * gap / a * z_bar
+        bar.a[i] = bar.a[i] - per / a * (D * z_bar - rise * b * new_bar)
         k_bar[i] = -beta * y_bar[i]
         y_bar[i] = z_bar
         d_bar[i] = per * z_bar
