@@ -39,9 +39,9 @@ class DiscretisationTable(Table):
     is given."""
 
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
-    """How far a particle of a body is from its first place at most, along each axis and in spacings, at random but the same
-    in every run: a fluid on a lattice is stiffer than one without order, and its derivatives at rest have corners. Points
-    of files and the particles of an emitter stay where they are."""
+    """How far a particle of a body is from its first place at most, along each axis and in spacings, at random but the
+    same in every run: a fluid on a lattice is stiffer than one without order, and its derivatives at rest have corners.
+    Points of files and the particles of an emitter stay where they are."""
 
     @property
     def support_radius(self) -> float:

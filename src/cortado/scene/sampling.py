@@ -34,7 +34,7 @@ class FluidSample:
     """The last of the particles once more, in the same order, as they are along the emitter; None without one."""
 
     def jittered(self, most: float) -> Points:
-        """(n, d) [m] positions with each coordinate of particles that nobody has placed changed by up to ``most`` [m]."""
+        """(n, d) [m] positions, with each coordinate of what nobody has placed changed by up to ``most`` [m]."""
         moves = np.random.default_rng(0).uniform(-most, most, self.positions.shape)
         return np.where(self.is_placed[:, None], self.positions, self.positions + moves)
 

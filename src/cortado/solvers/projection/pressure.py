@@ -66,9 +66,9 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
 
     @wp.func
     def parts(up: real, down: real):
-        """How much of the slopes of z+ and of sigma z- k' has: all of one of them, or half at a corner, the mean of both
-        sides. Fluid that moves as a whole is on the corner z+ = z- = 0 everywhere, and inside sigma is 1, so that there
-        is no corner but in this formula."""
+        """How much of the slopes of z+ and of sigma z- k' has: all of one of them, or at a corner the mean of both
+        sides. Fluid that moves as a whole is on the corner z+ = z- = 0 everywhere, and inside sigma is 1, so that
+        there is no corner but in this formula."""
         rise, fall = real(0.0), real(0.0)
         if up > real(0.0):
             rise = real(1.0)
