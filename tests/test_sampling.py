@@ -191,7 +191,7 @@ def test_a_fluid_that_walls_leave_no_room_for_is_refused():
 
 
 def test_a_first_lattice_can_be_jittered(tmp_path):
-    """Particles of bodies alone, not points of a file or those in a nozzle; the same in every run; it is computed with."""
+    """Particles of bodies alone, not points of a file or those in a nozzle; the same in every run."""
     points = tmp_path / "points.npy"
     np.save(points, [[0.9, 0.1], [0.9, 0.3]])
     bodies = [box([0.0, 0.0], [0.5, 0.5]), {"shape": "points", "file": str(points)}]
