@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -470,6 +471,15 @@ def test_the_command_runs_until_a_time(run_command, tmp_path):
     assert sizes_of(found).tobytes() == sizes_of(wanted).tobytes()
     on = Simulation(tmp_path / "scene.toml").run(3, state=found.last_state)
     assert on.positions[0].tobytes() == found.positions[-1].tobytes() and on.times[0] == found.times[-1]
+
+
+@pytest.mark.parametrize("free, code", [(0.3, 0), (0.1, 1)])
+def test_the_disk_must_have_room_for_the_frames_that_are_expected(run_command, monkeypatch, free, code):
+    """There is room for four times as many in the file, which takes none before they come."""
+    usage = SimpleNamespace(free=int(free * 1e6))
+    monkeypatch.setattr("cortado.files.vtkhdf.shutil", SimpleNamespace(disk_usage=lambda path: usage))
+    found, _, err = run_command("--time", "0.5", "--no-pictures")
+    assert found == code and ("free on its disk" in err) == (code == 1), err
 
 
 @pytest.mark.parametrize(
