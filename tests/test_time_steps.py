@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -407,10 +408,39 @@ def run_command(cortado_command, tmp_path):
 
 
 def test_a_run_whose_steps_become_too_short_says_so(monkeypatch):
-    monkeypatch.setattr("cortado.rollout.durations.expected_steps", lambda scene, time: 3)
+    monkeypatch.setattr("cortado.rollout.durations.expected_steps", lambda scene, time, values: 3)
     with pytest.warns(cortado.CortadoWarning, match="the run ended at 0.1.* s, before the time that was asked for"):
         run = Simulation(drop(CHOSEN)).run(time=10.0)
     assert len(run.converged) == 12
+
+
+@pytest.mark.parametrize(
+    "changes, values",
+    [
+        ({}, {"gravity": [0.0, -2000.0]}),
+        ({}, {"initial_velocities": np.full((64, 2), [80.0, 60.0])}),
+        ({"forces": {"viscosity": "pairwise"}}, {"viscosity": 500.0}),
+    ],
+)
+@pytest.mark.filterwarnings("error::cortado.CortadoWarning")
+def test_a_run_with_parameters_that_shorten_its_steps_reaches_its_time(changes, values):
+    simulation = Simulation(drop(CHOSEN, **changes), precision="float64")
+    longest = sizes_of(simulation.run(1)).max()
+    assert simulation.run(time=longest, controls=values, record_every=1000).times[-1] >= longest * (1.0 - 1e-9)
+
+
+@pytest.mark.parametrize("kind", SOLVERS)
+def test_a_bound_that_float32_does_not_hold_is_refused(kind):
+    scene = drop({**SOLVERS[kind], **CHOSEN, "greatest_time_step": 1e-20})
+    with pytest.raises(InputError, match="chosen as 1e-20 s at most, but must be at least 1e-12 s in this precision"):
+        Simulation(scene).run(3)
+    assert Simulation(scene, precision="float64").run(3).times[-1] == pytest.approx(3e-20, rel=1e-12)
+
+
+@pytest.mark.parametrize("step", [CHOSEN, {"time_step": 0.001}])
+def test_a_time_of_more_steps_than_can_be_counted_is_refused(step):
+    with pytest.raises(InputError, match=r"time is 1e\+300 s, but must be less, as that takes about .*e\+30\d steps"):
+        Simulation(drop(step)).run(time=1e300)
 
 
 @pytest.mark.parametrize(
@@ -441,6 +471,15 @@ def test_the_command_runs_until_a_time(run_command, tmp_path):
     assert sizes_of(found).tobytes() == sizes_of(wanted).tobytes()
     on = Simulation(tmp_path / "scene.toml").run(3, state=found.last_state)
     assert on.positions[0].tobytes() == found.positions[-1].tobytes() and on.times[0] == found.times[-1]
+
+
+@pytest.mark.parametrize("free, code", [(0.3, 0), (0.1, 1)])
+def test_the_disk_must_have_room_for_the_frames_that_are_expected(run_command, monkeypatch, free, code):
+    """There is room for four times as many in the file, which takes none before they come."""
+    usage = SimpleNamespace(free=int(free * 1e6))
+    monkeypatch.setattr("cortado.files.vtkhdf.shutil", SimpleNamespace(disk_usage=lambda path: usage))
+    found, _, err = run_command("--time", "0.5", "--no-pictures")
+    assert found == code and ("free on its disk" in err) == (code == 1), err
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,7 @@ class TrajectoryWriter:
         constants: arrays by name that hold for the whole run.
         diagnostics: the type of each number that `append_steps` will be told of a step, by name.
         origin: what the particles are of, as a text of JSON.
+        expected: how many frames are likely to come, which the disk must have room for; all of them if left out.
 
     Raises:
         InputError: a size that makes no sense, or a path that cannot be written.
@@ -66,6 +67,7 @@ class TrajectoryWriter:
         constants: Mapping[str, ArrayLike] | None = None,
         diagnostics: Mapping[str, DTypeLike] | None = None,
         origin: str = "",
+        expected: int | None = None,
     ) -> None:
         moments = np.array(times, dtype=np.float64, ndmin=1)
         if len(moments) < 1 or particles < 1 or dimension not in (2, 3) or steps < 0:
@@ -90,7 +92,7 @@ class TrajectoryWriter:
         )
         self._unfinished = unfinished(self.path)
         with sentences(self.path):
-            _require_room(self._layout, self.path)
+            _require_room(self._layout, self.path, expected)
             self._file = open(self._unfinished, "x+b", buffering=0)  # noqa: SIM115
             try:
                 pages, self._places = self._layout.create()
@@ -305,11 +307,12 @@ def _records(columns: Mapping[str, ArrayLike], record: np.dtype[Any]) -> NDArray
     return records
 
 
-def _require_room(layout: FileLayout, path: Path) -> None:
-    """Raise ComputationError if the disk has no room for all the frames."""
+def _require_room(layout: FileLayout, path: Path, expected: int | None) -> None:
+    """Raise ComputationError if the disk has no room for the frames that are expected."""
     free = shutil.disk_usage(path.absolute().parent).free
-    if layout.size > free:
+    frames = len(layout.times) if expected is None else min(expected, len(layout.times))
+    if (needed := layout.size * frames / len(layout.times)) > free:
         raise ComputationError(
-            f"{path} needs {layout.size / 1e6:.4g} MB for {len(layout.times)} frames, but {free / 1e6:.4g} MB are "
+            f"{path} needs {needed / 1e6:.4g} MB for {frames} frames, but {free / 1e6:.4g} MB are "
             f"free on its disk; record fewer frames, free some space, or choose another place."
         )

@@ -10,16 +10,20 @@ from cortado.arrays import as_numbers, as_one_number, check_steps
 from cortado.errors import InputError
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.rollout import Rollout
-from cortado.rollout.scene_parameters import Simulated
+from cortado.rollout.scene_parameters import SceneParameters, Simulated
+from cortado.rollout.step_bounds import step_bounds
 from cortado.rollout.step_sizes import ChosenSteps
+from cortado.scene.parameters.values import Arrays
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import COURANT
-from cortado.scene.stability import chosen_limits, stability_limits
+from cortado.scene.stability import stability_limits
 
 SAME = 1e-9
 """Relative: a time that so little is missing of has been reached."""
 ROOM = 4
 """There is room for so many times the steps that fluid takes which falls through the whole container all the time."""
+MOST = 1e17
+"""Steps of a run of so many seconds."""
 
 
 def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, values: Mapping[str, Any]) -> int:
@@ -37,14 +41,15 @@ def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, v
         given = values.get("time_step") if isinstance(values, Mapping) else None
         sizes = as_numbers("parameter time_step", simulation.scene.solver.time_step if given is None else given)
         shortest = float(sizes.min(initial=np.inf))
-        return check_steps(max(ceil(time / shortest * (1.0 - SAME)), 1)) if 0.0 < shortest < np.inf else 1
+        return _counted_steps(time, time / shortest * (1.0 - SAME)) if 0.0 < shortest < np.inf else 1
     if simulation.batch is not None:
         raise InputError(
             "time is given, but must be left out of a batch that chooses its time steps, whose scenes do not reach it "
             "together: give steps."
         )
-    ParameterSpace(simulation, 0).checked(values)  # a row for each step has no meaning: nobody knows how many there are
-    return check_steps(ROOM * expected_steps(simulation.scene, time))
+    # a row for each step has no meaning: nobody knows how many there are
+    own = SceneParameters(simulation, 0).upright(ParameterSpace(simulation, 0).checked(values))
+    return ROOM * expected_steps(simulation.scene, time, own)
 
 
 def expected_frames(rollout: Rollout, record_every: int) -> int:
@@ -57,11 +62,19 @@ def expected_of(rollout: Rollout) -> int:
     return rollout.steps // ROOM if np.isfinite(rollout.step_sizes.end) else rollout.steps
 
 
-def expected_steps(scene: Scene, time: float) -> int:
-    """How many steps [s] fluid would take that falls through the whole container all the time."""
+def expected_steps(scene: Scene, time: float, values: Arrays) -> int:
+    """How many steps fluid would take for a time [s] that falls through the whole container all the time, with
+    parameters that replace the scene's; raises `InputError` where nobody can count them."""
     courant = COURANT if scene.solver.courant is None else scene.solver.courant
-    limit = stability_limits(scene)["speed"] * courant * 0.5 / 0.4  # which is of 0.4 support radii
-    return max(ceil(time / min(*chosen_limits(scene).values(), limit)), 1)
+    limit = stability_limits(scene, values)["speed"] * courant * 0.5 / 0.4  # which is of 0.4 support radii
+    return _counted_steps(time, time / min(float(step_bounds(scene, values, 1)[0]), limit))
+
+
+def _counted_steps(time: float, steps: float) -> int:
+    """So many steps, rounded up."""
+    if steps > MOST:
+        raise InputError(f"time is {time:g} s, but must be less, as that takes about {steps:.2g} steps.")
+    return max(ceil(steps), 1)
 
 
 def end_after(rollout: Rollout, time: float | None) -> None:

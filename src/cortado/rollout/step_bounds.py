@@ -21,10 +21,16 @@ def greatest_step(scene: SceneTables, values: Arrays) -> float:
     return found
 
 
-def step_bounds(scene: SceneTables, values: Arrays, steps: int) -> NDArray:
-    """(steps,) that of each step [s]: a gravity that is given bounds each by its own row."""
+def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0.0) -> NDArray:
+    """(steps,) that of each step [s]: a gravity that is given bounds each by its own row. Raises `InputError` where one
+    is below the ``least`` [s] that a precision bears."""
     bounds = np.full(max(steps, 1), greatest_step(scene, values))
     if "gravity" in values:
         limits = gravity_limits(scene, np.atleast_2d(values["gravity"])).values()
         bounds = np.minimum(bounds, np.minimum.reduce(list(limits)))
+    if (shortest := float(bounds.min())) < least:
+        raise InputError(
+            f"The time step is chosen as {shortest:.3g} s at most, but must be at least {least:g} s in this precision: "
+            "make solver.greatest_time_step, or what else bounds it, larger."
+        )
     return bounds

@@ -23,10 +23,12 @@ def frame_writer(
     diagnostics: Mapping[str, NDArray[Any]],
     origin: Origin | None,
     quantities: Iterable[str] = (),
+    expected: int | None = None,
 ) -> vtkhdf.TrajectoryWriter:
     """A file with room for frames at ``times`` (frames,) [s] that hold the same fields as the first, with
     ``quantities`` of these names, and for what is noted of so many steps, which have the names and types of
-    ``diagnostics``; all of it of particles of an origin."""
+    ``diagnostics``; all of it of particles of an origin. The disk must have room for all frames, or for as many as are
+    ``expected``."""
     particles, dimension = first["positions"].shape[-2:]
     single = first["positions"].dtype == np.float32
     vectors = [name for name in quantities if len(QUANTITIES[name].shape(particles, dimension)) == 2]
@@ -44,6 +46,7 @@ def frame_writer(
         constants=constants,
         diagnostics={name: column.dtype for name, column in diagnostics.items()},
         origin="" if origin is None else origin.to_json(),
+        expected=expected,
     )
 
 

@@ -117,10 +117,9 @@ def _write_trajectory(
     recorded = np.array([*range(0, steps, record_every), steps])
     times, first = Clock(clock.steps, clock.time).times(recorded, size), simulation.frame(rollout.initial)
     constants, origin = simulation.constants(rollout), rollout.origins[0]
+    noted, expected = rollout.diagnostics, expected_frames(rollout, record_every)
     with (
-        frame_writer(
-            folder.trajectory, times, first, constants, steps, rollout.diagnostics, origin, watch.names
-        ) as writer,
+        frame_writer(folder.trajectory, times, first, constants, steps, noted, origin, watch.names, expected) as writer,
         track(expected_of(rollout), "run") as advance,
     ):
 
