@@ -13,7 +13,7 @@ FASTER = (1.5, 2.0, 2.5, 3.0)
 """Over the speed in the nozzle, where the jet is measured."""
 TIMES = {"inviscid": 5.0, "viscous": 7.0}
 """In SPEED / GRAVITY. A tip that falls freely passes the last of these depths at 2. In honey of 5 Pa s the first
-particles, which nothing pulls from below, come as a blob: there the jet is steady to 1 % only from 4.5 on."""
+particles, which nothing pulls from below, come as a blob: as much flows there as must, within 1 %, only from 4.5 on."""
 
 
 def falling_jet(across, dimension, viscosity=0.0, solver=PROJECTION, discretisation=C2, device="cpu"):
