@@ -80,7 +80,8 @@ class Projection:
         B = B[:, 0, 0]
         own = np.einsum("iab,ib->ia", L, total) + gamma
         a = ((own**2).sum(1) + 0.05 * square) / m
-        a += (np.einsum("iab,ijb->ija", L, g) ** 2).sum(-1) @ (1 / m)
+        unequal = 1 + 2 * ((m[:, None] - m) / (m[:, None] + m)) ** 2
+        a += (unequal * (np.einsum("iab,ijb->ija", L, g) ** 2).sum(-1)) @ (1 / m)
 
         def force(k):
             pull = k[:, None, None] * L
