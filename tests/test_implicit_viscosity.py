@@ -6,6 +6,7 @@ import pytest
 import cortado
 from cortado import CortadoError, Problem, Simulation, gradients, losses
 from cortado.cli import main
+from cortado.errors import CortadoWarning
 from cortado.scene.stability import is_implicit, stability_limits, viscous_limit
 from cortado.sph.implicit_viscosity import ImplicitViscousStress
 from scenes import HONEY, plane, scene
@@ -138,3 +139,20 @@ def test_fluid_at_rest_needs_no_iteration():
     simulation = Simulation(made, precision="float64")
     np.testing.assert_array_equal(simulation.run(2).positions[-1], simulation.positions)
     assert (simulation.solver.forces[-1].iterations == 0).all()
+
+
+def test_iterations_of_every_step_are_noted_and_too_few_are_told_of(monkeypatch):
+    """The same in every member of a batch as alone, and as often as the last solve says."""
+    simulation = Simulation(thick(), precision="float64")
+    run = simulation.run(4)
+    noted = run.diagnostics["viscous_iterations"]
+    assert noted.shape == (4,) and (noted > 3).all() and noted[-1] == simulation.solver.forces[-1].iterations[0]
+    thinner = {"viscosity": np.array([20.0, 1.0])}
+    both = Simulation(thick(), precision="float64", batch=2).run(4, thinner)
+    np.testing.assert_array_equal(both[0].diagnostics["viscous_iterations"], noted)
+    assert (both[1].diagnostics["viscous_iterations"] != noted).any()
+    assert "viscous_iterations" not in Simulation(thick("explicit"), precision="float64").run(1).diagnostics
+    monkeypatch.setattr("cortado.sph.implicit_viscosity.MOST", 3)
+    monkeypatch.setattr("cortado.sph.implicit_viscosity.Solve.most", 3)
+    with pytest.warns(CortadoWarning, match="the viscosity did not converge in 4 of 4 steps, in which it took 3 iter"):
+        Simulation(thick(), precision="float64").run(4)

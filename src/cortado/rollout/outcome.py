@@ -7,6 +7,7 @@ import numpy as np
 from cortado.errors import DivergedError
 from cortado.rollout.rollout import Rollout
 from cortado.scene.scene import Scene
+from cortado.sph.implicit_viscosity import Solve
 from cortado.words import counted
 
 
@@ -15,6 +16,10 @@ def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
     converged = rollout.diagnostics["converged"]
     if not converged.all():
         yield not_converged_sentence(converged, scene)
+    solves = rollout.diagnostics.get(Solve.name, np.zeros(0))
+    if missed := np.count_nonzero(solves >= Solve.most):
+        found = f"the viscosity did not converge in {missed} of {solves.size} steps, in which it took {Solve.most}"
+        yield f"{found} iterations: try a smaller time step."
     if early := early_sentence(rollout):
         yield early
     if rollout.lost:

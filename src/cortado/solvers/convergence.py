@@ -23,6 +23,8 @@ class ConvergenceKernels:
     """A loop that has ended; the last one of a step ends the step."""
     count_step: Any
     """The end of a step without loops."""
+    note: Any
+    """The iterations that a force took in a step to solve its equations."""
 
 
 @cache
@@ -104,4 +106,14 @@ def convergence_kernels(precision: Precision) -> ConvergenceKernels:
     ):
         end_step(wp.tid(), bad, bad_step, step)
 
-    return ConvergenceKernels(decide, record, count_step)
+    @wp.kernel(module=module, enable_backward=False)
+    def note(
+        count: wp.array(dtype=wp.int32),
+        step: wp.array(dtype=wp.int32),
+        # out
+        iterations: wp.array2d(dtype=wp.int32),
+    ):
+        b = wp.tid()
+        iterations[step[b], b] = count[b]
+
+    return ConvergenceKernels(decide, record, count_step, note)

@@ -13,6 +13,7 @@ from cortado.device.launching import KernelLauncher, sum_and_maximum
 from cortado.particles.state import Layout
 from cortado.solvers.containment import Containment
 from cortado.solvers.convergence import UNKNOWN, convergence_kernels
+from cortado.solvers.solve_record import IterativeSolve, SolveRecord
 from cortado.solvers.solver import Counts
 
 
@@ -73,10 +74,12 @@ class LoopRecord:
 
 
 class IterationLog:
-    """The records of a step's loops: a `StepLog`. A solver without loops has only to say that it converged."""
+    """The records of a step's loops, and of what its forces solve: a `StepLog`. A solver that has neither has only to
+    say that it converged."""
 
-    def __init__(self, steps: int, loops: Sequence["Loop"], layout: Layout):
+    def __init__(self, steps: int, loops: Sequence["Loop"], solves: Sequence[IterativeSolve], layout: Layout):
         self.records = tuple(LoopRecord(steps, loop) for loop in loops)
+        self.solves = tuple(SolveRecord(steps, solve, layout) for solve in solves)
         self._steps, self._layout = 0, layout
 
     @property
@@ -87,17 +90,22 @@ class IterationLog:
         for record in self.records:
             found |= record.diagnostics
             converged &= record.converged
+        found |= {solve.solve.name: solve.found for solve in self.solves}
         return {**found, "converged": converged}
 
     def read(self, steps: int) -> None:
         self._steps = steps
         for record in self.records:
             record.read(steps)
+        for solve in self.solves:
+            solve.read(steps)
 
     def assign(self, other: "IterationLog") -> None:
         self._steps = other._steps
         for own, given in zip(self.records, other.records, strict=True):
             own.assign(given)
+        for solve, solved in zip(self.solves, other.solves, strict=True):
+            solve.assign(solved)
 
     def seek(self, step: int) -> Counts:
         return tuple(record.loop.seek(record, step) for record in self.records)

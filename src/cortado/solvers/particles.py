@@ -137,7 +137,8 @@ class ParticleSolver:
         return self.layout.parameters(steps, requires_grad)
 
     def new_log(self, steps: int) -> IterationLog:
-        return IterationLog(steps, self.loops, self.layout)
+        solves = [force.solve for force in self.forces if hasattr(force, "solve")]
+        return IterationLog(steps, self.loops, solves, self.layout)
 
     def set_substeps(self, substeps: int) -> None:
         if substeps != self.substeps:
@@ -222,6 +223,8 @@ class ParticleSolver:
         record the loops, and count the step."""
         f, containment = self.fields, self.containment
         containment.look(self.search.order, f["x"], f["rho_0"], x, v, new_state)
+        for solve in log.solves:
+            solve.note(self.launch, self.step_number)
         for k, (loop, record) in enumerate(zip(self.loops, log.records, strict=True), 1):
             loop.note(record, containment, self.step_number, is_last=k == len(self.loops))
         if not self.loops:

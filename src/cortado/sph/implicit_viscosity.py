@@ -34,6 +34,8 @@ MOST = 1_000
 class Solve:
     """Conjugate gradients for the particles of one solver, with arrays of its own."""
 
+    name, most = "viscous_iterations", MOST
+
     def __init__(self, layout: Layout, operator: tuple[Any, Any]):
         """``operator``: the kernels that `operator_kernels` gives."""
         self._kernels, (self._pull, self._multiply), self._layout = solve_kernels(layout.precision), operator, layout
@@ -87,7 +89,7 @@ class ImplicitViscousStress(ViscousStress):
         super().__init__(setting, law, parameters)
         layout, operator = setting.layout, operator_kernels(*self._made_for)
         self._implicit = implicit_kernels(*self._made_for)
-        self._pull, self._solve = operator[0], Solve(layout, operator)
+        self._pull, self.solve = operator[0], Solve(layout, operator)
         sizes = {"shape": layout.all_particles, "device": layout.device}
         vectors = (wp.zeros(dtype=layout.precision.vector, **sizes) for _ in range(4))
         self._u, self._r, self._y, self._still = vectors
@@ -100,7 +102,7 @@ class ImplicitViscousStress(ViscousStress):
     @property
     def iterations(self) -> NDArray:
         """(members,) those of the last solve, of a run or of a derivative."""
-        return np.asarray(self._solve.count.numpy())
+        return np.asarray(self.solve.count.numpy())
 
     def _known(self, *more: Any) -> tuple[Any, ...]:
         """Arguments of the kernels of B, with A and T of the velocities u."""
@@ -112,7 +114,7 @@ class ImplicitViscousStress(ViscousStress):
         known = self._known()
         step.launch(self._pull, *known, v=self._u)
         step.launch(self._force.forward, *known, v=self._u, acceleration_in=self._still, acceleration=self._r)
-        self._solve(step, known, self._r, self._y)
+        self.solve(step, known, self._r, self._y)
         wp.copy(after, before)
         add(self._y, after)
         self._after = after
@@ -132,12 +134,12 @@ class ImplicitViscousStress(ViscousStress):
         step.launch(self._implicit.stress_tangent, *dot.named, self._constants, self._of, both, **theta, **change)
         now = {"v": self._u, "v_dot": u_dot, "acceleration_in_dot": before, "acceleration_dot": self._r}
         step.launch(self._force.tangent, now, change, *self._known(*dot.named))
-        self._solve(step, self._known(), self._r, after)
+        self.solve(step, self._known(), self._r, after)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array:
         """Returns the adjoint of the acceleration by all other forces."""
         step.launch(self._implicit.weigh, acceleration_bar=acceleration_bar, r=self._r)
-        self._solve(step, self._known(), self._r, self._y)
+        self.solve(step, self._known(), self._r, self._y)
         step.launch(self._implicit.unweigh, y=self._y, r=self._r)
         self._at_the_end(step)
         theta = {"theta": self._packed.theta(step), "theta_bar": self._packed.shares}

@@ -18,7 +18,7 @@ from cortado.files.interruption import keeping
 from cortado.files.progress import announce, track
 from cortado.particles.state import State
 from cortado.rollout.durations import expected_frames, expected_of
-from cortado.rollout.outcome import early_sentence, not_converged_sentence
+from cortado.rollout.outcome import trouble
 from cortado.rollout.rollout import Rollout
 from cortado.runs.frame_file import append_frame, frame_writer
 from cortado.runs.report import Section
@@ -61,11 +61,8 @@ def run_scene(
         folder = RunFolder.create(out, scene.to_json(), command, overwrite=overwrite, **noted)
         with keeping(lambda: f"the frames so far are in {folder.trajectory}" if folder.trajectory.exists() else ""):
             _compute(simulation, rollout, folder, record_every, pictures, watch)
-    converged = rollout.diagnostics["converged"]
-    if not converged.all():
-        warnings.warn(not_converged_sentence(converged, scene), CortadoWarning, stacklevel=2)
-    if early := early_sentence(rollout):
-        warnings.warn(early, CortadoWarning, stacklevel=2)
+    for told in trouble(rollout, scene):
+        warnings.warn(told, CortadoWarning, stacklevel=2)
     return f"The results are in {folder.path}; open report.html, or trajectory.vtkhdf in ParaView."
 
 
