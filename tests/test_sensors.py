@@ -8,7 +8,7 @@ import pytest
 import cortado
 from bad_tasks import TINY_SCENE
 from cortado.cli import main
-from cortado.errors import InputError
+from cortado.errors import CortadoWarning, InputError
 from cortado.losses import Series
 from cortado.losses.series import SensorMatch
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
@@ -272,6 +272,13 @@ def test_a_sensor_has_places_of_its_own_and_a_region_may_have_no_end():
     read = cortado.Simulation(plane()).run(8, sensors=sensors).sensors
     assert np.abs(read["open"].values[-1]).max() > 0.0
     assert read["open"].values.tobytes() == read["left"].values.tobytes()
+
+
+def test_a_batch_that_does_not_read_the_sensors_of_its_scene_says_so():
+    made = plane(sensor=[{"name": "probe", "kind": "pressure_probe", "position": [0.2, 0.1]}])
+    with pytest.warns(CortadoWarning, match="the sensors of the scene are not read in a batch"):
+        cortado.Simulation(made, batch=2).run(1)
+    assert cortado.Simulation(made).run(1).sensors
 
 
 def test_a_series_in_a_batch_is_that_of_each_scene():

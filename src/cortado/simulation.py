@@ -223,7 +223,8 @@ class Simulation(Stepping, Measuring, Picturing):
             watch.step(step, state)
 
         rollout.forward(keep, keep=False)
-        for sentence in trouble(rollout, self.scene):
+        unread = ["the sensors of the scene are not read in a batch."] if self.batch and self.scene.sensor else []
+        for sentence in (*trouble(rollout, self.scene), *unread):
             warnings.warn(sentence, CortadoWarning, stacklevel=5)
         fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
         own = {name: np.array([one[name] for one in looks]) for name in watch.names}
