@@ -66,10 +66,9 @@ def test_what_flows_between_plates(reynolds, low):
     assert found["flow"] == pytest.approx(1.0, abs=0.01) and found["slope"] == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.parametrize("low", [0.0, 0.45])
-def test_with_pressure_the_projection_keeps_what_flows(low):
-    """Rows slide past each other by 5 and 6 spacings."""
-    found = Channel(20, 4.0, low, "wendland_c2", solver="projection").run()
+def test_with_pressure_the_projection_keeps_what_flows():
+    """Between rows of a Couette flow that slide past each other by 5 spacings."""
+    found = Channel(20, 4.0, 0.45, "wendland_c2", solver="projection").run()
     assert found["slid"] > 4.0
     assert found["flow"] == pytest.approx(1.0, abs=0.01) and found["slope"] == pytest.approx(1.0, abs=0.01)
 

@@ -57,11 +57,12 @@ class Scene(SceneTables):
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
-        """What results depend on: not [picture] and [[sensor]], nor an empty [[force]], a jitter of 0, and how a
-        time step is chosen that is fixed."""
+        """What results depend on: not [picture] and [[sensor]], nor an empty [[force]], a jitter of 0, the form of a
+        surface tension that is not there, and how a time step is chosen that is fixed."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
         aside |= {} if self.force else {"force": True}
         aside |= {} if self.discretisation.jitter else {"discretisation": {"jitter"}}
+        aside |= {} if self.forces.surface_tension else {"forces": {"surface_tension_form"}}
         aside |= {} if self.solver.chooses else {"solver": {"courant", "greatest_time_step"}}
         return json.dumps(self.model_dump(mode="json", exclude=aside), indent=2)
 
