@@ -11,7 +11,7 @@ NU = 0.1
 """[m2/s]"""
 
 
-def sloping_film(slope, deep, solver=PROJECTION, discretisation=C2, viscosity_form="stress", strain=1.2, device="cpu"):
+def sloping_film(slope, deep, solver=PROJECTION, discretisation=C2, strain=1.2, device="cpu"):
     """The mean speed of a film, so many particles deep, over g sin(a) H^2 / (3 nu). The film is mixed on a slope of 0.1
     first. Also of each sixth of the time in which it is measured."""
     spacing = DEPTH / deep
@@ -32,7 +32,7 @@ def sloping_film(slope, deep, solver=PROJECTION, discretisation=C2, viscosity_fo
                 "periodic": [True, False],
                 "slip": "no",
             },
-            forces={"gravity": [GRAVITY * slope / size, -GRAVITY / size], "viscosity": viscosity_form},
+            forces={"gravity": [GRAVITY * slope / size, -GRAVITY / size], "viscosity": "stress"},
             solver={**solver, "time_step": step},
             device=device,
         )

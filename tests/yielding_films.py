@@ -23,12 +23,13 @@ def film(slope: float, deep: int) -> tuple[Simulation, int]:
     """A film at rest, so many particles deep, and how many steps it takes."""
     spacing, size = DEPTH / deep, np.sqrt(1.0 + slope**2)
     steps = int(np.ceil(TIME / (0.2 * spacing / 1.2)))
-    law = {"kind": "herschel_bulkley", "flow_index": 0.6, "yield_stress": 20.0, "regularisation": REGULARISATION}
+    consistency, index, stress = LAW.values()
+    law = {"kind": "herschel_bulkley", "flow_index": index, "yield_stress": stress, "regularisation": REGULARISATION}
     sides = {"lower": [0.0, 0.0], "upper": [8.0 * spacing, 1.5 * DEPTH], "periodic": [True, False]}
     simulation = simulated(
         spacing,
         discretisation=C2,
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 40.0, "rheology": law}],
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": consistency, "rheology": law}],
         fluid=[box([0.0, 0.0], [8.0 * spacing, DEPTH])],
         container={"shape": "box", **sides, "slip": "no"},
         forces={"gravity": [GRAVITY * slope / size, -GRAVITY / size], "viscosity": "stress"},

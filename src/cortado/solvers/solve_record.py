@@ -1,6 +1,6 @@
 """What is noted of a system of equations that a force solves in every step."""
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import warp as wp
 from numpy.typing import NDArray
@@ -42,5 +42,5 @@ class SolveRecord:
 
     def note(self, launch: KernelLauncher, step: wp.array) -> None:
         """Record the solve of a step, given the number of it in each scene."""
-        counts: dict[str, Any] = {"count": self.solve.count, "step": step, "iterations": self.iterations}
-        launch(self._note, **counts, threads=self.iterations.shape[1])
+        members = self.iterations.shape[1]
+        launch(self._note, count=self.solve.count, step=step, iterations=self.iterations, threads=members)
