@@ -69,6 +69,8 @@ class Simulation:
         scene = as_scene(scene)
         if not isinstance(scene.solver, PcisphSolver):
             raise InputError(f"solver.kind is {shown(scene.solver.kind)}, but must be pcisph for the reference engine.")
+        if scene.solver.shifting:
+            raise InputError("solver.shifting is true, but must be left out for the reference engine.")
         if len(scene.phase) > 1 or scene.emitter is not None:
             raise InputError("scene has several phases or an emitter, but must have neither for the reference engine.")
         unknown = [p.name for p in BY_NAME.values() if p.is_optional and p.present(scene)]
