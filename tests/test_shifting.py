@@ -75,5 +75,5 @@ def test_what_has_no_shift_says_so():
     simulation = Simulation(plane(solver=SHIFTED), precision="float64")
     problem = Problem(simulation, steps=2, loss=losses.CentreOfMass([0.3, 0.3]))
     for estimator in (gradients.Tape(), gradients.FrozenGeometry()):
-        with pytest.raises(CortadoError, match='solver.kind "pcisph" with shifting has no '):
+        with pytest.raises(CortadoError, match=r'solver\.kind "pcisph" with shifting has no '):
             problem.value_and_gradient({}, gradient=estimator)
