@@ -1,0 +1,204 @@
+"""What a solid is to the discretisation: signed distances and nearest points of its surface, in float64."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.discretise.shapes import Points
+
+Which = NDArray[np.bool_]
+
+
+class Solid(ABC):
+    """A closed body in d dimensions."""
+
+    @abstractmethod
+    def extent(self) -> tuple[Points, Points]:
+        """The box around it: lower and upper, each (d,) [m]."""
+
+    @abstractmethod
+    def distance(self, points: Points) -> Points:
+        """(n,) how far points (n, d) [m] are from the surface, negative inside [m]."""
+
+    @abstractmethod
+    def nearest(self, points: Points) -> Points:
+        """(n, d) [m] the points of the surface that are nearest to points (n, d) [m]."""
+
+    def outward(self, points: Points) -> Points:
+        """(n, d) unit vectors away from the solid at points (n, d) [m] that are not on its surface."""
+        across = (points - self.nearest(points)) * np.sign(self.distance(points))[:, None]
+        return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300))
+
+
+@dataclass(frozen=True)
+class Placed(Solid):
+    """A solid that is turned about the origin and then moved."""
+
+    solid: Solid
+    position: Points
+    """(d,) where its origin is [m]"""
+    turn: Points
+    """(d, d) the rotation matrix"""
+
+    def extent(self) -> tuple[Points, Points]:
+        lower, upper = self.solid.extent()
+        middle, half = self.turn @ (0.5 * (lower + upper)), np.abs(self.turn) @ (0.5 * (upper - lower))
+        return self.position + middle - half, self.position + middle + half
+
+    def distance(self, points: Points) -> Points:
+        return self.solid.distance((points - self.position) @ self.turn)
+
+    def nearest(self, points: Points) -> Points:
+        return self.position + self.solid.nearest((points - self.position) @ self.turn) @ self.turn.T
+
+
+@dataclass(frozen=True)
+class Union(Solid):
+    """Several solids as one; they may overlap."""
+
+    solids: Sequence[Solid]
+
+    def extent(self) -> tuple[Points, Points]:
+        ends = np.array([solid.extent() for solid in self.solids])
+        return ends[:, 0].min(axis=0), ends[:, 1].max(axis=0)
+
+    def distance(self, points: Points) -> Points:
+        """As `Solid.distance`; where solids overlap, the depth below the surface of one of them, which is less."""
+        return np.min([solid.distance(points) for solid in self.solids], axis=0)
+
+    def nearest(self, points: Points) -> Points:
+        first = np.argmin([solid.distance(points) for solid in self.solids], axis=0)
+        found = np.empty_like(points)
+        for number, solid in enumerate(self.solids):
+            found[first == number] = solid.nearest(points[first == number])
+        return found
+
+
+@dataclass(frozen=True)
+class Box(Solid):
+    """A box about the origin, along the axes."""
+
+    half: Points
+    """(d,) half of its sides [m]"""
+
+    def extent(self) -> tuple[Points, Points]:
+        return -self.half, self.half
+
+    def distance(self, points: Points) -> Points:
+        beyond = np.abs(points) - self.half
+        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
+        return np.asarray(outside + np.minimum(beyond.max(axis=1), 0.0))
+
+    def nearest(self, points: Points) -> Points:
+        found = np.clip(points, -self.half, self.half)
+        beyond = np.abs(points) - self.half
+        inside = np.flatnonzero((beyond < 0.0).all(axis=1))
+        axis = np.argmax(beyond[inside], axis=1)
+        found[inside, axis] = np.where(points[inside, axis] < 0.0, -self.half[axis], self.half[axis])
+        return found
+
+
+@dataclass(frozen=True)
+class Round(Solid):
+    """All points no further than a radius from a segment about the origin: a capsule, or a sphere (in 2-D a disc) where
+    the segment has no length."""
+
+    half: Points
+    """(d,) from the middle of the segment to its end [m]"""
+    radius: float
+    """[m]"""
+
+    def extent(self) -> tuple[Points, Points]:
+        reach = np.abs(self.half) + self.radius
+        return -reach, reach
+
+    def distance(self, points: Points) -> Points:
+        return np.asarray(np.linalg.norm(points - self._within(points), axis=1) - self.radius)
+
+    def nearest(self, points: Points) -> Points:
+        within = self._within(points)
+        away = points - within
+        length = np.linalg.norm(away, axis=1, keepdims=True)
+        sideways = np.eye(points.shape[1])[np.argmin(np.abs(self.half))]
+        return np.asarray(within + self.radius * np.where(length > 0.0, away / np.maximum(length, 1e-300), sideways))
+
+    def _within(self, points: Points) -> Points:
+        """(n, d) the nearest points of the segment."""
+        square = float(self.half @ self.half)
+        along = np.clip(points @ self.half / square, -1.0, 1.0) if square > 0.0 else np.zeros(len(points))
+        return np.asarray(along[:, None] * self.half)
+
+
+@dataclass(frozen=True)
+class Cylinder(Solid):
+    """A cylinder about the origin, along an axis of space."""
+
+    radius: float
+    """[m]"""
+    half: float
+    """Half of its height [m]."""
+    axis: int
+
+    @cached_property
+    def _profile(self) -> Box:
+        """Of a half plane through the axis: distance from it, and height."""
+        return Box(np.array([self.radius, self.half]))
+
+    def extent(self) -> tuple[Points, Points]:
+        reach = np.where(np.arange(3) == self.axis, self.half, self.radius)
+        return -reach, reach
+
+    def distance(self, points: Points) -> Points:
+        return self._profile.distance(self._flat(points))
+
+    def nearest(self, points: Points) -> Points:
+        flat = self._flat(points)
+        found = self._profile.nearest(flat)
+        across = np.delete(points, self.axis, axis=1)
+        away = np.where(flat[:, :1] > 0.0, across / np.maximum(flat[:, :1], 1e-300), np.array([1.0, 0.0]))
+        return np.insert(found[:, :1] * away, self.axis, found[:, 1], axis=1)
+
+    def _flat(self, points: Points) -> Points:
+        """(n, 2) distance from the axis, and height [m]."""
+        across = np.linalg.norm(np.delete(points, self.axis, axis=1), axis=1)
+        return np.column_stack([across, points[:, self.axis]])
+
+
+@dataclass(frozen=True)
+class Polygon(Solid):
+    """A polygon in 2-D, whose sides do not cross."""
+
+    corners: Points
+    """(m, 2) [m], either way round"""
+
+    def extent(self) -> tuple[Points, Points]:
+        return self.corners.min(axis=0), self.corners.max(axis=0)
+
+    def distance(self, points: Points) -> Points:
+        away = np.linalg.norm(points - self.nearest(points), axis=1)
+        return np.where(self._holds(points), -away, away)
+
+    def nearest(self, points: Points) -> Points:
+        best, found = np.full(len(points), np.inf), np.empty_like(points)
+        for first, last in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
+            side = last - first
+            along = np.clip((points - first) @ side / (side @ side), 0.0, 1.0)
+            place = first + along[:, None] * side
+            square = ((points - place) ** 2).sum(axis=1)
+            nearer = square < best
+            best, found[nearer] = np.minimum(best, square), place[nearer]
+        return found
+
+    def _holds(self, points: Points) -> Which:
+        """(n,) by the number of sides that a ray along the first axis crosses."""
+        inside = np.zeros(len(points), dtype=bool)
+        for (x_0, y_0), (x_1, y_1) in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
+            if y_0 == y_1:
+                continue
+            spans = (y_0 > points[:, 1]) != (y_1 > points[:, 1])
+            inside ^= spans & (points[:, 0] < x_0 + (points[:, 1] - y_0) * (x_1 - x_0) / (y_1 - y_0))
+        return inside
