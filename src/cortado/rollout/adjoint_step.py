@@ -1,8 +1,8 @@
-"""A backward step of a rollout by the solver's own adjoint."""
+"""Backward steps of a rollout by the solver's own adjoint."""
 
 from cortado.particles.state import Parameters, State
 from cortado.rollout.rollout import Rollout
-from cortado.solvers.solver import Counts, StepAdjoint
+from cortado.solvers.solver import Counts, ResumingAdjoint, StepAdjoint
 
 
 class AdjointStep:
@@ -19,6 +19,27 @@ class AdjointStep:
 
     def step(self, state: State, counts: Counts, bar: State) -> None:
         self.solver.replay(state, self._parameters, counts)
+        self._adjoint.step(counts, bar, self._parameters)
+
+    def parameters(self) -> Parameters:
+        return self._adjoint.collect()
+
+
+class ResumingStep:
+    """A `BackwardStep` whose step is taken once more from what is known of its result."""
+
+    capturable = True
+
+    def __init__(self, rollout: Rollout, adjoint: ResumingAdjoint):
+        self.rollout, self.solver, self._parameters = rollout, rollout.solver, rollout.parameters
+        self._adjoint = adjoint
+
+    def begin(self) -> None:
+        self._adjoint.begin()
+        self._adjoint.arrive(self.rollout.last_state())
+
+    def step(self, state: State, counts: Counts, bar: State) -> None:
+        self._adjoint.replay(state, self._parameters, counts)
         self._adjoint.step(counts, bar, self._parameters)
 
     def parameters(self) -> Parameters:
