@@ -40,7 +40,8 @@ Observer = Callable[[int], None]
 
 @dataclass(frozen=True)
 class Terms:
-    """Which parts of a step's derivative count; the step itself is never changed. All of them are the exact one."""
+    """Which parts of the derivative of a step of PCISPH count, where all are the exact one; the step itself is never
+    changed."""
 
     viscosity: bool = True
     """The viscous force's derivative (report eq. 14, put right)."""
@@ -112,7 +113,7 @@ class Simulation:
         - "complex_step": with u^2 = -1, and b far below round-off;
         - "finite_difference": central, of the step ``difference`` (in directions); states are those of the run ahead;
         - "as_printed": the report's eqs. 12 to 14 as they stand, wrong: no pressure from before and no clamp in (12),
-          one density for two in (13), gamma = 2 (d + 2 mu) before (14). Only with the pairwise viscosity;
+          one density for two in (13), gamma = 2 (d + 2 mu) before (14). Only with PCISPH and pairwise viscosity;
         - "as_printed_right_viscosity": the same with gamma = 2 (d + 2) mu;
         - "as_printed_predicted_density": and (12) with the predicted density, as Algorithm 2's text has it.
         """
@@ -199,7 +200,7 @@ class Simulation:
 
     def _check_terms(self, terms: Terms | None) -> None:
         if terms not in (None, Terms()) and isinstance(self.scene.solver, ProjectionSolver):
-            raise InputError("terms leave something out, which they must not with the projection: only PCISPH has them.")
+            raise InputError("terms leave a part out, which they must not with the projection: only PCISPH has parts.")
 
     def _checked(self, name: str, value: Any, steps: int, what: str) -> Digits:
         if name not in PARAMETERS:
