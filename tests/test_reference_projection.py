@@ -178,6 +178,10 @@ def test_without_pressure_nothing_is_projected():
             lambda s: reference.Simulation(s.scene.replaced("forces.viscous_solve='implicit'")),
             'must have viscous_solve = "explicit"',
         ),
+        (
+            lambda s: reference.Simulation(s.scene.replaced("phase[0].rheology={kind='power_law', flow_index=0.6}")),
+            r"scene has phase\[0\].rheology, but must leave it out",
+        ),
     ],
 )
 def test_a_mistake_gives_a_sentence(call, sentence):

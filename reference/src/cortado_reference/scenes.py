@@ -28,6 +28,8 @@ def check_scene(scene: Scene) -> None:
     unknown = [p.name for p in BY_NAME.values() if p.is_optional and p.present(scene)]
     if unknown:
         raise InputError(f"scene has forces.{unknown[0]}, but must leave it out for the reference engine.")
+    if scene.phase[0].rheology is not None:
+        raise InputError("scene has phase[0].rheology, but must leave it out for the reference engine.")
     if scene.force:
         raise InputError("scene has [[force]], but must leave it out for the reference engine.")
     if scene.schedule.courses:

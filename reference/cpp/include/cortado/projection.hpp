@@ -1,5 +1,5 @@
-// What makes a step of the projection of PCISPH's prediction: pressures that make velocities free of divergence, a
-// shift, and the repair of density, with every intermediate value that derivatives need. docs/projection.md writes the
+// The projection, from predicted velocities to the result of a step: pressures that make velocities free of divergence,
+// a shift, and the repair of density, with every intermediate value that derivatives need. docs/projection.md writes the
 // same in the same order.
 #pragma once
 
@@ -7,7 +7,8 @@
 
 namespace cortado {
 
-// How much of the slopes of z+ and of sigma z- the clamp has: all of one of them, or on a corner the mean of both sides.
+// How much of the slopes of z+ and of sigma z- the clamp has: all of one of them, or on a corner the mean of both
+// sides.
 template <class Scalar>
 struct Clamp {
     Scalar rise{0}, fall{0};
@@ -26,16 +27,16 @@ struct Projection {
 
     std::vector<Moments<Scalar, D>> moments;
     std::vector<Effects<Scalar, D>> effects;
-    std::vector<Values<Scalar>> k, y;      // [i]: before iteration i, and after the last one, where both are the same
-    std::vector<Values<Scalar>> divergences; // [i]: the divergence that iteration i finds
-    std::vector<Vectors<Scalar, D>> u;     // [i]: the velocity that y[i] leaves; the last is the result
-    Matrices<Scalar, D> A;                 // sum v_ij g_ij^T of it
-    Vectors<Scalar, D> crowd;              // sum (1 + q_ij / (4 + q_ij)) g_ij
-    Vectors<Scalar, D> x_moved;            // x'
-    std::vector<Vectors<Scalar, D>> x_now; // [i]: before repair i; the last is the result
-    std::vector<Values<Scalar>> c;         // [i]: lambda before repair i
-    std::vector<Values<Scalar>> excess;    // [i]: n - 1 as repair i finds it
-    double error = 0;                      // average compression as the last repair found it
+    std::vector<Values<Scalar>> k, y;         // [i]: before iteration i, and after the last one, where both are the same
+    std::vector<Values<Scalar>> divergences;  // [i]: the divergence that iteration i finds
+    std::vector<Vectors<Scalar, D>> u;        // [i]: the velocity that y[i] leaves; the last is the result
+    Matrices<Scalar, D> A;                    // sum v_ij g_ij^T of it
+    Vectors<Scalar, D> crowd;                 // sum (1 + q_ij / (4 + q_ij)) g_ij
+    Vectors<Scalar, D> x_moved;               // x'
+    std::vector<Vectors<Scalar, D>> x_now;    // [i]: before repair i; the last is the result
+    std::vector<Values<Scalar>> c;            // [i]: lambda before repair i
+    std::vector<Values<Scalar>> excess;       // [i]: n - 1 as repair i finds it
+    double error = 0;                         // average compression as the last repair found it
 
     State<Scalar, D> result() const { return {x_now.back(), u.back(), k.back()}; }
 
@@ -110,7 +111,8 @@ private:
         });
     }
 
-    void iterate(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Values<Scalar>& n, std::size_t at) {
+    void iterate(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Values<Scalar>& n,
+                 std::size_t at) {
         each_particle(n.size(), model.threads, [&](std::size_t i) {
             const Vectors<Scalar, D>& v = u[at];
             Scalar divergence = moments[i].gamma.dot(v[i]);

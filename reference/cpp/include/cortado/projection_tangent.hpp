@@ -53,7 +53,8 @@ Vectors<Real, D> pull_tangent(const Model<Real, D>& model, const Step<Real, D>& 
         for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair) {
             const int j = pair->other;
             const Vector<Real, D> dx_ij = dx[i] - dx[j];
-            total += model.volume * ((dT + change(j)) * pair->gradient() + (T + pull(j)) * pair->hessian_product(dx_ij));
+            const Vector<Real, D> dg = pair->hessian_product(dx_ij);
+            total += model.volume * ((dT + change(j)) * pair->gradient() + (T + pull(j)) * dg);
         }
         du[i] = dv_star[i] - total / model.rest_density;
     });
@@ -88,7 +89,8 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
                 dD += model.volume * (by_u.dot(du[i] - du[j]) + by_x.dot(u[i] - u[j]));
             }
             const Real b = at.wanted(model, i, step.n[i]), D_i = at.divergences[k][i], per = at.step_of(model, i);
-            const Real db = step.n[i] < 1 ? Real(((of.full - 1) * dn[i] - change.full * (1 - step.n[i])) / dt) : Real(0);
+            const Real less = (of.full - 1) * dn[i] - change.full * (1 - step.n[i]);
+            const Real db = step.n[i] < 1 ? Real(less / dt) : Real(0);
             const Real down = at.y[k][i] + per * D_i, dper = -per * change.a / of.a;
             const Clamp<Real> clamp(Real(at.y[k][i] + per * (D_i - b)), down);
             const Real moved = dy[i] + dper * D_i + per * dD;
@@ -130,8 +132,8 @@ State<Real, D> projection_tangent(const Model<Real, D>& model, const Step<Real, 
             Vector<Real, D> total = dc[i] * at.moments[i].gamma + c[i] * moments_dot[i].gamma;
             for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair) {
                 const int j = pair->other;
-                const Vector<Real, D> dx_ij = dot.x[i] - dot.x[j];
-                total += model.volume * ((dc[i] + dc[j]) * pair->gradient() + (c[i] + c[j]) * pair->hessian_product(dx_ij));
+                const Vector<Real, D> dg = pair->hessian_product(dot.x[i] - dot.x[j]);
+                total += model.volume * ((dc[i] + dc[j]) * pair->gradient() + (c[i] + c[j]) * dg);
             }
             dx_now[i] = dx_moved[i] - total / m;
         });

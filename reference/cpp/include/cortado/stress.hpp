@@ -82,7 +82,8 @@ struct Fullness {
         const Scalar one(1);
         const Second<Scalar, D> second(M);
         if (!(second.value > Scalar(0))) return;
-        const Scalar H = Scalar(D) * M.determinant() / second.value, empty = one / Scalar(5), width = Scalar(3) / Scalar(10);
+        const Scalar H = Scalar(D) * M.determinant() / second.value;
+        const Scalar empty = one / Scalar(5), width = Scalar(3) / Scalar(10);
         if (!(H > empty)) return;
         const Scalar t = (H - empty) / width;
         if (!(t < one)) {
