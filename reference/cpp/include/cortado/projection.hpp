@@ -1,6 +1,6 @@
 // The projection, from predicted velocities to the result of a step: pressures that make velocities free of divergence,
-// a shift, and the repair of density, with every intermediate value that derivatives need. docs/projection.md writes the
-// same in the same order.
+// a shift, and the repair of density, with every intermediate value that derivatives need. docs/projection.md writes
+// the same in the same order.
 #pragma once
 
 #include "surroundings.hpp"
@@ -27,7 +27,7 @@ struct Projection {
 
     std::vector<Moments<Scalar, D>> moments;
     std::vector<Effects<Scalar, D>> effects;
-    std::vector<Values<Scalar>> k, y;         // [i]: before iteration i, and after the last one, where both are the same
+    std::vector<Values<Scalar>> k, y;         // [i]: before iteration i; the last two are the result, and the same
     std::vector<Values<Scalar>> divergences;  // [i]: the divergence that iteration i finds
     std::vector<Vectors<Scalar, D>> u;        // [i]: the velocity that y[i] leaves; the last is the result
     Matrices<Scalar, D> A;                    // sum v_ij g_ij^T of it
