@@ -27,7 +27,7 @@ struct Projection {
 
     std::vector<Moments<Scalar, D>> moments;
     std::vector<Effects<Scalar, D>> effects;
-    std::vector<Values<Scalar>> k, y;         // [i]: before iteration i; the last two are the result, and the same
+    std::vector<Values<Scalar>> k, y;         // [i]: before iteration i; the last of each is the result
     std::vector<Values<Scalar>> divergences;  // [i]: the divergence that iteration i finds
     std::vector<Vectors<Scalar, D>> u;        // [i]: the velocity that y[i] leaves; the last is the result
     Matrices<Scalar, D> A;                    // sum v_ij g_ij^T of it
