@@ -9,7 +9,7 @@ from cortado.scene.parameters.registry import BY_NAME
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import PcisphSolver, ProjectionSolver
 from cortado.scene.stability import is_implicit
-from cortado.solvers.projection.constants import ProjectionConstants
+from cortado.solvers.projection.constants import lattice_constants
 from cortado_reference.engine import extension
 
 CLOSEST = 0.25
@@ -84,8 +84,7 @@ def _of_solver(scene: Scene, discrete: DiscreteScene) -> dict[str, Any]:
     """What the engine is told of the solver; without pressure both take the same step."""
     solver = scene.solver
     if isinstance(solver, ProjectionSolver):
-        of = scene.discretisation.spacing, discrete.lattice.support, scene.dimension
-        constants = ProjectionConstants.of(discrete.kernel, *of)
+        constants = lattice_constants(scene, discrete)
         return {
             "projection": scene.forces.pressure,
             "maximum_iterations": solver.iterations,
