@@ -156,7 +156,7 @@ private:
         each_particle(count, model.threads, [&](std::size_t i) {
             const Scalar weights = model.self_weight + model.weights(i, fluid, walls, x_now[at]);
             excess[at][i] = model.volume * weights - Scalar(1);
-            const Scalar z = c[at][i] + step_of(model, i) / Scalar(2) * excess[at][i];
+            const Scalar z = c[at][i] + step_of(model, i) * excess[at][i];
             c[at + 1][i] = z < Scalar(0) ? Scalar(effects[i].repaired * z) : z;
         });
         Real sum(0);

@@ -73,10 +73,12 @@ Matrix<Scalar, D> regular_inverse(const Matrix<Scalar, D>& M) {
 template <class Scalar, int D>
 struct Surroundings {
     Filling<Scalar, D> filling;
-    Smoothstep<Scalar> tension, corrected, shifted, repaired;
+    Smoothstep<Scalar> tension, full, corrected, shifted, repaired;
     Scalar away;              // B
     Scalar direction, lean;   // the denominators of N and C
-    Matrix<Scalar, D> K, N, C;
+    Scalar below, lack;       // M : P / (d - 1) + 0.05, and t
+    Matrix<Scalar, D> K, N, P, C;
+    Matrix<Scalar, D> beside;  // t P - (1 + t) C
     Matrix<Scalar, D> bare;   // (L - 1) / c
     Vector<Scalar, D> own;    // L g + gamma
     Effects<Scalar, D> found;
@@ -84,6 +86,7 @@ struct Surroundings {
     Surroundings(const Model<Scalar, D>& model, const Moments<Scalar, D>& of)
         : filling(of.M),
           tension(filling.H, 10, 50),
+          full(Scalar(filling.H + of.nu), 10, 50),
           corrected(filling.H, 20, 50),
           shifted(filling.H, 50, 80),
           repaired(filling.H, 80, 95) {
@@ -96,12 +99,16 @@ struct Surroundings {
         lean = of.M.cwiseProduct(N).sum() + hundredths<Scalar>(5);
         const Matrix<Scalar, D> across = (unit - N) * of.M * N;
         C = hundredths<Scalar>(105) / lean * (across + across.transpose());
-        bare = away * (K - unit) - (one - away) * C;
+        P = unit - N;
+        below = of.M.cwiseProduct(P).sum() / Scalar(D - 1) + hundredths<Scalar>(5);
+        lack = hundredths<Scalar>(20) * (hundredths<Scalar>(105) / below - one);
+        beside = lack * P - (one + lack) * C;
+        bare = away * (K - unit) + (one - away) * beside;
         found.L = unit + corrected.value * bare;
         own = found.L * of.g + of.gamma;
         found.a = (own.dot(own) + model.least_diagonal) / m + (found.L * found.L).cwiseProduct(of.Q).sum();
         found.tension = tension.value * away;
-        found.full = tension.value;
+        found.full = full.value;
         found.shifted = shifted.value;
         found.repaired = repaired.value * away;
     }
@@ -127,8 +134,8 @@ struct Shift {
         root = square_root(Scalar(turned + least * least));
         rate = Scalar(20) * turned / (root + least);
         bend = square_root(Scalar(one + Scalar(4) * rate * rate));
-        out = of.g + of.gamma / Scalar(2);
-        slope = crowd + of.gamma / Scalar(2);
+        out = of.g + of.gamma;
+        slope = crowd + of.gamma;
         square = out.dot(out) + hundredths<Scalar>(3) * hundredths<Scalar>(3) / (s * s);
         part = out.dot(slope) / square;
         along = slope - part * out;
