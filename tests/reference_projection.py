@@ -25,8 +25,18 @@ class Projection:
     feet: np.ndarray
     """From wall particles to the surface."""
     periods: np.ndarray
-    iterations: int
-    repairs: int
+    iterations: int = 4
+    repairs: int = 2
+
+    @classmethod
+    def of(cls, simulation):
+        """Beside the walls of a simulation."""
+        solver, scene, d = simulation.solver, simulation.scene, simulation.dimension
+        search, lattice = solver.search, solver.lattice
+        walls = search.wall_positions.numpy()[:, :d], search.wall_weights.numpy(), search.wall_feet.numpy()[:, :d]
+        kernel, spacing = solver.discretisation.smoothing, scene.discretisation.spacing
+        periods = np.array(scene.container.periods(d)[1])
+        return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods)
 
     def pairs(self, x, y):
         """Separations (n, m, d), and V W and V grad W of them."""
@@ -52,31 +62,37 @@ class Projection:
         square = (g**2).sum()
         return 1 / (1.05 * ((np.sin(waves @ lattice.T) @ g) ** 2).sum(1).max() / square), square
 
-    def step(self, x, v_star, before, m, dt):
-        """Positions, velocities and k after the step, from predicted velocities and the k of the step before."""
-        (n, d), (apart, W, g) = x.shape, self.pairs(x, x)
+    def around(self, x):
+        """W, g, the sum of g, gamma, nu, M, H and the inverse of M."""
+        d, (apart, W, g) = x.shape[1], self.pairs(x, x)
         _, wall_W, wall_g = self.pairs(x, self.walls)
-        density = self.density(x)
         normal = self.feet / np.linalg.norm(self.feet, axis=1, keepdims=True)
         gamma = np.einsum("b,iba,ba,bc->ic", self.wall_weights, wall_g, normal, normal)
         nu = wall_W @ self.wall_weights
-        total = g.sum(1)
         M = -np.einsum("ija,ijb->iab", g, apart)
         if d == 2:
             H = 2 * np.linalg.det(M) / (np.trace(M, axis1=1, axis2=2) + 1e-12)
         else:
             squares = (np.trace(M, axis1=1, axis2=2) ** 2 - np.trace(M @ M, axis1=1, axis2=2)) / 2
             H = 3 * np.linalg.det(M) / (squares + 1e-12)
+        return W, g, g.sum(1), gamma, nu, M, H, 1.05 * np.linalg.inv(M + 0.05 * np.eye(d))
+
+    def step(self, x, v_star, before, m, dt):
+        """Positions, velocities and k after the step, from predicted velocities and the k of the step before."""
+        (n, d), density = x.shape, self.density(x)
+        _, g, total, gamma, nu, M, H, inverse = self.around(x)
         B = 1 / (1 + (nu / 0.05) ** 4)
         tension = between(H, 0.1, 0.5) * B
-        inverse = 1.05 * np.linalg.inv(M + 0.05 * np.eye(d))
         omega, square = self.constants(d)
         N = gamma[:, :, None] * gamma[:, None, :]
         N = N / ((gamma**2).sum(1) + 0.01 * 0.05 * square)[:, None, None]
-        across = (np.eye(d) - N) @ M @ N
+        P = np.eye(d) - N
+        across = P @ M @ N
         C = 1.05 / ((M * N).sum((1, 2)) + 0.05)[:, None, None] * (across + across.transpose(0, 2, 1))
-        B, full = B[:, None, None], between(H, 0.1, 0.5)
-        L = np.eye(d) + between(H, 0.2, 0.5)[:, None, None] * (B * (inverse - np.eye(d)) - (1 - B) * C)
+        t = 0.2 * (1.05 / ((M * P).sum((1, 2)) / (d - 1) + 0.05) - 1)[:, None, None]
+        beside = t * P - (1 + t) * C
+        B, full = B[:, None, None], between(H + nu, 0.1, 0.5)
+        L = np.eye(d) + between(H, 0.2, 0.5)[:, None, None] * (B * (inverse - np.eye(d)) + (1 - B) * beside)
         B = B[:, 0, 0]
         own = np.einsum("iab,ib->ia", L, total) + gamma
         a = ((own**2).sum(1) + 0.05 * square) / m
@@ -101,23 +117,23 @@ class Projection:
             later = (1 + np.sqrt(1 + 4 * t * t)) / 2
             y, k, t = new + (t - 1) / later * (new - k), new, later  # y of the last one is not used
         v = v_star - force(k) / m[:, None]
-        moved = x + dt * v + self.shift(v, W, g, total, gamma, inverse, H, dt)
+        moved = x + dt * v + self.shift(x, v, dt)
         now, c = moved, np.zeros(n)
         low = between(H, 0.8, 0.95) * B
         for _ in range(self.repairs):
-            z = c + omega / 2 * (self.density(now) - 1) / a
+            z = c + omega * (self.density(now) - 1) / a
             c = np.where(z > 0, z, low * z)
             now = moved - (((c[:, None] + c[None, :])[..., None] * g).sum(1) + c[:, None] * gamma) / m[:, None]
         return now, v, k
 
-    def shift(self, v, W, g, total, gamma, inverse, H, dt):
-        s, d = self.spacing, v.shape[1]
+    def shift(self, x, v, dt):
+        (W, g, total, gamma, _, _, H, inverse), s, d = self.around(x), self.spacing, x.shape[1]
         gradient = np.einsum("ija,ijb,ibc->iac", v[:, None] - v[None, :], g, inverse)
         rate = 20 * (np.sqrt(dt**2 * (gradient**2).sum((1, 2)) + 1e-10) - 1e-5)
         near = self.volume * self.kernel.weight(np.array([s]), d, self.support)[0]
         close = (W / near) ** 4
-        slope = ((1 + 0.25 * close / (1 + close / 4))[..., None] * g).sum(1) + gamma / 2
-        out = total + gamma / 2
+        slope = ((1 + 0.25 * close / (1 + close / 4))[..., None] * g).sum(1) + gamma
+        out = total + gamma
         along = slope - out * ((out * slope).sum(1) / ((out**2).sum(1) + (0.03 / s) ** 2))[:, None]
         strength = rate / np.sqrt(1 + (rate / 0.5) ** 2)
         wish = -(strength * s**2 * between(H, 0.5, 0.8))[:, None] * along

@@ -156,7 +156,9 @@ def test_a_long_launch_is_not_repeated_often():
         time.sleep(1.2 * BATCH)
 
     assert LaunchTimer(launcher, 2)(work) >= BATCH
-    assert len(calls) == 9  # one to begin with, three that are timed alone, one for the graph, two to warm up, two repeats
+    assert (
+        len(calls) == 9
+    )  # one to begin with, three that are timed alone, one for the graph, two to warm up, two repeats
 
 
 @pytest.mark.skipif(not Path("/proc/stat").exists(), reason="the system does not say how busy it is")

@@ -301,6 +301,8 @@ ELSEWHERE = {
     "surrounding_kernels": "of the projection: whole steps in tests/test_projection.py",
     "velocity_kernels": "the same",
     "shift_kernels": "the same",
+    "moving_kernels": "the same",
+    "place_kernels": "of PCISPH with shifting: whole steps in tests/test_shifting.py",
     "repair_kernels": "the same",
     "pressed_adjoint_kernel": "of a quantity: tests/test_quantities.py",
     "phase_colour_kernels": "of pictures, by differences: tests/test_render.py",

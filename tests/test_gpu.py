@@ -50,6 +50,7 @@ SCENES = {
     "three fluids": plane_of_three(),
     "stress": plane(forces={"gravity": [0.0, -9.81], "viscosity": "stress"}),
     "projection": splash(kind="projection"),
+    "shifting": splash(shifting=True),
     "projection in the plane": plane_of_three(solver={"kind": "projection", "time_step": 0.002}),
     "implicit, with a law": plane(
         phase=[{**HONEY, "rheology": {"kind": "bingham", "yield_stress": 5.0, "regularisation": 0.5}}],

@@ -32,16 +32,7 @@ def test_a_step_is_that_of_the_twin(case):
     made = CASES[case]()
     made = made.replaced(*(f"phase[{number}].viscosity=0" for number in range(len(made.phase))))
     simulation = Simulation(made, precision="float64")
-    solver, d, given = simulation.solver, simulation.dimension, thrown(simulation)
-    search, lattice = solver.search, solver.lattice
-    walls = search.wall_positions.numpy()[:, :d], search.wall_weights.numpy(), search.wall_feet.numpy()[:, :d]
-    twin = Projection(
-        *(solver.discretisation.smoothing, lattice.support, lattice.volume, made.discretisation.spacing),
-        *walls,
-        np.array(made.container.periods(d)[1]),
-        iterations=4,
-        repairs=2,
-    )
+    given, twin = thrown(simulation), Projection.of(simulation)
     gravity, dt = np.array(made.forces.gravity), 0.002
     m = simulation.state()["reference_density"]
     run = simulation.run(3, given)

@@ -349,7 +349,7 @@ def test_words_and_panels():
 
 UNUSED = (
     *(("discretisation", "jitter"), ("forces", "surface_tension_form")),
-    *(("solver", "courant"), ("solver", "greatest_time_step")),
+    *(("solver", "courant"), ("solver", "greatest_time_step"), ("solver", "shifting")),
 )
 """Keys that change nothing in a scene that does not use them."""
 

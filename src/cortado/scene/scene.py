@@ -58,12 +58,13 @@ class Scene(SceneTables):
 
     def computed_json(self) -> str:
         """What results depend on: not [picture] and [[sensor]], nor an empty [[force]], a jitter of 0, the form of a
-        surface tension that is not there, and how a time step is chosen that is fixed."""
+        surface tension that is not there, how a time step is chosen that is fixed, and a shifting that is off."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
         aside |= {} if self.force else {"force": True}
         aside |= {} if self.discretisation.jitter else {"discretisation": {"jitter"}}
         aside |= {} if self.forces.surface_tension else {"forces": {"surface_tension_form"}}
-        aside |= {} if self.solver.chooses else {"solver": {"courant", "greatest_time_step"}}
+        unused = set() if self.solver.chooses else {"courant", "greatest_time_step"}
+        aside["solver"] = unused if getattr(self.solver, "shifting", True) else unused | {"shifting"}
         return json.dumps(self.model_dump(mode="json", exclude=aside), indent=2)
 
     @classmethod

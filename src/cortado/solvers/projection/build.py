@@ -4,7 +4,7 @@ from cortado.scene.solvers import ProjectionSolver
 from cortado.solvers.build import particle_system
 from cortado.solvers.makers import SolverSetting
 from cortado.solvers.pcisph.solver import Pcisph
-from cortado.solvers.projection.constants import ProjectionConstants
+from cortado.solvers.projection.constants import lattice_constants
 from cortado.solvers.projection.solver import Projection
 from cortado.solvers.solver import Solver
 
@@ -20,11 +20,10 @@ class ProjectionMaker:
     def build(self, setting: SolverSetting) -> Solver:
         """The solver of a scene that is cut into particles, on a device. Without pressure nothing is projected, and all
         solvers take the same step."""
-        system, cut, table = particle_system(setting), setting.scene.discretisation, self._table
+        system, table = particle_system(setting), self._table
         if not setting.scene.forces.pressure:
             return Pcisph(system, None)
-        lattice = setting.discrete.kernel, cut.spacing, setting.discrete.lattice.support, setting.scene.dimension
-        return Projection(system, ProjectionConstants.of(*lattice), table.iterations, table.repairs)
+        return Projection(system, lattice_constants(setting.scene, setting.discrete), table.iterations, table.repairs)
 
 
 maker = ProjectionMaker

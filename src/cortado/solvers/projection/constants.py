@@ -7,6 +7,8 @@ import numpy as np
 
 from cortado.discretise.calibration import lattice_offsets, rest_volume
 from cortado.discretise.smoothing import SmoothingKernel
+from cortado.scene.discrete_scene import DiscreteScene
+from cortado.scene.scene import Scene
 
 MARGIN = 1.05
 """By how much the relaxation stays below that of the lattice's stiffest wave."""
@@ -42,3 +44,9 @@ class ProjectionConstants:
         stiffest = float(((np.sin(waves @ offsets.T) @ gradients) ** 2).sum(axis=1).max()) / square
         nearest = volume * float(kernel.weight(np.array([spacing]), dimension, support)[0])
         return cls(spacing, 1.0 / (MARGIN * stiffest), DEPARTURE * square, nearest)
+
+
+def lattice_constants(scene: Scene, discrete: DiscreteScene) -> ProjectionConstants:
+    """Those of the lattice of a scene."""
+    lattice = discrete.kernel, scene.discretisation.spacing, discrete.lattice.support, scene.dimension
+    return ProjectionConstants.of(*lattice)

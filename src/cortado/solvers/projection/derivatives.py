@@ -30,7 +30,7 @@ class ProjectionTangent(ParticleTangent):
         self._around = named({name: wp.zeros_like(array) for name, array in solver.around.items()}, "dot")
         self._pull = solver.new_arrays(T=solver.pull.dtype, T_dot=solver.pull.dtype)
         self._x_star_dot, self._v_star_dot, self._v_new_dot = (solver.vectors() for _ in range(3))
-        self._u_dot, self._x_moved_dot, self._x_now_dot = (solver.vectors() for _ in range(3))
+        self._u_dot, self._delta_dot, self._x_moved_dot, self._x_now_dot = (solver.vectors() for _ in range(4))
         self._k_dot, self._y_dot, self._c_dot = (solver.numbers() for _ in range(3))
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
@@ -45,10 +45,11 @@ class ProjectionTangent(ParticleTangent):
         steps = {"k_dot": self._k_dot, "y_dot": self._y_dot}
         context.launch(kernels.pressure.start.tangent, *known, start, steps)
         self._project(context, known, counts[0])
-        moved = {"v_new": solver.v_new, "v_new_dot": self._v_new_dot, "x_moved_dot": self._x_moved_dot}
-        context.launch(kernels.shift.tangent, *known, solver.kept, solver.shifted, moved)
-        wp.copy(self._x_now_dot, self._x_moved_dot)
-        self._c_dot.zero_()
+        flow = {"v_flow": solver.v_new, "v_flow_dot": self._v_new_dot, "delta_dot": self._delta_dot}
+        context.launch(kernels.shift.tangent, *known, solver.kept, solver.shifted, flow)
+        moved = {"v_new": solver.v_new, "v_new_dot": self._v_new_dot, "delta_dot": self._delta_dot}
+        begun = {"x_moved_dot": self._x_moved_dot, "x_now_dot": self._x_now_dot, "c_dot": self._c_dot}
+        context.launch(kernels.moving.tangent, *known, moved, begun)
         for k in range(counts[1]):
             at, new = solver.repaired[k], solver.repaired[k + 1]
             measured = {"x_now": at["x_now"], "c_in": at["c"], "excess": at["excess"]}
@@ -142,9 +143,10 @@ class ProjectionAdjoint(ParticleAdjoint):
         known = (*self.bar.named, self._around, solver.around)
         self._mend(context, known, counts[1])
         moved = {"v_new": solver.v_new, "v_new_bar": self._v_new_bar, "x_moved_bar": self._x_moved_bar}
-        own, sums = kernels.shift.adjoint
-        for kernel in (own, sums):
-            context.launch(kernel, *known, self._kept, solver.kept, solver.shifted, moved)
+        context.launch(kernels.moving.adjoint, *known, moved)
+        flow = {"v_flow": solver.v_new, "v_flow_bar": self._v_new_bar, "delta_bar": self._x_moved_bar}
+        for kernel in kernels.shift.adjoint:
+            context.launch(kernel, *known, self._kept, solver.kept, solver.shifted, flow)
         self._project(context, known, counts[0])
         start = {"k_before": solver.carried[IMPULSE], "k_before_bar": self._k_before_bar}
         context.launch(kernels.pressure.start.adjoint, *known, start, k_bar=self._k_bar, y_bar=self._y_bar)

@@ -1,11 +1,11 @@
 """Particles of the interior are shifted to where they are fewer (Lind et al. 2012; Skillen, Lind, Stansby and Rogers
 2013), at a rate that follows the velocity gradient, so that a fluid at rest is not stirred:
 
-    delta = -r s^2 u P grad C,   grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma / 2,   q_ij = (W_ij / W(s))^4,
+    delta = -r s^2 u P grad C,   grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma,   q_ij = (W_ij / W(s))^4,
 
 with r = 20 dt |grad v|, softly at least 0 and at most 0.5, and |delta| softly at most 0.1 s. P takes out the direction
-of the surface, g + gamma / 2, and u of `cortado.solvers.projection.surroundings` is 0 at surfaces. Velocities stay as
-they are: with a correction by (delta . grad) v the fluid gains energy. The new position is x + dt v + delta.
+of the surface, g + gamma, and u of `cortado.solvers.projection.surroundings` is 0 at surfaces. Velocities stay as
+they are: with a correction by (delta . grad) v the fluid gains energy.
 """
 
 from dataclasses import dataclass
@@ -61,7 +61,7 @@ def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftF
         G = A * inverse(M)
         turned = dt * dt * wp.ddot(G, G)
         strength = rate * turned / (wp.sqrt(turned + least * least) + least)
-        out, slope = g + real(0.5) * gamma, crowd + real(0.5) * gamma
+        out, slope = g + gamma, crowd + gamma
         square = wp.dot(out, out) + surface / (spacing * spacing)
         along = slope - (wp.dot(out, slope) / square) * out
         strength = strength / wp.sqrt(real(1.0) + (strength / greatest) * (strength / greatest))
@@ -105,7 +105,7 @@ def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftF
 
 @cache
 def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """The kernels of the new positions; the adjoint are two, that of a particle's own and that of its sums."""
+    """The kernels of delta; the adjoint are two, that of a particle's own and that of its sums."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
     neighbourhood, weights4 = neighbourhood_type(precision), weights_type(precision)
@@ -118,56 +118,55 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     along = shift_functions(precision, dimension, tangent_module).back
     back = shift_functions(precision, dimension, adjoint_module).back
     own = {name: kind for name, kind in entries(precision).items() if name in ("M", "g", "gamma", "weights")}
-    seen, bars = bundle(**own), bundle(x=vector, time_step=real, **own)
+    seen, bars = bundle(**own), bundle(time_step=real, **own)
     kept = bundle(A=matrix, crowd=vector)
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
 
     @wp.kernel(module=module)
-    def new_positions(
+    def shift(
         s: neighbourhood,
         nearest: real,
         spacing: real,
         time_step: wp.array(dtype=real),
         x: wp.array(dtype=vector),
-        v_new: wp.array(dtype=vector),
+        v_flow: wp.array(dtype=vector),
         of: seen,
         # out
         kept: kept,
-        x_moved: wp.array(dtype=vector),
+        delta: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z, crowd = crowding(i, x, v_new, nearest, s)
+        row_x, row_y, row_z, crowd = crowding(i, x, v_flow, nearest, s)
         if lane() > 0:
             return
         dt, A = time_step[i // s.particles], wp.matrix_from_rows(row_x, row_y, row_z)
-        delta = shift_of(A, crowd, of.M[i], of.g[i], of.gamma[i], of.weights[i][2], dt, spacing)
         kept.A[i] = A
         kept.crowd[i] = crowd
-        x_moved[i] = x[i] + dt * v_new[i] + delta
+        delta[i] = shift_of(A, crowd, of.M[i], of.g[i], of.gamma[i], of.weights[i][2], dt, spacing)
 
     @wp.kernel(module=tangent_module, enable_backward=False)
-    def new_positions_tangent(
+    def shift_tangent(
         s: neighbourhood,
         nearest: real,
         spacing: real,
         time_step: wp.array(dtype=real),
         time_step_dot: wp.array(dtype=real),
         x: wp.array(dtype=vector),
-        v_new: wp.array(dtype=vector),
+        v_flow: wp.array(dtype=vector),
         of: seen,
         kept: kept,
-        dot: bundle(x=vector, v_new=vector, **own),
+        dot: bundle(x=vector, v_flow=vector, **own),
         # out
-        x_moved_dot: wp.array(dtype=vector),
+        delta_dot: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        row_x, row_y, row_z, crowd_dot = crowding_tangent(i, x, dot.x, v_new, dot.v_new, nearest, s)
+        row_x, row_y, row_z, crowd_dot = crowding_tangent(i, x, dot.x, v_flow, dot.v_flow, nearest, s)
         if lane() > 0:
             return
         member = i // s.particles
         dt, A_dot = time_step[member], wp.matrix_from_rows(row_x, row_y, row_z)
-        total = dot.x[i] + dt * dot.v_new[i] + time_step_dot[member] * v_new[i]
+        total = vector()
         for k in range(3):
             unit = vector()
             unit[k] = real(1.0)
@@ -177,28 +176,33 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
             entry = wp.ddot(by_A, A_dot) + wp.dot(by_crowd, crowd_dot) + wp.ddot(by_M, dot.M[i])
             entry += wp.dot(by_g, dot.g[i]) + wp.dot(by_gamma, dot.gamma[i]) + by_u * dot.weights[i][2]
             total += (entry + by_dt * time_step_dot[member]) * unit
-        x_moved_dot[i] = total
+        delta_dot[i] = total
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def own_adjoint(
         particles: int,
         spacing: real,
         time_step: wp.array(dtype=real),
-        v_new: wp.array(dtype=vector),
         of: seen,
         kept: kept,
-        x_moved_bar: wp.array(dtype=vector),
+        delta_bar: wp.array(dtype=vector),
         # in and out
-        v_new_bar: wp.array(dtype=vector),
         bar: bars,
         # out
         A_bar: wp.array(dtype=matrix),
         crowd_bar: wp.array(dtype=vector),
     ):
         i = wp.tid()
-        dt, moved = time_step[i // particles], x_moved_bar[i]
         by_A, by_crowd, by_M, by_g, by_gamma, by_u, by_dt = back(
-            kept.A[i], kept.crowd[i], of.M[i], of.g[i], of.gamma[i], of.weights[i][2], dt, spacing, moved
+            kept.A[i],
+            kept.crowd[i],
+            of.M[i],
+            of.g[i],
+            of.gamma[i],
+            of.weights[i][2],
+            time_step[i // particles],
+            spacing,
+            delta_bar[i],
         )
         no = real(0.0)
         A_bar[i] = by_A
@@ -207,27 +211,25 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         bar.g[i] = bar.g[i] + by_g
         bar.gamma[i] = bar.gamma[i] + by_gamma
         bar.weights[i] = bar.weights[i] + weights4(no, no, by_u, no)
-        bar.x[i] = bar.x[i] + moved
-        bar.time_step[i] = bar.time_step[i] + by_dt + wp.dot(moved, v_new[i])
-        v_new_bar[i] = v_new_bar[i] + dt * moved
+        bar.time_step[i] = bar.time_step[i] + by_dt
 
     @wp.kernel(module=adjoint_module, enable_backward=False)
     def sums_adjoint(
         s: neighbourhood,
         nearest: real,
         x: wp.array(dtype=vector),
-        v_new: wp.array(dtype=vector),
+        v_flow: wp.array(dtype=vector),
         A_bar: wp.array(dtype=matrix),
         crowd_bar: wp.array(dtype=vector),
         # in and out
-        v_new_bar: wp.array(dtype=vector),
+        v_flow_bar: wp.array(dtype=vector),
         x_bar: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid() // LANES
-        v_part, x_part = crowding_back(i, x, v_new, A_bar, crowd_bar, nearest, s)
+        v_part, x_part = crowding_back(i, x, v_flow, A_bar, crowd_bar, nearest, s)
         if lane() > 0:
             return
-        v_new_bar[i] = v_new_bar[i] + v_part
+        v_flow_bar[i] = v_flow_bar[i] + v_part
         x_bar[i] = x_bar[i] + x_part
 
-    return Kernels(new_positions, new_positions_tangent, (own_adjoint, sums_adjoint))
+    return Kernels(shift, shift_tangent, (own_adjoint, sums_adjoint))

@@ -17,6 +17,7 @@ from cortado.particles.state import Parameters, State
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.constants import ProjectionConstants
+from cortado.solvers.projection.moving import moving_kernels
 from cortado.solvers.projection.pressure import PressureKernels, pressure_kernels
 from cortado.solvers.projection.repair import RepairKernels, repair_kernels
 from cortado.solvers.projection.shifting import shift_kernels
@@ -38,6 +39,7 @@ class ProjectionKernels:
     velocity: VelocityKernels
     pressure: PressureKernels
     shift: Any
+    moving: Any
     repair: RepairKernels
 
     @classmethod
@@ -49,6 +51,7 @@ class ProjectionKernels:
             velocity_kernels(*own),
             pressure_kernels(*own),
             shift_kernels(*own),
+            moving_kernels(discretisation.precision),
             repair_kernels(*own),
         )
 
@@ -79,7 +82,7 @@ class ProjectionSteps(ParticleSolver):
         """u = v* - D^T y / m, the divergence of u, y and k before each iteration; the last has y = k of all of them."""
         self.repaired = [self.new_arrays(**self._repair_kinds)]
         """x_k, lambda and n - 1 before each repair."""
-        self.x_star, self.v_star, self.v_new, self.x_moved = (self.vectors() for _ in range(4))
+        self.x_star, self.v_star, self.v_new, self.x_moved, self.delta = (self.vectors() for _ in range(5))
         self.momenta = momenta(iterations)
         limits = (LoopLimits(count, count, 0.0, 0.0) for count in (iterations, repairs))
         names = ("iterations", "divergence_errors"), ("repairs", "density_errors")
@@ -163,11 +166,11 @@ class ProjectionSteps(ParticleSolver):
     def move(self, context: StepContext, last: int) -> None:
         """The new velocities, by the k of a slot, and the positions that they and the shift lead to."""
         kernels, at = self.kernels, {"y": self.iterates[last]["y"], "T": self.pull}
-        new = {"v_new": self.v_new, "x_moved": self.x_moved}
         context.launch(kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star, u=self.v_new)
-        context.launch(kernels.shift.forward, self.around, self.kept, self.shifted, new)
-        wp.copy(self.repaired[0]["x_now"], self.x_moved)
-        self.repaired[0]["c"].zero_()
+        flow, first = {"v_flow": self.v_new, "delta": self.delta}, self.repaired[0]
+        context.launch(kernels.shift.forward, self.around, self.kept, self.shifted, flow)
+        moved = {"v_new": self.v_new, "delta": self.delta, "x_moved": self.x_moved}
+        context.launch(kernels.moving.forward, moved, x_now=first["x_now"], c=first["c"])
 
     def mend(self, context: StepContext, before: int, after: int) -> None:
         """A repair, from the positions of one slot to those of another."""
