@@ -18,6 +18,7 @@ class AdjointStep:
         self._adjoint.begin()
 
     def step(self, state: State, counts: Counts, bar: State) -> None:
+        self.solver.reserve(counts)
         self.solver.replay(state, self._parameters, counts)
         self._adjoint.step(counts, bar, self._parameters)
 

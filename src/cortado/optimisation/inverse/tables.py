@@ -20,7 +20,7 @@ from pydantic import (
 
 from cortado.errors import Words
 from cortado.executors import Executor, InProcess
-from cortado.gradients import AdjointEstimator, AdjointViscosity, EnsembleMean, Exact, FrozenGeometry, GradientEstimator
+from cortado.gradients import AdjointEstimator, AdjointViscosity, EnsembleMean, Exact, FrozenGeometry, GradientEstimator, ImplicitPressure
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch, Optimiser
 from cortado.optimisation.start import MOST_ITERATIONS
@@ -42,6 +42,7 @@ ESTIMATORS: dict[str, AdjointEstimator] = {
     "exact": Exact(),
     "frozen_geometry": FrozenGeometry(),
     "adjoint_viscosity": AdjointViscosity(),
+    "implicit_pressure": ImplicitPressure(),
 }
 RANDOM = "random"
 CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
