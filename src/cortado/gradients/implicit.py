@@ -18,14 +18,15 @@ class ImplicitPressure(AdjointEstimator):
     point k = Phi(k, u), and so the adjoint u^ = Phi_u^T l with (1 - Phi_k^T) l = k^, which conjugate gradients solve.
 
     Bias: none at the fixed point. After a few iterations the pressure is not there yet, and the gradient is that of a
-    fluid with the same pressure that would be. The first guess of a step, the pressure of the last, has no adjoint.
+    fluid with the same pressure that would be. The first guess of a step, the pressure of the last, has no adjoint. The
+    gradient with respect to the rest density of a single phase, which the pressure cancels, is of no use then.
     Cost: it does not depend on the iterations of the solver, neither the memory nor the work.
 
     Only for scenes with the solver ``"projection"``. Source: implicit differentiation of fixed points (Christianson
     1994, Optimization Methods and Software 3).
     """
 
-    tolerance: float = 1e-3
+    tolerance: float = 0.1
     """The solve ends where its residual has fallen to this part of the first, in the norm of its diagonal; at least 0,
     where `iterations` are done in any case."""
     iterations: int = 100

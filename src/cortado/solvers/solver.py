@@ -153,8 +153,8 @@ class Solver(Protocol):
         """The same with a frozen geometry, in which no force depends on positions: for `FrozenGeometry`."""
 
     def implicit_adjoint(self, steps: int, tolerance: float, iterations: int) -> ResumingAdjoint:
-        """The same with the pressure as the fixed point of its iterations, whose adjoint is solved for until the residual
-        has fallen to ``tolerance`` of the first, in ``iterations`` at most: for `ImplicitPressure`."""
+        """The same with the pressure as the fixed point of its iterations, whose adjoint is solved for until the
+        residual has fallen to ``tolerance`` of the first, in ``iterations`` at most: for `ImplicitPressure`."""
 
     def differentiable(self) -> Self:
         """The same solver, with arrays that Warp's tape can differentiate."""

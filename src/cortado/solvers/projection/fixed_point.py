@@ -1,4 +1,4 @@
-"""The adjoint of the pressure as the fixed point of its iterations, whatever way led to it (`gradients.ImplicitPressure`).
+"""The adjoint of the pressure as the fixed point of its iterations, for `gradients.ImplicitPressure`.
 
 At convergence k = Phi(k, inputs), with Phi an iteration of `cortado.solvers.projection.pressure` without extrapolation,
 where k' has a part c of the slope by z: 1 where fluid is pushed, sigma where it is pulled, else 0. With A = D m^-1 D^T,
@@ -209,9 +209,7 @@ class FixedPointAdjoint(ProjectionAdjoint):
         def multiply(p: wp.array, found: dict[str, wp.array]) -> None:
             by = {"y": self._y, "T": self._pull}
             self._pull_by(context, p, **by)
-            context.launch(
-                solver.kernels.velocity.velocity.forward, solver.around, by, v_star=self._still, u=self._u
-            )
+            context.launch(solver.kernels.velocity.velocity.forward, solver.around, by, v_star=self._still, u=self._u)
             context.launch(self._own.multiply, *own, found, u=self._u, p=p)
 
         self._solution.solve(context, multiply, self._w, self._r, self._q)
