@@ -8,7 +8,7 @@ import pytest
 from cortado import InputError, Problem, Simulation, gradients, losses
 from cortado.device.launching import KernelLauncher
 from cortado.gradients import ImplicitPressure
-from scenes import jet, plane, plane_of_three, scene
+from scenes import jet, plane, plane_of_three, scene, thrown
 
 PERIODIC = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]}
 MADE = {
@@ -27,14 +27,10 @@ def problem_of(case, iterations, steps=5, **options):
     return Problem(simulation, steps, losses.FinalPositions(simulation.positions + 0.03))
 
 
-def point_of(simulation, seed=3):
+def point_of(simulation):
     """Gravity and, of what no nozzle leads, a first state with scatter."""
     found = {"gravity": np.array(simulation.scene.forces.gravity)}
-    if simulation.scene.emitter is None:
-        random, x, v = np.random.default_rng(seed), simulation.positions, simulation.velocities
-        inwards = simulation.scene.discretisation.spacing * (0.02 + 0.1 * random.random(x.shape))
-        found |= {"initial_positions": x + inwards, "initial_velocities": v + 0.5 * random.standard_normal(v.shape)}
-    return found
+    return found | ({} if simulation.scene.emitter is not None else thrown(simulation))
 
 
 def distances(case, iterations, estimator):

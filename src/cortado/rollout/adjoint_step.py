@@ -26,22 +26,17 @@ class AdjointStep:
         return self._adjoint.collect()
 
 
-class ResumingStep:
-    """A `BackwardStep` whose step is taken once more from what is known of its result."""
-
-    capturable = True
+class ResumingStep(AdjointStep):
+    """The same, where the step is taken once more from what is known of its result."""
 
     def __init__(self, rollout: Rollout, adjoint: ResumingAdjoint):
-        self.rollout, self.solver, self._parameters = rollout, rollout.solver, rollout.parameters
-        self._adjoint = adjoint
+        super().__init__(rollout, adjoint)
+        self._resuming = adjoint
 
     def begin(self) -> None:
-        self._adjoint.begin()
-        self._adjoint.arrive(self.rollout.last_state())
+        super().begin()
+        self._resuming.arrive(self.rollout.last_state())
 
     def step(self, state: State, counts: Counts, bar: State) -> None:
-        self._adjoint.replay(state, self._parameters, counts)
-        self._adjoint.step(counts, bar, self._parameters)
-
-    def parameters(self) -> Parameters:
-        return self._adjoint.collect()
+        self._resuming.replay(state, self._parameters, counts)
+        self._resuming.step(counts, bar, self._parameters)
