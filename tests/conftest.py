@@ -18,7 +18,8 @@ from cortado.cli import main
 from cortado.cli.subcommands import CORTADO
 
 WITHOUT_ENGINE = find_spec("cortado_reference") is None and shutil.which("c++") is None
-collect_ignore = ["test_reference.py", "test_study.py", "test_study_figures.py", "test_study_growth.py"]
+collect_ignore = ["test_reference.py", "test_reference_projection.py", "test_study.py"]
+collect_ignore += ["test_study_figures.py", "test_study_growth.py"]
 collect_ignore = collect_ignore if WITHOUT_ENGINE else []
 
 

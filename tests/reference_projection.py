@@ -86,10 +86,13 @@ class Projection:
         omega, square = self.constants(d)
         N = gamma[:, :, None] * gamma[:, None, :]
         N = N / ((gamma**2).sum(1) + 0.01 * 0.05 * square)[:, None, None]
-        across = (np.eye(d) - N) @ M @ N
+        P = np.eye(d) - N
+        across = P @ M @ N
         C = 1.05 / ((M * N).sum((1, 2)) + 0.05)[:, None, None] * (across + across.transpose(0, 2, 1))
-        B, full = B[:, None, None], between(H, 0.1, 0.5)
-        L = np.eye(d) + between(H, 0.2, 0.5)[:, None, None] * (B * (inverse - np.eye(d)) - (1 - B) * C)
+        t = 0.2 * (1.05 / ((M * P).sum((1, 2)) / (d - 1) + 0.05) - 1)[:, None, None]
+        beside = t * P - (1 + t) * C
+        B, full = B[:, None, None], between(H + nu, 0.1, 0.5)
+        L = np.eye(d) + between(H, 0.2, 0.5)[:, None, None] * (B * (inverse - np.eye(d)) + (1 - B) * beside)
         B = B[:, 0, 0]
         own = np.einsum("iab,ib->ia", L, total) + gamma
         a = ((own**2).sum(1) + 0.05 * square) / m
@@ -118,7 +121,7 @@ class Projection:
         now, c = moved, np.zeros(n)
         low = between(H, 0.8, 0.95) * B
         for _ in range(self.repairs):
-            z = c + omega / 2 * (self.density(now) - 1) / a
+            z = c + omega * (self.density(now) - 1) / a
             c = np.where(z > 0, z, low * z)
             now = moved - (((c[:, None] + c[None, :])[..., None] * g).sum(1) + c[:, None] * gamma) / m[:, None]
         return now, v, k
@@ -129,8 +132,8 @@ class Projection:
         rate = 20 * (np.sqrt(dt**2 * (gradient**2).sum((1, 2)) + 1e-10) - 1e-5)
         near = self.volume * self.kernel.weight(np.array([s]), d, self.support)[0]
         close = (W / near) ** 4
-        slope = ((1 + 0.25 * close / (1 + close / 4))[..., None] * g).sum(1) + gamma / 2
-        out = total + gamma / 2
+        slope = ((1 + 0.25 * close / (1 + close / 4))[..., None] * g).sum(1) + gamma
+        out = total + gamma
         along = slope - out * ((out * slope).sum(1) / ((out**2).sum(1) + (0.03 / s) ** 2))[:, None]
         strength = rate / np.sqrt(1 + (rate / 0.5) ** 2)
         wish = -(strength * s**2 * between(H, 0.5, 0.8))[:, None] * along

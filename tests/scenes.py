@@ -90,3 +90,11 @@ def scatter(positions: np.ndarray, spacing: float) -> None:
     three away from the others."""
     positions[np.argsort(positions[:, 1])[:4], 1] = spacing * np.array([-0.1, 0.05, 0.15, 0.35])
     positions[-3:, 1] += 3 * spacing
+
+
+def thrown(simulation, seed=3):
+    """Positions and velocities of a state with scatter in both."""
+    random, x, v = np.random.default_rng(seed), simulation.positions, simulation.velocities
+    spacing = simulation.scene.discretisation.spacing
+    inwards = 0.02 * spacing + 0.1 * spacing * random.random(x.shape)
+    return {"initial_positions": x + inwards, "initial_velocities": v + 0.5 * random.standard_normal(v.shape)}

@@ -293,10 +293,19 @@ def test_wrong_arguments_are_sentences(arguments, words):
         certify(problem_of(plane(), 3), **arguments)
 
 
+def test_on_a_corner_differences_decide_as_far_as_both_sides_agree():
+    """Water that falls as a whole is on the corner of the projection's clamp, at its surface."""
+    falling = plane(solver={"kind": "projection", "time_step": 0.002}, discretisation={"spacing": 0.05, "jitter": 0.1})
+    found = certify(Simulation(falling, precision="float64"), steps=60)
+    assert found.right and found.consistency.corner[-1] > 1e-4 and "on a corner" in str(found)
+    moving = certify(problem_of(plane(), 10))
+    assert moving.right and moving.consistency.corner[-1] < 1e-4 and "corner" not in str(moving)
+
+
 # ---- verdicts ----------------------------------------------------------------------------------------------------
 
 
-def comparison(adjoint=1.0, tangents=(0.5, 1.0), differences=((0.5, 1.0),) * 3, loss=1.0):
+def comparison(adjoint=1.0, tangents=(0.5, 1.0), differences=((0.5, 1.0),) * 3, loss=1.0, sides=0.0):
     return Consistency(
         sample_steps=np.array([1, 2]),
         losses=np.array([0.5 * loss, loss]),
@@ -304,6 +313,7 @@ def comparison(adjoint=1.0, tangents=(0.5, 1.0), differences=((0.5, 1.0),) * 3, 
         size=1e-3 * abs(tangents[-1]),
         tangents=np.array(tangents),
         differences=np.array(differences),
+        sides=np.full((len(differences), 2), sides),
         steps=np.array([1e-2, 1e-3, 1e-4])[: len(differences)],
     )
 
@@ -317,6 +327,7 @@ def comparison(adjoint=1.0, tangents=(0.5, 1.0), differences=((0.5, 1.0),) * 3, 
         comparison(adjoint=1e-16, tangents=(0.0, -1e-16), differences=((0.0, 3e-13), (0.0, 2e-12), (0.0, 1e-11))),
         comparison(differences=((0.5, 1.1), (0.5, 1.001), (0.5, 1.0001))),
         comparison(differences=((0.5, 1.0001), (0.5, 1.0001), (0.5, 1.0))),  # beside a kink
+        comparison(differences=((0.5, 1.01),) * 3, sides=0.02),  # on it
     ],
 )
 def test_what_is_right(right):
@@ -326,6 +337,7 @@ def test_what_is_right(right):
 @pytest.mark.parametrize(
     "wrong",
     [
+        comparison(differences=((0.5, 1.01),) * 3, sides=0.005),
         comparison(adjoint=np.nan),
         comparison(adjoint=-1.0),
         comparison(adjoint=0.0),

@@ -21,6 +21,7 @@ from finite_differences import decades, distance
 SHORT = {
     "carry": {"moving": 10, "standing": 5, "blocks": 5, "distance": 1e-3},
     "splash": {"blocks": 4, "repeats": 3},
+    "splash_projection": {"blocks": 4, "repeats": 3},
     "latte": {"actions": 4, "repeats": 3, "standing": 2, "column": 2},
     "latte_dense": {"actions": 4, "repeats": 3, "standing": 2, "column": 2},
     "mix": {"blocks": 4, "repeats": 3},

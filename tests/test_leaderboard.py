@@ -10,6 +10,7 @@ from benchmarks.counting import Counted, Steps
 from benchmarks.gradients import scenes
 from benchmarks.gradients.__main__ import main
 from benchmarks.gradients.cells import Cell
+from benchmarks.gradients.certificates import main as certificates
 from benchmarks.gradients.controls import CONTROLS, VelocityModes
 from benchmarks.gradients.coverage import REFERENCE, Intervals, coverage, intervals
 from benchmarks.gradients.over_scenes import over_scenes
@@ -246,7 +247,22 @@ def test_resolutions_are_compared_at_the_same_times():
         for horizon in horizons
         for what in (("truth", [1.0, 0.0]), ("exact", [0.5, 0.0] if horizon < 400 else [0.8, 0.6]))
     ]
-    head, _, coarse, fine = resolution(records).splitlines()[2:]
-    assert head == "| spacing [mm] | 0.1 s | 0.2 s | useful up to |"
-    assert coarse == "| 25 | 1.00 [0.5] | 1.00 [0.5] | more than 0.2 s |"
-    assert fine == "| 12.5 | 1.00 [0.5] | 0.80 [1] | 0.15 s |"
+    title, _, head, _, coarse, fine = resolution(records).splitlines()
+    assert title == "**exact, l**"
+    assert head == "| scene | spacing [mm] | 0.1 s | 0.2 s | useful up to |"
+    assert coarse == "| plane-144 | 25 | 1.00 [0.5] | 1.00 [0.5] | more than 0.2 s |"
+    assert fine == "| plane-576 | 12.5 | 1.00 [0.5] | 0.80 [1] | 0.15 s |"
+
+
+def test_a_short_run_of_a_scene_has_certificates(tiny, capsys):
+    assert certificates(["--scenes", "tiny", "--steps", "8", "--seeds", "1", "2"]) == 0
+    *_, row = capsys.readouterr().out.splitlines()
+    assert row.startswith("| tiny | 2 of 2 | 8 [8, 8] | ")
+
+
+@pytest.mark.parametrize("name", [name for name in scenes.SCENES if "projection" in name])
+def test_a_scene_by_the_projection_is_another_one_of_the_leaderboard_but_for_its_solver(name):
+    projection, other = scenes.scene(name), scenes.scene(name.partition("-projection")[0])
+    assert projection.solver.kind == "projection" != other.solver.kind
+    assert projection.solver.time_step == other.solver.time_step
+    assert (projection.fluid, projection.container, projection.forces) == (other.fluid, other.container, other.forces)

@@ -5,7 +5,7 @@ import pytest
 
 from cortado import InputError, Problem, Simulation, gradients, losses
 from reference_projection import Projection
-from scenes import jet, plane, plane_of_three, pour, scene, two_layers
+from scenes import jet, plane, plane_of_three, pour, scene, thrown, two_layers
 
 SOLVER = {"kind": "projection", "time_step": 0.002}
 PERIODIC = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.4, 0.8], "periodic": [True, False]}
@@ -16,14 +16,6 @@ CASES = {
     "periodic": lambda: plane(solver=SOLVER, container=PERIODIC, discretisation=C2),
     "three phases": lambda: plane_of_three(solver=SOLVER, mixture={"mobility": 0.0}),
 }
-
-
-def thrown(simulation, seed=3):
-    """Positions and velocities of a state with scatter in both."""
-    random, x, v = np.random.default_rng(seed), simulation.positions, simulation.velocities
-    spacing = simulation.scene.discretisation.spacing
-    inwards = 0.02 * spacing + 0.1 * spacing * random.random(x.shape)
-    return {"initial_positions": x + inwards, "initial_velocities": v + 0.5 * random.standard_normal(v.shape)}
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -364,6 +364,7 @@ def test_an_observer_may_stop_a_run():
         (lambda s: reference.Simulation(splash(), threads=0), "threads is 0"),
         (lambda s: reference.Simulation(3), "must be a cortado.Scene or the path of a scene file"),
         (lambda s: reference.Simulation(two_layers()), "several phases or an emitter"),
+        (lambda s: reference.Simulation(splash(shifting=True)), "solver.shifting is true, but must be left out"),
         (
             lambda s: reference.Simulation(SCENES["laminar, no slip"]).tangent({}, {}, 5, method="as_printed"),
             "must not be used with the laminar viscosity",

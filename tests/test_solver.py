@@ -313,5 +313,7 @@ def test_a_solver_without_derivatives_says_so():
 def test_the_reference_engine_is_pcisph_alone():
     made = scene()
     other = made.model_copy(update={"solver": PackageSolver.model_construct(kind="dfsph", time_step=0.002)})
-    with pytest.raises(InputError, match=r"solver\.kind is 'dfsph', but must be pcisph for the reference engine"):
+    with pytest.raises(
+        InputError, match=r"solver\.kind is 'dfsph', but must be pcisph or projection for the reference engine"
+    ):
         reference.Simulation(other)

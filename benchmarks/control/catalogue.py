@@ -5,10 +5,10 @@ from cortado import InputError
 from .carry import Carry
 from .latte import Latte, LatteDense
 from .mix import Mix
-from .splash import Splash
+from .splash import Splash, SplashProjection
 from .task import Task
 
-TASKS: dict[str, type[Task]] = {one.name: one for one in (Carry, Splash, Latte, LatteDense, Mix)}
+TASKS: dict[str, type[Task]] = {one.name: one for one in (Carry, Splash, SplashProjection, Latte, LatteDense, Mix)}
 SIZES = ("small", "large")
 
 

@@ -66,9 +66,12 @@ class Splash(Task):
             for lower, upper in boxes
         ]
         container = {"shape": "box", "lower": [0.0] * self.dimension, "upper": [self.width, self.width, *depth]}
-        return scene_of(
-            "splash", spacing, self.time_step, container, phase=[WATER], fluid=fluid, render=self._view(depth)
-        )
+        tables = {"phase": [WATER], "fluid": fluid, "render": self._view(depth)}
+        return scene_of("splash", spacing, self.time_step, container, **tables, **self._solved(spacing))
+
+    def _solved(self, spacing: float) -> dict[str, Any]:
+        """What the scene has instead of the solver and the kernel of all tasks."""
+        return {}
 
     def _view(self, depth: list[float]) -> dict[str, Any]:
         """From the front."""
@@ -110,3 +113,13 @@ class Splash(Task):
         end = problem.end(parameters)
         assert isinstance(problem.loss, Image)
         return {"-PSNR [dB]": -image_losses.psnr(problem.loss.image(end), problem.loss.target)}
+
+
+class SplashProjection(Splash):
+    """The same by the projection, with that solver's own kernel."""
+
+    name = "splash_projection"
+
+    def _solved(self, spacing: float) -> dict[str, Any]:
+        solver = {"kind": "projection", "time_step": self.time_step}
+        return {"discretisation": {"spacing": spacing}, "solver": solver}

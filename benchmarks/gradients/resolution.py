@@ -25,28 +25,29 @@ USEFUL = 0.9
 
 
 def resolution(records: Iterable[Record]) -> str:
-    """For each estimator a table in Markdown, with a row for each scene: the median cosine at each time [the size], and
-    the last time up to which the cosine is `USEFUL`."""
+    """For each estimator and loss a table in Markdown, with a row for each scene: the median cosine at each time [the
+    size], and the last time up to which the cosine is `USEFUL`."""
     known = {Cell.of(record): record for record in records}
-    estimators = sorted({cell.estimator for cell in known} - {TRUTH})
-    return "\n\n".join(f"**{name}**\n\n{_table(name, known)}" for name in estimators)
+    kinds = sorted({(cell.estimator, cell.loss) for cell in known if cell.estimator != TRUTH})
+    return "\n\n".join(f"**{', '.join(kind)}**\n\n{_table(*kind, known)}" for kind in kinds)
 
 
-def _table(estimator: str, known: dict[Cell, Record]) -> str:
+def _table(estimator: str, loss: str, known: dict[Cell, Record]) -> str:
     own: dict[str, dict[float, list[tuple[float, float]]]] = {}
     for cell, record in known.items():
-        judged = score(record, known.get(cell.question, {})) if cell.estimator == estimator else None
+        asked = (cell.estimator, cell.loss) == (estimator, loss)
+        judged = score(record, known.get(cell.question, {})) if asked else None
         if judged is not None:
             own.setdefault(cell.scene, {}).setdefault(_time(cell), []).append(judged)
     times = sorted({time for scores in own.values() for time in scores})
     lines = [
-        "| spacing [mm] | " + " | ".join(f"{time:g} s" for time in times) + " | useful up to |",
-        "|---" * (len(times) + 2) + "|",
+        "| scene | spacing [mm] | " + " | ".join(f"{time:g} s" for time in times) + " | useful up to |",
+        "|---" * (len(times) + 3) + "|",
     ]
     for name in sorted(own, key=_spacing, reverse=True):
         scores = own[name]
         texts = [_score(scores[time]) if time in scores else "-" for time in times]
-        lines.append(f"| {1e3 * _spacing(name):g} | {' | '.join(texts)} | {_reach(scores)} |")
+        lines.append(f"| {name} | {1e3 * _spacing(name):g} | {' | '.join(texts)} | {_reach(scores)} |")
     return "\n".join(lines)
 
 

@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 
 from cortado.device.cores import usable_cores
-from cortado.discretise.calibration import SKIN, stress_control
 from cortado.discretise.region import TOLERANCE
 from cortado.errors import DivergedError, InputError, shown
-from cortado.scene.discrete_scene import DiscreteScene, discretise
+from cortado.scene.discrete_scene import discretise
 from cortado.scene.parameters.registry import BY_NAME
 from cortado.scene.parameters.values import checked_value
 from cortado.scene.scene import Scene, as_scene
-from cortado.scene.solvers import PcisphSolver
+from cortado.scene.solvers import ProjectionSolver
 from cortado.scene.stability import divergence_advice
 from cortado_reference.digits import Digits
 from cortado_reference.engine import extension, precisions
 from cortado_reference.histories import Gradient, History
 from cortado_reference.losses import Loss
+from cortado_reference.scenes import check_scene, engine_scene
 
 METHODS = (
     "analytic",
@@ -33,8 +33,6 @@ METHODS = (
 )
 """Ways to a tangent; see `Simulation.tangent`."""
 PARAMETERS = ("gravity", "initial_positions", "initial_velocities", "viscosity")
-CLOSEST = 0.25
-"""In spacings: from where on a wall without slip pulls no harder, with the stress."""
 LEAST_PARALLEL = {"float128": 30}
 """Particles for which another thread is worth its while, 1000 where not said: in float128 every operation is slow."""
 Observer = Callable[[int], None]
@@ -42,7 +40,8 @@ Observer = Callable[[int], None]
 
 @dataclass(frozen=True)
 class Terms:
-    """Which parts of a step's derivative count; the step itself is never changed. All of them are the exact one."""
+    """Which parts of the derivative of a step of PCISPH count, where all are the exact one; the step itself is never
+    changed."""
 
     viscosity: bool = True
     """The viscous force's derivative (report eq. 14, put right)."""
@@ -67,23 +66,7 @@ class Simulation:
         all cores unless said, or one where there are too few particles. The bits of the results do not depend on them.
         """
         scene = as_scene(scene)
-        if not isinstance(scene.solver, PcisphSolver):
-            raise InputError(f"solver.kind is {shown(scene.solver.kind)}, but must be pcisph for the reference engine.")
-        if scene.solver.shifting:
-            raise InputError("solver.shifting is true, but must be left out for the reference engine.")
-        if len(scene.phase) > 1 or scene.emitter is not None:
-            raise InputError("scene has several phases or an emitter, but must have neither for the reference engine.")
-        unknown = [p.name for p in BY_NAME.values() if p.is_optional and p.present(scene)]
-        if unknown:
-            raise InputError(f"scene has forces.{unknown[0]}, but must leave it out for the reference engine.")
-        if scene.force:
-            raise InputError("scene has [[force]], but must leave it out for the reference engine.")
-        if scene.schedule.courses:
-            raise InputError(
-                "scene has a schedule, but must leave it out for the reference engine, which takes a gravity for each "
-                "step by controls."
-            )
-        scene.solver.fixed_time_step("the reference engine")
+        check_scene(scene)
         if precision not in precisions():
             raise InputError(f"precision is {shown(precision)}, but must be one of {', '.join(precisions())}.")
         self.scene, self.precision = scene, precision
@@ -97,7 +80,7 @@ class Simulation:
             least = LEAST_PARALLEL.get(precision, 1000)
             threads = min(usable_cores(), 1 + len(self.positions) // least)
         self.threads = _positive("threads", threads)
-        self._engine = extension().make_engine(precision, _engine_scene(scene, discrete), self.threads)
+        self._engine = extension().make_engine(precision, engine_scene(scene, discrete), self.threads)
 
     def run(
         self,
@@ -130,7 +113,7 @@ class Simulation:
         - "complex_step": with u^2 = -1, and b far below round-off;
         - "finite_difference": central, of the step ``difference`` (in directions); states are those of the run ahead;
         - "as_printed": the report's eqs. 12 to 14 as they stand, wrong: no pressure from before and no clamp in (12),
-          one density for two in (13), gamma = 2 (d + 2 mu) before (14). Only with the pairwise viscosity;
+          one density for two in (13), gamma = 2 (d + 2 mu) before (14). Only with PCISPH and pairwise viscosity;
         - "as_printed_right_viscosity": the same with gamma = 2 (d + 2) mu;
         - "as_printed_predicted_density": and (12) with the predicted density, as Algorithm 2's text has it.
         """
@@ -140,7 +123,10 @@ class Simulation:
             raise InputError(
                 f"terms are given, but must be left out with the method {method!r}: only analytic has them."
             )
+        self._check_terms(terms)
         form = self.scene.forces.viscosity
+        if method.startswith("as_printed") and isinstance(self.scene.solver, ProjectionSolver):
+            raise InputError("method is as printed, which must not be used with the projection: it is of PCISPH.")
         if method.startswith("as_printed") and form in ("laminar", "stress"):
             raise InputError(
                 f"method is as printed, which must not be used with the {form} viscosity: (14) is pairwise."
@@ -168,6 +154,7 @@ class Simulation:
 
         ``observe`` is called with the number of every step on the way forward, then on the way back.
         """
+        self._check_terms(terms)
         shape, values = self.positions.shape, []
 
         def adjoint(*raw: Any) -> tuple[Any, Any]:
@@ -211,6 +198,10 @@ class Simulation:
         ]
         return extension().Parameters(*map(_numbers, chosen))
 
+    def _check_terms(self, terms: Terms | None) -> None:
+        if terms not in (None, Terms()) and isinstance(self.scene.solver, ProjectionSolver):
+            raise InputError("terms leave a part out, which they must not with the projection: only PCISPH has parts.")
+
     def _checked(self, name: str, value: Any, steps: int, what: str) -> Digits:
         if name not in PARAMETERS:
             raise InputError(
@@ -248,43 +239,6 @@ class Simulation:
 
 def _float64(value: Any) -> np.ndarray:
     return np.asarray(value.high if isinstance(value, Digits) else value, dtype=np.float64)
-
-
-def _engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:
-    lattice, solver, form = discrete.lattice, scene.solver, scene.forces.viscosity
-    assert isinstance(solver, PcisphSolver)
-    no_slip = getattr(scene.container, "slip", "free") == "no"
-    greatest, spacing = solver.maximum_density_tolerance, scene.discretisation.spacing
-    values = {
-        "dimension": scene.dimension,
-        "kernel": discrete.kernel.name,
-        "support": lattice.support,
-        "reach": (1.0 + SKIN) * lattice.support,
-        "normalisation": lattice.normalisation,
-        "volume": lattice.volume,
-        "stiffness": lattice.stiffness,
-        "response": lattice.response,
-        "laplacian_correction": lattice.laplacian_correction,
-        "wall_positions": discrete.walls.positions.ravel().tolist(),
-        "wall_weights": discrete.walls.weights.tolist(),
-        "wall_feet": discrete.walls.feet.ravel().tolist(),
-        "periods": [*map(float, discrete.periods), *[0.0] * (3 - scene.dimension)],
-        "rest_density": scene.phase[0].rest_density,
-        "time_step": solver.time_step,
-        "viscosity": form,
-        "friction": (discrete.wall_layers.friction if form == "laminar" else 1.0) if no_slip else 0.0,
-        "control": stress_control(discrete.kernel, spacing, lattice.support, scene.dimension),
-        "closest": CLOSEST * spacing,
-        "pressure": scene.forces.pressure,
-        "minimum_iterations": solver.minimum_iterations,
-        "maximum_iterations": solver.maximum_iterations,
-        "density_tolerance": solver.density_tolerance,
-        "maximum_density_tolerance": float("inf") if greatest is None else greatest,
-    }
-    made = extension().Scene()
-    for name, value in values.items():
-        setattr(made, name, value)
-    return made
 
 
 def _numbers(digits: Digits) -> Any:

@@ -44,6 +44,8 @@ class Consistency(ShortRepr):
     """(sample_steps,) by forward mode."""
     differences: np.ndarray
     """(tried, sample_steps) central differences; no rows where reverse and forward mode already differ."""
+    sides: np.ndarray
+    """(tried, sample_steps) by how much the differences to one side and to the other differ."""
     steps: np.ndarray
     """(tried,) their steps h, in units of the direction."""
 
@@ -70,6 +72,12 @@ class Consistency(ShortRepr):
         return self._worst(np.abs(self.differences - self.tangents))
 
     @property
+    def corner(self) -> np.ndarray:
+        """(sample_steps,) the least relative distance of differences to one side and to the other, the greatest up to
+        there. It is small in the limit of small h but on a corner of the loss, where both have limits of their own."""
+        return np.asarray(self._worst(self.sides).min(axis=0, initial=np.inf))
+
+    @property
     def converged(self) -> np.ndarray:
         """(sample_steps,) whether differences of two successive h agree up to there. Where none do, chaos or round-off
         hides the limit of differences."""
@@ -89,12 +97,12 @@ class Consistency(ShortRepr):
     def differences_agree(self) -> bool:
         """Whether forward mode is near a central difference at every sample step at which differences converge.
 
-        Near means within `SLACK` times the least distance of two successive differences. One near difference is enough:
-        beside a kink of the loss, differences agree with each other and are off until h is smaller than the distance
-        to the kink.
+        Near means within `SLACK` times the least distance of two successive differences, or, on a corner of the loss,
+        within the distance of both sides. One near difference is enough: beside a kink of the loss, differences agree
+        with each other and are off until h is smaller than the distance to the kink.
         """
         allowed = np.maximum(SLACK * self.gaps.min(axis=0, initial=np.inf), RESOLUTION)
-        near = self.misses.min(axis=0, initial=np.inf) <= allowed
+        near = self.misses.min(axis=0, initial=np.inf) <= np.maximum(allowed, self.corner)
         return bool(near[self.converged].all())
 
     @property
@@ -130,10 +138,10 @@ def check_consistency(history: LossHistory, values: Arrays, gradient: Arrays, al
     tangent = history.tangent(values, along)
     losses, tangents = tangent.losses, tangent.slopes
     products = np.concatenate([(gradient[name] * along[name]).ravel() for name in along])
-    found: list[np.ndarray] = []
+    found: list[tuple[np.ndarray, np.ndarray]] = []
 
     def so_far() -> Consistency:
-        differences = np.array(found).reshape(-1, len(losses))
+        differences, sides = np.array(found).reshape(-1, 2, len(losses)).transpose(1, 0, 2)
         return Consistency(
             history.sample_steps,
             losses,
@@ -141,12 +149,13 @@ def check_consistency(history: LossHistory, values: Arrays, gradient: Arrays, al
             size=float(np.linalg.norm(products)),
             tangents=tangents,
             differences=differences,
+            sides=sides,
             steps=np.array(STEPS[: len(found)]),
         )
 
     best = np.inf
     for h in STEPS if so_far().disagreement < MODE_TOLERANCE else ():
-        found.append(history.difference(values, along, h))
+        found.append(history.sides(values, along, h, losses))
         gap = so_far().gaps[-1, -1] if len(found) > 1 else np.inf
         settled = gap < RESOLUTION / SLACK or (best < PLATEAU and gap > best)
         if settled and so_far().differences_agree:

@@ -59,11 +59,19 @@ class LossHistory:
     def difference(self, parameters: Arrays, along: Arrays, h: float) -> np.ndarray:
         """(sample_steps,) central differences of step h along a direction of all or some of the parameters; NaN where a
         run diverges."""
-        differences = [
-            _change(loss, before, after) if isinstance(loss, Rounded) and h < 1.0 else _values(loss, before, after)
-            for loss, before, after in self._beside(parameters, along, h)
-        ]
-        return self._total(differences or np.full(len(self.sample_steps), np.nan)) / (2.0 * h)
+        return self.sides(parameters, along, h, np.zeros(len(self.sample_steps)))[0]
+
+    def sides(self, parameters: Arrays, along: Arrays, h: float, losses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Those, and (sample_steps,) by how much the differences of step h to one side and to the other differ, given
+        the ``losses`` (sample_steps,) between them; 0 of losses in float32, whose round-off would be all of it."""
+        differences, sums = [], []
+        for loss, before, after in self._beside(parameters, along, h):
+            rounded = isinstance(loss, Rounded)
+            differences.append(_change(loss, before, after) if rounded and h < 1.0 else _values(loss, before, after))
+            sums.append(np.nan if rounded else loss.value(before) + loss.value(after))
+        unknown = np.full(len(self.sample_steps), np.nan)
+        bends = np.abs(self._total(sums or unknown) - 2.0 * losses) / h
+        return self._total(differences or unknown) / (2.0 * h), np.nan_to_num(bends)
 
     def rough_miss(self, parameters: Arrays, along: Arrays) -> float:
         """Relative distance of the adjoints of `Rounded` losses from finite differences of their values.

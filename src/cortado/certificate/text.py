@@ -6,7 +6,7 @@ from math import log10
 from typing import Any
 
 from cortado.certificate.alignment import Alignment
-from cortado.certificate.consistency import Consistency
+from cortado.certificate.consistency import PLATEAU, Consistency
 from cortado.certificate.horizon import Horizon
 
 WIDTH = 110
@@ -24,11 +24,13 @@ def parameter_table(loss_changes: Mapping[str, float], wrong: Sequence[str]) -> 
 
 
 def consistency_words(c: Consistency) -> str:
-    """To how many digits reverse mode, forward mode and central differences agree."""
+    """To how many digits reverse mode, forward mode and central differences agree, and whether that is on a corner."""
     digits = f"reverse and forward mode agree to {_digits(c.disagreement)} digits"
     if c.miss is None:
         return f"{digits}, no difference is reliable here"
-    return f"{digits}, with differences to {_digits(c.miss)}, up to step {c.last_converged}"
+    on_it = float(c.corner[c.converged][-1])
+    corner = f" (on a corner of the loss: slopes of both sides differ by {on_it:.1%})" if on_it > PLATEAU else ""
+    return f"{digits}, with differences to {_digits(c.miss)}, up to step {c.last_converged}{corner}"
 
 
 def horizon_table(horizons: Sequence[Horizon]) -> str:

@@ -23,6 +23,7 @@ from cortado.gradients.estimator import (
 from cortado.gradients.exact import Exact, FrozenGeometry, Tape
 from cortado.gradients.filters import AdjointViscosity, Damped
 from cortado.gradients.guided import Guided
+from cortado.gradients.implicit import ImplicitPressure
 from cortado.rollout.rollout import Observer
 from cortado.scene.parameters.values import Values
 
@@ -40,6 +41,7 @@ __all__ = [
     "FrozenGeometry",
     "GradientEstimator",
     "Guided",
+    "ImplicitPressure",
     "RandomizedSmoothing",
     "Tape",
     "estimate",

@@ -264,7 +264,6 @@ class Rollout:
             return
         key = (derivative, counts)
         if key not in self._steps_back:
-            self.solver.reserve(counts)
             self._steps_back[key] = CapturedGraph(work, self.solver.launch)
         self._steps_back[key]()
 
@@ -286,6 +285,10 @@ class Rollout:
             derivative.step(counts, dot, self.parameters)
             solver.write_state(counts, self.parameters, state)
             observe(n + 1, dot)
+
+    def last_state(self) -> State:
+        """The state after all steps of the last forward run, for a way back that is about to begin."""
+        return self._checkpoints.state(self.steps, self._replayed)
 
     def _require(self, what: str, evaluation: int) -> None:
         """Whether a forward run was of the present evaluation; raises `InputError`."""

@@ -26,7 +26,7 @@ from cortado.scene.discrete_scene import Lattice
 from cortado.solvers.containment import Containment, Walled
 from cortado.solvers.convergence import convergence_kernels
 from cortado.solvers.loop import IterationLog, Loop
-from cortado.solvers.solver import Counts, StepAdjoint, StepTangent
+from cortado.solvers.solver import Counts, ResumingAdjoint, StepAdjoint, StepTangent
 from cortado.sph.carried import Carried
 from cortado.sph.density import density_kernels
 from cortado.sph.integration import integration_kernels
@@ -265,6 +265,9 @@ class ParticleSolver:
 
     def frozen_adjoint(self, steps: int) -> StepAdjoint:
         self._lacks("reverse mode with a frozen geometry", "try gradients.Exact")
+
+    def implicit_adjoint(self, steps: int, tolerance: float, iterations: int) -> ResumingAdjoint:
+        self._lacks("implicit adjoint of its pressure", "try gradients.Exact")
 
     def differentiable(self) -> Self:
         self._lacks("tape", "try gradients.RandomizedSmoothing, which only runs forward")

@@ -63,6 +63,16 @@ class StepAdjoint(Protocol):
         """The adjoints of the parameters, of all steps since `begin`."""
 
 
+class ResumingAdjoint(StepAdjoint, Protocol):
+    """The same where the pressure of a step is taken from the state that the step led to."""
+
+    def arrive(self, state: State) -> None:
+        """The state after the step that comes next."""
+
+    def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
+        """As that of `Solver`, but without the iterations of the pressure. The step before comes next."""
+
+
 class PressureTangent(StepTangent, Protocol):
     """That of a solver with pressures, which quantities and sensors can be differentiated through."""
 
@@ -85,8 +95,8 @@ class PressureAdjoint(StepAdjoint, Protocol):
 
 class Solver(Protocol):
     """The solver of a scene, or of a batch of scenes, on one device, which rollouts share. Of its methods `make_room`
-    and `reset` alone wait for the device and read from it. `tangent`, `adjoint`, `frozen_adjoint` and `differentiable`
-    raise `InputError`, one sentence, where a solver has no such derivative.
+    and `reset` alone wait for the device and read from it. `tangent`, `adjoint`, `frozen_adjoint`, `implicit_adjoint`
+    and `differentiable` raise `InputError`, one sentence, where a solver has no such derivative.
     """
 
     discretisation: Discretisation
@@ -141,6 +151,10 @@ class Solver(Protocol):
 
     def frozen_adjoint(self, steps: int) -> StepAdjoint:
         """The same with a frozen geometry, in which no force depends on positions: for `FrozenGeometry`."""
+
+    def implicit_adjoint(self, steps: int, tolerance: float, iterations: int) -> ResumingAdjoint:
+        """The same with the pressure as the fixed point of its iterations, whose adjoint is solved for until the
+        residual has fallen to ``tolerance`` of the first, in ``iterations`` at most: for `ImplicitPressure`."""
 
     def differentiable(self) -> Self:
         """The same solver, with arrays that Warp's tape can differentiate."""

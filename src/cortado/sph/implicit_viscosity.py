@@ -5,8 +5,9 @@ With the acceleration a by all other forces, and g(v) by the stress of fluid wit
 
     a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y),
 
-which conjugate gradients solve to round-off. So the derivatives are those of the solution, whatever way led to it: the
-tangent is one more solve with B, and so is the adjoint, as B is symmetric in the product weighted with masses.
+which `cortado.sph.conjugate_gradients` solves to round-off. So the derivatives are those of the solution, whatever way
+led to it: the tangent is one more solve with B, and so is the adjoint, as B is symmetric in the product weighted with
+masses.
 """
 
 from typing import Any
@@ -16,13 +17,13 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.launching import add
-from cortado.device.precision import FLOAT32
 from cortado.errors import MissingDerivativeError
 from cortado.particles.state import Layout
 from cortado.scene.scene import Scene
 from cortado.scene.stability import is_implicit
+from cortado.sph.conjugate_gradients import ConjugateGradients, round_off
 from cortado.sph.implicit_derivatives import implicit_kernels
-from cortado.sph.implicit_kernels import operator_kernels, solve_kernels
+from cortado.sph.implicit_kernels import operator_kernels
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.viscosity_law import Law
 from cortado.sph.viscous_stress import ViscousStress
@@ -31,50 +32,26 @@ MOST = 1_000
 """Iterations of a solve."""
 
 
-class Solve:
-    """Conjugate gradients for the particles of one solver, with arrays of its own."""
+class Solve(ConjugateGradients):
+    """Conjugate gradients for the particles of one solver."""
 
     name, most = "viscous_iterations", MOST
 
     def __init__(self, layout: Layout, operator: tuple[Any, Any]):
         """``operator``: the kernels that `operator_kernels` gives."""
-        self._kernels, (self._pull, self._multiply), self._layout = solve_kernels(layout.precision), operator, layout
-        self._tolerance = 3e-7 if layout.precision is FLOAT32 else 1e-14
-        real, vector = layout.precision.real, layout.precision.vector
-        sizes = {"shape": layout.all_particles, "device": layout.device}
-        self._p, self._product = (wp.zeros(dtype=vector, **sizes) for _ in range(2))
-        self._share = wp.zeros(dtype=real, **sizes)
-        scenes = {"shape": layout.members, "device": layout.device}
-        self._first, self._size = (wp.zeros(dtype=real, **scenes) for _ in range(2))
-        self.count, self._going = (wp.zeros(dtype=wp.int32, **scenes) for _ in range(2))
-        """(members,) iterations of the last solve."""
-        self._active = wp.zeros(1, dtype=wp.int32, device=layout.device)
-        self._sums = layout.sum_of(real), layout.sum_of(real)
+        precision = layout.precision
+        super().__init__(layout, precision.vector, round_off(precision), MOST)
+        self._pull, self._multiply = operator
 
     def __call__(self, step: StepContext, known: Any, r: wp.array, y: wp.array) -> None:
         """Write to ``y`` what solves B y = r, (n,) vectors both, and overwrite ``r``; ``known``: arguments of the
         kernels of B."""
-        kernels, members, (sum_shares, sum_curvatures) = self._kernels, self._layout.members, self._sums
-        n = self._layout.all_particles
-        step.launch(kernels.begin, r=r, p=self._p, y=y, share=self._share, threads=n)
-        self._active.zero_()
-        scene = {"size": self._size, "count": self.count, "going": self._going, "active": self._active}
-        total = sum_shares(self._share)
-        step.launch(kernels.start, scene, total=total, first=self._first, threads=members)
 
-        def iterate() -> None:
-            step.launch(self._pull, *known, v=self._p)
-            step.launch(self._multiply, *known, v=self._p, product=self._product, share=self._share)
-            curvature = sum_curvatures(self._share)
-            own = {"p": self._p, "product": self._product, "r": r, "y": y, "share": self._share}
-            step.launch(kernels.descend, scene, own, curvature=curvature, threads=n)
-            total = sum_shares(self._share)
-            step.launch(kernels.turn, scene, own, total=total, threads=n)
-            limits = {"tolerance": self._tolerance, "most": MOST, "first": self._first}
-            step.launch(kernels.decide, scene, limits, total=total, threads=members)
+        def multiply(p: wp.array, found: dict[str, wp.array]) -> None:
+            step.launch(self._pull, *known, v=p)
+            step.launch(self._multiply, *known, found, v=p)
 
-        step.join()  # a loop of a graph cannot begin while something is computed aside
-        wp.capture_while(self._active, iterate)
+        self.solve(step, multiply, step.fields["m"], r, y)
 
 
 class ImplicitViscousStress(ViscousStress):

@@ -1,29 +1,23 @@
 // The adjoint of a step: the transpose of `step_tangent`, every sum a gather.
 #pragma once
 
+#include "projection_adjoint.hpp"
 #include "stress_derivative.hpp"
 #include "viscosity_derivative.hpp"
 
 namespace cortado {
 
-// From `bar`, the adjoint of a step's result, to that of its state, in place; adds to those of its parameters.
+// Of PCISPH's pressures: adds to the adjoints of the state, of accelerations (at first dt times that of velocities), of
+// densities and of yields.
 template <class Real, int D>
-void step_adjoint(const Model<Real, D>& model, Step<Real, D>& step, const State<Real, D>& state, State<Real, D>& bar,
-                  Real viscosity, const Terms& terms, Vector<Real, D>& gravity_bar, Real& viscosity_bar) {
-    const std::size_t count = state.x.size();
-    const Real m = model.rest_density, dt = model.time_step;
-    const Real push_factor = model.volume / m;
+void pressure_adjoint(const Model<Real, D>& model, const Step<Real, D>& step, State<Real, D>& bar, const Terms& terms,
+                      Vectors<Real, D>& a_bar, Values<Real>& n_bar, Values<Real>& y_bar) {
+    const std::size_t count = a_bar.size();
+    const Real m = model.rest_density, dt = model.time_step, push_factor = model.volume / m;
     const Pairs<Real, D>&fluid = step.fluid, &walls = step.walls;
-    step.fluid.bend(model.smoothing, model.threads);
-    step.walls.bend(model.smoothing, model.threads);
-
-    Vectors<Real, D> a_bar(count), push_bar(count);
-    each_particle(count, model.threads, [&](std::size_t i) {
-        bar.v[i] += dt * bar.x[i];
-        a_bar[i] = push_bar[i] = dt * bar.v[i];
-    });
-    Values<Real> n_bar(count, Real(0)), p_bar(count, Real(0)), y_bar(count, Real(0)), r(count);
-    for (int k = step.iterations() - 1; terms.pressure && k >= 0; --k) {
+    Vectors<Real, D> push_bar = a_bar;
+    Values<Real> p_bar(count, Real(0)), r(count);
+    for (int k = step.iterations() - 1; k >= 0; --k) {
         // The pressure force, to the adjoints of x, n, p and (r) the predicted sum of W.
         each_particle(count, model.threads, [&](std::size_t i) {
             const Real n = step.n[i], c_i = step.p[k][i] / (n * n);
@@ -52,23 +46,36 @@ void step_adjoint(const Model<Real, D>& model, Step<Real, D>& step, const State<
         });
         // The predicted sum of W, to the adjoints of what was predicted.
         each_particle(count, model.threads, [&](std::size_t i) {
-            const Vectors<Real, D>& x = step.x_star[k];
-            Vector<Real, D> total = Vector<Real, D>::Constant(Real(0));
-            const auto add = [&](const Vector<Real, D>& separation, Real weight) {
-                const Real r_squared = separation.dot(separation);
-                if (model.smoothing.near(r_squared))
-                    total += (weight * model.smoothing.slope(model.smoothing.q_of(r_squared))) * separation;
-            };
-            for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair)
-                add(model.period.nearest(x[i] - x[pair->other]), r[i] + r[pair->other]);
-            for (auto pair = walls.begin_of(i); pair != walls.end_of(i); ++pair)
-                add(model.period.nearest(x[i] - model.wall_positions[pair->other]),
-                    model.wall_weights[pair->other] * r[i]);
+            const Vector<Real, D> total = weights_adjoint(model, i, step, step.x_star[k], r);
             bar.x[i] += total;
             bar.v[i] += dt * total;
             push_bar[i] = (dt * dt) * total;
             a_bar[i] += push_bar[i];
         });
+    }
+}
+
+// From `bar`, the adjoint of a step's result, to that of its state, in place; adds to those of its parameters.
+template <class Real, int D>
+void step_adjoint(const Model<Real, D>& model, Step<Real, D>& step, const State<Real, D>& state, State<Real, D>& bar,
+                  Real viscosity, const Terms& terms, Vector<Real, D>& gravity_bar, Real& viscosity_bar) {
+    const std::size_t count = state.x.size();
+    const Real m = model.rest_density;
+    const Pairs<Real, D>&fluid = step.fluid, &walls = step.walls;
+    step.fluid.bend(model.smoothing, model.threads);
+    step.walls.bend(model.smoothing, model.threads);
+
+    Vectors<Real, D> a_bar(count);
+    Values<Real> n_bar(count, Real(0)), y_bar(count, Real(0));
+    if (model.projection) {
+        bar.v = ProjectionAdjoint<Real, D>(model, step, state).find(bar, n_bar);
+        for (std::size_t i = 0; i < count; ++i) a_bar[i] = model.time_step * bar.v[i];
+    } else {
+        for (std::size_t i = 0; i < count; ++i) {
+            bar.v[i] += model.time_step * bar.x[i];
+            a_bar[i] = model.time_step * bar.v[i];
+        }
+        if (terms.pressure) pressure_adjoint(model, step, bar, terms, a_bar, n_bar, y_bar);
     }
     for (const auto& one : a_bar) gravity_bar += one;
 

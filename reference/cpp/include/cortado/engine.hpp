@@ -41,6 +41,12 @@ struct Scene {
     bool pressure;
     int minimum_iterations, maximum_iterations;
     double density_tolerance, maximum_density_tolerance;
+    bool projection;                     // in the place of PCISPH: `maximum_iterations` of its pressures, and
+    int repairs;                         // of density
+    double spacing;                      // [m]
+    double relaxation;                   // omega
+    double least_diagonal;               // 0.05 a_0 [1 / m2]
+    double nearest_weight;               // V W(s)
 };
 
 // What a run depends on, and also the type of a direction and of a gradient.

@@ -25,6 +25,7 @@ template <class Scalar, int D>
 struct State {
     Vectors<Scalar, D> x;  // [m]
     Vectors<Scalar, D> v;  // [m / s]
+    Values<Scalar> k;      // dt p of the projection [Pa s]
 };
 
 // Every particle writes its own values only: the same bits for any number of threads.

@@ -23,6 +23,10 @@ struct Model {
     bool pressure;
     int minimum_iterations, maximum_iterations;
     Real density_tolerance, maximum_density_tolerance;
+    bool projection;
+    int repairs;
+    Scalar spacing, relaxation, least_diagonal, nearest_weight;
+    Values<Scalar> momenta;  // beta of the projection's iterations (Nesterov 1983), and 0 of the last
     Vectors<Real, D> wall_positions, wall_normals;
     Values<Real> wall_depths;  // behind the surface
     Values<Scalar> wall_weights;
@@ -55,6 +59,13 @@ struct Model {
           maximum_iterations(s.maximum_iterations),
           density_tolerance(Real(s.density_tolerance)),
           maximum_density_tolerance(Real(s.maximum_density_tolerance)),
+          projection(s.projection),
+          repairs(s.repairs),
+          spacing(Real(s.spacing)),
+          relaxation(Real(s.relaxation)),
+          least_diagonal(Real(s.least_diagonal)),
+          nearest_weight(Real(s.nearest_weight)),
+          momenta(s.maximum_iterations, Scalar(0)),
           wall_positions(joined_vectors<Real, D>(high_only(s.wall_positions))),
           wall_normals(joined_vectors<Real, D>(high_only(s.wall_feet))),
           wall_depths(wall_normals.size()),
@@ -64,6 +75,12 @@ struct Model {
         for (std::size_t b = 0; b < wall_normals.size(); ++b) {
             wall_depths[b] = square_root(Real(wall_normals[b].dot(wall_normals[b])));
             wall_normals[b] /= wall_depths[b];
+        }
+        Real t(1);
+        for (std::size_t k = 0; k + 1 < momenta.size(); ++k) {
+            const Real later = (Real(1) + square_root(Real(Real(1) + Real(4) * t * t))) / Real(2);
+            momenta[k] = Scalar((t - Real(1)) / later);
+            t = later;
         }
     }
 

@@ -70,7 +70,8 @@ public:
         append(x, states.back().x);
         append(v, states.back().v);
         const auto [x_bar, v_bar] = loss(x, v);
-        State<Real, D> bar{joined_vectors<Real, D>(x_bar), joined_vectors<Real, D>(v_bar)};
+        State<Real, D> bar{joined_vectors<Real, D>(x_bar), joined_vectors<Real, D>(v_bar), states.back().k};
+        bar.k.assign(bar.k.size(), Real(0));
         Vectors<Real, D> gravity_bar = zero_vectors<Real, D>(steps);
         Real viscosity_bar = 0;
         history.position_norms.assign(steps + 1, norm(bar.x));
@@ -100,7 +101,8 @@ private:
     };
 
     static Run<Real> begin(const Parameters& at, int steps) {
-        Run<Real> run{{joined_vectors<Real, D>(at.positions), joined_vectors<Real, D>(at.velocities)},
+        Run<Real> run{{joined_vectors<Real, D>(at.positions), joined_vectors<Real, D>(at.velocities),
+                       Values<Real>(at.positions.size() / D, Real(0))},
                       joined_vectors<Real, D>(at.gravity),
                       joined<Real>(at.viscosity, 0)};
         if (int(run.gravity.size()) != steps) throw std::invalid_argument("gravity must have a vector for each step");
@@ -181,7 +183,8 @@ private:
                 for (int axis = 0; axis < D; ++axis) both[i][axis] = Scalar(a[i][axis], size * b[i][axis]);
             return both;
         };
-        const Run<Scalar> both{{joined(run.first.x, dot.first.x), joined(run.first.v, dot.first.v)},
+        const Run<Scalar> both{{joined(run.first.x, dot.first.x), joined(run.first.v, dot.first.v),
+                                Values<Scalar>(run.first.k.size(), Scalar(0))},
                                joined(run.gravity, dot.gravity),
                                Scalar(run.viscosity, size * dot.viscosity)};
         const auto part = [&](const Vectors<Scalar, D>& from, bool second) {
@@ -193,8 +196,8 @@ private:
         };
         forward<Scalar>(Model<Scalar, D>(scene_, threads_), both, history, observe,
                         [&](int step, const State<Scalar, D>& state) {
-                            keep(step, State<Real, D>{part(state.x, false), part(state.v, false)},
-                                 State<Real, D>{part(state.x, true), part(state.v, true)});
+                            keep(step, State<Real, D>{part(state.x, false), part(state.v, false), {}},
+                                 State<Real, D>{part(state.x, true), part(state.v, true), {}});
                         });
     }
 

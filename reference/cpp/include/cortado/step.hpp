@@ -1,8 +1,9 @@
-// One step of PCISPH (Solenthaler and Pajarola 2009; the report's Algorithm 1, put right), with every intermediate
-// value that its derivatives need. Memory is kept from one step to the next. docs/discretisation.md writes the same step in the same order.
+// One step of PCISPH (Solenthaler and Pajarola 2009; the report's Algorithm 1, put right), or of the projection, with
+// every intermediate value that its derivatives need. Memory is kept from one step to the next. docs/discretisation.md
+// writes the same step in the same order.
 #pragma once
 
-#include "stress.hpp"
+#include "projection.hpp"
 
 namespace cortado {
 
@@ -21,15 +22,18 @@ struct Step {
     std::vector<Values<Scalar>> excess;      // [k]: m n* - rho_0
     std::vector<Values<Scalar>> p;           // [k]: after iteration k
     Vectors<Scalar, D> v_star;               // the last: the result
+    Projection<Scalar, D> projection;        // what it makes of the first x_star and v_star
     double error = 0, greatest_error = 0;    // compression as the last iteration found it
 
     int iterations() const { return iterations_; }
-    State<Scalar, D> result() const { return {x_star[iterations_], v_star}; }
+    State<Scalar, D> result() const {
+        return projected_ ? projection.result() : State<Scalar, D>{x_star[iterations_], v_star, {}};
+    }
     Scalar delta(const Model<Scalar, D>& model, std::size_t i) const {
         return y[i] * model.stiffness / (model.time_step * model.time_step);
     }
 
-    // Take a step; `iterations` -1: as many as the tolerances ask for.
+    // Take a step; `iterations` -1: as many of PCISPH as the tolerances ask for.
     void take(const Model<Scalar, D>& model, const State<Scalar, D>& state, const Vector<Scalar, D>& gravity,
               const Scalar& viscosity, int iterations = -1) {
         const std::size_t count = state.x.size();
@@ -83,6 +87,13 @@ struct Step {
             v_star[i] = state.v[i] + dt * acceleration[i];
             x_star[0][i] = state.x[i] + dt * v_star[i];
         });
+        projected_ = model.projection;
+        if (projected_) {
+            projection.take(model, fluid, walls, state, n, v_star);
+            iterations_ = model.maximum_iterations;
+            error = projection.error;
+            return;
+        }
         const bool free = iterations < 0;
         const int least = !model.pressure ? 0 : free ? model.minimum_iterations : iterations;
         const int most = !model.pressure ? 0 : free ? model.maximum_iterations : iterations;
@@ -135,6 +146,7 @@ private:
         });
     }
 
+    bool projected_ = false;
     int iterations_ = 0;
     Values<Scalar> c_;
 };

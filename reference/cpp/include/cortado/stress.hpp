@@ -59,6 +59,19 @@ Value difference_of(const std::vector<Value>& values, std::size_t i, int j) {
     return j < 0 ? values[i] : Value(values[i] - values[j]);
 }
 
+// The invariant of order D - 1 of a symmetric matrix, and its gradient.
+template <class Scalar, int D>
+struct Second {
+    Scalar value;
+    Matrix<Scalar, D> slope = Matrix<Scalar, D>::Identity();
+
+    explicit Second(const Matrix<Scalar, D>& M) : value(M.trace()) {
+        if constexpr (D == 2) return;
+        slope = value * slope - M;
+        value = (value * value - (M * M).trace()) / Scalar(2);
+    }
+};
+
 // The fullness S of M, and its gradient where that is asked for: both 0 where neighbours lie on a line.
 template <class Scalar, int D>
 struct Fullness {
@@ -66,16 +79,11 @@ struct Fullness {
     Matrix<Scalar, D> slope = Matrix<Scalar, D>::Constant(Scalar(0));
 
     explicit Fullness(const Matrix<Scalar, D>& M) {
-        const Scalar determinant = M.determinant(), trace = M.trace(), one(1);
-        const Matrix<Scalar, D> unit = Matrix<Scalar, D>::Identity();
-        Scalar second = trace;  // the invariant of order D - 1, and its gradient
-        Matrix<Scalar, D> second_slope = unit;
-        if constexpr (D == 3) {
-            second = (trace * trace - (M * M).trace()) / Scalar(2);
-            second_slope = trace * unit - M;
-        }
-        if (!(second > Scalar(0))) return;
-        const Scalar H = Scalar(D) * determinant / second, empty = one / Scalar(5), width = Scalar(3) / Scalar(10);
+        const Scalar one(1);
+        const Second<Scalar, D> second(M);
+        if (!(second.value > Scalar(0))) return;
+        const Scalar H = Scalar(D) * M.determinant() / second.value;
+        const Scalar empty = one / Scalar(5), width = Scalar(3) / Scalar(10);
         if (!(H > empty)) return;
         const Scalar t = (H - empty) / width;
         if (!(t < one)) {
@@ -83,7 +91,7 @@ struct Fullness {
             return;
         }
         S = t * t * (Scalar(3) - Scalar(2) * t);
-        const Matrix<Scalar, D> H_slope = H * (M.inverse() - second_slope / second);
+        const Matrix<Scalar, D> H_slope = H * (M.inverse() - second.slope / second.value);
         slope = (Scalar(6) * t * (one - t) / width) * H_slope;
     }
 };

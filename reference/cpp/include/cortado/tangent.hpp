@@ -1,38 +1,11 @@
 // The tangent of a step, derived by hand: the report's Algorithm 2 and eqs. 11 to 14, put right.
 #pragma once
 
+#include "projection_tangent.hpp"
 #include "stress_derivative.hpp"
 #include "viscosity_derivative.hpp"
 
 namespace cortado {
-
-// sum_j G(x_ij) . dx_ij + sum_b w_b G(x_ib) . dx_i at positions x over lists (eq. 11, over V).
-template <class Real, int D>
-Real weights_tangent(const Model<Real, D>& model, std::size_t i, const Step<Real, D>& step, const Vectors<Real, D>& x,
-                     const Vectors<Real, D>& dx) {
-    Real total = 0;
-    const auto slope = [&](const Vector<Real, D>& separation, const Vector<Real, D>& by) {
-        const Real r_squared = separation.dot(separation);
-        if (!model.smoothing.near(r_squared)) return Real(0);
-        return Real(model.smoothing.slope(model.smoothing.q_of(r_squared)) * separation.dot(by));
-    };
-    for (auto pair = step.fluid.begin_of(i); pair != step.fluid.end_of(i); ++pair)
-        total += slope(model.period.nearest(x[i] - x[pair->other]), dx[i] - dx[pair->other]);
-    for (auto pair = step.walls.begin_of(i); pair != step.walls.end_of(i); ++pair)
-        total += model.wall_weights[pair->other] *
-                 slope(model.period.nearest(x[i] - model.wall_positions[pair->other]), dx[i]);
-    return total;
-}
-
-// dn at x(t)
-template <class Real, int D>
-Values<Real> density_tangent(const Model<Real, D>& model, const Step<Real, D>& step, const Vectors<Real, D>& x,
-                             const Vectors<Real, D>& dx) {
-    Values<Real> dn(x.size());
-    each_particle(x.size(), model.threads,
-                  [&](std::size_t i) { dn[i] = model.volume * weights_tangent(model, i, step, x, dx); });
-    return dn;
-}
 
 // The derivative of the acceleration without pressure (eq. 14, put right); `kappa` is that of the derivative.
 template <class Real, int D>
@@ -115,6 +88,11 @@ State<Real, D> step_tangent(const Model<Real, D>& model, Step<Real, D>& step, co
         terms.viscosity ? acceleration_tangent(model, step, state, dot, dn, gravity_dot, Real(model.kappa * viscosity),
                                                Real(model.kappa * viscosity_dot))
                         : Vectors<Real, D>(count, gravity_dot);
+    if (model.projection) {
+        Vectors<Real, D> dv_star(count);
+        for (std::size_t i = 0; i < count; ++i) dv_star[i] = dot.v[i] + model.time_step * da[i];
+        return projection_tangent(model, step, state, dot, dn, dv_star);
+    }
     Values<Real> dy(count);
     each_particle(count, model.threads, [&](std::size_t i) {
         Vector<Real, D> change = Vector<Real, D>::Constant(Real(0));
@@ -122,7 +100,7 @@ State<Real, D> step_tangent(const Model<Real, D>& model, Step<Real, D>& step, co
             change += model.wall_weights[pair->other] * pair->hessian_product(dot.x[i]);
         dy[i] = -2 * step.y[i] * step.y[i] * step.wall_gradient[i].dot(change) / model.response;
     });
-    State<Real, D> new_dot{Vectors<Real, D>(count), Vectors<Real, D>(count)};
+    State<Real, D> new_dot{Vectors<Real, D>(count), Vectors<Real, D>(count), {}};
     const auto predict = [&](std::size_t i, const Vector<Real, D>& push_dot) {
         predict_tangent(i, model.time_step, dot, da, push_dot, new_dot);
     };

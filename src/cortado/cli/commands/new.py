@@ -16,8 +16,8 @@ dimension = $dimension
 
 [discretisation]
 spacing = $spacing                      # m, between particles at rest: half of it is $more times as many
-support = 2.0                       # how far a particle sees, in spacings
-kernel = "cubic_spline"             # or "wendland_c2", "wendland_c4"
+support = 2.6                       # how far a particle sees, in spacings
+kernel = "wendland_c2"              # or "wendland_c4" with a support of 3, "cubic_spline" with 2
 
 # Materials: a table for each.
 [[phase]]
@@ -63,10 +63,10 @@ viscosity = "stress"                # or "none"; "pairwise" and "laminar" are th
 #surface_tension = 0.07             # N/m
 
 [solver]
+kind = "projection"                 # or "pcisph", which has other keys than iterations and repairs
 time_step = 0.002                   # s; `cortado describe` says what limits it; "auto" chooses it before each step
-minimum_iterations = 3              # of the pressure, in every step
-maximum_iterations = 50
-density_tolerance = 0.01            # the average compression at which they end
+iterations = 4                      # of the pressure, in every step
+repairs = 2                         # that bring particles back to the rest density
 
 # What changes over time: gravity, as in a box that is shaken, "tilt", or the "nozzle_path" of an [emitter].
 #[schedule.gravity]

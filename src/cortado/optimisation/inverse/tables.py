@@ -20,7 +20,15 @@ from pydantic import (
 
 from cortado.errors import Words
 from cortado.executors import Executor, InProcess
-from cortado.gradients import AdjointEstimator, AdjointViscosity, EnsembleMean, Exact, FrozenGeometry, GradientEstimator
+from cortado.gradients import (
+    AdjointEstimator,
+    AdjointViscosity,
+    EnsembleMean,
+    Exact,
+    FrozenGeometry,
+    GradientEstimator,
+    ImplicitPressure,
+)
 from cortado.losses.image_losses import ImageLoss, Pyramid, SquaredDifference
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch, Optimiser
 from cortado.optimisation.start import MOST_ITERATIONS
@@ -42,6 +50,7 @@ ESTIMATORS: dict[str, AdjointEstimator] = {
     "exact": Exact(),
     "frozen_geometry": FrozenGeometry(),
     "adjoint_viscosity": AdjointViscosity(),
+    "implicit_pressure": ImplicitPressure(),
 }
 RANDOM = "random"
 CAN_BE_RANDOM = ("initial_positions", "mass_fractions")
@@ -195,7 +204,8 @@ class GradientTable(Table):
     """[optimise.gradient]: which gradient the search follows, see docs/gradients.md."""
 
     name: Annotated[str, OneOf(ESTIMATORS)] = "exact"
-    """Name of the estimator; "adjoint_viscosity" is for long splashes."""
+    """Name of the estimator; "adjoint_viscosity" is for long splashes, "implicit_pressure" for the solver
+    "projection" with many iterations."""
     coefficient: Annotated[float, quantity(ge=0.0)] | None = None
     """C of `AdjointViscosity`, whose strength is C times what the fluid strains in a step; if left out, 2."""
     samples: Annotated[int, count(1, 10_000)] = 1

@@ -25,7 +25,7 @@ class PcisphMaker:
         limits = pressure_limits(self._table) if setting.scene.forces.pressure else None
         system = particle_system(setting)
         if self._table.shifting:
-            return ShiftedPcisph(system, lattice_constants(setting), limits)
+            return ShiftedPcisph(system, lattice_constants(setting.scene, setting.discrete), limits)
         return Pcisph(system, limits)
 
 

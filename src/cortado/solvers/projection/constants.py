@@ -7,7 +7,8 @@ import numpy as np
 
 from cortado.discretise.calibration import lattice_offsets, rest_volume
 from cortado.discretise.smoothing import SmoothingKernel
-from cortado.solvers.makers import SolverSetting
+from cortado.scene.discrete_scene import DiscreteScene
+from cortado.scene.scene import Scene
 
 MARGIN = 1.05
 """By how much the relaxation stays below that of the lattice's stiffest wave."""
@@ -45,8 +46,7 @@ class ProjectionConstants:
         return cls(spacing, 1.0 / (MARGIN * stiffest), DEPARTURE * square, nearest)
 
 
-def lattice_constants(setting: SolverSetting) -> ProjectionConstants:
+def lattice_constants(scene: Scene, discrete: DiscreteScene) -> ProjectionConstants:
     """Those of the lattice of a scene."""
-    scene, discrete = setting.scene, setting.discrete
     lattice = discrete.kernel, scene.discretisation.spacing, discrete.lattice.support, scene.dimension
     return ProjectionConstants.of(*lattice)

@@ -177,16 +177,24 @@ class ProjectionAdjoint(ParticleAdjoint):
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
         """Of the new velocities and of the iterations, to the adjoints of v* and of the first k."""
-        solver, kernels, velocity = self._solver, self._solver.kernels.pressure, self._solver.kernels.velocity
-        last = {"u": solver.v_new, "u_bar": self._v_new_bar, "v_star": solver.v_star}
-        steps = {"f": self._f, "T": self._pull, "S": self._push}
-        context.launch(velocity.end_adjoint, *known, last, steps, y=solver.iterates[iterations]["k"])
-        first = {"y": solver.iterates[iterations]["k"], "y_bar": self._k_bar}
-        context.launch(velocity.velocity.adjoint, *known, steps, first)
-        clamp, divergence = kernels.update.adjoint
-        steps |= {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar}
+        solver = self._solver
+        self._from_velocities(context, known, solver.iterates[iterations]["k"])
         for k in reversed(range(iterations)):
-            at = solver.iterates[k]
-            context.launch(clamp, *known, at, solver.relaxed, steps, beta=solver.momenta[k])
-            context.launch(divergence, *known, at, steps, v_star=solver.v_star)
-            context.launch(velocity.velocity.adjoint, *known, at, steps)
+            self._back(context, known, solver.iterates[k], solver.momenta[k])
+
+    def _from_velocities(self, context: StepContext, known: tuple[Named, ...], k: wp.array) -> None:
+        """Of the new velocities, to the adjoints of v* and of the last k."""
+        solver, velocity = self._solver, self._solver.kernels.velocity
+        last = {"u": solver.v_new, "u_bar": self._v_new_bar, "v_star": solver.v_star}
+        steps = {"f": self._f, "T": self._pull}
+        context.launch(velocity.end_adjoint, *known, last, steps, y=k)
+        context.launch(velocity.velocity.adjoint, *known, steps, y=k, y_bar=self._k_bar)
+
+    def _back(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], beta: float) -> None:
+        """Of one iteration, from those of k' and y' to those of k and y, and of v*."""
+        solver, (clamp, divergence) = self._solver, self._solver.kernels.pressure.update.adjoint
+        steps = {"f": self._f, "T": self._pull, "S": self._push}
+        steps |= {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar}
+        context.launch(clamp, *known, at, solver.relaxed, steps, beta=beta)
+        context.launch(divergence, *known, at, steps, v_star=solver.v_star)
+        context.launch(solver.kernels.velocity.velocity.adjoint, *known, at, steps)

@@ -16,12 +16,14 @@ maximum have corners, at which one of the two derivatives is taken. The result i
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import warp as wp
 
 from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
+from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.solvers.projection.sums import projection_sums
 from cortado.solvers.projection.surroundings import entries, weights_type
@@ -38,26 +40,20 @@ class PressureKernels:
     """k' and y'; its adjoint are two kernels, that of the clamp and that of D."""
 
 
+@dataclass(frozen=True)
+class PressureFunctions:
+    """Warp functions of one particle."""
+
+    wanted: Any
+    """b of n, f and dt."""
+    parts: Any
+    """The parts of two slopes that k' has."""
+
+
 @cache
-def pressure_kernels(discretisation: Discretisation, dimension: int) -> PressureKernels:
-    """In 2 or 3 dimensions."""
-    precision = discretisation.precision
-    real, vector, pair_of = precision.real, precision.vector, precision.pair
-    neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
-    packed, matrix, whole = symmetric(precision), matrix_type(precision), moment_functions(precision, dimension).change
-    six, pack, times = packed.kind, packed.pack, packed.times
-    divergence, divergence_tangent = sums.divergence, sums.divergence_tangent
-    divergence_back = sums.divergence_back
-    topic = f"projection_{dimension}d"
-    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
-    adjoint_module = discretisation.module(False, topic)
-    weights4 = weights_type(precision)
-    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "a", "weights")}
-    seen = bundle(**own)
-    bars = bundle(x=vector, v=vector, n=real, m=real, time_step=real, **own)
-    iterate = bundle(u=vector, d=real, y=real, k=real)
-    LANES = discretisation.lanes
-    lane = lane_functions(precision, LANES).lane
+def pressure_functions(precision: Precision) -> PressureFunctions:
+    """In a precision."""
+    real = precision.real
 
     @wp.func
     def wanted(n: real, full: real, dt: real) -> real:
@@ -80,6 +76,31 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
             elif down == real(0.0):
                 fall = real(0.5)
         return rise, fall
+
+    return PressureFunctions(wanted, parts)
+
+
+@cache
+def pressure_kernels(discretisation: Discretisation, dimension: int) -> PressureKernels:
+    """In 2 or 3 dimensions."""
+    precision = discretisation.precision
+    real, vector, pair_of = precision.real, precision.vector, precision.pair
+    neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
+    packed, matrix, whole = symmetric(precision), matrix_type(precision), moment_functions(precision, dimension).change
+    six, pack, times = packed.kind, packed.pack, packed.times
+    divergence, divergence_tangent = sums.divergence, sums.divergence_tangent
+    divergence_back = sums.divergence_back
+    topic = f"projection_{dimension}d"
+    module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
+    adjoint_module = discretisation.module(False, topic)
+    weights4 = weights_type(precision)
+    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "a", "weights")}
+    seen = bundle(**own)
+    bars = bundle(x=vector, v=vector, n=real, m=real, time_step=real, **own)
+    iterate = bundle(u=vector, d=real, y=real, k=real)
+    clamp, LANES = pressure_functions(precision), discretisation.lanes
+    wanted, parts = clamp.wanted, clamp.parts
+    lane = lane_functions(precision, LANES).lane
 
     @wp.kernel(module=module)
     def start(

@@ -1,6 +1,6 @@
 """Density is repaired in positions alone, by Jacobi iterations from x', the positions after the shift:
 
-    lambda' = z if z > 0, else r z,   z = lambda + omega / 2 (n(x_k) - 1) / a,
+    lambda' = z if z > 0, else r z,   z = lambda + omega (n(x_k) - 1) / a,
     x_k+1 = x' - (sum_j (lambda'_i + lambda'_j) g_ij + lambda'_i gamma_i) / m.
 
 Velocities stay as they are: in them a repair would be a force that acts once more in the next step. r of
@@ -71,7 +71,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         if lane() > 0:
             return
         over = s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - real(1.0)
-        z = c_in[i] + real(0.5) * omega * over / of.a[i]
+        z = c_in[i] + omega * over / of.a[i]
         if z < real(0.0):
             z = of.weights[i][3] * z
         compression = wp.max(over, real(0.0))
@@ -97,7 +97,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         total = weights_tangent(i, x_now, x_now_dot, s)
         if lane() > 0:
             return
-        per = real(0.5) * omega / of.a[i]
+        per = omega / of.a[i]
         z = c_in[i] + per * excess[i]
         z_dot = c_in_dot[i] + per * (s.volume * total - dot.a[i] / of.a[i] * excess[i])
         if z < real(0.0):
@@ -196,7 +196,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> RepairKern
         if lane() > 0:
             return
         a = of.a[i]
-        per = real(0.5) * omega / a
+        per = omega / a
         z_bar = c_bar[i] + by_c + wp.dot(of.gamma[i], f[i])
         z = c_in[i] + per * excess[i]
         if z < real(0.0):

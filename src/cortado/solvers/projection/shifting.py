@@ -1,10 +1,10 @@
 """Particles of the interior are shifted to where they are fewer (Lind et al. 2012; Skillen, Lind, Stansby and Rogers
 2013), at a rate that follows the velocity gradient, so that a fluid at rest is not stirred:
 
-    delta = -r s^2 u P grad C,   grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma / 2,   q_ij = (W_ij / W(s))^4,
+    delta = -r s^2 u P grad C,   grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma,   q_ij = (W_ij / W(s))^4,
 
 with r = 20 dt |grad v|, softly at least 0 and at most 0.5, and |delta| softly at most 0.1 s. P takes out the direction
-of the surface, g + gamma / 2, and u of `cortado.solvers.projection.surroundings` is 0 at surfaces. Velocities stay as
+of the surface, g + gamma, and u of `cortado.solvers.projection.surroundings` is 0 at surfaces. Velocities stay as
 they are: with a correction by (delta . grad) v the fluid gains energy.
 """
 
@@ -61,7 +61,7 @@ def shift_functions(precision: Precision, dimension: int, module: Any) -> ShiftF
         G = A * inverse(M)
         turned = dt * dt * wp.ddot(G, G)
         strength = rate * turned / (wp.sqrt(turned + least * least) + least)
-        out, slope = g + real(0.5) * gamma, crowd + real(0.5) * gamma
+        out, slope = g + gamma, crowd + gamma
         square = wp.dot(out, out) + surface / (spacing * spacing)
         along = slope - (wp.dot(out, slope) / square) * out
         strength = strength / wp.sqrt(real(1.0) + (strength / greatest) * (strength / greatest))

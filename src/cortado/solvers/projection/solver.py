@@ -2,8 +2,9 @@
 
 from cortado.particles.state import Parameters
 from cortado.solvers.projection.derivatives import ProjectionAdjoint, ProjectionTangent
+from cortado.solvers.projection.fixed_point import FixedPointAdjoint
 from cortado.solvers.projection.steps import ProjectionSteps
-from cortado.solvers.solver import StepAdjoint, StepTangent
+from cortado.solvers.solver import ResumingAdjoint, StepAdjoint, StepTangent
 
 
 class Projection(ProjectionSteps):
@@ -14,3 +15,6 @@ class Projection(ProjectionSteps):
 
     def adjoint(self, steps: int) -> StepAdjoint:
         return ProjectionAdjoint(self, steps)
+
+    def implicit_adjoint(self, steps: int, tolerance: float, iterations: int) -> ResumingAdjoint:
+        return FixedPointAdjoint(self, steps, tolerance, iterations)

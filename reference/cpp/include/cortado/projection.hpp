@@ -1,0 +1,175 @@
+// The projection, from predicted velocities to the result of a step: pressures that make velocities free of divergence,
+// a shift, and the repair of density, with every intermediate value that derivatives need. docs/projection.md writes
+// the same in the same order.
+#pragma once
+
+#include "surroundings.hpp"
+
+namespace cortado {
+
+// How much of the slopes of z+ and of sigma z- the clamp has: all of one of them, or on a corner the mean of both
+// sides.
+template <class Scalar>
+struct Clamp {
+    Scalar rise{0}, fall{0};
+
+    Clamp(const Scalar& up, const Scalar& down) {
+        using Real = typename RealOf<Scalar>::type;
+        const Real above = real_part(up), below = real_part(down), half = Real(1) / Real(2);
+        rise = Scalar(above > Real(0) ? Real(1) : above == Real(0) ? half : Real(0));
+        if (above <= Real(0)) fall = Scalar(below < Real(0) ? Real(1) : below == Real(0) ? half : Real(0));
+    }
+};
+
+template <class Scalar, int D>
+struct Projection {
+    using Real = typename RealOf<Scalar>::type;
+
+    std::vector<Moments<Scalar, D>> moments;
+    std::vector<Effects<Scalar, D>> effects;
+    std::vector<Values<Scalar>> k, y;         // [i]: before iteration i; the last of each is the result
+    std::vector<Values<Scalar>> divergences;  // [i]: the divergence that iteration i finds
+    std::vector<Vectors<Scalar, D>> u;        // [i]: the velocity that y[i] leaves; the last is the result
+    Matrices<Scalar, D> A;                    // sum v_ij g_ij^T of it
+    Vectors<Scalar, D> crowd;                 // sum (1 + q_ij / (4 + q_ij)) g_ij
+    Vectors<Scalar, D> x_moved;               // x'
+    std::vector<Vectors<Scalar, D>> x_now;    // [i]: before repair i; the last is the result
+    std::vector<Values<Scalar>> c;            // [i]: lambda before repair i
+    std::vector<Values<Scalar>> excess;       // [i]: n - 1 as repair i finds it
+    double error = 0;                         // average compression as the last repair found it
+
+    State<Scalar, D> result() const { return {x_now.back(), u.back(), k.back()}; }
+
+    // omega / a
+    Scalar step_of(const Model<Scalar, D>& model, std::size_t i) const { return model.relaxation / effects[i].a; }
+    // b, for a density n
+    Scalar wanted(const Model<Scalar, D>& model, std::size_t i, const Scalar& n) const {
+        const Scalar one(1);
+        return n < one ? (one - effects[i].full) * (one - n) / model.time_step : Scalar(0);
+    }
+
+    // From lists over a state, its densities n and predicted velocities.
+    void take(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Pairs<Scalar, D>& walls,
+              const State<Scalar, D>& state, const Values<Scalar>& n, const Vectors<Scalar, D>& v_star) {
+        const std::size_t count = state.x.size(), iterations = model.maximum_iterations, repairs = model.repairs;
+        const auto sized = [count](auto& all, std::size_t length) {
+            all.resize(length);
+            for (auto& one : all) one.resize(count);
+        };
+        for (auto* each : {&k, &y}) sized(*each, iterations + 1);
+        sized(divergences, iterations);
+        sized(u, iterations + 1);
+        sized(x_now, repairs + 1);
+        sized(c, repairs + 1);
+        sized(excess, repairs);
+        find(model, fluid, walls, count);
+        for (std::size_t i = 0; i < count; ++i) k[0][i] = y[0][i] = effects[i].full * state.k[i];
+        for (std::size_t at = 0; at < iterations; ++at) {
+            pull(model, fluid, y[at], v_star, u[at]);
+            iterate(model, fluid, n, at);
+        }
+        pull(model, fluid, y[iterations], v_star, u[iterations]);
+        move(model, fluid, state.x, u[iterations]);
+        for (std::size_t at = 0; at < repairs; ++at) repair(model, fluid, walls, at);
+    }
+
+private:
+    void find(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Pairs<Scalar, D>& walls,
+              std::size_t count) {
+        moments.resize(count);
+        effects.resize(count);
+        each_particle(count, model.threads, [&](std::size_t i) {
+            Moments<Scalar, D> of;
+            for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
+                const Vector<Scalar, D> g = model.volume * pair->gradient();
+                of.M -= g * pair->x.transpose();
+                of.Q += g * g.transpose() / model.rest_density;
+                of.g += g;
+            }
+            for (auto pair = walls.begin_of(i); pair != walls.end_of(i); ++pair) {
+                const Vector<Scalar, D> normal = model.wall_normals[pair->other].template cast<Scalar>();
+                const Scalar volume = model.volume * model.wall_weights[pair->other];
+                of.gamma += (volume * normal.dot(pair->gradient())) * normal;
+                of.nu += volume * pair->w;
+            }
+            moments[i] = of;
+            effects[i] = Surroundings<Scalar, D>(model, of).found;
+        });
+    }
+
+    // The velocity v* - D^T y / m that pressures leave.
+    void pull(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Values<Scalar>& y,
+              const Vectors<Scalar, D>& v_star, Vectors<Scalar, D>& left) const {
+        each_particle(y.size(), model.threads, [&](std::size_t i) {
+            Vector<Scalar, D> total = y[i] * moments[i].gamma;
+            const Matrix<Scalar, D> T = y[i] * effects[i].L;
+            for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
+                const int j = pair->other;
+                total += model.volume * ((T + y[j] * effects[j].L) * pair->gradient());
+            }
+            left[i] = v_star[i] - total / model.rest_density;
+        });
+    }
+
+    void iterate(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Values<Scalar>& n,
+                 std::size_t at) {
+        each_particle(n.size(), model.threads, [&](std::size_t i) {
+            const Vectors<Scalar, D>& v = u[at];
+            Scalar divergence = moments[i].gamma.dot(v[i]);
+            for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
+                const Vector<Scalar, D> v_ij = v[i] - v[pair->other], corrected = effects[i].L * pair->gradient();
+                divergence += model.volume * v_ij.dot(corrected);
+            }
+            const Scalar per = step_of(model, i), down = y[at][i] + per * divergence;
+            const Scalar up = y[at][i] + per * (divergence - wanted(model, i, n[i]));
+            const Clamp<Scalar> clamp(up, down);
+            const Scalar found = clamp.rise * up + clamp.fall * effects[i].tension * down;
+            divergences[at][i] = divergence;
+            k[at + 1][i] = found;
+            y[at + 1][i] = found + model.momenta[at] * (found - k[at][i]);
+        });
+    }
+
+    // The shift, and the positions that it and velocities lead to.
+    void move(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Vectors<Scalar, D>& x,
+              const Vectors<Scalar, D>& v) {
+        for (Vectors<Scalar, D>* each : {&crowd, &x_moved}) each->resize(x.size());
+        A.resize(x.size());
+        each_particle(x.size(), model.threads, [&](std::size_t i) {
+            A[i] = Matrix<Scalar, D>::Constant(Scalar(0));
+            crowd[i] = Vector<Scalar, D>::Constant(Scalar(0));
+            for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair) {
+                const Vector<Scalar, D> g = model.volume * pair->gradient();
+                A[i] += (v[i] - v[pair->other]) * g.transpose();
+                crowd[i] += Closeness<Scalar>(model.volume * pair->w, model.nearest_weight).value * g;
+            }
+            const Shift<Scalar, D> shift(model, moments[i], effects[i].shifted, A[i], crowd[i]);
+            x_moved[i] = x[i] + model.time_step * v[i] + shift.delta;
+            x_now[0][i] = x_moved[i];
+            c[0][i] = Scalar(0);
+        });
+    }
+
+    void repair(const Model<Scalar, D>& model, const Pairs<Scalar, D>& fluid, const Pairs<Scalar, D>& walls,
+                std::size_t at) {
+        const std::size_t count = x_moved.size();
+        each_particle(count, model.threads, [&](std::size_t i) {
+            const Scalar weights = model.self_weight + model.weights(i, fluid, walls, x_now[at]);
+            excess[at][i] = model.volume * weights - Scalar(1);
+            const Scalar z = c[at][i] + step_of(model, i) * excess[at][i];
+            c[at + 1][i] = z < Scalar(0) ? Scalar(effects[i].repaired * z) : z;
+        });
+        Real sum(0);
+        for (const Scalar& one : excess[at])
+            if (real_part(one) > Real(0)) sum += real_part(one);
+        error = double(sum / Real(double(count)));
+        each_particle(count, model.threads, [&](std::size_t i) {
+            Vector<Scalar, D> total = c[at + 1][i] * moments[i].gamma;
+            for (auto pair = fluid.begin_of(i); pair != fluid.end_of(i); ++pair)
+                total += (model.volume * (c[at + 1][i] + c[at + 1][pair->other])) * pair->gradient();
+            x_now[at + 1][i] = x_moved[i] - total / model.rest_density;
+        });
+    }
+};
+
+}  // namespace cortado

@@ -1,0 +1,220 @@
+// The adjoint of the part that the projection has in a step: the transpose of `projection_tangent`, every sum a gather.
+#pragma once
+
+#include "density_derivative.hpp"
+#include "surroundings_derivative.hpp"
+
+namespace cortado {
+
+template <class Real, int D>
+class ProjectionAdjoint {
+public:
+    ProjectionAdjoint(const Model<Real, D>& model, const Step<Real, D>& step, const State<Real, D>& state)
+        : model_(model),
+          step_(step),
+          state_(state),
+          at_(step.projection),
+          count_(state.x.size()),
+          moments_bar_(count_),
+          effects_bar_(count_),
+          x_bar_(zero_vectors<Real, D>(count_)),
+          v_star_bar_(zero_vectors<Real, D>(count_)),
+          f_(count_) {}
+
+    // From the adjoint of a step's result to that of its state but for what predicted velocities depend on; adds to
+    // that of densities n, and returns that of predicted velocities.
+    Vectors<Real, D> find(State<Real, D>& bar, Values<Real>& n_bar) {
+        const Vectors<Real, D> moved_bar = repairs(bar.x);
+        shift(moved_bar, bar.v);
+        Values<Real> y_bar(count_, Real(0));
+        project(bar.k, y_bar, bar.v, n_bar);
+        each([&](std::size_t i) {
+            const Real first_bar = bar.k[i] + y_bar[i];
+            bar.k[i] = at_.effects[i].full * first_bar;
+            effects_bar_[i].full += state_.k[i] * first_bar;
+        });
+        surroundings();
+        bar.x = x_bar_;
+        return v_star_bar_;
+    }
+
+private:
+    template <class Body>
+    void each(const Body& body) const {
+        each_particle(count_, model_.threads, body);
+    }
+    // `body(j, pair, g, x_bar)` for all pairs of fluid, where `body` adds to what multiplies H in the adjoint of x.
+    template <class Body>
+    void each_pair(std::size_t i, const Body& body) {
+        for (auto pair = step_.fluid.begin_of(i); pair != step_.fluid.end_of(i); ++pair) {
+            Vector<Real, D> bent = Vector<Real, D>::Zero();
+            body(pair->other, *pair, Vector<Real, D>(model_.volume * pair->gradient()), bent);
+            x_bar_[i] += model_.volume * pair->hessian_product(bent);
+        }
+    }
+
+    // From the adjoint of the last positions to that of those before all repairs.
+    Vectors<Real, D> repairs(const Vectors<Real, D>& last_bar) {
+        Vectors<Real, D> now_bar = last_bar, moved_bar = zero_vectors<Real, D>(count_);
+        Values<Real> c_bar(count_, Real(0)), r(count_);
+        for (int k = int(at_.excess.size()) - 1; k >= 0; --k) {
+            const Values<Real>& c = at_.c[k + 1];
+            each([&](std::size_t i) {
+                moved_bar[i] += now_bar[i];
+                f_[i] = -now_bar[i] / model_.rest_density;
+            });
+            each([&](std::size_t i) {
+                const Effects<Real, D>& of = at_.effects[i];
+                Real z_bar = c_bar[i] + at_.moments[i].gamma.dot(f_[i]);
+                each_pair(i, [&](int j, const auto&, const Vector<Real, D>& g, Vector<Real, D>& bent) {
+                    const Vector<Real, D> f_ij = f_[i] - f_[j];
+                    z_bar += g.dot(f_ij);
+                    bent = (c[i] + c[j]) * f_ij;
+                });
+                const Real per = at_.step_of(model_, i), excess = at_.excess[k][i];
+                const Real z = at_.c[k][i] + per * excess;
+                if (z < 0) {
+                    effects_bar_[i].repaired += z * z_bar;
+                    z_bar *= of.repaired;
+                }
+                moments_bar_[i].gamma += c[i] * f_[i];
+                effects_bar_[i].a -= per * excess / of.a * z_bar;
+                r[i] = model_.volume * per * z_bar;
+                c_bar[i] = z_bar;
+            });
+            each([&](std::size_t i) { now_bar[i] = weights_adjoint(model_, i, step_, at_.x_now[k], r); });
+        }
+        for (std::size_t i = 0; i < count_; ++i) moved_bar[i] += now_bar[i];
+        return moved_bar;
+    }
+
+    // From the adjoint of x' to that of the new velocities, to which it adds.
+    void shift(const Vectors<Real, D>& moved_bar, Vectors<Real, D>& v_bar) {
+        std::vector<Crowding<Real, D>> bar(count_);
+        each([&](std::size_t i) {
+            const ShiftSlope<Real, D> shift(model_, at_.moments[i], {at_.A[i], at_.crowd[i], at_.effects[i].shifted});
+            bar[i] = shift.adjoint(moved_bar[i], moments_bar_[i]);
+            effects_bar_[i].shifted += bar[i].shifted;
+            x_bar_[i] += moved_bar[i];
+            v_bar[i] += model_.time_step * moved_bar[i];
+        });
+        const Vectors<Real, D>& v = at_.u.back();
+        each([&](std::size_t i) {
+            each_pair(i, [&](int j, const auto& pair, const Vector<Real, D>& g, Vector<Real, D>& bent) {
+                const Matrix<Real, D> A_bar = bar[i].A + bar[j].A;
+                const Vector<Real, D> crowd_bar = bar[i].crowd - bar[j].crowd, v_ij = v[i] - v[j];
+                const Closeness<Real> near(Real(model_.volume * pair.w), model_.nearest_weight);
+                v_bar[i] += A_bar * g;
+                x_bar_[i] += near.slope * g.dot(crowd_bar) * g;
+                bent = A_bar.transpose() * v_ij + near.value * crowd_bar;
+            });
+        });
+    }
+
+    // Of the velocity that y leaves, from its adjoint, to that of y.
+    void pull(const Values<Real>& y, const Vectors<Real, D>& u_bar, Values<Real>& y_bar) {
+        each([&](std::size_t i) {
+            v_star_bar_[i] += u_bar[i];
+            f_[i] = -u_bar[i] / model_.rest_density;
+        });
+        each([&](std::size_t i) {
+            const Matrix<Real, D>& L = at_.effects[i].L;
+            Matrix<Real, D> T_bar = Matrix<Real, D>::Zero();
+            each_pair(i, [&](int j, const auto&, const Vector<Real, D>& g, Vector<Real, D>& bent) {
+                const Vector<Real, D> f_ij = f_[i] - f_[j];
+                T_bar += f_ij * g.transpose();
+                bent = (y[i] * L + y[j] * at_.effects[j].L) * f_ij;
+            });
+            T_bar = even<Real, D>(T_bar);
+            y_bar[i] += L.cwiseProduct(T_bar).sum() + at_.moments[i].gamma.dot(f_[i]);
+            effects_bar_[i].L += y[i] * T_bar;
+            moments_bar_[i].gamma += y[i] * f_[i];
+        });
+    }
+
+    // From the adjoints of the last k and of the new velocities to those of the first k and y.
+    void project(Values<Real>& k_bar, Values<Real>& y_bar, const Vectors<Real, D>& v_bar, Values<Real>& n_bar) {
+        const Real dt = model_.time_step;
+        Values<Real> d_bar(count_);
+        Vectors<Real, D> u_bar(count_);
+        pull(at_.y.back(), v_bar, y_bar);
+        for (int k = int(at_.divergences.size()) - 1; k >= 0; --k) {
+            const Real beta = model_.momenta[k];
+            each([&](std::size_t i) {
+                const Effects<Real, D>& of = at_.effects[i];
+                Effects<Real, D>& of_bar = effects_bar_[i];
+                const Real n = step_.n[i], b = at_.wanted(model_, i, n), D_i = at_.divergences[k][i];
+                const Real per = at_.step_of(model_, i), down = at_.y[k][i] + per * D_i;
+                const Clamp<Real> clamp(Real(at_.y[k][i] + per * (D_i - b)), down);
+                const Real new_bar = k_bar[i] + (1 + beta) * y_bar[i], up_bar = clamp.rise * new_bar;
+                const Real z_bar = up_bar + clamp.fall * of.tension * new_bar, b_bar = -per * up_bar;
+                of_bar.tension += clamp.fall * down * new_bar;
+                of_bar.a -= per / of.a * (D_i * z_bar - b * up_bar);
+                if (n < 1) {
+                    n_bar[i] -= (1 - of.full) / dt * b_bar;
+                    of_bar.full -= (1 - n) / dt * b_bar;
+                }
+                k_bar[i] = -beta * y_bar[i];
+                y_bar[i] = z_bar;
+                d_bar[i] = per * z_bar;
+            });
+            each([&](std::size_t i) {
+                const Matrix<Real, D>& L = at_.effects[i].L;
+                const Vectors<Real, D>& u = at_.u[k];
+                Matrix<Real, D> L_bar = Matrix<Real, D>::Zero();
+                u_bar[i] = d_bar[i] * at_.moments[i].gamma;
+                each_pair(i, [&](int j, const auto&, const Vector<Real, D>& g, Vector<Real, D>& bent) {
+                    const Vector<Real, D> u_ij = u[i] - u[j];
+                    const Matrix<Real, D> S = d_bar[i] * L + d_bar[j] * at_.effects[j].L;
+                    u_bar[i] += S * g;
+                    L_bar += u_ij * g.transpose();
+                    bent = S * u_ij;
+                });
+                effects_bar_[i].L += d_bar[i] * even<Real, D>(L_bar);
+                moments_bar_[i].gamma += d_bar[i] * u[i];
+            });
+            pull(at_.y[k], u_bar, y_bar);
+        }
+    }
+
+    // From the adjoints of effects and moments to that of positions.
+    void surroundings() {
+        each([&](std::size_t i) {
+            const Moments<Real, D> more =
+                SurroundingsSlope<Real, D>(model_, at_.moments[i]).adjoint(effects_bar_[i]);
+            Moments<Real, D>& bar = moments_bar_[i];
+            bar.M += more.M;
+            bar.Q += more.Q;
+            bar.g += more.g;
+            bar.gamma += more.gamma;
+            bar.nu += more.nu;
+        });
+        each([&](std::size_t i) {
+            const Moments<Real, D>& own = moments_bar_[i];
+            each_pair(i, [&](int j, const auto& pair, const Vector<Real, D>& g, Vector<Real, D>& bent) {
+                const Moments<Real, D>& other = moments_bar_[j];
+                const Vector<Real, D> stretch = (own.M + other.M) * pair.x;
+                const Vector<Real, D> square = (own.Q + other.Q) * g;
+                bent = 2 / model_.rest_density * square + own.g - other.g - stretch;
+                x_bar_[i] -= (model_.volume * pair.a) * stretch;
+            });
+            for (auto pair = step_.walls.begin_of(i); pair != step_.walls.end_of(i); ++pair) {
+                const Vector<Real, D>& normal = model_.wall_normals[pair->other];
+                const Real volume = model_.volume * model_.wall_weights[pair->other];
+                const Vector<Real, D> along = normal.dot(own.gamma) * normal;
+                x_bar_[i] += volume * (pair->hessian_product(along) + own.nu * pair->gradient());
+            }
+        });
+    }
+
+    const Model<Real, D>& model_;
+    const Step<Real, D>& step_;
+    const State<Real, D>& state_;
+    const Projection<Real, D>& at_;
+    std::size_t count_;
+    std::vector<Moments<Real, D>> moments_bar_;
+    std::vector<Effects<Real, D>> effects_bar_;
+    Vectors<Real, D> x_bar_, v_star_bar_, f_;  // f is -u_bar / m of a velocity, or that of a position
+};
+
+}  // namespace cortado

@@ -1,0 +1,161 @@
+// What a particle's neighbourhood lets the projection do, from the moments of its neighbours, and how far it is
+// shifted. docs/projection.md has the formulas, by the same letters.
+#pragma once
+
+#include "stress.hpp"
+
+namespace cortado {
+
+template <class Scalar>
+Scalar hundredths(int count) {
+    using Real = typename RealOf<Scalar>::type;
+    return Scalar(Real(count) / Real(100));
+}
+
+// M = -sum g_ij x_ij^T, Q = sum g_ij g_ij^T / m and g = sum g_ij of fluid, gamma and nu of walls.
+template <class Scalar, int D>
+struct Moments {
+    Matrix<Scalar, D> M = Matrix<Scalar, D>::Constant(Scalar(0)), Q = M;
+    Vector<Scalar, D> g = Vector<Scalar, D>::Constant(Scalar(0)), gamma = g;
+    Scalar nu{0};
+};
+
+// What follows from them: L, the diagonal a, and how much tension is let through (sigma), how full it is (f), and how
+// much is shifted and repaired.
+template <class Scalar, int D>
+struct Effects {
+    Matrix<Scalar, D> L = Matrix<Scalar, D>::Constant(Scalar(0));
+    Scalar a{0}, tension{0}, full{0}, shifted{0}, repaired{0};
+};
+
+// 0 below a first number, 1 above a second one, and a cubic between them; numbers are in hundredths.
+template <class Scalar>
+struct Smoothstep {
+    Scalar value{0}, slope{0};
+
+    Smoothstep(const Scalar& at, int first, int second) {
+        const Scalar width = hundredths<Scalar>(second - first), t = (at - hundredths<Scalar>(first)) / width, one(1);
+        if (!(t > Scalar(0))) return;
+        if (!(t < one)) {
+            value = one;
+            return;
+        }
+        value = t * t * (Scalar(3) - Scalar(2) * t);
+        slope = Scalar(6) * t * (one - t) / width;
+    }
+};
+
+// H = D det M / (the invariant of order D - 1), and its gradient.
+template <class Scalar, int D>
+struct Filling {
+    Scalar H;
+    Matrix<Scalar, D> slope;
+
+    explicit Filling(const Matrix<Scalar, D>& M) {
+        using Real = typename RealOf<Scalar>::type;
+        const Second<Scalar, D> second(M);
+        const Scalar below = second.value + Scalar(Real(1) / Real(1e12)), dimension(D);
+        H = dimension * M.determinant() / below;
+        Matrix<Scalar, D> cofactors = M.trace() * Matrix<Scalar, D>::Identity() - M;
+        if constexpr (D == 3) cofactors = M * M - M.trace() * M + second.value * Matrix<Scalar, D>::Identity();
+        slope = (dimension * cofactors - H * second.slope) / below;
+    }
+};
+
+// 1.05 (M + 0.05)^-1
+template <class Scalar, int D>
+Matrix<Scalar, D> regular_inverse(const Matrix<Scalar, D>& M) {
+    const Matrix<Scalar, D> unit = Matrix<Scalar, D>::Identity(), sum = M + hundredths<Scalar>(5) * unit;
+    return hundredths<Scalar>(105) * sum.inverse();
+}
+
+// The effects of moments, with what is between them.
+template <class Scalar, int D>
+struct Surroundings {
+    Filling<Scalar, D> filling;
+    Smoothstep<Scalar> tension, full, corrected, shifted, repaired;
+    Scalar away;              // B
+    Scalar direction, lean;   // the denominators of N and C
+    Scalar below, lack;       // M : P / (d - 1) + 0.05, and t
+    Matrix<Scalar, D> K, N, P, C;
+    Matrix<Scalar, D> beside;  // t P - (1 + t) C
+    Matrix<Scalar, D> bare;   // (L - 1) / c
+    Vector<Scalar, D> own;    // L g + gamma
+    Effects<Scalar, D> found;
+
+    Surroundings(const Model<Scalar, D>& model, const Moments<Scalar, D>& of)
+        : filling(of.M),
+          tension(filling.H, 10, 50),
+          full(Scalar(filling.H + of.nu), 10, 50),
+          corrected(filling.H, 20, 50),
+          shifted(filling.H, 50, 80),
+          repaired(filling.H, 80, 95) {
+        const Scalar one(1), m = model.rest_density, ratio = of.nu / hundredths<Scalar>(5);
+        const Matrix<Scalar, D> unit = Matrix<Scalar, D>::Identity();
+        away = one / (one + ratio * ratio * ratio * ratio);
+        K = regular_inverse<Scalar, D>(of.M);
+        direction = of.gamma.dot(of.gamma) + hundredths<Scalar>(1) * model.least_diagonal;
+        N = of.gamma * of.gamma.transpose() / direction;
+        lean = of.M.cwiseProduct(N).sum() + hundredths<Scalar>(5);
+        const Matrix<Scalar, D> across = (unit - N) * of.M * N;
+        C = hundredths<Scalar>(105) / lean * (across + across.transpose());
+        P = unit - N;
+        below = of.M.cwiseProduct(P).sum() / Scalar(D - 1) + hundredths<Scalar>(5);
+        lack = hundredths<Scalar>(20) * (hundredths<Scalar>(105) / below - one);
+        beside = lack * P - (one + lack) * C;
+        bare = away * (K - unit) + (one - away) * beside;
+        found.L = unit + corrected.value * bare;
+        own = found.L * of.g + of.gamma;
+        found.a = (own.dot(own) + model.least_diagonal) / m + (found.L * found.L).cwiseProduct(of.Q).sum();
+        found.tension = tension.value * away;
+        found.full = full.value;
+        found.shifted = shifted.value;
+        found.repaired = repaired.value * away;
+    }
+};
+
+// How far a particle is shifted, from A = sum v_ij g_ij^T and the crowd of its neighbours, sum (1 + ...) g_ij.
+template <class Scalar, int D>
+struct Shift {
+    Matrix<Scalar, D> K, G;
+    Scalar root, rate, bend;        // sqrt(dt^2 |G|^2 + e^2), r before it is bounded, sqrt(1 + (r / 0.5)^2)
+    Vector<Scalar, D> out, slope, along;
+    Scalar square, part;            // of out; of slope along it
+    Vector<Scalar, D> wish, delta;
+    Scalar farthest, bound;         // [m]; sqrt(1 + |wish|^2 / farthest^2)
+
+    Shift(const Model<Scalar, D>& model, const Moments<Scalar, D>& of, const Scalar& shifted,
+          const Matrix<Scalar, D>& A, const Vector<Scalar, D>& crowd) {
+        using Real = typename RealOf<Scalar>::type;
+        const Scalar one(1), dt = model.time_step, s = model.spacing, least(Real(1) / Real(1e5));
+        K = regular_inverse<Scalar, D>(of.M);
+        G = A * K;
+        const Scalar turned = dt * dt * G.cwiseProduct(G).sum();
+        root = square_root(Scalar(turned + least * least));
+        rate = Scalar(20) * turned / (root + least);
+        bend = square_root(Scalar(one + Scalar(4) * rate * rate));
+        out = of.g + of.gamma;
+        slope = crowd + of.gamma;
+        square = out.dot(out) + hundredths<Scalar>(3) * hundredths<Scalar>(3) / (s * s);
+        part = out.dot(slope) / square;
+        along = slope - part * out;
+        wish = (-rate / bend * s * s * shifted) * along;
+        farthest = s / Scalar(10);
+        bound = square_root(Scalar(one + wish.dot(wish) / (farthest * farthest)));
+        delta = wish / bound;
+    }
+};
+
+// 1 + q / (4 + q) with q = (W_ij / W(s))^4, and its derivative by V W_ij.
+template <class Scalar>
+struct Closeness {
+    Scalar value, slope;
+
+    Closeness(const Scalar& weight, const Scalar& nearest) {
+        const Scalar near = weight / nearest, cube = near * near * near, below = Scalar(4) + cube * near;
+        value = Scalar(1) + cube * near / below;
+        slope = Scalar(16) * cube / (below * below * nearest);
+    }
+};
+
+}  // namespace cortado

@@ -1,0 +1,152 @@
+// Derivatives of what a particle's neighbourhood lets the projection do, and of its shift: tangents, and their
+// transposes.
+#pragma once
+
+#include "surroundings.hpp"
+
+namespace cortado {
+
+template <class Real, int D>
+Matrix<Real, D> even(const Matrix<Real, D>& A) {
+    return (A + A.transpose()) / Real(2);
+}
+
+// From a change of M, and from an adjoint of K = 1.05 (M + 0.05)^-1: both are -K A K / 1.05.
+template <class Real, int D>
+Matrix<Real, D> inverse_change(const Matrix<Real, D>& K, const Matrix<Real, D>& A) {
+    return -K * A * K / hundredths<Real>(105);
+}
+
+// The derivative of the effects of moments, at these moments.
+template <class Real, int D>
+class SurroundingsSlope {
+public:
+    SurroundingsSlope(const Model<Real, D>& model, const Moments<Real, D>& of)
+        : m_(model.rest_density), of_(of), at_(model, of) {
+        const Real ratio = of.nu / hundredths<Real>(5);
+        away_slope_ = -4 * at_.away * at_.away * ratio * ratio * ratio / hundredths<Real>(5);
+        lack_slope_ = -hundredths<Real>(21) / (at_.below * at_.below * (D - 1));
+        mixed_ = at_.K - Matrix<Real, D>::Identity() - at_.beside;
+    }
+
+    Effects<Real, D> tangent(const Moments<Real, D>& dot) const {
+        const Real dH = at_.filling.slope.cwiseProduct(dot.M).sum(), dB = away_slope_ * dot.nu;
+        const Matrix<Real, D> grown = of_.gamma * dot.gamma.transpose() + dot.gamma * of_.gamma.transpose();
+        const Matrix<Real, D> dN = (grown - 2 * of_.gamma.dot(dot.gamma) * at_.N) / at_.direction;
+        const Matrix<Real, D> across = at_.P * dot.M * at_.N + at_.P * of_.M * dN - dN * of_.M * at_.N;
+        const Real lean_dot = dot.M.cwiseProduct(at_.N).sum() + of_.M.cwiseProduct(dN).sum();
+        const Matrix<Real, D> dC = (hundredths<Real>(210) * even<Real, D>(across) - lean_dot * at_.C) / at_.lean;
+        const Matrix<Real, D> dK = inverse_change<Real, D>(at_.K, dot.M);
+        const Real lack_dot = lack_slope_ * (dot.M.cwiseProduct(at_.P).sum() - of_.M.cwiseProduct(dN).sum());
+        const Matrix<Real, D> beside_dot = lack_dot * (at_.P - at_.C) - at_.lack * dN - (1 + at_.lack) * dC;
+        const Matrix<Real, D> change = dB * mixed_ + at_.away * dK + (1 - at_.away) * beside_dot;
+        Effects<Real, D> found;
+        found.L = at_.corrected.slope * dH * at_.bare + at_.corrected.value * change;
+        const Vector<Real, D> own_dot = found.L * of_.g + at_.found.L * dot.g + dot.gamma;
+        const Matrix<Real, D> square = at_.found.L * at_.found.L, turned = of_.Q * at_.found.L;
+        found.a = 2 * at_.own.dot(own_dot) / m_ + 2 * found.L.cwiseProduct(turned).sum() +
+                  square.cwiseProduct(dot.Q).sum();
+        found.tension = at_.tension.slope * dH * at_.away + at_.tension.value * dB;
+        found.full = at_.full.slope * (dH + dot.nu);
+        found.shifted = at_.shifted.slope * dH;
+        found.repaired = at_.repaired.slope * dH * at_.away + at_.repaired.value * dB;
+        return found;
+    }
+
+    // The transpose; the adjoints of M and Q are symmetric.
+    Moments<Real, D> adjoint(const Effects<Real, D>& bar) const {
+        const Matrix<Real, D>& L = at_.found.L;
+        Moments<Real, D> found;
+        const Vector<Real, D> own_bar = 2 * bar.a / m_ * at_.own;
+        const Matrix<Real, D> by_a = own_bar * of_.g.transpose() + 2 * bar.a * of_.Q * L;
+        const Matrix<Real, D> L_bar = even<Real, D>(bar.L + by_a), bare_bar = at_.corrected.value * L_bar;
+        found.Q = bar.a * L * L;
+        found.g = L * own_bar;
+        const Real H_bar = at_.corrected.slope * L_bar.cwiseProduct(at_.bare).sum() +
+                           at_.tension.slope * at_.away * bar.tension + at_.full.slope * bar.full +
+                           at_.shifted.slope * bar.shifted + at_.repaired.slope * at_.away * bar.repaired;
+        const Real B_bar = bare_bar.cwiseProduct(mixed_).sum() + at_.tension.value * bar.tension +
+                           at_.repaired.value * bar.repaired;
+        found.nu = away_slope_ * B_bar + at_.full.slope * bar.full;
+        const Matrix<Real, D> beside_bar = (1 - at_.away) * bare_bar, C_bar = -(1 + at_.lack) * beside_bar;
+        const Matrix<Real, D> across_bar = hundredths<Real>(210) / at_.lean * C_bar;
+        const Real lacked = lack_slope_ * beside_bar.cwiseProduct(at_.P - at_.C).sum();
+        const Real lean_bar = -C_bar.cwiseProduct(at_.C).sum() / at_.lean;
+        const Matrix<Real, D> N_bar = even<Real, D>(of_.M * at_.P * across_bar - across_bar * at_.N * of_.M) +
+                                      (lean_bar - lacked) * of_.M - at_.lack * beside_bar;
+        const Real along = N_bar.cwiseProduct(at_.N).sum();
+        found.gamma = own_bar + 2 / at_.direction * (N_bar * of_.gamma - along * of_.gamma);
+        found.M = H_bar * at_.filling.slope + inverse_change<Real, D>(at_.K, at_.away * bare_bar) +
+                  even<Real, D>(at_.P * across_bar * at_.N) + lean_bar * at_.N + lacked * at_.P;
+        return found;
+    }
+
+private:
+    Real m_;
+    Moments<Real, D> of_;
+    Surroundings<Real, D> at_;
+    Matrix<Real, D> mixed_;  // K - 1 - t P + (1 + t) C
+    Real away_slope_, lack_slope_;  // of B by nu, of t by M : P
+};
+
+// What the shift of a particle depends on but moments, and also a change of that and an adjoint.
+template <class Real, int D>
+struct Crowding {
+    Matrix<Real, D> A;
+    Vector<Real, D> crowd;
+    Real shifted;
+};
+
+template <class Real, int D>
+class ShiftSlope {
+public:
+    ShiftSlope(const Model<Real, D>& model, const Moments<Real, D>& of, const Crowding<Real, D>& at)
+        : A_(at.A), shifted_(at.shifted), at_(model, of, at.shifted, at.A, at.crowd) {
+        const Real dt = model.time_step;
+        rate_slope_ = 20 * dt * dt / at_.root;
+        scale_ = -model.spacing * model.spacing;
+        strength_slope_ = 1 / (at_.bend * at_.bend * at_.bend);
+    }
+
+    Vector<Real, D> tangent(const Moments<Real, D>& dot, const Crowding<Real, D>& change) const {
+        const Matrix<Real, D> dG = change.A * at_.K + A_ * inverse_change<Real, D>(at_.K, dot.M);
+        const Real strength_dot = strength_slope_ * rate_slope_ * at_.G.cwiseProduct(dG).sum();
+        const Vector<Real, D> out_dot = dot.g + dot.gamma, slope_dot = change.crowd + dot.gamma;
+        const Real part_dot =
+            (out_dot.dot(at_.slope) + at_.out.dot(slope_dot) - 2 * at_.part * at_.out.dot(out_dot)) / at_.square;
+        const Vector<Real, D> along_dot = slope_dot - part_dot * at_.out - at_.part * out_dot;
+        const Real grown = strength_dot * shifted_ + strength() * change.shifted;
+        const Vector<Real, D> wish_dot = scale_ * (grown * at_.along + strength() * shifted_ * along_dot);
+        return bounded(wish_dot);
+    }
+
+    // From the adjoint of the shift to that of its crowding; adds to that of moments.
+    Crowding<Real, D> adjoint(const Vector<Real, D>& delta_bar, Moments<Real, D>& bar) const {
+        const Vector<Real, D> wish_bar = scale_ * bounded(delta_bar);
+        const Real along_wish = at_.along.dot(wish_bar), strength_bar = shifted_ * along_wish;
+        const Vector<Real, D> along_bar = strength() * shifted_ * wish_bar;
+        const Real part_bar = -at_.out.dot(along_bar) / at_.square;
+        const Vector<Real, D> slope_bar = along_bar + part_bar * at_.out;
+        const Vector<Real, D> out_bar = part_bar * at_.slope - at_.part * (along_bar + 2 * part_bar * at_.out);
+        const Matrix<Real, D> G_bar = strength_slope_ * rate_slope_ * strength_bar * at_.G;
+        bar.g += out_bar;
+        bar.gamma += out_bar + slope_bar;
+        bar.M += inverse_change<Real, D>(at_.K, even<Real, D>(A_.transpose() * G_bar));
+        return {G_bar * at_.K, slope_bar, strength() * along_wish};
+    }
+
+private:
+    Real strength() const { return at_.rate / at_.bend; }
+    // The derivative of wish / sqrt(1 + |wish|^2 / farthest^2), which is symmetric.
+    Vector<Real, D> bounded(const Vector<Real, D>& change) const {
+        const Real square = at_.farthest * at_.farthest * at_.bound * at_.bound;
+        return (change - at_.wish.dot(change) / square * at_.wish) / at_.bound;
+    }
+
+    Matrix<Real, D> A_;
+    Real shifted_;
+    Shift<Real, D> at_;
+    Real rate_slope_, strength_slope_, scale_;  // of r by G : dG; of the bounded r by r; -s^2
+};
+
+}  // namespace cortado

@@ -1,0 +1,103 @@
+"""Scenes as the extension module wants them, and which ones it knows."""
+
+from typing import Any
+
+from cortado.discretise.calibration import SKIN, stress_control
+from cortado.errors import InputError, shown
+from cortado.scene.discrete_scene import DiscreteScene
+from cortado.scene.parameters.registry import BY_NAME
+from cortado.scene.scene import Scene
+from cortado.scene.solvers import PcisphSolver, ProjectionSolver
+from cortado.scene.stability import is_implicit
+from cortado.solvers.projection.constants import lattice_constants
+from cortado_reference.engine import extension
+
+CLOSEST = 0.25
+"""In spacings: from where on a wall without slip pulls no harder, with the stress."""
+
+
+def check_scene(scene: Scene) -> None:
+    """Refuse what the engine does not know."""
+    if not isinstance(scene.solver, PcisphSolver | ProjectionSolver):
+        kind = shown(scene.solver.kind)
+        raise InputError(f"solver.kind is {kind}, but must be pcisph or projection for the reference engine.")
+    if isinstance(scene.solver, PcisphSolver) and scene.solver.shifting:
+        raise InputError("solver.shifting is true, but must be left out for the reference engine.")
+    if len(scene.phase) > 1 or scene.emitter is not None:
+        raise InputError("scene has several phases or an emitter, but must have neither for the reference engine.")
+    unknown = [p.name for p in BY_NAME.values() if p.is_optional and p.present(scene)]
+    if unknown:
+        raise InputError(f"scene has forces.{unknown[0]}, but must leave it out for the reference engine.")
+    if scene.phase[0].rheology is not None:
+        raise InputError("scene has phase[0].rheology, but must leave it out for the reference engine.")
+    if scene.force:
+        raise InputError("scene has [[force]], but must leave it out for the reference engine.")
+    if scene.schedule.courses:
+        raise InputError(
+            "scene has a schedule, but must leave it out for the reference engine, which takes a gravity for each "
+            "step by controls."
+        )
+    scene.solver.fixed_time_step("the reference engine")
+    if is_implicit(scene):
+        raise InputError(
+            'scene has viscosity at the end of a step, but must have viscous_solve = "explicit" in [forces], or a '
+            "shorter time step, for the reference engine."
+        )
+
+
+def engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:
+    """What the extension module is told of a scene and of its particles."""
+    lattice, solver, form = discrete.lattice, scene.solver, scene.forces.viscosity
+    no_slip = getattr(scene.container, "slip", "free") == "no"
+    spacing = scene.discretisation.spacing
+    values = {
+        "dimension": scene.dimension,
+        "kernel": discrete.kernel.name,
+        "support": lattice.support,
+        "reach": (1.0 + SKIN) * lattice.support,
+        "normalisation": lattice.normalisation,
+        "volume": lattice.volume,
+        "stiffness": lattice.stiffness,
+        "response": lattice.response,
+        "laplacian_correction": lattice.laplacian_correction,
+        "wall_positions": discrete.walls.positions.ravel().tolist(),
+        "wall_weights": discrete.walls.weights.tolist(),
+        "wall_feet": discrete.walls.feet.ravel().tolist(),
+        "periods": [*map(float, discrete.periods), *[0.0] * (3 - scene.dimension)],
+        "rest_density": scene.phase[0].rest_density,
+        "time_step": solver.time_step,
+        "viscosity": form,
+        "friction": (discrete.wall_layers.friction if form == "laminar" else 1.0) if no_slip else 0.0,
+        "control": stress_control(discrete.kernel, spacing, lattice.support, scene.dimension),
+        "closest": CLOSEST * spacing,
+        "pressure": scene.forces.pressure,
+        "spacing": spacing,
+        **_of_solver(scene, discrete),
+    }
+    made = extension().Scene()
+    for name, value in values.items():
+        setattr(made, name, value)
+    return made
+
+
+def _of_solver(scene: Scene, discrete: DiscreteScene) -> dict[str, Any]:
+    """What the engine is told of the solver; without pressure both take the same step."""
+    solver = scene.solver
+    if isinstance(solver, ProjectionSolver):
+        constants = lattice_constants(scene, discrete)
+        return {
+            "projection": scene.forces.pressure,
+            "maximum_iterations": solver.iterations,
+            "repairs": solver.repairs,
+            "relaxation": constants.relaxation,
+            "least_diagonal": constants.least_diagonal,
+            "nearest_weight": constants.nearest_weight,
+        }
+    assert isinstance(solver, PcisphSolver)
+    greatest = solver.maximum_density_tolerance
+    return {
+        "minimum_iterations": solver.minimum_iterations,
+        "maximum_iterations": solver.maximum_iterations,
+        "density_tolerance": solver.density_tolerance,
+        "maximum_density_tolerance": float("inf") if greatest is None else greatest,
+    }

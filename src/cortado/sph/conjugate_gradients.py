@@ -1,0 +1,213 @@
+"""The method of conjugate gradients (Hestenes and Stiefel 1952) for B y = r, of numbers or vectors of particles.
+
+B is symmetric and positive with respect to the product sum_i w_i a_i . b_i with weights w, in which everything is
+measured here. Each scene of a batch goes on until |r| has fallen to a part of the first, and stays as it is then.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.precision import FLOAT32, Precision
+from cortado.device.reduction import type_name
+from cortado.particles.state import Layout
+from cortado.sph.parts import StepContext
+
+
+@dataclass(frozen=True)
+class SolveKernels:
+    """The kernels of conjugate gradients, which need no neighbours."""
+
+    begin: Any
+    """p = r, y = 0."""
+    start: Any
+    """Of a scene: whether there is anything to do."""
+    descend: Any
+    """y and r after a step along p."""
+    turn: Any
+    """The next p."""
+    decide: Any
+    """Of a scene: whether to go on."""
+
+
+@cache
+def solve_kernels(precision: Precision, kind: Any) -> SolveKernels:
+    """Of a precision, for numbers or vectors of it; ``going`` (members,) is 1 for a scene that goes on."""
+    real = precision.real
+    module = wp.get_module(f"cortado_conjugate_gradients_{type_name(kind)}")
+    module.options["enable_backward"] = False
+    square = _square_of_numbers(real, module) if kind is real else _square_of_vectors(kind, real, module)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def begin(
+        w: wp.array(dtype=real),
+        r: wp.array(dtype=kind),
+        # out
+        p: wp.array(dtype=kind),
+        y: wp.array(dtype=kind),
+        share: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        p[i] = r[i]
+        y[i] = kind(real(0.0))
+        share[i] = w[i] * square(r[i])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def start(
+        total: wp.array(dtype=real),
+        # out
+        first: wp.array(dtype=real),
+        size: wp.array(dtype=real),
+        count: wp.array(dtype=wp.int32),
+        going: wp.array(dtype=wp.int32),
+        active: wp.array(dtype=wp.int32),
+    ):
+        """``active`` is the number of scenes that go on."""
+        b = wp.tid()
+        first[b] = total[b]
+        size[b] = total[b]
+        count[b] = 0
+        going[b] = 0
+        if total[b] > real(0.0):
+            going[b] = 1
+            wp.atomic_add(active, 0, 1)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def descend(
+        particles: int,
+        going: wp.array(dtype=wp.int32),
+        size: wp.array(dtype=real),
+        curvature: wp.array(dtype=real),
+        w: wp.array(dtype=real),
+        p: wp.array(dtype=kind),
+        product: wp.array(dtype=kind),
+        # in and out
+        y: wp.array(dtype=kind),
+        r: wp.array(dtype=kind),
+        # out
+        share: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        b = i // particles
+        if going[b] == 0:
+            return
+        step = size[b] / curvature[b]
+        left = r[i] - step * product[i]
+        y[i] = y[i] + step * p[i]
+        r[i] = left
+        share[i] = w[i] * square(left)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def turn(
+        particles: int,
+        going: wp.array(dtype=wp.int32),
+        size: wp.array(dtype=real),
+        total: wp.array(dtype=real),
+        r: wp.array(dtype=kind),
+        # in and out
+        p: wp.array(dtype=kind),
+    ):
+        i = wp.tid()
+        b = i // particles
+        if going[b] == 1:
+            p[i] = r[i] + (total[b] / size[b]) * p[i]
+
+    @wp.kernel(module=module, enable_backward=False)
+    def decide(
+        tolerance: real,
+        most: int,
+        total: wp.array(dtype=real),
+        first: wp.array(dtype=real),
+        # in and out
+        size: wp.array(dtype=real),
+        count: wp.array(dtype=wp.int32),
+        going: wp.array(dtype=wp.int32),
+        active: wp.array(dtype=wp.int32),
+    ):
+        b = wp.tid()
+        if going[b] == 0:
+            return
+        size[b] = total[b]
+        count[b] = count[b] + 1
+        if count[b] >= most or not total[b] > tolerance * tolerance * first[b]:
+            going[b] = 0
+            wp.atomic_sub(active, 0, 1)
+
+    return SolveKernels(begin, start, descend, turn, decide)
+
+
+def _square_of_numbers(real: Any, module: Any) -> Any:
+    @wp.func(module=module)
+    def square(a: real) -> real:
+        return a * a
+
+    return square
+
+
+def _square_of_vectors(vector: Any, real: Any, module: Any) -> Any:
+    @wp.func(module=module)
+    def square(a: vector) -> real:
+        return wp.dot(a, a)
+
+    return square
+
+
+def round_off(precision: Precision) -> float:
+    """The part of the first |r| below which a solve gets no better."""
+    return 3e-7 if precision is FLOAT32 else 1e-14
+
+
+class ConjugateGradients:
+    """Solves for the particles of one solver, with arrays of its own."""
+
+    def __init__(self, layout: Layout, kind: Any, tolerance: float, most: int):
+        """For numbers or vectors, a Warp ``kind``, until |r| has fallen to ``tolerance`` of the first, or ``most``
+        iterations are done."""
+        real = layout.precision.real
+        self._kernels, self._layout = solve_kernels(layout.precision, kind), layout
+        self._limits = {"tolerance": tolerance, "most": most}
+        sizes = {"shape": layout.all_particles, "device": layout.device}
+        self._p, self._product = (wp.zeros(dtype=kind, **sizes) for _ in range(2))
+        self._share = wp.zeros(dtype=real, **sizes)
+        scenes = {"shape": layout.members, "device": layout.device}
+        self._first, self._size = (wp.zeros(dtype=real, **scenes) for _ in range(2))
+        self.count, self._going = (wp.zeros(dtype=wp.int32, **scenes) for _ in range(2))
+        """(members,) iterations of the last solve."""
+        self._active = wp.zeros(1, dtype=wp.int32, device=layout.device)
+        self._sums = layout.sum_of(real), layout.sum_of(real)
+
+    def solve(
+        self,
+        step: StepContext,
+        multiply: Callable[[wp.array, dict[str, wp.array]], None],
+        w: wp.array,
+        r: wp.array,
+        y: wp.array,
+    ) -> None:
+        """Write to ``y`` what solves B y = r, (n,) both, with weights ``w``, and overwrite ``r``.
+
+        ``multiply`` launches what writes B p, for ``p``, its first argument, to the ``product`` of its second, and the
+        w p B p of each particle to the ``share``.
+        """
+        kernels, members, (sum_shares, sum_curvatures) = self._kernels, self._layout.members, self._sums
+        n = self._layout.all_particles
+        step.launch(kernels.begin, w=w, r=r, p=self._p, y=y, share=self._share, threads=n)
+        self._active.zero_()
+        scene = {"size": self._size, "count": self.count, "going": self._going, "active": self._active}
+        total = sum_shares(self._share)
+        step.launch(kernels.start, scene, total=total, first=self._first, threads=members)
+
+        def iterate() -> None:
+            multiply(self._p, {"product": self._product, "share": self._share})
+            curvature = sum_curvatures(self._share)
+            own = {"w": w, "p": self._p, "product": self._product, "r": r, "y": y, "share": self._share}
+            step.launch(kernels.descend, scene, own, curvature=curvature, threads=n)
+            total = sum_shares(self._share)
+            step.launch(kernels.turn, scene, own, total=total, threads=n)
+            step.launch(kernels.decide, scene, self._limits, total=total, first=self._first, threads=members)
+
+        step.join()  # a loop of a graph cannot begin while something is computed aside
+        wp.capture_while(self._active, iterate)

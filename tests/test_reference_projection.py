@@ -1,0 +1,189 @@
+"""The projection in the reference engine: its steps are those of the slow twin and of the Warp engine, so are its
+derivatives, and in float128 differences confirm them far below what float64 can resolve."""
+
+import numpy as np
+import pytest
+
+from cortado import InputError, Problem, Simulation, losses, reference
+from cortado.reference import Terms
+from cortado.scene.discrete_scene import discretise
+from reference_projection import Projection
+from scenes import plane, scene
+from test_projection import C2, PERIODIC, SOLVER, thrown
+from test_reference import distance, target_of
+
+CUBIC = {"spacing": 0.05, "support": 2.0, "kernel": "cubic_spline"}
+C4 = {"spacing": 0.05, "support": 3.0, "kernel": "wendland_c4"}
+NO_SLIP = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.8], "slip": "no"}
+SCENES = {
+    "plane": plane(solver=SOLVER),
+    "space": scene(solver=SOLVER),
+    "periodic, laminar": plane(
+        solver=SOLVER,
+        container=PERIODIC,
+        discretisation=C2,
+        forces={"gravity": [1.0, -9.81], "viscosity": "laminar"},
+    ),
+    "stress, no slip": plane(solver=SOLVER, container=NO_SLIP, discretisation=C2),
+    "wendland_c4": plane(solver={**SOLVER, "iterations": 7, "repairs": 1}, discretisation=C4),
+    "free space": plane(solver=SOLVER, container={"shape": "none"}, forces={"gravity": [0.0, 0.0]}),
+}
+scenes = pytest.mark.parametrize("made", SCENES.values(), ids=SCENES)
+
+
+def point_and_direction(simulation, steps, at_rest=False):
+    """All parameters at once: fluid that is thrown, or, ``at_rest``, the lattice of a scene that moves as a whole."""
+    random = np.random.default_rng(1)
+    point = thrown(simulation) | {
+        "gravity": np.tile(simulation.scene.forces.gravity, (steps, 1)),
+        "viscosity": np.array(0.05),
+    }
+    if at_rest:
+        shape = simulation.positions.shape
+        point |= {"initial_positions": simulation.positions, "initial_velocities": np.full(shape, 0.5)}
+    return point, {name: 0.1 * random.standard_normal(np.shape(value)) for name, value in point.items()}
+
+
+@pytest.mark.parametrize("smoothing", [CUBIC, C2, C4], ids=lambda one: one["kernel"])
+@pytest.mark.parametrize("make", [plane, scene])
+def test_steps_are_those_of_the_twin(make, smoothing):
+    """Five steps without viscosity, all but the first from pressures of the one before."""
+    made = make(solver=SOLVER, discretisation=smoothing).replaced("phase[0].viscosity=0")
+    simulation, discrete = reference.Simulation(made), discretise(made)
+    lattice, walls, dt = discrete.lattice, discrete.walls, 0.002
+    twin = Projection(
+        *(discrete.kernel, lattice.support, lattice.volume, made.discretisation.spacing),
+        *(walls.positions, walls.weights, walls.feet, np.zeros(made.dimension)),
+        iterations=4,
+        repairs=2,
+    )
+    given = thrown(simulation)
+    run = simulation.run(5, given)
+    x, v, k = given["initial_positions"], given["initial_velocities"], np.zeros(len(simulation.positions))
+    for step in range(1, 6):
+        x, v, k = twin.step(x, v + dt * np.array(made.forces.gravity), k, np.full(len(x), 1000.0), dt)
+        np.testing.assert_allclose(run.positions.high[step], x, rtol=0.0, atol=1e-13)
+        np.testing.assert_allclose(run.velocities.high[step], v, rtol=0.0, atol=1e-11)
+    assert (k > 0.0).any() and (k < 0.0).any()
+
+
+@scenes
+def test_it_is_the_projection_of_the_warp_engine(made):
+    """Steps, what is recorded of them, and derivatives with respect to all parameters."""
+    simulation, warp, steps = reference.Simulation(made), Simulation(made, precision="float64"), 20
+    point, directions = point_and_direction(simulation, steps)
+    wanted, found = warp.run(steps, point), simulation.run(steps, point)
+    np.testing.assert_allclose(found.positions.high[-1], wanted.positions[-1], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(found.velocities.high[-1], wanted.velocities[-1], rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(found.density_errors, wanted.density_errors, rtol=0.0, atol=1e-13)
+    assert np.array_equal(found.iterations, wanted.iterations) and (wanted.density_errors > 0.0).any()
+    target = target_of(simulation)
+    problem = Problem(warp, steps, losses.FinalPositions(target))
+    loss, bars = problem.value_and_gradient(point)
+    mine = simulation.gradient(point, steps, reference.FinalPositions(target))
+    assert mine.value == pytest.approx(loss, rel=1e-12)
+    for name, bar in bars.items():
+        assert distance(mine.parameters[name].high, bar) < 1e-10, name
+    tangent = simulation.tangent(point, directions, steps)
+    bar, _ = reference.FinalPositions(target).adjoint(tangent.positions[-1], tangent.velocities[-1])
+    forward = (bar * tangent.position_tangents.high[-1]).sum()
+    size = np.linalg.norm(bar) * tangent.position_norms[-1]
+    assert abs(forward - problem.tangent(point, directions)) < 1e-10 * size
+
+
+@pytest.mark.parametrize("name", ["plane", "free space"])
+def test_on_corners_of_the_clamp_it_takes_the_mean_slope_too(name):
+    """The lattice as a scene has it, moving as a whole: there is no divergence, and so the clamp is on its corner."""
+    made = SCENES[name]
+    simulation, steps = reference.Simulation(made), 2
+    point, directions = point_and_direction(simulation, steps, at_rest=True)
+    target = target_of(simulation)
+    _, bars = Problem(Simulation(made, precision="float64"), steps, losses.FinalPositions(target)).value_and_gradient(
+        point
+    )
+    mine = simulation.gradient(point, steps, reference.FinalPositions(target))
+    for name, bar in bars.items():
+        assert np.linalg.norm(mine.parameters[name].high - bar) < 1e-9 * max(np.linalg.norm(bar), 1e-6), name
+    analytic, dual = (simulation.tangent(point, directions, steps, method) for method in ("analytic", "dual"))
+    assert distance(dual.velocity_tangents[-1], analytic.velocity_tangents[-1]) < 1e-12
+
+
+@scenes
+def test_methods_agree_and_the_adjoint_is_the_transpose(made):
+    simulation, steps = reference.Simulation(made), 30
+    point, directions = point_and_direction(simulation, steps)
+    exact = simulation.tangent(point, directions, steps)
+    for method in ("dual", "complex_step"):
+        other = simulation.tangent(point, directions, steps, method=method)
+        assert distance(other.position_tangents[-1], exact.position_tangents[-1]) < 1e-12
+        assert distance(other.velocity_tangents[-1], exact.velocity_tangents[-1]) < 1e-12
+    loss = reference.FinalPositions(target_of(simulation))
+    bar, _ = loss.adjoint(exact.positions[-1], exact.velocities[-1])
+    back = simulation.gradient(point, steps, loss)
+    reverse = sum((back.parameters[name].high * along).sum() for name, along in directions.items())
+    size = np.linalg.norm(bar) * exact.position_norms[-1]
+    assert abs((bar * exact.position_tangents.high[-1]).sum() - reverse) < 1e-12 * size
+
+
+@pytest.mark.parametrize("name", ["plane", "space"])
+def test_differences_confirm_derivatives_far_below_round_off_of_float64(name):
+    """In float64 the best step of central differences leaves an error of about 1e-9."""
+    if "float128" not in reference.precisions():
+        pytest.skip("the compiler has no float128")
+    simulation, steps = reference.Simulation(SCENES[name], "float128"), 6
+    point, directions = point_and_direction(simulation, steps)
+    exact = simulation.tangent(point, directions, steps, record_every=steps)
+    for method in ("dual", "complex_step"):
+        other = simulation.tangent(point, directions, steps, method=method, record_every=steps)
+        assert distance(other.position_tangents[-1], exact.position_tangents[-1]) < 1e-28
+        assert distance(other.velocity_tangents[-1], exact.velocity_tangents[-1]) < 1e-28
+    found = simulation.tangent(
+        point, directions, steps, method="finite_difference", difference=1e-12, record_every=steps
+    )
+    assert distance(found.position_tangents[-1], exact.position_tangents[-1]) < 1e-18
+    assert distance(found.velocity_tangents[-1], exact.velocity_tangents[-1]) < 1e-18
+
+
+def test_same_bits_with_any_number_of_threads():
+    found = []
+    for threads in (1, 3):
+        simulation = reference.Simulation(SCENES["plane"], threads=threads)
+        point, directions = point_and_direction(simulation, 10)
+        tangent = simulation.tangent(point, directions, 10)
+        gradient = simulation.gradient(point, 10, reference.FinalPositions(target_of(simulation)))
+        arrays = [tangent.velocity_tangents.high, *(digits.high for digits in gradient.parameters.values())]
+        found.append(b"".join(array.tobytes() for array in arrays))
+    assert found[0] == found[1]
+
+
+def test_without_pressure_nothing_is_projected():
+    forces = {"gravity": [0.0, -9.81], "viscosity": "pairwise", "pressure": False}
+    solvers = {"time_step": 0.002}, SOLVER
+    one, other = (reference.Simulation(plane(forces=forces, solver=solver)) for solver in solvers)
+    wanted, found = (simulation.run(10, thrown(simulation)) for simulation in (one, other))
+    assert np.array_equal(found.positions.high, wanted.positions.high)
+    assert found.iterations.tolist() == [0] * 10
+
+
+@pytest.mark.parametrize(
+    "call, sentence",
+    [
+        (lambda s: s.tangent({}, {}, 5, method="as_printed"), "must not be used with the projection"),
+        (lambda s: s.tangent({}, {}, 5, terms=Terms(hessian=False)), "must not with the projection"),
+        (
+            lambda s: s.gradient({}, 5, reference.FinalPositions(s.positions), terms=Terms(pressure=False)),
+            "must not with the projection",
+        ),
+        (
+            lambda s: reference.Simulation(s.scene.replaced("forces.viscous_solve='implicit'")),
+            'must have viscous_solve = "explicit"',
+        ),
+        (
+            lambda s: reference.Simulation(s.scene.replaced("phase[0].rheology={kind='power_law', flow_index=0.6}")),
+            r"scene has phase\[0\].rheology, but must leave it out",
+        ),
+    ],
+)
+def test_a_mistake_gives_a_sentence(call, sentence):
+    with pytest.raises(InputError, match=sentence):
+        call(reference.Simulation(SCENES["plane"]))
