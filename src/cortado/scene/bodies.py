@@ -6,35 +6,46 @@ Their particles are then moved until the fluid is at rest everywhere: `cortado.d
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from typing import TypeGuard
 
 import numpy as np
 
 from cortado.discretise.pairs import apart, pairs_within
-from cortado.discretise.region import Region
+from cortado.discretise.room import Room
 from cortado.discretise.shapes import Points, grid
-from cortado.scene.fluids import RoundFluid
+from cortado.scene.fluids import Fluid, RegionFluid, RoundFluid
 
 FINER = 4
 """Cells at the surface are cut into so many along each axis to measure a volume."""
 LOOSENESS, MOST_LOOSENESS = 0.05, 0.008
 """Particles that a round body lacks, over those in its outermost spacing, and over all of its own: particles off the
 lattice see each other as denser than as many on it, by 4 % with the Wendland kernels and a support of 2 spacings."""
+ALIGNED = 1e-3
+"""In spacings: by how much the surface of a solid may be off the faces of the cells that are outside of it."""
 DIGITS = 6
 """Decimals of distances [spacings] by which particles are ordered: what is equal but for round-off stays in order."""
 
 
+def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGuard[RegionFluid]:
+    """Whether particles of a body may have another density than the lattice: where its own surface cuts cells, or where
+    it is no further than ``reach`` [m] from a solid."""
+    if not isinstance(fluid, RegionFluid) or isinstance(fluid, RoundFluid):
+        return isinstance(fluid, RoundFluid)
+    return bool(len(room.solids) and (room.from_solids(fluid.particles(spacing)) < reach).any())
+
+
 @dataclass(frozen=True)
 class CutBody:
-    """The part of a body of fluid that a container leaves room for."""
+    """The part of a body of fluid that a container and solids leave room for."""
 
-    fluid: RoundFluid
-    room: Region
+    fluid: RegionFluid
+    room: Room
     spacing: float
     """[m]"""
 
     def distance(self, points: Points) -> Points:
         """(n,) how far points (n, d) [m] are outside of the body, negative inside [m]."""
-        return np.maximum(self.fluid.region().distance(points), self.room.distance(points))
+        return np.maximum(self.fluid.region(self.spacing).distance(points), self.room.distance(points))
 
     def shares(self, points: Points) -> Points:
         """(n,) the part of the cell around each of the points (n, d) [m] that is within the body."""
@@ -42,7 +53,7 @@ class CutBody:
 
     def volume(self, depth: float = 0.0) -> float:
         """[m^d] of what is more than a depth [m] below the surface."""
-        dimension, fine = len(self.room.lower), self.spacing / FINER
+        dimension, fine = self.room.dimension, self.spacing / FINER
         cells = self.fluid.block(self.spacing).grown(1).points()
         distances = self.distance(cells) + depth
         cut = cells[np.abs(distances) < 0.5 * self.spacing * np.sqrt(dimension)]
@@ -56,13 +67,23 @@ class CutBody:
         """The number of its particles."""
         volume = self.volume()
         lacking = min(LOOSENESS * (volume - self.volume(self.spacing)), MOST_LOOSENESS * volume)
-        return round((volume - lacking) / self.spacing ** len(self.room.lower))
+        return round((volume - lacking) / self.spacing ** self.room.dimension)
 
     def particles(self) -> Points:
-        """(count, d) [m] where its particles begin: on the lattice, as deep as there are points."""
+        """(n, d) [m] where its particles begin: on the lattice, and where surfaces cut its cells as deep as there are
+        points, `count` of them."""
+        if not self._cuts_cells():
+            return self.fluid.particles_in(self.room, self.spacing)
         points = self.fluid.lattice(self.spacing, self.spacing)
         depths = np.round(self.distance(points) / self.spacing, DIGITS)
         return points[np.sort(np.argsort(depths, kind="stable")[: self.count])]
+
+    def _cuts_cells(self) -> bool:
+        """Whether a surface goes through cells: that of a round body, or that of a solid."""
+        if isinstance(self.fluid, RoundFluid):
+            return True
+        from_solids = self.room.from_solids(self.fluid.particles(self.spacing))
+        return bool((np.abs(from_solids) < (0.5 - ALIGNED) * self.spacing).any())
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from cortado.discretise.region import Region
 from cortado.discretise.shapes import Points
+from cortado.discretise.solids.solid import Box, HalfSpace, Hollow, Placed, Revolved, Solid
 from cortado.discretise.walls.places import Places, box_places, cup_places
 from cortado.discretise.walls.points import box_walls, cup_walls
 from cortado.errors import Words
@@ -45,6 +46,10 @@ class Container(Table):
     def places(self, dimension: int, spacing: float, reach: float) -> Places:
         """Where fluid may rest less than ``reach`` [m] from a wall."""
 
+    @abstractmethod
+    def solids(self, dimension: int) -> tuple[Solid, ...]:
+        """What closes it, as solids, of which a period has none."""
+
     def wall_count(self, spacing: float) -> float:
         """About how many wall particles one layer has, without making any."""
         ends = self.extent()
@@ -68,6 +73,9 @@ class NoContainer(Container):
 
     def region(self, dimension: int) -> Region:
         return Region.everywhere(dimension)
+
+    def solids(self, dimension: int) -> tuple[Solid, ...]:
+        return ()
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         return np.zeros((0, dimension))
@@ -99,6 +107,12 @@ class BoxContainer(Container):
 
     def region(self, dimension: int) -> Region:
         return Region.between(*self.extent())
+
+    def solids(self, dimension: int) -> tuple[Solid, ...]:
+        (lower, upper), closed = self.extent(), ~np.array(self.periodic)
+        axes = np.eye(dimension)[closed]
+        lowest = [HalfSpace(axis, float(lower @ axis), lower, upper) for axis in axes]
+        return (*lowest, *(HalfSpace(-axis, -float(upper @ axis), lower, upper) for axis in axes))
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         return box_walls(*self.extent(), self.periodic, spacing, depth)
@@ -145,6 +159,12 @@ class CylinderContainer(Container):
             return closed
         is_along = np.arange(3) == axis
         return replace(closed, upper=np.where(is_along, np.inf, closed.upper), rim=float(closed.upper[axis]))
+
+    def solids(self, dimension: int) -> tuple[Solid, ...]:
+        axis, reach = INDEX_OF_AXIS[self.axis], 0.0 if self.lid else self.height
+        profile = Box(np.array([self.radius, 0.5 * (self.height + reach)]))
+        middle = np.array(self.base) + 0.5 * (self.height + reach) * np.eye(3)[axis]
+        return (Hollow(Placed(Revolved(profile, axis), middle, np.eye(3))),)
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         upright = cup_walls(self.radius, self.height, self.lid, spacing, depth)

@@ -20,13 +20,19 @@ from cortado.discretise.packing import Packing
 from cortado.discretise.region import Region
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
+from cortado.discretise.solids.walls import ExposedSurface, WallPoints, solid_places
 from cortado.discretise.walls.layers import WallLayers, wall_layers
-from cortado.discretise.walls.weights import RestLattice, WallSurface
+from cortado.discretise.walls.places import Places
+from cortado.discretise.walls.weights import RestLattice, WallSurface, even_changes, uneven_changes
 from cortado.errors import CortadoWarning
 from cortado.scene.bodies import Surroundings
 from cortado.scene.fluids import PointsFluid
-from cortado.scene.sampling import FluidSample, fluid_particles, period, wall_particles
+from cortado.scene.room import room_of
+from cortado.scene.sampling import FluidSample, fluid_particles, period
 from cortado.scene.scene import Scene
+
+NEAREST_PLACE = 0.4
+"""In spacings: places that are looked at for the weights of walls are no nearer to any surface."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ class Walls:
     weights: Points
     """(b,) w_b [-]: what each counts for in the density, a fluid particle being 1."""
     feet: Points
-    """(b, d) from each to the nearest point of the container's surface [m]."""
+    """(b, d) from each to the nearest point of its surface [m]."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,7 @@ class DiscreteScene:
     wall_layers: WallLayers
     """How the walls lie and how they drag; also for a scene without walls."""
     walls: Walls
-    """The wall particles; none without a container."""
+    """The wall particles; none without a container and solids."""
     periods: Points
     """(d,) lengths of the period [m], 0 along an axis that is not periodic."""
 
@@ -130,10 +136,25 @@ def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Point
 
 
 def _walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
-    particles = wall_particles(scene, layers.depths)
+    """Those of the container and of all solids, whose weights are found together."""
+    room, (lower, lengths) = room_of(scene), period(scene)
+    spacing, reach = lattice.spacing, lattice.support
+    beside = scene.container.places(scene.dimension, spacing, reach)
+    if not room.solids:
+        points, places, fit = _container_walls(scene, layers), beside, even_changes
+    else:
+        solids = [*scene.container.solids(scene.dimension), *room.solids]
+        points, fit = ExposedSurface.of(room, solids, spacing).walls(layers), uneven_changes
+        about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
+        places = about.some(room.contains(about.points, -NEAREST_PLACE * spacing))
+    surface = WallSurface(points.positions, points.flat, lattice, room, lower, lengths, fit)
+    return Walls(points.positions, surface.weights(places), points.feet)
+
+
+def _container_walls(scene: Scene, layers: WallLayers) -> WallPoints:
+    """Those of the container, in layers of even particles."""
+    spacing, region = scene.discretisation.spacing, scene.container.region(scene.dimension).opened(period(scene)[1])
+    particles = [scene.container.walls(scene.dimension, spacing, depth) for depth in layers.depths]
+    positions = np.concatenate(particles)
     flat = np.repeat(layers.weights, [len(layer) for layer in particles])
-    positions, (lower, lengths) = np.concatenate(particles), period(scene)
-    places = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
-    region = scene.container.region(scene.dimension).opened(lengths)
-    weights = WallSurface(positions, flat, lattice, region, lower, lengths).weights(places)
-    return Walls(positions, weights, region.nearest(positions) - positions)
+    return WallPoints(positions, flat, region.nearest(positions) - positions)

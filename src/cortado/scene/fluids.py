@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from cortado.discretise.region import Region
+from cortado.discretise.room import Room
 from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, block_between, corners, grid
 from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
 from cortado.scene.points import read_points
@@ -49,8 +50,8 @@ class Fluid(FluidBody):
         """(n, d) [m] particles that lie in a convex region only if all of them do."""
         return self.particles(spacing)
 
-    def particles_in(self, region: Region, spacing: float) -> Points:
-        """(n, d) [m] those that a container leaves room for."""
+    def particles_in(self, room: Room, spacing: float) -> Points:
+        """(n, d) [m] those that a container and solids leave room for."""
         return self.particles(spacing)
 
 
@@ -70,13 +71,26 @@ class LatticeFluid(Fluid):
     def particles(self, spacing: float) -> Points:
         return self.block(spacing).points()
 
-    def particles_in(self, region: Region, spacing: float) -> Points:
+    def particles_in(self, room: Room, spacing: float) -> Points:
         """(n, d) [m] those that are half a spacing or more from all walls, where they would be compressed otherwise."""
         everything = self.particles(spacing)
-        return everything[region.contains(everything, (ROUND_OFF - 0.5) * spacing)]
+        return everything[room.contains(everything, (ROUND_OFF - 0.5) * spacing)]
 
 
-class BoxFluid(LatticeFluid):
+class RegionFluid(LatticeFluid):
+    """A body that fills a region."""
+
+    @abstractmethod
+    def region(self, spacing: float) -> Region:
+        """What it fills; of a box its whole cells."""
+
+    def lattice(self, spacing: float, reach: float) -> Points:
+        """(n, d) [m] points of a lattice in the box around the shape and as far as ``reach`` [m] beyond it, one for
+        each cell of the spacing's volume, with whole layers between faces that are flat."""
+        return self.block(spacing).grown(int(np.ceil(reach / spacing))).points()
+
+
+class BoxFluid(RegionFluid):
     """A box, filled with particles at ``lower + (i + 1/2) spacing``."""
 
     shape: Literal["box"] = "box"
@@ -93,26 +107,21 @@ class BoxFluid(LatticeFluid):
     def block(self, spacing: float) -> Block:
         return block_between(self.lower, self.upper, spacing)
 
+    def region(self, spacing: float) -> Region:
+        first, last = self.block(spacing).extent
+        return Region.between(first - 0.5 * spacing, last + 0.5 * spacing)
+
     def witnesses(self, spacing: float) -> Points:
         return self.corners(spacing)
 
 
-class RoundFluid(LatticeFluid):
+class RoundFluid(RegionFluid):
     """A body whose surface cuts through cells of the lattice: its particles are packed before a run begins
     (`cortado.discretise.packing`), and ``particles`` are whole cells, which tell roughly where they are."""
 
-    @abstractmethod
-    def region(self) -> Region:
-        """What it fills."""
-
-    def lattice(self, spacing: float, reach: float) -> Points:
-        """(n, d) [m] points of a lattice in the box around the shape and as far as ``reach`` [m] beyond it, one for
-        each cell of the spacing's volume, with whole layers between faces that are flat."""
-        return self.block(spacing).grown(int(np.ceil(reach / spacing))).points()
-
     def particles(self, spacing: float) -> Points:
         points = self.block(spacing).points()
-        return points[self.region().contains(points, 0.0)]
+        return points[self.region(spacing).contains(points, 0.0)]
 
 
 class SphereFluid(RoundFluid):
@@ -127,7 +136,7 @@ class SphereFluid(RoundFluid):
     def block(self, spacing: float) -> Block:
         return block_about(self.centre, np.full(len(self.centre), self.radius), spacing)
 
-    def region(self) -> Region:
+    def region(self, spacing: float) -> Region:
         return Region.ball(np.array(self.centre), self.radius)
 
 
@@ -156,7 +165,7 @@ class CylinderFluid(RoundFluid):
         standing = np.where(np.arange(3) == axis, base + 0.5 * spacing, block.first)
         return Block(standing, block.counts, spacing)
 
-    def region(self) -> Region:
+    def region(self, spacing: float) -> Region:
         return Region.cylinder(np.array(self.base), self.radius, self.height, INDEX_OF_AXIS[self.axis])
 
     def lattice(self, spacing: float, reach: float) -> Points:

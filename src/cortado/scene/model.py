@@ -20,6 +20,7 @@ from cortado.scene.render import Render
 from cortado.scene.rheology import AnyRheology
 from cortado.scene.schedule import Schedule
 from cortado.scene.sensors import AnySensor
+from cortado.scene.solids import AnySolid
 from cortado.scene.solvers import AnySolver, smoothing_of
 from cortado.scene.tables import Table
 
@@ -115,6 +116,8 @@ class SceneTables(Table):
     """An emitter, out of which fluid comes; its particles come after those of all fluids."""
     container: AnyContainer = Field(default=NoContainer(), validate_default=True)
     """What holds the fluid."""
+    solid: tuple[AnySolid, ...] = ()
+    """Solids, which fluid flows around or is held by, besides the container."""
     mixture: MixtureTable = MixtureTable()
     """How phases mix; the default if there is only one."""
     forces: Forces = Field(default=Forces(), validate_default=True)
@@ -151,13 +154,14 @@ class SceneTables(Table):
         given = table is not None and "dimension" in info.data
         return table.in_dimension(info.data["dimension"]) if given else table
 
-    @field_validator("sensor")
+    @field_validator("sensor", "solid")
     @classmethod
-    def _resolve_sensors(cls, sensors: Any, info: ValidationInfo) -> Any:
-        for index, sensor in enumerate(sensors):
-            if sensor.name in [one.name for one in sensors[:index]]:
-                raise field_error((index, "name"), sensor.name, "another name than those of the sensors before")
-        return cls._resolve_fluids(sensors, info)
+    def _resolve_named(cls, tables: Any, info: ValidationInfo) -> Any:
+        for index, table in enumerate(tables):
+            if table.name in [one.name for one in tables[:index]]:
+                wanted = f"another name than those of the {info.field_name}s before"
+                raise field_error((index, "name"), table.name, wanted)
+        return cls._resolve_fluids(tables, info)
 
     @field_validator("fluid")
     @classmethod

@@ -1,6 +1,5 @@
-"""From a scene to its particles, in float64: fluid and walls."""
+"""From a scene to its fluid particles, in float64."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +7,10 @@ from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError
-from cortado.scene.bodies import CutBody
+from cortado.scene.bodies import CutBody, is_packed
 from cortado.scene.emitter import EmitterSample
-from cortado.scene.fluids import PointsFluid, RoundFluid
+from cortado.scene.fluids import PointsFluid
+from cortado.scene.room import room_of
 from cortado.scene.scene import Scene
 
 
@@ -49,8 +49,11 @@ def fluid_particles(scene: Scene) -> FluidSample:
     """The fluid of a scene, before particles of round bodies are packed. Raises `InputError` if a file with points is
     gone since the scene was read, or if walls leave no room for any particle of a fluid."""
     spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
-    room = scene.container.region(scene.dimension).opened(period(scene)[1])
-    bodies = [CutBody(fluid, room, spacing) if isinstance(fluid, RoundFluid) else None for fluid in scene.fluid]
+    room = room_of(scene)
+    reach = scene.discretisation.support_radius
+    bodies = [
+        CutBody(fluid, room, spacing) if is_packed(fluid, room, reach, spacing) else None for fluid in scene.fluid
+    ]
     positions = [
         fluid.particles_in(room, spacing) if body is None else body.particles()
         for fluid, body in zip(scene.fluid, bodies, strict=True)
@@ -86,13 +89,8 @@ def _why_none(body: CutBody | None, spacing: float) -> str:
             f" that is half a spacing, {0.5 * spacing:g} m, or more from all walls: it must be larger, or further "
             "from them"
         )
-    cells = body.volume() / spacing ** len(body.room.lower)
+    cells = body.volume() / spacing**body.room.dimension
     return f", as the volume that walls leave it is {cells:.2g} of that of a particle: it must be larger"
-
-
-def wall_particles(scene: Scene, depths: Sequence[float]) -> list[Points]:
-    """The wall particles of a scene's container: a layer (b, d) [m] for each depth [m] behind its surface."""
-    return [scene.container.walls(scene.dimension, scene.discretisation.spacing, depth) for depth in depths]
 
 
 def period(scene: Scene) -> tuple[Points, Points]:

@@ -10,7 +10,7 @@ from cortado.errors import LONGEST, SceneError, shown
 from cortado.scene.fields import GREATEST, MISSING, FieldPath
 
 Schema = Mapping[str, Any]
-ABSENT = {"mesh": "meshes", "obstacle": "obstacles", "stl": "meshes", "rigid": "rigid bodies", "solid": "solids"}
+ABSENT = {"rigid": "rigid bodies"}
 """What scenes are asked for and cannot have, by what it is called in them: in words, in the plural."""
 
 

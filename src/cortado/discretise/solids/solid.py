@@ -3,7 +3,6 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,30 +133,24 @@ class Round(Solid):
 
 
 @dataclass(frozen=True)
-class Cylinder(Solid):
-    """A cylinder about the origin, along an axis of space."""
+class Revolved(Solid):
+    """A solid of revolution about an axis of space through the origin."""
 
-    radius: float
-    """[m]"""
-    half: float
-    """Half of its height [m]."""
+    profile: Solid
+    """Its cut with a plane through the axis, in 2-D: across the axis, to both sides, and along it."""
     axis: int
 
-    @cached_property
-    def _profile(self) -> Box:
-        """Of a half plane through the axis: distance from it, and height."""
-        return Box(np.array([self.radius, self.half]))
-
     def extent(self) -> tuple[Points, Points]:
-        reach = np.where(np.arange(3) == self.axis, self.half, self.radius)
-        return -reach, reach
+        lower, upper = self.profile.extent()
+        along = np.arange(3) == self.axis
+        return np.where(along, lower[1], -upper[0]), np.where(along, upper[1], upper[0])
 
     def distance(self, points: Points) -> Points:
-        return self._profile.distance(self._flat(points))
+        return self.profile.distance(self._flat(points))
 
     def nearest(self, points: Points) -> Points:
         flat = self._flat(points)
-        found = self._profile.nearest(flat)
+        found = self.profile.nearest(flat)
         across = np.delete(points, self.axis, axis=1)
         away = np.where(flat[:, :1] > 0.0, across / np.maximum(flat[:, :1], 1e-300), np.array([1.0, 0.0]))
         return np.insert(found[:, :1] * away, self.axis, found[:, 1], axis=1)
@@ -166,6 +159,45 @@ class Cylinder(Solid):
         """(n, 2) distance from the axis, and height [m]."""
         across = np.linalg.norm(np.delete(points, self.axis, axis=1), axis=1)
         return np.column_stack([across, points[:, self.axis]])
+
+
+@dataclass(frozen=True)
+class HalfSpace(Solid):
+    """All that is below a plane, as far as a box shows it."""
+
+    normal: Points
+    """(d,) unit vector upwards"""
+    height: float
+    """Of the plane along it [m]."""
+    lower: Points
+    """(d,) [m]"""
+    upper: Points
+    """(d,) [m]"""
+
+    def extent(self) -> tuple[Points, Points]:
+        return self.lower, self.upper
+
+    def distance(self, points: Points) -> Points:
+        return np.asarray(points @ self.normal - self.height)
+
+    def nearest(self, points: Points) -> Points:
+        return np.asarray(points - self.distance(points)[:, None] * self.normal)
+
+
+@dataclass(frozen=True)
+class Hollow(Solid):
+    """All of space but a shape: a tank with walls of any thickness."""
+
+    cavity: Solid
+
+    def extent(self) -> tuple[Points, Points]:
+        return self.cavity.extent()
+
+    def distance(self, points: Points) -> Points:
+        return -self.cavity.distance(points)
+
+    def nearest(self, points: Points) -> Points:
+        return self.cavity.nearest(points)
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,12 @@ class Places:
         dimension = points.shape[1]
         return cls(points, np.broadcast_to(np.eye(dimension), (len(points), dimension, dimension)))
 
-    def some(self, which: slice) -> "Places":
+    @classmethod
+    def joined(cls, parts: Sequence["Places"]) -> "Places":
+        """One behind the other."""
+        return cls(np.concatenate([one.points for one in parts]), np.concatenate([one.axes for one in parts]))
+
+    def some(self, which: slice | NDArray[np.bool_]) -> "Places":
         """Some of them."""
         return Places(self.points[which], self.axes[which])
 

@@ -1,5 +1,6 @@
-"""What every wall particle of a container counts for in the density, by least squares, in float64."""
+"""What every wall particle counts for in the density, by least squares, in float64."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from cortado.discretise.calibration import lattice_offsets
 from cortado.discretise.pairs import apart, pairs_within
-from cortado.discretise.region import Region
+from cortado.discretise.room import Room
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.walls.places import Places
@@ -18,6 +19,11 @@ if TYPE_CHECKING:
 STIFFNESS = 3e-3
 """How much a weight resists a change, relative, beside an error of the density: where densities leave a weight open it
 stays that of a flat wall."""
+UNEVEN_STIFFNESS = 0.06
+"""The same where particles are not on a lattice. With 0.003 some of them have no weight, and fluid passes there."""
+LEAST, ROUNDS = 0.1, 4
+"""Of a weight over that of a flat wall, where particles are not on a lattice; rounds in which weights that would be
+less are set to it, and the others found anew."""
 BALANCE = 0.02
 """What the push of a uniform pressure counts beside an error of the density. Densities alone hardly say how steep two
 layers are: round a cup they would make them so shallow that fluid passes. At 0.1 corners would be too dense."""
@@ -45,8 +51,8 @@ class RestLattice:
         gradients = self.kernel.gradient(separations, self.support)
         return np.asarray(np.column_stack([weights, self.spacing * gradients]) / total)
 
-    def missing(self, places: Places, region: Region) -> Points:
-        """(n, 1 + d) the part of the lattice's `sums` that lies outside of a region, for a lattice at each of the
+    def missing(self, places: Places, room: Room) -> Points:
+        """(n, 1 + d) the part of the lattice's `sums` that lies outside of a room, for a lattice at each of the
         places.
 
         A lattice point is outside by as much as its cell is.
@@ -54,7 +60,7 @@ class RestLattice:
         dimension = places.points.shape[1]
         offsets = lattice_offsets(self.spacing, self.support, dimension)
         cells = places.points[:, None] + offsets @ places.axes
-        shares = region.cell_shares(cells.reshape(-1, dimension), self.spacing).reshape(-1, len(offsets))
+        shares = room.cell_shares(cells.reshape(-1, dimension), self.spacing).reshape(-1, len(offsets))
         found = (1.0 - shares) @ self.sums(-offsets)
         found[:, 1:] = (found[:, None, 1:] @ places.axes)[:, 0]
         return np.asarray(found)
@@ -62,7 +68,7 @@ class RestLattice:
 
 @dataclass(frozen=True)
 class WallSurface:
-    """The walls of a container, whose weights are sought."""
+    """The walls of a room, whose weights are sought."""
 
     walls: Points
     """(b, d) wall particles [m]"""
@@ -70,12 +76,14 @@ class WallSurface:
     """(b,) their weights in a flat wall [-]"""
     lattice: RestLattice
     """The lattice of the fluid at rest."""
-    region: Region
+    room: Room
     """Where fluid may be."""
     lower: Points
     """(d,) where the period begins [m]"""
     lengths: Points
     """(d,) the lengths of the period [m], 0 for axes without one"""
+    fit: "Fit"
+    """`even_changes`, or `uneven_changes` where particles are on no lattice."""
 
     def weights(self, places: Places) -> Points:
         """(b,) [-] what wall particles count for in the density, a fluid particle being 1.
@@ -85,18 +93,15 @@ class WallSurface:
         cup, and across the seam of a period. Against the push, as in `wall_layers`, the wall's part in the gradient is
         twice that of the fluid that is missing.
         """
-        from scipy.optimize import lsq_linear
-        from scipy.sparse import eye_array, vstack
+        from scipy.sparse import vstack
 
-        count = len(self.walls)
-        if not count:
+        if not len(self.walls):
             return np.zeros(0)
         chunks = range(0, len(places.points), CHUNK)
         demands = [self._demands(places.some(slice(start, start + CHUNK))) for start in chunks]
-        sums = vstack([*(part for part, _ in demands), STIFFNESS * eye_array(count)]).tocsr()
-        wanted = np.concatenate([*(part for _, part in demands), STIFFNESS * np.ones(count)])
-        changes = lsq_linear(sums, wanted - sums.sum(axis=1), bounds=(-1.0, np.inf), lsq_solver="lsmr", tol=1e-10).x
-        return np.asarray(self.flat * (1.0 + changes), dtype=np.float64)
+        sums = vstack([part for part, _ in demands]).tocsr()
+        wanted = np.concatenate([part for _, part in demands])
+        return np.asarray(self.flat * (1.0 + self.fit(sums, wanted - sums.sum(axis=1))), dtype=np.float64)
 
     def _demands(self, places: Places) -> tuple["csr_array", Points]:
         """A matrix (m, b) that gives, with the weights of the walls over their flat ones, what is wanted, (m,)."""
@@ -107,7 +112,39 @@ class WallSurface:
         shape, indices = (len(places.points), len(self.walls)), (place.astype(np.int32), wall.astype(np.int32))
         seen = self.flat[wall, None] * self.lattice.sums(separations)
         densities, *gradients = (coo_array((part, indices), shape=shape).tocsr() for part in seen.T)
-        missing = self.lattice.missing(places, self.region)
-        near = ~self.region.contains(places.points, -self.lattice.spacing)
+        missing = self.lattice.missing(places, self.room)
+        near = ~self.room.contains(places.points, -self.lattice.spacing)
         sums = vstack([densities, *(BALANCE * gradient[near] for gradient in gradients)]).tocsr()
         return sums, np.concatenate([missing[:, 0], 2.0 * BALANCE * missing[near, 1:].T.ravel()])
+
+
+Fit = Callable[["csr_array", Points], Points]
+"""Of changes (b,) of weights, relative to those of a flat wall, given a matrix (m, b) and what it is to make of them,
+(m,)."""
+
+
+def even_changes(sums: "csr_array", wanted: Points) -> Points:
+    """Those of particles on lattices, whose weights are at least 0."""
+    from scipy.optimize import lsq_linear
+    from scipy.sparse import eye_array, vstack
+
+    count = sums.shape[1]
+    system = vstack([sums, STIFFNESS * eye_array(count)]).tocsr()
+    right = np.concatenate([wanted, np.zeros(count)])
+    return np.asarray(lsq_linear(system, right, bounds=(-1.0, np.inf), lsq_solver="lsmr", tol=1e-10).x)
+
+
+def uneven_changes(sums: "csr_array", wanted: Points) -> Points:
+    """Those of particles that are about evenly spaced, whose weights are at least `LEAST` of those of a flat wall."""
+    from scipy.sparse.linalg import lsmr
+
+    changes, free = np.zeros(sums.shape[1]), np.ones(sums.shape[1], dtype=bool)
+    for _ in range(ROUNDS):
+        some = sums[:, free]
+        held = wanted - sums[:, ~free] @ changes[~free]
+        changes[free] = lsmr(some, held, damp=UNEVEN_STIFFNESS, atol=1e-6, btol=1e-6)[0]
+        if (changes[free] >= LEAST - 1.0).all():
+            break
+        free &= changes >= LEAST - 1.0
+        changes[~free] = LEAST - 1.0
+    return np.maximum(changes, LEAST - 1.0)

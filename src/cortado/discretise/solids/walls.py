@@ -1,0 +1,171 @@
+"""The wall particles of solids, and places beside them where fluid may rest, in float64."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.discretise.room import Room
+from cortado.discretise.shapes import Points
+from cortado.discretise.solids.solid import Solid
+from cortado.discretise.solids.surface_points import FINE, SurfacePoints, evenly_chosen, lattice_about, surface_feet, surface_points
+from cortado.discretise.walls.layers import WallLayers
+from cortado.discretise.walls.places import Places
+
+MARGIN = 0.01
+"""In spacings: a part of a surface that is no further within its room touches a wall or another solid."""
+TOLERANCE = 0.05
+"""In spacings: by how much less deep points may be beneath one surface than beneath another."""
+HALVINGS, ROUNDS = 12, 30
+
+
+@dataclass(frozen=True)
+class WallPoints:
+    """Wall particles whose weights are not known yet."""
+
+    positions: Points
+    """(b, d) [m]"""
+    flat: Points
+    """(b,) what each would count for in the density if its wall were flat [-]"""
+    feet: Points
+    """(b, d) from each to the nearest point of its surface [m]"""
+
+    @classmethod
+    def joined(cls, parts: Sequence["WallPoints"]) -> "WallPoints":
+        """One behind the other."""
+        return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in ("positions", "flat", "feet")))
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+@dataclass(frozen=True)
+class ExposedSurface:
+    """What fluid in a room can touch of solids that may touch each other, as fine points."""
+
+    feet: Points
+    """(n, d) [m]"""
+    away: Points
+    """(n, d) unit vectors into the room"""
+    owner: NDArray[np.int64]
+    """(n,) whose they are: index into `solids`"""
+    solids: Sequence[Solid]
+    room: Room
+    spacing: float
+    """Of particles; each point stands for a part of the surface that is a `FINE`th of it long and wide [m]."""
+
+    @classmethod
+    def of(cls, room: Room, solids: Sequence[Solid], spacing: float) -> "ExposedSurface":
+        """That of solids which close a room."""
+        found = [surface_feet(solid, spacing / FINE) for solid in solids]
+        feet, away = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        owner = np.repeat(np.arange(len(solids)), [len(part) for part, _ in found])
+        free = _is_exposed(feet, away, room, spacing)
+        return cls(feet[free], away[free], owner[free], solids, room, spacing)
+
+    @cached_property
+    def _tree(self) -> Any:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.feet)
+
+    def walls(self, layers: WallLayers) -> WallPoints:
+        """Wall particles in layers at the depths of those of flat walls, each with the weight of as much of a flat wall
+        as its part of the layer is."""
+        found = [self.beneath(depth) for depth in layers.depths]
+        positions = np.concatenate([one.points for one in found])
+        flat = np.concatenate([weight * one.shares for one, weight in zip(found, layers.weights, strict=True)])
+        return WallPoints(positions, flat, self._feet_of(positions) - positions)
+
+    def beneath(self, depth: float) -> SurfacePoints:
+        """Points about a spacing [m] apart, ``depth`` [m] beneath the surface, or in the middle of what is thinner."""
+        points = np.concatenate([self._at(depth), self._in_the_middle(depth)])
+        areas = np.full(len(points), (self.spacing / FINE) ** (points.shape[1] - 1))
+        return evenly_chosen(points, areas, self.spacing)
+
+    def _at(self, depth: float) -> Points:
+        """(n, d) [m] fine points at a depth."""
+        fine, found = self.spacing / FINE, []
+        for points in lattice_about(self.feet, depth + 0.5 * fine, fine, self._tree):
+            near = self._tree.query(points, distance_upper_bound=depth + fine)[0]
+            points = points[np.isfinite(near) & (near > depth - fine)]
+            points = points[self.room.distance(points) > 0.0]
+            feet = self._feet_of(points)
+            down = points - feet
+            distances = np.linalg.norm(down, axis=1)
+            band = np.abs(distances - depth) < 0.5 * fine
+            found.append(feet[band] + (depth / distances[band, None]) * down[band])
+        return np.concatenate([np.zeros((0, self.feet.shape[1])), *found])
+
+    def _feet_of(self, points: Points) -> Points:
+        """(n, d) [m] the point of the surface that is nearest to each of the points (n, d) [m] beneath it: on a solid,
+        or where two of them meet."""
+        fine, (reach, nearest) = self.spacing / FINE, self._tree.query(points)
+        found, owner = self.feet[nearest], self.owner[nearest]
+        best = np.full(len(points), np.inf)
+        for solid in self.solids:
+            near = np.flatnonzero(np.abs(solid.distance(points)) < np.minimum(best, reach + fine))
+            feet = solid.nearest(points[near])
+            up, distances = feet - points[near], np.linalg.norm(feet - points[near], axis=1)
+            free = _is_exposed(feet, up / np.maximum(distances, 1e-300)[:, None], self.room, self.spacing)
+            near = near[free]
+            found[near], best[near] = feet[free], distances[free]
+        between = np.flatnonzero(np.isinf(best))
+        found[between] = self._edges(found[between], owner[between])
+        return found
+
+    def _edges(self, feet: Points, owner: NDArray[np.int64]) -> Points:
+        """(n, d) [m] points where the solid that feet (n, d) [m] belong to meets the one that is next to them, near
+        the feet: these, moved to one surface and the other in turn."""
+        distances = np.abs([solid.distance(feet) for solid in self.solids])
+        distances[owner, np.arange(len(feet))] = np.inf
+        other, found = np.argmin(distances, axis=0), feet.copy()
+        for first, second in {(int(a), int(b)) for a, b in zip(owner, other, strict=True)}:
+            pair = (owner == first) & (other == second)
+            for _ in range(ROUNDS):
+                found[pair] = self.solids[first].nearest(self.solids[second].nearest(found[pair]))
+        near = np.linalg.norm(found - feet, axis=1) < self.spacing
+        return np.where(near[:, None], found, feet)
+
+    def _in_the_middle(self, depth: float) -> Points:
+        """(n, d) [m] points beneath the feet that have another part of the surface nearer than at a depth, as deep as
+        that is."""
+        thin = np.flatnonzero(~self._is_nearest(slice(None), np.full(len(self.feet), depth)))
+        low, high = np.zeros(len(thin)), np.full(len(thin), depth)
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            good = self._is_nearest(thin, middle)
+            low, high = np.where(good, middle, low), np.where(good, high, middle)
+        return np.asarray(self.feet[thin] - low[:, None] * self.away[thin])
+
+    def _is_nearest(self, which: Any, depths: Points) -> np.ndarray:
+        """(n,) whether no part of the surface is nearer than its foot to a point beneath each of some, at depths (n,)
+        [m]."""
+        distances = self._tree.query(self.feet[which] - depths[:, None] * self.away[which])[0]
+        return np.asarray(distances > depths - TOLERANCE * self.spacing)
+
+
+def _is_exposed(feet: Points, away: Points, room: Room, spacing: float) -> NDArray[np.bool_]:
+    """(n,) whether fluid in a room can touch points of surfaces (n, d) [m], from which unit vectors (n, d) point away."""
+    return room.contains(feet + 2.0 * MARGIN * spacing * away, -MARGIN * spacing)
+
+
+def solid_places(solid: Solid, spacing: float, reach: float) -> Places:
+    """Places half a spacing, one and a half, ... up to ``reach`` [m] from a solid, where a lattice that is turned as
+    the surface is may rest."""
+    heights = spacing * (np.arange(int(np.ceil(reach / spacing - 0.5))) + 0.5)
+    points = np.concatenate([surface_points(solid, spacing, -height).points for height in heights])
+    return Places(points, _frames(solid.outward(points)))
+
+
+def _frames(normals: Points) -> Points:
+    """(n, d, d) axes, a unit vector a row, of which the first are unit vectors (n, d)."""
+    if normals.shape[1] == 2:
+        return np.stack([normals, normals[:, ::-1] * np.array([-1.0, 1.0])], axis=1)
+    least = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    first = least - (least * normals).sum(axis=1, keepdims=True) * normals
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([normals, first, np.cross(normals, first)], axis=1)

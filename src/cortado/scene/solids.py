@@ -1,0 +1,255 @@
+"""Solids, which fluid flows around or is held by, each with its shape."""
+
+from abc import abstractmethod
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, model_validator
+
+from cortado.discretise.shapes import Points
+from cortado.discretise.solids.solid import Box, Hollow, Placed, Polygon, Revolved, Round, Solid
+from cortado.scene.fields import Colour, FieldPath, Length, Text, Vector, field_error, quantity, without_numpy
+from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
+from cortado.scene.tables import Table
+
+Angle = Annotated[float, quantity("rad")]
+Size = Annotated[float, quantity("m", gt=0.0)]
+
+
+def _in_a_list(value: Any) -> Any:
+    value = without_numpy(value)
+    return value if isinstance(value, (list, tuple)) else [value]
+
+
+Rotation = Annotated[tuple[Angle, ...], BeforeValidator(_in_a_list), Field(min_length=1, max_length=3)]
+Axis = Literal["x", "y", "z"]
+
+
+class SolidTable(Table):
+    """What fluid cannot enter."""
+
+    name: Text
+    """What others call it."""
+    position: tuple[Length, ...] | None = None
+    """(d,) Where the middle of its shape, its centroid, is [m]; left out, it is where its measures put it."""
+    rotation: Rotation = ()
+    """How it is turned about its middle [rad]: in 3-D a rotation vector, in 2-D one number, counterclockwise."""
+    side: Literal["outside", "inside"] = "outside"
+    """Where fluid may be: outside of the shape, or inside of it, as in a tank."""
+    slip: Literal["free", "no"] = "free"
+    """"no": the viscous force acts between fluid and solid; "free": it does not."""
+    colour: Colour = (0.55, 0.55, 0.58)
+    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light."""
+
+    @property
+    def sticks(self) -> bool:
+        """Whether fluid has no slip along it."""
+        return self.slip == "no"
+
+    @abstractmethod
+    def shape_about(self) -> tuple[Solid, Points]:
+        """The shape about its middle, not turned, and where its measures put the middle, (d,) [m]."""
+
+    def solid(self) -> Solid:
+        """Where fluid may not be."""
+        return Hollow(self.body()) if self.side == "inside" else self.body()
+
+    def body(self) -> Solid:
+        """The shape in its place."""
+        shape, middle = self.shape_about()
+        return Placed(shape, middle if self.position is None else np.array(self.position), self.turn(len(middle)))
+
+    def turn(self, dimension: int) -> NDArray[np.float64]:
+        """(d, d) the rotation matrix."""
+        return rotation_matrix(self.rotation or (0.0,) * (2 * dimension - 3))
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        if self.position is not None and len(self.position) != dimension:
+            wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
+            raise field_error((*path, "position"), self.position, wanted)
+        if self.rotation and len(self.rotation) != 2 * dimension - 3:
+            wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
+            raise field_error((*path, "rotation"), self.rotation, wanted)
+        return super().in_dimension(dimension, path)
+
+
+class BoxSolid(SolidTable):
+    """A box, or a rectangle in 2-D."""
+
+    shape: Literal["box"] = "box"
+    lower: Vector[Length]
+    """(d,) Corner with the least coordinates, before it is turned [m]."""
+    upper: Vector[Length]
+    """(d,) Corner with the greatest coordinates [m]."""
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        check_order(self.lower, self.upper)
+        return self
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        lower, upper = np.array(self.lower), np.array(self.upper)
+        return Box(0.5 * (upper - lower)), 0.5 * (lower + upper)
+
+
+class SphereSolid(SolidTable):
+    """A sphere, or a disc in 2-D."""
+
+    shape: Literal["sphere"] = "sphere"
+    centre: Vector[Length]
+    """(d,) Middle [m]."""
+    radius: Size
+    """From the middle to the surface [m]."""
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        centre = np.array(self.centre)
+        return Round(np.zeros_like(centre), self.radius), centre
+
+
+class CapsuleSolid(SolidTable):
+    """All that is no further than a radius from a segment."""
+
+    shape: Literal["capsule"] = "capsule"
+    start: Vector[Length]
+    """(d,) One end of the segment [m]."""
+    end: Vector[Length]
+    """(d,) The other end [m]."""
+    radius: Size
+    """From the segment to the surface [m]."""
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        start, end = np.array(self.start), np.array(self.end)
+        return Round(0.5 * (end - start), self.radius), 0.5 * (start + end)
+
+
+class CylinderSolid(SolidTable):
+    """A cylinder, in 3-D."""
+
+    shape: Literal["cylinder"] = "cylinder"
+    base: Vector[Length]
+    """(3,) Middle of the bottom [m]."""
+    radius: Size
+    """From the axis to the side [m]."""
+    height: Size
+    """From the base, along the axis [m]."""
+    axis: Axis = "y"
+    """The axis of space along which it stands, before it is turned."""
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        refuse_plane(dimension, path, '"box", "sphere", "capsule", "cup" or "polygon"')
+        return super().in_dimension(dimension, path)
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        axis = INDEX_OF_AXIS[self.axis]
+        profile = Box(np.array([self.radius, 0.5 * self.height]))
+        return Revolved(profile, axis), np.array(self.base) + 0.5 * self.height * np.eye(3)[axis]
+
+
+class CupSolid(SolidTable):
+    """A cup that is open at the top; in 2-D its cut through the axis."""
+
+    shape: Literal["cup"] = "cup"
+    base: Vector[Length]
+    """(d,) Middle of the bottom, outside [m]."""
+    radius: Size
+    """From the axis to the side, inside [m]."""
+    height: Size
+    """From the bottom, outside, to the rim [m]."""
+    thickness: Size
+    """Of the side and the bottom [m]."""
+    axis: Axis = "y"
+    """The axis of space along which it stands, before it is turned; in 2-D it stands along y."""
+
+    @model_validator(mode="after")
+    def _check_height(self) -> Self:
+        if self.thickness >= self.height:
+            raise field_error(("thickness",), self.thickness, f"less than height, {self.height:g}")
+        return self
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        if dimension == 2 and self.axis != "y":
+            raise field_error((*path, "axis"), self.axis, '"y" in 2-D')
+        return super().in_dimension(dimension, path)
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        dimension, middle = len(self.base), self._middle()
+        outside, rim, bottom = self.radius + self.thickness, self.height - middle, self.thickness - middle
+        half = [(outside, -middle), (outside, rim), (self.radius, rim), (self.radius, bottom)]
+        profile = Polygon(np.array([*half, *((-x, y) for x, y in half[::-1])]))
+        up = np.eye(dimension)[INDEX_OF_AXIS[self.axis]]
+        shape = profile if dimension == 2 else Revolved(profile, INDEX_OF_AXIS[self.axis])
+        return shape, np.array(self.base) + middle * up
+
+    def _middle(self) -> float:
+        """How high its centroid is above the base [m]."""
+        power = len(self.base) - 1
+        solid, hollow = (self.radius + self.thickness) ** power, self.radius**power
+        whole, cavity = solid * self.height, hollow * (self.height - self.thickness)
+        moment = 0.5 * whole * self.height - 0.5 * cavity * (self.height + self.thickness)
+        return moment / (whole - cavity)
+
+
+class PolygonSolid(SolidTable):
+    """A polygon, in 2-D."""
+
+    shape: Literal["polygon"] = "polygon"
+    corners: Annotated[tuple[Annotated[tuple[Length, ...], Field(min_length=2, max_length=2)], ...], Field(min_length=3)]
+    """(m, 2) The corners, one after the other along the edge, either way round [m]."""
+
+    @model_validator(mode="after")
+    def _check_sides(self) -> Self:
+        if crossing := _crossing(np.array(self.corners)):
+            first, second = crossing
+            wanted = f"corners of sides that do not cross, as sides {first} and {second} do"
+            raise field_error(("corners",), self.corners, wanted)
+        return self
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        if dimension == 3:
+            raise field_error((*path, "shape"), "polygon", '"box", "sphere", "capsule", "cylinder" or "cup" in 3-D')
+        return super().in_dimension(dimension, path)
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        corners = np.array(self.corners)
+        following = np.roll(corners, -1, axis=0)
+        parts = corners[:, 0] * following[:, 1] - following[:, 0] * corners[:, 1]
+        middle = ((corners + following) * parts[:, None]).sum(axis=0) / (3.0 * parts.sum())
+        return Polygon(corners - middle), middle
+
+
+AnySolid = Annotated[
+    BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid, Field(discriminator="shape")
+]
+
+
+def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
+    """(d, d) of a rotation vector [rad], or in 2-D of an angle."""
+    from scipy.spatial.transform import Rotation as Turn
+
+    if len(rotation) == 1:
+        return np.asarray(Turn.from_rotvec([0.0, 0.0, rotation[0]]).as_matrix()[:2, :2])
+    return np.asarray(Turn.from_rotvec(rotation).as_matrix())
+
+
+def _crossing(corners: Points) -> tuple[int, int] | None:
+    """The numbers of two sides of a polygon that meet beside its corners, or of one without a length."""
+    count, sides = len(corners), np.roll(corners, -1, axis=0) - corners
+
+    def turned(a: Points, b: Points) -> float:
+        return float(a[0] * b[1] - a[1] * b[0])
+
+    for first in range(count):
+        if not sides[first].any():
+            return first, first
+        for second in range(first + 1, count):
+            apart = corners[second] - corners[first]
+            across = turned(sides[first], sides[second])
+            if (second - first) in (1, count - 1):  # neighbours, which may only lie on each other
+                if across == 0.0 and sides[first] @ sides[second] < 0.0:
+                    return first, second
+            elif across != 0.0:
+                along = turned(apart, sides[second]) / across, turned(apart, sides[first]) / across
+                if all(0.0 <= part <= 1.0 for part in along):
+                    return first, second
+    return None
