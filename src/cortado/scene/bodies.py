@@ -67,7 +67,7 @@ class CutBody:
         """The number of its particles."""
         volume = self.volume()
         lacking = min(LOOSENESS * (volume - self.volume(self.spacing)), MOST_LOOSENESS * volume)
-        return round((volume - lacking) / self.spacing ** self.room.dimension)
+        return round((volume - lacking) / self.spacing**self.room.dimension)
 
     def particles(self) -> Points:
         """(n, d) [m] where its particles begin: on the lattice, and where surfaces cut its cells as deep as there are

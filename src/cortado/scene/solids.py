@@ -194,7 +194,9 @@ class PolygonSolid(SolidTable):
     """A polygon, in 2-D."""
 
     shape: Literal["polygon"] = "polygon"
-    corners: Annotated[tuple[Annotated[tuple[Length, ...], Field(min_length=2, max_length=2)], ...], Field(min_length=3)]
+    corners: Annotated[
+        tuple[Annotated[tuple[Length, ...], Field(min_length=2, max_length=2)], ...], Field(min_length=3)
+    ]
     """(m, 2) The corners, one after the other along the edge, either way round [m]."""
 
     @model_validator(mode="after")

@@ -17,8 +17,9 @@ from cortado.particles.state import Layout
 from cortado.scene.containers import NoContainer
 from cortado.scene.discrete_scene import DiscreteScene
 from cortado.scene.parameters.registry import PARAMETERS
+from cortado.scene.room import solids_of
 from cortado.scene.scene import Scene
-from cortado.solvers.containment import Walled
+from cortado.solvers.containment import Obstacle, Walled
 from cortado.solvers.makers import SolverSetting
 from cortado.solvers.particles import ParticleSystem
 from cortado.sph.diffusion import Diffusion
@@ -152,5 +153,10 @@ def _nozzle(scene: Scene, discrete: DiscreteScene) -> Nozzle | None:
 def _walled(scene: Scene, discrete: DiscreteScene) -> Walled:
     """Where particles may go. Walls act through the pressure: without it they hold nothing."""
     holds = scene.container if scene.forces.pressure else NoContainer()
-    region = holds.region(scene.dimension).opened(discrete.periods)
-    return Walled(region, discrete.near, scene.discretisation.spacing)
+    region, tables = holds.region(scene.dimension).opened(discrete.periods), scene.solid
+    solids = solids_of(tables) if scene.forces.pressure else ()
+    obstacles = [
+        Obstacle(table.name, solid, table.side == "inside", np.inf)
+        for table, solid in zip(tables, solids, strict=False)
+    ]
+    return Walled(region, discrete.near, scene.discretisation.spacing, tuple(obstacles), discrete.periods)

@@ -10,12 +10,34 @@ from cortado.device.host import HostCopy
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import Precision
 from cortado.discretise.region import TOLERANCE, Region
+from cortado.discretise.shapes import Points
+from cortado.discretise.solids.solid import Solid
 from cortado.particles.arrays import padded
 from cortado.particles.state import Layout, State
-from cortado.solvers.containment_kernels import NO_PARTICLE, bounds_type, lost_kernel
+from cortado.solvers.containment_kernels import NO_PARTICLE, bounds_type, lost_kernel, solids_type
 
+THINNEST = 0.4
+"""Of the thickness of a solid: particles that are deeper in it are lost."""
+REACH = 4.0
+"""In spacings: how far from a surface particles are looked at."""
+HEIGHT = 100.0
+"""Of a mesh that stands for a plane shape, over its width."""
+FINE = 0.2
+"""In spacings: the width of faces by which round solids are looked at."""
 FURTHEST = 1e6
 """In spacings from the region of the first particles and walls: particles beyond are lost."""
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A solid, in its place."""
+
+    name: str
+    solid: Solid
+    is_hollow: bool
+    """Whether fluid is inside of the shape."""
+    thickness: float
+    """Of its thinnest part [m], as far as it is known; infinite otherwise."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +50,19 @@ class Walled:
     """A box around the first particles and the walls."""
     spacing: float
     """[m]"""
+    solids: tuple[Obstacle, ...]
+    """What it cannot enter."""
+    periods: Points
+    """(d,) the lengths of the period [m], 0 for axes without one"""
 
     @property
     def dimension(self) -> int:
         """2 or 3."""
         return len(self.near.lower)
+
+    def tolerance(self, one: Obstacle) -> float:
+        """How deep in a solid a particle may be [m]."""
+        return min(TOLERANCE * self.spacing, THINNEST * one.thickness)
 
     def furthest(self, precision: Precision) -> Region:
         """The box that positions must not leave [m]: far away, and as far from the origin as a precision resolves; what
@@ -61,9 +91,14 @@ class Containment:
         """``first_waiting``: the first particle, in the scene's order, that may wait in a nozzle."""
         self.walled, self._precision, self._launch = walled, layout.precision, launch
         self._kernel = lost_kernel(layout.precision)
-        own = {"bounds": self._made_bounds(), "particles": layout.particles, "first_waiting": first_waiting}
-        self._constants: dict[str, Any] = own
         members, device = layout.members, layout.device
+        self._meshes = [_mesh(one, walled.spacing, device) for one in walled.solids]
+        self._constants: dict[str, Any] = {
+            "bounds": self._made_bounds(),
+            "solids": self._made_solids(device),
+            "particles": layout.particles,
+            "first_waiting": first_waiting,
+        }
         self.bad_step = wp.full(members, -1, dtype=wp.int32, device=device)
         """(members,) the first step in which a scene lost a particle; -1 while it has lost none."""
         self.bad_particle = wp.full(members, NO_PARTICLE, dtype=wp.int32, device=device)
@@ -121,12 +156,31 @@ class Containment:
             return "has no finite position"
         if not self.walled.region.contains(position[None], TOLERANCE * self.walled.spacing)[0]:
             return f"left the container and was at {place}"
+        for one in self.walled.solids:
+            if one.solid.distance(position[None])[0] < -self.walled.tolerance(one):
+                return f"entered the solid {one.name!r} and was at {place}"
         if self.is_imprecise(position):
             limit = f"{self._precision.furthest:g} spacings from the origin"
             return f"was at {place}, further than positions are precise in {self._precision.name}, {limit}"
         if not self.walled.furthest(self._precision).contains(position[None], 0.0)[0]:
             return f"was at {place}, further than {FURTHEST:g} spacings from the scene"
         return f"at {place} has no finite velocity or no volume"
+
+    def _made_solids(self, device: wp.Device) -> Any:
+        precision, walled = self._precision, self.walled
+        solids, middles = solids_type(precision)(), [_middle(one) for one in walled.solids]
+        places = padded(np.array(middles)) if middles else np.zeros((0, 3))
+        periods = padded(walled.periods[None])[0]
+        solids.meshes = wp.array([mesh.id for mesh in self._meshes], dtype=wp.uint64, device=device)
+        solids.middles = wp.array(places, dtype=precision.vector, device=device)
+        sides = [-1.0 if one.is_hollow else 1.0 for one in walled.solids]
+        solids.sides = wp.array(sides, dtype=precision.real, device=device)
+        tolerances = [walled.tolerance(one) for one in walled.solids]
+        solids.tolerances = wp.array(tolerances, dtype=precision.real, device=device)
+        solids.reach = REACH * walled.spacing
+        solids.period = precision.vector(*periods)
+        solids.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in periods))
+        return solids
 
     def _made_bounds(self) -> Any:
         precision, region, tolerance = self._precision, self.walled.region, TOLERANCE * self.walled.spacing
@@ -141,3 +195,31 @@ class Containment:
         bounds.radius, bounds.rim = region.radius + tolerance, region.rim
         bounds.nearest, bounds.furthest = vector(furthest.lower), vector(furthest.upper)
         return bounds
+
+
+def _middle(one: Obstacle) -> Points:
+    """(d,) of the box around its shape [m]."""
+    lower, upper = one.solid.extent()
+    return np.asarray(0.5 * (lower + upper))
+
+
+def _mesh(one: Obstacle, spacing: float, device: wp.Device) -> wp.Mesh:
+    """The surface of its shape about its middle; in the plane, where it is as high as it is far from anything else."""
+    faces = one.solid.faces(FINE * spacing)
+    faces = faces.reversed() if one.is_hollow else faces
+    vertices, corners = faces.vertices - _middle(one), faces.corners
+    if vertices.shape[1] == 2:
+        height = HEIGHT * (np.ptp(vertices) + spacing)
+        low, high, count = (
+            np.insert(vertices, 2, -height, axis=1),
+            np.insert(vertices, 2, height, axis=1),
+            len(vertices),
+        )
+        a, b = corners.T
+        vertices = np.concatenate([low, high])
+        corners = np.concatenate([np.stack([a, b, b + count], axis=1), np.stack([a, b + count, a + count], axis=1)])
+    return wp.Mesh(
+        points=wp.array(vertices, dtype=wp.vec3f, device=device),
+        indices=wp.array(corners.ravel(), dtype=wp.int32, device=device),
+        support_winding_number=True,
+    )

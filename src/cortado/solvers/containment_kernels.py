@@ -1,4 +1,4 @@
-"""Which particles are lost: outside of their container, too far away for their precision, or not finite."""
+"""Which particles are lost: outside of their container, in a solid, too far away for their precision, or not finite."""
 
 from functools import cache
 from typing import Any
@@ -34,10 +34,34 @@ def bounds_type(precision: Precision) -> Any:
 
 
 @cache
+def solids_type(precision: Precision) -> Any:
+    """The Warp struct of solids, as meshes about their middles."""
+    real, vector = precision.real, precision.vector
+
+    class Solids:
+        meshes: wp.array(dtype=wp.uint64)
+        middles: wp.array(dtype=vector)
+        """[m]"""
+        sides: wp.array(dtype=real)
+        """1 where fluid is outside of a mesh, -1 where it is inside."""
+        tolerances: wp.array(dtype=real)
+        """How deep in a solid a particle may be [m]."""
+        reach: wp.float32
+        """How far from a surface one is looked for [m]."""
+        period: vector
+        """[m], 0 along an axis that is not periodic."""
+        frequency: vector
+        """1 / period [1 / m], or 0."""
+
+    Solids.__name__ = Solids.__qualname__ = f"Solids_{precision.name}"
+    return wp.struct(Solids)
+
+
+@cache
 def lost_kernel(precision: Precision) -> Any:
     """The kernel that looks for particles that were lost in a step."""
     real, vector = precision.real, precision.vector
-    bounds_struct = bounds_type(precision)
+    bounds_struct, solids_struct = bounds_type(precision), solids_type(precision)
     module = wp.get_module(f"cortado_containment_{precision.name}")
     module.options["enable_backward"] = False
 
@@ -58,12 +82,29 @@ def lost_kernel(precision: Precision) -> Any:
         return between(x, b.lower, b.upper) and wp.length(wp.cw_mul(x - b.base, b.across)) <= b.radius
 
     @wp.func
+    def is_free(x: vector, solids: solids_struct) -> bool:
+        """Whether x is not deep in any solid; what is far from all surfaces is."""
+        for k in range(solids.meshes.shape[0]):
+            y = x - solids.middles[k]
+            turns = wp.cw_mul(y, solids.frequency)
+            y -= wp.cw_mul(vector(wp.round(turns[0]), wp.round(turns[1]), wp.round(turns[2])), solids.period)
+            place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
+            found = wp.mesh_query_point_sign_winding_number(solids.meshes[k], place, solids.reach)
+            if found.result:
+                surface = wp.mesh_eval_position(solids.meshes[k], found.face, found.u, found.v)
+                depth = -real(found.sign) * solids.sides[k] * real(wp.length(place - surface))
+                if depth > solids.tolerances[k]:
+                    return False
+        return True
+
+    @wp.func
     def below_rim(x: vector, b: bounds_struct) -> bool:
         return wp.dot(x, b.up) < b.rim
 
     @wp.kernel(module=module, enable_backward=False)
     def find_lost(
         bounds: bounds_struct,
+        solids: solids_struct,
         particles: int,
         first_waiting: int,
         order: wp.array(dtype=wp.int32),
@@ -81,7 +122,7 @@ def lost_kernel(precision: Precision) -> Any:
         nothing is looked for.
 
         Lost is what is not finite, too far away, of a mixture without a volume, or what went through a wall: it was
-        inside before the step and is outside after it. Over the rim of an open cup fluid may go, and what a nozzle
+        inside before the step and is outside after it, or it is in a solid then. Over the rim of an open cup fluid may go, and what a nozzle
         leads, so that it is not where it would be without one, passes walls with it: such are only among the particles
         from ``first_waiting`` on, in scene order. ``x`` is the new state in that order; the others are sorted, and
         ``x_free`` and ``v_free`` are the new state without the nozzle.
@@ -105,7 +146,8 @@ def lost_kernel(precision: Precision) -> Any:
             and below_rim(before, bounds)
             and below_rim(x_i, bounds)
         )
-        if escaped or not good:
+        entered = let_go and good and is_free(before, solids) and not is_free(x_i, solids)
+        if escaped or entered or not good:
             wp.atomic_min(bad, member, p)
             wp.atomic_add(count, member, 1)
 

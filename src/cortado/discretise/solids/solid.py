@@ -1,4 +1,4 @@
-"""What a solid is to the discretisation: signed distances and nearest points of its surface, in float64."""
+"""What a solid is to the discretisation: signed distances, nearest points and faces of its surface, in float64."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import Points, across
+from cortado.discretise.solids.faces import Faces, arc, box_faces, polygon_faces, revolved_faces
 
 Which = NDArray[np.bool_]
 
@@ -26,6 +27,10 @@ class Solid(ABC):
     @abstractmethod
     def nearest(self, points: Points) -> Points:
         """(n, d) [m] the points of the surface that are nearest to points (n, d) [m]."""
+
+    @abstractmethod
+    def faces(self, fine: float) -> Faces:
+        """Its surface in flat faces, some ``fine`` [m] wide where it is round."""
 
     def outward(self, points: Points) -> Points:
         """(n, d) unit vectors away from the solid at points (n, d) [m] that are not on its surface."""
@@ -54,6 +59,9 @@ class Placed(Solid):
     def nearest(self, points: Points) -> Points:
         return self.position + self.solid.nearest((points - self.position) @ self.turn) @ self.turn.T
 
+    def faces(self, fine: float) -> Faces:
+        return self.solid.faces(fine).moved(self.turn, self.position)
+
 
 @dataclass(frozen=True)
 class Union(Solid):
@@ -75,6 +83,9 @@ class Union(Solid):
         for number, solid in enumerate(self.solids):
             found[first == number] = solid.nearest(points[first == number])
         return found
+
+    def faces(self, fine: float) -> Faces:
+        return Faces.joined([solid.faces(fine) for solid in self.solids])
 
 
 @dataclass(frozen=True)
@@ -100,6 +111,9 @@ class Box(Solid):
         found[inside, axis] = np.where(points[inside, axis] < 0.0, -self.half[axis], self.half[axis])
         return found
 
+    def faces(self, fine: float) -> Faces:
+        return box_faces(self.half)
+
 
 @dataclass(frozen=True)
 class Round(Solid):
@@ -124,6 +138,17 @@ class Round(Solid):
         length = np.linalg.norm(away, axis=1, keepdims=True)
         sideways = np.eye(points.shape[1])[np.argmin(np.abs(self.half))]
         return np.asarray(within + self.radius * np.where(length > 0.0, away / np.maximum(length, 1e-300), sideways))
+
+    def faces(self, fine: float) -> Faces:
+        length = float(np.linalg.norm(self.half))
+        above = arc(np.array([0.0, length]), self.radius, 0.0, np.pi, fine)
+        profile = polygon_faces(np.concatenate([above, -above]))
+        along = self.half / length if length > 0.0 else np.eye(len(self.half))[-1]
+        frame = np.stack([*across(along), along], axis=1)  # its last column is along the segment
+        if len(self.half) == 2:
+            return profile.moved(frame * np.array([np.linalg.det(frame), 1.0]), np.zeros(2))
+        frame[:, 0] *= np.linalg.det(frame)
+        return revolved_faces(profile, 2, fine).moved(frame, np.zeros(3))
 
     def _within(self, points: Points) -> Points:
         """(n, d) the nearest points of the segment."""
@@ -155,6 +180,9 @@ class Revolved(Solid):
         away = np.where(flat[:, :1] > 0.0, across / np.maximum(flat[:, :1], 1e-300), np.array([1.0, 0.0]))
         return np.insert(found[:, :1] * away, self.axis, found[:, 1], axis=1)
 
+    def faces(self, fine: float) -> Faces:
+        return revolved_faces(self.profile.faces(fine), self.axis, fine)
+
     def _flat(self, points: Points) -> Points:
         """(n, 2) distance from the axis, and height [m]."""
         across = np.linalg.norm(np.delete(points, self.axis, axis=1), axis=1)
@@ -183,6 +211,14 @@ class HalfSpace(Solid):
     def nearest(self, points: Points) -> Points:
         return np.asarray(points - self.distance(points)[:, None] * self.normal)
 
+    def faces(self, fine: float) -> Faces:
+        size = float(np.linalg.norm(self.upper - self.lower))
+        middle = 0.5 * (self.lower + self.upper)
+        top = middle - (middle @ self.normal - self.height) * self.normal
+        frame = np.stack([*across(self.normal), self.normal], axis=1)
+        frame[:, 0] *= np.linalg.det(frame)
+        return box_faces(np.full(len(middle), size)).moved(frame, top - size * self.normal)
+
 
 @dataclass(frozen=True)
 class Hollow(Solid):
@@ -198,6 +234,9 @@ class Hollow(Solid):
 
     def nearest(self, points: Points) -> Points:
         return self.cavity.nearest(points)
+
+    def faces(self, fine: float) -> Faces:
+        return self.cavity.faces(fine).reversed()
 
 
 @dataclass(frozen=True)
@@ -224,6 +263,9 @@ class Polygon(Solid):
             nearer = square < best
             best, found[nearer] = np.minimum(best, square), place[nearer]
         return found
+
+    def faces(self, fine: float) -> Faces:
+        return polygon_faces(self.corners)
 
     def _holds(self, points: Points) -> Which:
         """(n,) by the number of sides that a ray along the first axis crosses."""

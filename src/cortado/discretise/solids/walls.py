@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.solid import Solid
-from cortado.discretise.solids.surface_points import FINE, SurfacePoints, evenly_chosen, lattice_about, surface_feet, surface_points
+from cortado.discretise.solids.surface_points import (
+    FINE,
+    SurfacePoints,
+    evenly_chosen,
+    lattice_about,
+    surface_feet,
+    surface_points,
+)
 from cortado.discretise.walls.layers import WallLayers
 from cortado.discretise.walls.places import Places
 
