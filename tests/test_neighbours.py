@@ -16,7 +16,7 @@ from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.particles import candidates
 from cortado.particles.cells import Grid
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type
-from cortado.particles.neighbours import NeighbourSearch
+from cortado.particles.neighbours import NeighbourSearch, WallArrays
 from cortado.particles.state import Layout
 
 SUPPORT = 0.1
@@ -85,7 +85,11 @@ def lists(
     discretisation = kind(CUBIC_SPLINE, precision, lanes, periodic=any(period))
     names = np.arange(len(walls), dtype=np.float64)  # as weights, so that sorted walls tell who they were
     search = NeighbourSearch(
-        discretisation, grid, padded(walls), names, 0.0 * padded(walls), Layout(n, 1, precision, device), capacity
+        discretisation,
+        grid,
+        WallArrays(padded(walls), names, names, 0.0 * padded(walls)),
+        Layout(n, 1, precision, device),
+        capacity,
     )
     memory = wp.full((n, capacity + 8) if device.is_cpu else (capacity + 8, n), GUARD, dtype=wp.int32, device=device)
     search.neighbours = memory[:, :capacity].transpose((1, 0)) if device.is_cpu else memory[:capacity]
@@ -359,9 +363,8 @@ def test_lists_that_are_too_short_say_how_long_they_must_be(capacity, precision)
 def test_room_can_be_made():
     discretisation = Discretisation(CUBIC_SPLINE, FLOAT64)
     grid = Grid.around(np.zeros(3), np.ones(3), np.zeros(3), REACH, 1000)
-    search = NeighbourSearch(
-        discretisation, grid, np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), Layout(10, 1, FLOAT64, CPU), 4
-    )
+    nothing = WallArrays(np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 3)))
+    search = NeighbourSearch(discretisation, grid, nothing, Layout(10, 1, FLOAT64, CPU), 4)
     search.allocate(9)
     assert search.capacity == 12  # the next multiple of UNROLL
     assert search.neighbours.shape == (12, 10)

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from cortado.errors import InputError, SceneError
 from cortado.scene.discrete_scene import discretise
-from cortado.scene.sampling import fluid_particles, period, wall_particles
+from cortado.scene.sampling import fluid_particles, period
 from cortado.scene.scene import Scene
 
 SPACING = 0.05
@@ -32,7 +32,7 @@ def nearest(points: np.ndarray) -> float:
 
 
 def one_layer(scene: Scene, depth: float) -> np.ndarray:
-    return wall_particles(scene, [depth])[0]
+    return scene.container.walls(scene.dimension, scene.discretisation.spacing, depth)
 
 
 # ---- fluid -------------------------------------------------------------------------------------------------------

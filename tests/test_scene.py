@@ -132,9 +132,6 @@ def test_a_bad_override_is_a_sentence(scene_file, override):
 @pytest.mark.parametrize(
     "data, sentence",
     [
-        ({"container": {"shape": "mesh", "file": "cup.stl"}}, "container.shape is 'mesh'"),
-        ({"fluid": [{"shape": "mesh"}]}, "fluid[0].shape is 'mesh'"),
-        ({"obstacle": [{"shape": "box"}]}, "obstacle is not a key of the scene"),
         ({"rigid_body": {}}, "rigid_body is not a key of the scene"),
     ],
 )

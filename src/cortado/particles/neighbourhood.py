@@ -74,6 +74,8 @@ def neighbourhood_type(precision: Precision) -> Any:
         """[m]"""
         wall_weights: wp.array(dtype=real)
         """w_b [-]: what a wall particle counts for in the density, a fluid particle being 1."""
+        wall_grips: wp.array(dtype=real)
+        """w_b of walls without slip, 0 of those that slip freely [-]."""
         wall_feet: wp.array(dtype=vector)
         """From a wall particle to the nearest point of the container's surface [m]."""
         support: real
@@ -119,6 +121,7 @@ class PairFunctions:
     neighbour: Any
     wall_position: Any
     wall_weight: Any
+    wall_grip: Any
     wall_foot: Any
     vectors: Any
     numbers: Any
@@ -132,9 +135,9 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
     (grad a . u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x);
     ``per_size`` (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction
     per_size x . G, of second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the
-    list of i), ``wall_position``, ``wall_weight`` and ``wall_foot``; and ``vectors`` and ``numbers``, which load what
-    `UNROLL` neighbours have before any of it is used, so that the loads do not wait for one another (on a GPU a tenth
-    of a whole step).
+    list of i), ``wall_position``, ``wall_weight``, ``wall_grip`` and ``wall_foot``; and ``vectors`` and ``numbers``,
+    which load what `UNROLL` neighbours have before any of it is used, so that the loads do not wait for one another
+    (on a GPU a tenth of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
@@ -213,6 +216,10 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         return load_number(s.wall_weights, b)
 
     @wp.func
+    def wall_grip(b: int, s: neighbourhood) -> real:
+        return load_number(s.wall_grips, b)
+
+    @wp.func
     def wall_foot(b: int, s: neighbourhood) -> vector:
         return load_vector(s.wall_feet, b)
 
@@ -248,6 +255,7 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         neighbour=neighbour,
         wall_position=wall_position,
         wall_weight=wall_weight,
+        wall_grip=wall_grip,
         wall_foot=wall_foot,
         vectors=vectors,
         numbers=numbers,

@@ -8,6 +8,7 @@ The list holds j for i exactly when it holds i for j, because |x_i - x_j| is com
 sides.
 """
 
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -80,6 +81,20 @@ def fill_kernel(discretisation: Discretisation) -> Any:
     return fill
 
 
+@dataclass(frozen=True)
+class WallArrays:
+    """Wall particles, in any order."""
+
+    positions: np.ndarray
+    """(b, 3) [m]"""
+    weights: np.ndarray
+    """(b,) what each counts for in the density, a fluid particle being 1 [-]"""
+    grips: np.ndarray
+    """(b,) the same of those without slip, and 0 of those along which fluid slips freely"""
+    feet: np.ndarray
+    """(b, 3) from each to the surface [m]"""
+
+
 def _near_walls(grid: Grid, starts: np.ndarray) -> np.ndarray:
     """(cells,) whether there are walls in a cell or around it; ``starts`` (cells + 1,): where each has its first wall
     particle."""
@@ -100,14 +115,11 @@ class NeighbourSearch:
         self,
         discretisation: Discretisation,
         grid: Grid,
-        walls: np.ndarray,
-        wall_weights: np.ndarray,
-        wall_feet: np.ndarray,
+        walls: WallArrays,
         layout: Layout,
         capacity: int,
     ):
-        """``walls`` (b, 3) [m], ``wall_weights`` (b,) [-] and ``wall_feet`` (b, 3) [m], from wall particles to the
-        surface, the same ones for all scenes of a batch."""
+        """``walls`` are the same ones for all scenes of a batch."""
         precision, device, particles = discretisation.precision, layout.device, layout.all_particles
         self.particles, self.device = particles, device
         self._fill = fill_kernel(discretisation)
@@ -119,11 +131,12 @@ class NeighbourSearch:
         self._launch = KernelLauncher(particles, device, record_tape=False)
         self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
         self._seen = HostCopy(self._needed)
-        self.wall_positions = wp.array(walls, dtype=precision.vector, device=device)
-        self.wall_weights = wp.array(wall_weights, dtype=precision.real, device=device)
-        self.wall_feet = wp.array(wall_feet, dtype=precision.vector, device=device)
-        self._wall_sort = CellSort(grid, len(walls), precision, device)
-        self._unsorted_walls: tuple[np.ndarray, ...] | None = (walls, wall_weights, wall_feet)
+        self.wall_positions = wp.array(walls.positions, dtype=precision.vector, device=device)
+        self.wall_weights = wp.array(walls.weights, dtype=precision.real, device=device)
+        self.wall_grips = wp.array(walls.grips, dtype=precision.real, device=device)
+        self.wall_feet = wp.array(walls.feet, dtype=precision.vector, device=device)
+        self._wall_sort = CellSort(grid, len(walls.positions), precision, device)
+        self._unsorted_walls: WallArrays | None = walls
         self._grid, self._near_walls = grid, wp.zeros(grid.cells, dtype=wp.bool, device=device)
         self.allocate(capacity)
 
@@ -140,16 +153,17 @@ class NeighbourSearch:
         """Find the order of cells (``order``: sorted -> given) of positions (members n,) [m]; ties keep the given
         order."""
         if self._unsorted_walls is not None:  # once, and not before kernels are compiled side by side
-            self._sort_walls(*self._unsorted_walls)
+            self._sort_walls(self._unsorted_walls)
             self._unsorted_walls = None
         self._sort(positions)
 
-    def _sort_walls(self, walls: np.ndarray, wall_weights: np.ndarray, wall_feet: np.ndarray) -> None:
+    def _sort_walls(self, walls: WallArrays) -> None:
         self._wall_sort(self.wall_positions)
         sorted_to_given = self._wall_sort.order.numpy()
-        self.wall_positions.assign(walls[sorted_to_given])
-        self.wall_weights.assign(wall_weights[sorted_to_given])
-        self.wall_feet.assign(wall_feet[sorted_to_given])
+        self.wall_positions.assign(walls.positions[sorted_to_given])
+        self.wall_weights.assign(walls.weights[sorted_to_given])
+        self.wall_grips.assign(walls.grips[sorted_to_given])
+        self.wall_feet.assign(walls.feet[sorted_to_given])
         self._near_walls.assign(_near_walls(self._grid, self._wall_sort.grid.starts.numpy()))
 
     def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:

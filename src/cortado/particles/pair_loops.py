@@ -30,7 +30,7 @@ OVER_FLUID = """\
 OVER_WALLS = """\
     for _place in range(s.fluid_count[i] + _lane(), s.count[i], _LANES):
         _b = _neighbour(_place, i, s)
-        _w_b = _wall_weight(_b, s)
+        _w_b = {weight}(_b, s)
         _x_ij = _separation(_x_i, _wall_position(_b, s), s)
         {foot}
         {body}
@@ -61,12 +61,16 @@ def over_fluid(
     )
 
 
-def over_walls(d: Discretisation, arrays: Types, body: Body, footed: bool) -> str:
+def over_walls(d: Discretisation, arrays: Types, body: Body, footed: bool, rubs: bool) -> str:
     """A loop over the walls, whose particles have nothing but a place, a weight _w_b and a way to the surface, which
-    ``footed`` loops know as _foot."""
+    ``footed`` loops know as _foot. Where it ``rubs``, walls that slip freely have no weight."""
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
     foot = "_foot = _wall_foot(_b, s)" if footed else ""
-    return OVER_WALLS.format(foot=foot, body=_lines(8, body({**of_b, "x": "_wall_position(_b, s)"})))
+    return OVER_WALLS.format(
+        weight="_wall_grip" if rubs else "_wall_weight",
+        foot=foot,
+        body=_lines(8, body({**of_b, "x": "_wall_position(_b, s)"})),
+    )
 
 
 def summed(
@@ -114,7 +118,7 @@ def _is_vector_of(real: Any, kind: Any) -> bool:
 
 def _known(d: Discretisation) -> dict[str, Any]:
     pair = pair_functions(d)
-    used = ("separation", "neighbour", "vectors", "numbers", "wall_position", "wall_weight", "wall_foot")
+    used = ("separation", "neighbour", "vectors", "numbers", "wall_position", "wall_weight", "wall_grip", "wall_foot")
     return {
         **{f"_{name}": getattr(pair, name) for name in used},
         **{"_real": d.precision.real, "_vector": d.precision.vector, "_neighbourhood": neighbourhood_type(d.precision)},

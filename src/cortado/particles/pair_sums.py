@@ -26,14 +26,15 @@ Function = Callable[..., Any]
 Decorator = Callable[[Function], Any]
 
 
-def pair_sum(d: Discretisation, walls: Function | None = None, ahead: bool = True) -> Decorator:
+def pair_sum(d: Discretisation, walls: Function | None = None, ahead: bool = True, rubs: bool = False) -> Decorator:
     """A decorator that makes of a term the Warp function of its sum over fluid and walls. ``walls`` is the term of
-    walls if they act in another way; its parameters are among those of the fluid's."""
+    walls if they act in another way; its parameters are among those of the fluid's. A sum that ``rubs`` has nothing of
+    walls that slip freely."""
 
     def make(function: Function) -> Any:
         term, wall = Term.of(function), Term.of(walls or function)
         _check_walls(wall, term)
-        return _made(term, d, _over_fluid(term, d, ahead) + _over_walls(wall, d), wall)
+        return _made(term, d, _over_fluid(term, d, ahead) + _over_walls(wall, d, rubs), wall)
 
     return make
 
@@ -49,11 +50,11 @@ def fluid_sum(d: Discretisation, ahead: bool = True, module: Any = None) -> Deco
 
 
 def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
-    """What gives the decorator of a sum over what the fluid rubs against, for the term of walls: `pair_sum` where walls
-    have no slip, and `fluid_sum` where they slip freely."""
+    """What gives the decorator of a sum over what the fluid rubs against, for the term of walls: `pair_sum` where some
+    walls have no slip, and `fluid_sum` where all slip freely."""
 
     def summed(walls: Function, ahead: bool = True) -> Decorator:
-        return pair_sum(d, walls, ahead) if sticks else fluid_sum(d, ahead)
+        return pair_sum(d, walls, ahead, rubs=True) if sticks else fluid_sum(d, ahead)
 
     return summed
 
@@ -63,7 +64,7 @@ def wall_sum(d: Discretisation) -> Decorator:
 
     def make(function: Function) -> Any:
         term = Term.of(function)
-        return _made(term, d, _over_walls(term, d), term)
+        return _made(term, d, _over_walls(term, d, rubs=False), term)
 
     return make
 
@@ -85,14 +86,14 @@ def _over_fluid(term: Term, d: Discretisation, ahead: bool) -> str:
     return over_fluid(d, term.of_neighbours, body, ahead, *knows)
 
 
-def _over_walls(wall: Term, d: Discretisation) -> str:
+def _over_walls(wall: Term, d: Discretisation, rubs: bool) -> str:
     def body(of_b: Mapping[str, str]) -> list[str]:
         called = f"{_terms(wall)} = _wall_term({wall.seen_from_i(of_b, '-1')})"
         return [called, *(f"_total_{n} += _w_b * _term_{n}" for n in _numbers(wall))]
 
     if "x_ij" not in wall.parameters:
         raise TypeError(f"term {wall.name} has no x_ij, but must have it where it is summed over walls.")
-    return over_walls(d, wall.of_neighbours, body, "foot" in wall.parameters)
+    return over_walls(d, wall.of_neighbours, body, "foot" in wall.parameters, rubs)
 
 
 def _terms(term: Term) -> str:

@@ -11,6 +11,7 @@ from cortado.errors import InputError
 from cortado.scene.parameters.known import Known
 from cortado.scene.parameters.parameter import Range
 from cortado.scene.parameters.values import Arrays
+from cortado.scene.room import room_of
 from cortado.scene.scene import Scene
 from cortado.scene.stability import broken_limits
 
@@ -38,7 +39,9 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
         positions = values["initial_positions"]
         for particle in outside(scene, positions[:free])[:1]:
             place = place_in_words(positions[particle])
-            raise InputError(f"parameter initial_positions has particle {particle} at {place}, outside the container.")
+            raise InputError(
+                f"parameter initial_positions has particle {particle} at {place}, outside the container or in a solid."
+            )
         _check_room(positions[:free], spacing)
     if scene.solver.chooses and np.ndim(values.get("nozzle_path", 0.0)) == 2:
         raise InputError(
@@ -82,9 +85,9 @@ def _check_room(positions: np.ndarray, spacing: float) -> None:
 
 
 def outside(scene: Scene, points: Any) -> np.ndarray:
-    """The numbers of the points (n, d) [m] that are outside of the container; along a period nothing is."""
-    walled = scene.container.region(scene.dimension).opened(scene.container.periods(scene.dimension)[1])
-    return np.flatnonzero(~walled.contains(points, TOLERANCE * scene.discretisation.spacing))
+    """The numbers of the points (n, d) [m] that are outside of the container, along whose periods nothing is, or in a
+    solid."""
+    return np.flatnonzero(~room_of(scene).contains(points, TOLERANCE * scene.discretisation.spacing))
 
 
 def place_in_words(point: np.ndarray) -> str:

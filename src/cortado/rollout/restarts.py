@@ -73,7 +73,9 @@ def check_state(
     held = scene.forces.pressure and np.isinf(scene.container.region(scene.dimension).rim)
     for particle in outside(scene, positions[: simulation.free_particles])[:1] if held else ():
         place = place_in_words(positions[particle])
-        raise InputError(f"state positions has particle {particle} at {place}, outside the container of this scene.")
+        raise InputError(
+            f"state positions has particle {particle} at {place}, outside the container of this scene or in a solid."
+        )
     if scene.forces.pressure:
         check_apart("state positions", positions, origin.spacing, scene.container.periods(scene.dimension))
 

@@ -4,6 +4,7 @@ import numpy as np
 from pydantic_core import PydanticCustomError
 
 from cortado.device.memory import sampling_parts, shortage
+from cortado.discretise.region import TOLERANCE
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError, Words, shown
 from cortado.scene.containers import check_length
@@ -14,7 +15,9 @@ from cortado.scene.mixture import MixtureTable
 from cortado.scene.model import SceneTables
 from cortado.scene.overlaps import check_distinct, check_overlaps
 from cortado.scene.parameters.registry import BY_NAME
+from cortado.scene.room import room_of
 from cortado.scene.sentences import point_in_words
+from cortado.scene.solids import check_solid
 from cortado.scene.stability import chosen_limits
 
 MOST_PARTICLES = 2e8
@@ -39,8 +42,12 @@ def check_scene(scene: SceneTables) -> None:
         _check_distance(path, body, spacing)
     check_length(scene.container, spacing, scene.discretisation.support_radius)
     _check_place(scene)
+    for index, solid in enumerate(scene.solid):
+        check_solid(("solid", index), solid, spacing)
     for index, fluid in enumerate(scene.fluid):
         _check_inside(scene, index, fluid)
+        if isinstance(fluid, PointsFluid):
+            _check_free(scene, ("fluid", index), fluid.points())
         check_distinct(("fluid", index), fluid, spacing)
     if scene.emitter is not None:
         _check_outlet(scene, scene.emitter)
@@ -93,7 +100,8 @@ def _check_files(scene: SceneTables) -> None:
 def _check_counts(scene: SceneTables) -> None:
     """Before anything is allocated."""
     spacing = scene.discretisation.spacing
-    fluid, walls = sum(body.count(spacing) for _, body in _bodies(scene)), scene.container.wall_count(spacing)
+    fluid = sum(body.count(spacing) for _, body in _bodies(scene))
+    walls = scene.container.wall_count(spacing) + sum(solid.wall_count(spacing) for solid in scene.solid)
     for count, what in ((fluid, "particles of fluid"), (walls, "wall particles")):
         if count > MOST_PARTICLES:
             wanted = f"so large that there are at most {MOST_PARTICLES:.0e} {what}, not about {count:.1e}"
@@ -108,6 +116,10 @@ def _check_place(scene: SceneTables) -> None:
     spacing, ends = scene.discretisation.spacing, scene.container.extent()
     if ends is not None and np.abs(ends).max() > FURTHEST * spacing:
         raise field_error(("container",), Words(f"{np.abs(ends).max():g} m from the origin"), _nearer(spacing))
+    for index, solid in enumerate(scene.solid):
+        furthest = np.abs(solid.body().extent()).max()
+        if furthest > FURTHEST * spacing:
+            raise field_error(("solid", index), Words(f"{furthest:g} m from the origin"), _nearer(spacing))
 
 
 def _check_size(index: int, fluid: Fluid, spacing: float) -> None:
@@ -147,6 +159,15 @@ def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
         raise _outside(index, witnesses[outside][0])
 
 
+def _check_free(scene: SceneTables, path: FieldPath, points: Points) -> None:
+    """Points (n, d) [m] are outside of all solids."""
+    tolerance, room = TOLERANCE * scene.discretisation.spacing, room_of(scene)
+    within = room.from_solids(points) < -tolerance
+    if within.any():
+        found = Words(f"partly in a solid, for example at {point_in_words(points[within][0])}")
+        raise field_error(path, found, "outside of solids")
+
+
 def _outside(index: int, place: Points) -> PydanticCustomError:
     found = Words(f"partly outside, for example at {point_in_words(place)}")
     return field_error(("fluid", index), found, "inside the container")
@@ -162,6 +183,7 @@ def _check_outlet(scene: SceneTables, emitter: EmitterTable) -> None:
     if not scene.container.contains(outlet[None], tolerance).all():
         raise field_error(("emitter", "outlet"), emitter.outlet, "inside the container")
     outside = ~scene.container.contains(opening, tolerance)
+    _check_free(scene, ("emitter",), opening)
     if outside.any():
         wanted = f"so small that the opening is inside the container, also at {point_in_words(opening[outside][0])}"
         raise field_error(("emitter", "radius"), emitter.radius, wanted)

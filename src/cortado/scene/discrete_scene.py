@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortado.discretise.calibration import (
     lattice_laplacian_correction,
@@ -78,6 +79,8 @@ class Walls:
     """(b,) w_b [-]: what each counts for in the density, a fluid particle being 1."""
     feet: Points
     """(b, d) from each to the nearest point of its surface [m]."""
+    sticks: NDArray[np.bool_]
+    """(b,) whether fluid has no slip along each."""
 
 
 @dataclass(frozen=True)
@@ -142,13 +145,17 @@ def _walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     beside = scene.container.places(scene.dimension, spacing, reach)
     if not room.solids:
         points, places, fit = _container_walls(scene, layers), beside, even_changes
+        sticks = np.full(len(points), scene.container.sticks)
     else:
-        solids = [*scene.container.solids(scene.dimension), *room.solids]
-        points, fit = ExposedSurface.of(room, solids, spacing).walls(layers), uneven_changes
+        sides = scene.container.solids(scene.dimension)
+        surface = ExposedSurface.of(room, [*sides, *room.solids], spacing)
+        points, fit = surface.walls(layers), uneven_changes
+        stick = [scene.container.sticks] * len(sides) + [table.sticks for table in scene.solid]
+        sticks = np.array(stick)[surface.owners(points)]
         about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
         places = about.some(room.contains(about.points, -NEAREST_PLACE * spacing))
-    surface = WallSurface(points.positions, points.flat, lattice, room, lower, lengths, fit)
-    return Walls(points.positions, surface.weights(places), points.feet)
+    found = WallSurface(points.positions, points.flat, lattice, room, lower, lengths, fit)
+    return Walls(points.positions, found.weights(places), points.feet, sticks)
 
 
 def _container_walls(scene: Scene, layers: WallLayers) -> WallPoints:

@@ -135,6 +135,11 @@ class SceneTables(Table):
     picture: Picture | None = None
     """How shaded pictures and films are made."""
 
+    @property
+    def sticks(self) -> bool:
+        """Whether fluid has no slip along some walls."""
+        return self.container.sticks or any(solid.sticks for solid in self.solid)
+
     @model_validator(mode="before")
     @classmethod
     def _choose_smoothing(cls, data: Any) -> Any:

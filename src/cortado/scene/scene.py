@@ -57,8 +57,9 @@ class Scene(SceneTables):
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
-        """What results depend on: not [picture] and [[sensor]], nor an empty [[force]] or [[solid]], a jitter of 0, the form of a
-        surface tension that is not there, how a time step is chosen that is fixed, and a shifting that is off."""
+        """What results depend on: not [picture] and [[sensor]], nor an empty [[force]] or [[solid]], a jitter of 0, the
+        form of a surface tension that is not there, how a time step is chosen that is fixed, and a shifting that is
+        off."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
         aside |= {name: True for name in ("force", "solid") if not getattr(self, name)}
         aside |= {} if self.discretisation.jitter else {"discretisation": {"jitter"}}

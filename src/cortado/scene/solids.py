@@ -9,7 +9,8 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.solid import Box, Hollow, Placed, Polygon, Revolved, Round, Solid
-from cortado.scene.fields import Colour, FieldPath, Length, Text, Vector, field_error, quantity, without_numpy
+from cortado.errors import Words
+from cortado.scene.fields import Colour, FieldPath, Length, Text, Vector, field_error, quantity
 from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
 from cortado.scene.tables import Table
 
@@ -18,11 +19,10 @@ Size = Annotated[float, quantity("m", gt=0.0)]
 
 
 def _in_a_list(value: Any) -> Any:
-    value = without_numpy(value)
-    return value if isinstance(value, (list, tuple)) else [value]
+    return [value] if isinstance(value, (int, float)) else value
 
 
-Rotation = Annotated[tuple[Angle, ...], BeforeValidator(_in_a_list), Field(min_length=1, max_length=3)]
+Rotation = Annotated[tuple[Angle, ...], Field(min_length=1, max_length=3, fail_fast=True), BeforeValidator(_in_a_list)]
 Axis = Literal["x", "y", "z"]
 
 
@@ -33,8 +33,9 @@ class SolidTable(Table):
     """What others call it."""
     position: tuple[Length, ...] | None = None
     """(d,) Where the middle of its shape, its centroid, is [m]; left out, it is where its measures put it."""
-    rotation: Rotation = ()
-    """How it is turned about its middle [rad]: in 3-D a rotation vector, in 2-D one number, counterclockwise."""
+    rotation: Rotation | None = None
+    """How it is turned about its middle [rad], not at all if left out: in 3-D a rotation vector, in 2-D one number,
+    counterclockwise."""
     side: Literal["outside", "inside"] = "outside"
     """Where fluid may be: outside of the shape, or inside of it, as in a tank."""
     slip: Literal["free", "no"] = "free"
@@ -50,6 +51,16 @@ class SolidTable(Table):
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
         """The shape about its middle, not turned, and where its measures put the middle, (d,) [m]."""
+
+    @abstractmethod
+    def thinnest(self) -> float:
+        """Of its thinnest part [m]; infinite where that is not known."""
+
+    def wall_count(self, spacing: float) -> float:
+        """About how many wall particles one layer has, without making any."""
+        lower, upper = self.shape_about()[0].extent()
+        cells = np.maximum((upper - lower) / spacing, 1.0)
+        return float(2.0 * np.sum(np.prod(cells) / cells))
 
     def solid(self) -> Solid:
         """Where fluid may not be."""
@@ -68,7 +79,7 @@ class SolidTable(Table):
         if self.position is not None and len(self.position) != dimension:
             wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
             raise field_error((*path, "position"), self.position, wanted)
-        if self.rotation and len(self.rotation) != 2 * dimension - 3:
+        if self.rotation is not None and len(self.rotation) != 2 * dimension - 3:
             wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
             raise field_error((*path, "rotation"), self.rotation, wanted)
         return super().in_dimension(dimension, path)
@@ -92,6 +103,9 @@ class BoxSolid(SolidTable):
         lower, upper = np.array(self.lower), np.array(self.upper)
         return Box(0.5 * (upper - lower)), 0.5 * (lower + upper)
 
+    def thinnest(self) -> float:
+        return float(np.subtract(self.upper, self.lower).min())
+
 
 class SphereSolid(SolidTable):
     """A sphere, or a disc in 2-D."""
@@ -105,6 +119,9 @@ class SphereSolid(SolidTable):
     def shape_about(self) -> tuple[Solid, Points]:
         centre = np.array(self.centre)
         return Round(np.zeros_like(centre), self.radius), centre
+
+    def thinnest(self) -> float:
+        return 2.0 * self.radius
 
 
 class CapsuleSolid(SolidTable):
@@ -121,6 +138,9 @@ class CapsuleSolid(SolidTable):
     def shape_about(self) -> tuple[Solid, Points]:
         start, end = np.array(self.start), np.array(self.end)
         return Round(0.5 * (end - start), self.radius), 0.5 * (start + end)
+
+    def thinnest(self) -> float:
+        return 2.0 * self.radius
 
 
 class CylinderSolid(SolidTable):
@@ -144,6 +164,9 @@ class CylinderSolid(SolidTable):
         axis = INDEX_OF_AXIS[self.axis]
         profile = Box(np.array([self.radius, 0.5 * self.height]))
         return Revolved(profile, axis), np.array(self.base) + 0.5 * self.height * np.eye(3)[axis]
+
+    def thinnest(self) -> float:
+        return min(2.0 * self.radius, self.height)
 
 
 class CupSolid(SolidTable):
@@ -180,6 +203,9 @@ class CupSolid(SolidTable):
         up = np.eye(dimension)[INDEX_OF_AXIS[self.axis]]
         shape = profile if dimension == 2 else Revolved(profile, INDEX_OF_AXIS[self.axis])
         return shape, np.array(self.base) + middle * up
+
+    def thinnest(self) -> float:
+        return self.thickness
 
     def _middle(self) -> float:
         """How high its centroid is above the base [m]."""
@@ -219,6 +245,9 @@ class PolygonSolid(SolidTable):
         middle = ((corners + following) * parts[:, None]).sum(axis=0) / (3.0 * parts.sum())
         return Polygon(corners - middle), middle
 
+    def thinnest(self) -> float:
+        return np.inf
+
 
 AnySolid = Annotated[
     BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid, Field(discriminator="shape")
@@ -232,6 +261,13 @@ def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
     if len(rotation) == 1:
         return np.asarray(Turn.from_rotvec([0.0, 0.0, rotation[0]]).as_matrix()[:2, :2])
     return np.asarray(Turn.from_rotvec(rotation).as_matrix())
+
+
+def check_solid(path: FieldPath, solid: SolidTable, spacing: float) -> None:
+    """A solid is at least one spacing thick, so that there is room for the particles of its walls."""
+    if solid.side == "outside" and solid.thinnest() < spacing * (1.0 - 1e-6):
+        found = Words(f"only {solid.thinnest():g} m thick")
+        raise field_error(path, found, f"at least one spacing, {spacing:g} m, thick")
 
 
 def _crossing(corners: Points) -> tuple[int, int] | None:

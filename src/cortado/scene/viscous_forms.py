@@ -11,7 +11,7 @@ FAULTS = {
 
 def wall_sentence(scene: SceneTables) -> str | None:
     """What to say of a scene whose walls hold the fluid back; None if there is nothing."""
-    return _sentence(scene, 'container.slip is "no"') if scene.container.sticks else None
+    return _sentence(scene, 'slip is "no" at walls') if scene.sticks else None
 
 
 def parameter_sentence(scene: SceneTables) -> str | None:

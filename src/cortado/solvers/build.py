@@ -12,7 +12,7 @@ from cortado.errors import InputError
 from cortado.particles.arrays import padded
 from cortado.particles.cells import Grid
 from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.neighbours import NeighbourSearch
+from cortado.particles.neighbours import NeighbourSearch, WallArrays
 from cortado.particles.state import Layout
 from cortado.scene.containers import NoContainer
 from cortado.scene.discrete_scene import DiscreteScene
@@ -79,8 +79,8 @@ def _search(scene: Scene, discrete: DiscreteScene, discretisation: Discretisatio
     )
     room = first_capacity(support / scene.discretisation.spacing, scene.dimension)
     walls = discrete.walls
-    around = (padded(walls.positions), walls.weights, padded(walls.feet))
-    return NeighbourSearch(discretisation, grid, *around, layout, room)
+    arrays = WallArrays(padded(walls.positions), walls.weights, walls.weights * walls.sticks, padded(walls.feet))
+    return NeighbourSearch(discretisation, grid, arrays, layout, room)
 
 
 def _forces(
@@ -153,10 +153,10 @@ def _nozzle(scene: Scene, discrete: DiscreteScene) -> Nozzle | None:
 def _walled(scene: Scene, discrete: DiscreteScene) -> Walled:
     """Where particles may go. Walls act through the pressure: without it they hold nothing."""
     holds = scene.container if scene.forces.pressure else NoContainer()
-    region, tables = holds.region(scene.dimension).opened(discrete.periods), scene.solid
-    solids = solids_of(tables) if scene.forces.pressure else ()
+    region = holds.region(scene.dimension).opened(discrete.periods)
     obstacles = [
-        Obstacle(table.name, solid, table.side == "inside", np.inf)
-        for table, solid in zip(tables, solids, strict=False)
+        Obstacle(table.name, solid, table.side == "inside", table.thinnest())
+        for table, solid in zip(scene.solid, solids_of(scene.solid), strict=True)
+        if scene.forces.pressure
     ]
     return Walled(region, discrete.near, scene.discretisation.spacing, tuple(obstacles), discrete.periods)

@@ -1,4 +1,4 @@
-"""Which particles are lost: outside of their container, in a solid, too far away for their precision, or not finite."""
+"""Which particles are lost: outside of their container or in a solid, too far away, or not finite."""
 
 from functools import cache
 from typing import Any
@@ -122,10 +122,10 @@ def lost_kernel(precision: Precision) -> Any:
         nothing is looked for.
 
         Lost is what is not finite, too far away, of a mixture without a volume, or what went through a wall: it was
-        inside before the step and is outside after it, or it is in a solid then. Over the rim of an open cup fluid may go, and what a nozzle
-        leads, so that it is not where it would be without one, passes walls with it: such are only among the particles
-        from ``first_waiting`` on, in scene order. ``x`` is the new state in that order; the others are sorted, and
-        ``x_free`` and ``v_free`` are the new state without the nozzle.
+        inside before the step and is outside after it, or it is in a solid then. Over the rim of an open cup fluid may
+        go, and what a nozzle leads, so that it is not where it would be without one, passes walls with it: such are
+        only among the particles from ``first_waiting`` on, in scene order. ``x`` is the new state in that order; the
+        others are sorted, and ``x_free`` and ``v_free`` are the new state without the nozzle.
         """
         i = wp.tid()
         member = i // particles

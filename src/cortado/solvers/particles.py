@@ -288,7 +288,7 @@ def _neighbourhood(system: ParticleSystem) -> Any:
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count
     s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
-    s.wall_feet = search.wall_feet
+    s.wall_grips, s.wall_feet = search.wall_grips, search.wall_feet
     s.support, s.per_support, s.reach = lattice.support, 1.0 / lattice.support, (1.0 + SKIN) * lattice.support
     s.normalisation = lattice.normalisation
     s.self_weight, s.volume, s.response_scale = lattice.self_weight, lattice.volume, lattice.response**-0.5

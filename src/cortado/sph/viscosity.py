@@ -278,7 +278,7 @@ def force(setting: Setting) -> Viscosity | ViscousStress | None:
     """The form that a scene names: that of Monaghan (2005), which keeps linear and angular momentum, or that of Morris,
     Fox and Zhu (1997), which carries shear to a wall. None for a scene without."""
     scene, walls = setting.scene, setting.walls
-    sticks = scene.container.sticks
+    sticks = scene.sticks
     if scene.forces.viscosity == "stress":
         return stress_of(scene)(setting)
     if scene.forces.viscosity == "pairwise":

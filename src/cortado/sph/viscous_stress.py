@@ -28,7 +28,7 @@ class ViscousStress:
         """``law``: of the viscosity, with its parameters; by default that of a Newtonian fluid."""
         scene, discretisation, layout = setting.scene, setting.discretisation, setting.layout
         cut, self._law = scene.discretisation, law or newtonian_law()
-        self._made_for = (discretisation, scene.dimension, self._law, scene.container.sticks)
+        self._made_for = (discretisation, scene.dimension, self._law, scene.sticks)
         """What its kernels are made for."""
         self._stress, self._force = stress_kernels(*self._made_for)
         control = stress_control(discretisation.smoothing, cut.spacing, cut.support_radius, scene.dimension)

@@ -70,7 +70,8 @@ def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     first, second = [k for k in range(3) if k != axis]
     mirrored = -1.0 if axis == 1 else 1.0  # x, z and y make a left-handed frame
-    vertices, corners = [], []
+    vertices: list[Points] = []
+    corners: list[NDArray[np.int64]] = []
     for start, end in edges:
         base = len(vertices) * count
         for radius, height in (start, end):

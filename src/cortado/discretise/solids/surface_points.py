@@ -67,8 +67,8 @@ def evenly_chosen(candidates: Points, areas: Points, spacing: float) -> SurfaceP
 
 
 def thin_share(solid: Solid, spacing: float, thickness: float) -> tuple[float, Points]:
-    """The share of a solid's surface beneath which it is less thick than ``thickness`` [m], and a point (d,) [m] of that
-    share."""
+    """The share of a solid's surface beneath which it is less thick than ``thickness`` [m], and a point (d,) [m] of
+    that share."""
     points = surface_points(solid, spacing, 0.0)
     inwards = -_normals(solid, points.points, spacing)
     thin = solid.distance(points.points + thickness * inwards) > 0.0

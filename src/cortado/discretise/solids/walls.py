@@ -87,6 +87,10 @@ class ExposedSurface:
         flat = np.concatenate([weight * one.shares for one, weight in zip(found, layers.weights, strict=True)])
         return WallPoints(positions, flat, self._feet_of(positions) - positions)
 
+    def owners(self, walls: WallPoints) -> NDArray[np.int64]:
+        """(b,) whose wall particles are: index into `solids`."""
+        return np.asarray(self.owner[self._tree.query(walls.positions + walls.feet)[1]])
+
     def beneath(self, depth: float) -> SurfacePoints:
         """Points about a spacing [m] apart, ``depth`` [m] beneath the surface, or in the middle of what is thinner."""
         points = np.concatenate([self._at(depth), self._in_the_middle(depth)])
@@ -156,7 +160,7 @@ class ExposedSurface:
 
 
 def _is_exposed(feet: Points, away: Points, room: Room, spacing: float) -> NDArray[np.bool_]:
-    """(n,) whether fluid in a room can touch points of surfaces (n, d) [m], from which unit vectors (n, d) point away."""
+    """(n,) whether fluid in a room can touch points of surfaces (n, d) [m], from which unit vectors (n, d) point."""
     return room.contains(feet + 2.0 * MARGIN * spacing * away, -MARGIN * spacing)
 
 
