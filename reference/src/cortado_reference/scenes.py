@@ -32,6 +32,9 @@ def check_scene(scene: Scene) -> None:
         raise InputError("scene has phase[0].rheology, but must leave it out for the reference engine.")
     if scene.force:
         raise InputError("scene has [[force]], but must leave it out for the reference engine.")
+    slips = {table.slip for table in scene.solid} | ({scene.container.slip} if scene.container.extent() else set())
+    if len(slips) > 1:
+        raise InputError("scene has walls with and without slip, but must have one kind for the reference engine.")
     if scene.schedule.courses:
         raise InputError(
             "scene has a schedule, but must leave it out for the reference engine, which takes a gravity for each "
@@ -48,7 +51,7 @@ def check_scene(scene: Scene) -> None:
 def engine_scene(scene: Scene, discrete: DiscreteScene) -> Any:
     """What the extension module is told of a scene and of its particles."""
     lattice, solver, form = discrete.lattice, scene.solver, scene.forces.viscosity
-    no_slip = getattr(scene.container, "slip", "free") == "no"
+    no_slip = scene.sticks
     spacing = scene.discretisation.spacing
     values = {
         "dimension": scene.dimension,

@@ -8,7 +8,7 @@ import numpy as np
 
 from cortado.discretise.region import Region
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.solid import Solid
+from cortado.discretise.solids.solid import Placed, Solid
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,16 @@ class Room:
         within = self.region.cell_shares(points, spacing)
         return within * np.clip(self.from_solids(points) / spacing + 0.5, 0.0, 1.0)
 
+    def images(self, solid: Solid) -> list[Solid]:
+        """A solid, and those a period from it."""
+        turn = np.eye(self.dimension)
+        return [solid, *(Placed(solid, shift, turn) for shift in self._shifts()[1:])]
+
+    def _shifts(self) -> list[Points]:
+        """(d,) by how much images are off [m], the first of them not at all."""
+        ends = [(0.0, -length, length) if length else (0.0,) for length in self.periods]
+        return [np.array(shift) for shift in product(*ends)]
+
     def _images(self, points: Points) -> list[Points]:
         """Points (n, d) and those a period from them."""
-        shifts = product(*[(0.0, -length, length) if length else (0.0,) for length in self.periods])
-        return [points + np.array(shift) for shift in shifts]
+        return [points + shift for shift in self._shifts()]

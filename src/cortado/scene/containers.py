@@ -47,8 +47,8 @@ class Container(Table):
         """Where fluid may rest less than ``reach`` [m] from a wall."""
 
     @abstractmethod
-    def solids(self, dimension: int) -> tuple[Solid, ...]:
-        """What closes it, as solids, of which a period has none."""
+    def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
+        """What closes it, as solids, up to ``reach`` [m] beyond the ends of a period."""
 
     def wall_count(self, spacing: float) -> float:
         """About how many wall particles one layer has, without making any."""
@@ -74,7 +74,7 @@ class NoContainer(Container):
     def region(self, dimension: int) -> Region:
         return Region.everywhere(dimension)
 
-    def solids(self, dimension: int) -> tuple[Solid, ...]:
+    def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
         return ()
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
@@ -108,11 +108,12 @@ class BoxContainer(Container):
     def region(self, dimension: int) -> Region:
         return Region.between(*self.extent())
 
-    def solids(self, dimension: int) -> tuple[Solid, ...]:
-        (lower, upper), closed = self.extent(), ~np.array(self.periodic)
-        axes = np.eye(dimension)[closed]
-        lowest = [HalfSpace(axis, float(lower @ axis), lower, upper) for axis in axes]
-        return (*lowest, *(HalfSpace(-axis, -float(upper @ axis), lower, upper) for axis in axes))
+    def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
+        (lower, upper), periodic = self.extent(), np.array(self.periodic)
+        ends = lower - reach * periodic, upper + reach * periodic
+        axes = np.eye(dimension)[~periodic]
+        lowest = [HalfSpace(axis, float(lower @ axis), *ends) for axis in axes]
+        return (*lowest, *(HalfSpace(-axis, -float(upper @ axis), *ends) for axis in axes))
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         return box_walls(*self.extent(), self.periodic, spacing, depth)
@@ -160,10 +161,10 @@ class CylinderContainer(Container):
         is_along = np.arange(3) == axis
         return replace(closed, upper=np.where(is_along, np.inf, closed.upper), rim=float(closed.upper[axis]))
 
-    def solids(self, dimension: int) -> tuple[Solid, ...]:
-        axis, reach = INDEX_OF_AXIS[self.axis], 0.0 if self.lid else self.height
-        profile = Box(np.array([self.radius, 0.5 * (self.height + reach)]))
-        middle = np.array(self.base) + 0.5 * (self.height + reach) * np.eye(3)[axis]
+    def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
+        axis, height = INDEX_OF_AXIS[self.axis], self.height if self.lid else 2.0 * self.height
+        profile = Box(np.array([self.radius, 0.5 * height]))
+        middle = np.array(self.base) + 0.5 * height * np.eye(3)[axis]
         return (Hollow(Placed(Revolved(profile, axis), middle, np.eye(3))),)
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:

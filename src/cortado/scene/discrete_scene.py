@@ -22,10 +22,10 @@ from cortado.discretise.region import Region
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
 from cortado.discretise.solids.walls import ExposedSurface, WallPoints, solid_places
-from cortado.discretise.walls.layers import WallLayers, wall_layers
+from cortado.discretise.walls.layers import Planes, WallLayers, wall_layers
 from cortado.discretise.walls.places import Places
 from cortado.discretise.walls.weights import RestLattice, WallSurface, even_changes, uneven_changes
-from cortado.errors import CortadoWarning
+from cortado.errors import CortadoWarning, InputError
 from cortado.scene.bodies import Surroundings
 from cortado.scene.fluids import PointsFluid
 from cortado.scene.room import room_of
@@ -147,11 +147,17 @@ def _walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
         points, places, fit = _container_walls(scene, layers), beside, even_changes
         sticks = np.full(len(points), scene.container.sticks)
     else:
-        sides = scene.container.solids(scene.dimension)
-        surface = ExposedSurface.of(room, [*sides, *room.solids], spacing)
-        points, fit = surface.walls(layers), uneven_changes
-        stick = [scene.container.sticks] * len(sides) + [table.sticks for table in scene.solid]
-        sticks = np.array(stick)[surface.owners(points)]
+        sides = scene.container.solids(scene.dimension, reach)
+        images = [image for solid in room.solids for image in room.images(solid)]
+        surface = ExposedSurface.of(room, [*sides, *images], lower, reach, spacing)
+        planes = Planes(lattice.kernel, spacing, reach, scene.dimension)
+        points, fit = surface.walls(layers, planes), uneven_changes
+        several = len(images) // len(scene.solid)
+        tables = [*(scene.container for _ in sides), *(table for table in scene.solid for _ in range(several))]
+        for table in scene.solid:
+            if not any(tables[number] is table for number in np.unique(surface.owner)):
+                raise InputError(f"solid {table.name!r} has no surface that fluid in the container can touch.")
+        sticks = np.array([table.sticks for table in tables])[surface.owners(points)]
         about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
         places = about.some(room.contains(about.points, -NEAREST_PLACE * spacing))
     found = WallSurface(points.positions, points.flat, lattice, room, lower, lengths, fit)

@@ -19,14 +19,16 @@ from cortado.discretise.solids.surface_points import (
     surface_feet,
     surface_points,
 )
-from cortado.discretise.walls.layers import WallLayers
+from cortado.discretise.walls.layers import Planes, WallLayers
 from cortado.discretise.walls.places import Places
 
+DENSITY = 0.75
+"""In spacings: how far wall particles are apart."""
 MARGIN = 0.01
 """In spacings: a part of a surface that is no further within its room touches a wall or another solid."""
 TOLERANCE = 0.05
 """In spacings: by how much less deep points may be beneath one surface than beneath another."""
-HALVINGS, ROUNDS = 12, 30
+HALVINGS, ROUNDS, DIGITS = 12, 30, 4
 
 
 @dataclass(frozen=True)
@@ -61,17 +63,20 @@ class ExposedSurface:
     """(n,) whose they are: index into `solids`"""
     solids: Sequence[Solid]
     room: Room
+    lower: Points
+    """(d,) where the period begins [m]"""
     spacing: float
     """Of particles; each point stands for a part of the surface that is a `FINE`th of it long and wide [m]."""
 
     @classmethod
-    def of(cls, room: Room, solids: Sequence[Solid], spacing: float) -> "ExposedSurface":
-        """That of solids which close a room."""
+    def of(cls, room: Room, solids: Sequence[Solid], lower: Points, reach: float, spacing: float) -> "ExposedSurface":
+        """That of solids which close a room, up to ``reach`` [m] beyond the ends of a period that begins at ``lower``
+        (d,) [m]."""
         found = [surface_feet(solid, spacing / FINE) for solid in solids]
         feet, away = (np.concatenate(parts) for parts in zip(*found, strict=True))
         owner = np.repeat(np.arange(len(solids)), [len(part) for part, _ in found])
-        free = _is_exposed(feet, away, room, spacing)
-        return cls(feet[free], away[free], owner[free], solids, room, spacing)
+        free = _within_a_period(feet, lower, room.periods, reach) & _is_exposed(feet, away, room, spacing)
+        return cls(feet[free], away[free], owner[free], solids, room, lower, spacing)
 
     @cached_property
     def _tree(self) -> Any:
@@ -79,13 +84,21 @@ class ExposedSurface:
 
         return cKDTree(self.feet)
 
-    def walls(self, layers: WallLayers) -> WallPoints:
+    def walls(self, layers: WallLayers, planes: Planes) -> WallPoints:
         """Wall particles in layers at the depths of those of flat walls, each with the weight of as much of a flat wall
-        as its part of the layer is."""
-        found = [self.beneath(depth) for depth in layers.depths]
-        positions = np.concatenate([one.points for one in found])
-        flat = np.concatenate([weight * one.shares for one, weight in zip(found, layers.weights, strict=True)])
-        return WallPoints(positions, flat, self._feet_of(positions) - positions)
+        as its part of the layer is, and less where it is less deep: it counts the same for the first row of fluid."""
+        parts, first_row = [], 0.5 * self.spacing
+        for depth, weight in zip(layers.depths, layers.weights, strict=True):
+            found = self.beneath(depth)
+            feet = self._feet_of(found.points) - found.points
+            depths, which = np.unique(
+                np.round(np.linalg.norm(feet, axis=1) / self.spacing, DIGITS), return_inverse=True
+            )
+            seen = np.array([planes.weight(first_row + self.spacing * one) for one in depths])[which]
+            parts.append(
+                WallPoints(found.points, weight * found.shares * planes.weight(first_row + depth) / seen, feet)
+            )
+        return WallPoints.joined(parts)
 
     def owners(self, walls: WallPoints) -> NDArray[np.int64]:
         """(b,) whose wall particles are: index into `solids`."""
@@ -94,8 +107,10 @@ class ExposedSurface:
     def beneath(self, depth: float) -> SurfacePoints:
         """Points about a spacing [m] apart, ``depth`` [m] beneath the surface, or in the middle of what is thinner."""
         points = np.concatenate([self._at(depth), self._in_the_middle(depth)])
+        points = points[_within_a_period(points, self.lower, self.room.periods, 0.0)]
         areas = np.full(len(points), (self.spacing / FINE) ** (points.shape[1] - 1))
-        return evenly_chosen(points, areas, self.spacing)
+        found = evenly_chosen(points, areas, DENSITY * self.spacing)
+        return SurfacePoints(found.points, found.shares * DENSITY ** (points.shape[1] - 1))
 
     def _at(self, depth: float) -> Points:
         """(n, d) [m] fine points at a depth."""
@@ -157,6 +172,12 @@ class ExposedSurface:
         [m]."""
         distances = self._tree.query(self.feet[which] - depths[:, None] * self.away[which])[0]
         return np.asarray(distances > depths - TOLERANCE * self.spacing)
+
+
+def _within_a_period(points: Points, lower: Points, periods: Points, reach: float) -> NDArray[np.bool_]:
+    """(n,) whether points (n, d) [m] are no more than ``reach`` [m] outside of periods that begin at ``lower``."""
+    within = (points >= lower - reach) & (points < lower + periods + reach)
+    return np.asarray((within | (periods == 0.0)).all(axis=1))
 
 
 def _is_exposed(feet: Points, away: Points, room: Room, spacing: float) -> NDArray[np.bool_]:

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 STIFFNESS = 3e-3
 """How much a weight resists a change, relative, beside an error of the density: where densities leave a weight open it
 stays that of a flat wall."""
-UNEVEN_STIFFNESS = 0.06
+UNEVEN_STIFFNESS = 0.2
 """The same where particles are not on a lattice. With 0.003 some of them have no weight, and fluid passes there."""
-LEAST, ROUNDS = 0.1, 4
+LEAST, ROUNDS = 0.3, 4
 """Of a weight over that of a flat wall, where particles are not on a lattice; rounds in which weights that would be
 less are set to it, and the others found anew."""
 BALANCE = 0.02

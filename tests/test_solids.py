@@ -1,0 +1,297 @@
+"""Solids at rest: their shapes against brute force, their walls against the lattice, and that they hold fluid."""
+
+import numpy as np
+import pytest
+
+from cortado import DivergedError, InputError, Problem, Scene, SceneError, Simulation
+from cortado.discretise.calibration import rest_volume
+from cortado.discretise.pairs import pairs_within
+from cortado.discretise.smoothing import smoothing_kernel
+from cortado.losses import CentreOfMass
+from cortado.scene.discrete_scene import discretise
+from cortado.scene.room import solids_of
+from cortado.scene.solids import (
+    BoxSolid,
+    CapsuleSolid,
+    CupSolid,
+    CylinderSolid,
+    PolygonSolid,
+    SphereSolid,
+)
+
+SOLIDS = {
+    "rectangle": BoxSolid(name="a", lower=[0.0, 0.1], upper=[1.0, 0.6], rotation=0.3),
+    "disc": SphereSolid(name="a", centre=[0.3, 0.2], radius=0.5),
+    "flat capsule": CapsuleSolid(name="a", start=[0.0, 0.0], end=[0.5, 0.8], radius=0.3),
+    "flat cup": CupSolid(name="a", base=[0.1, 0.2], radius=0.4, height=0.9, thickness=0.2, rotation=-0.4),
+    "polygon": PolygonSolid(name="a", corners=[[0.0, 0.0], [0.2, 0.9], [0.4, 0.3], [1.0, 0.1]], position=[0.5, 0.5]),
+    "box": BoxSolid(name="a", lower=[0.0, 0.1, 0.0], upper=[1.0, 0.6, 0.7], rotation=[0.3, -0.2, 0.5]),
+    "sphere": SphereSolid(name="a", centre=[0.3, 0.2, 0.1], radius=0.5),
+    "capsule": CapsuleSolid(name="a", start=[0.0, 0.0, 0.1], end=[0.5, 0.8, 0.3], radius=0.3),
+    "cylinder": CylinderSolid(
+        name="a", base=[0.1, 0.2, 0.3], radius=0.4, height=0.7, axis="x", rotation=[0.1, 0.0, 0.4]
+    ),
+    "cup": CupSolid(
+        name="a", base=[0.1, 0.2, 0.3], radius=0.4, height=0.9, thickness=0.2, axis="z", rotation=[0.5, 0.0, 0.0]
+    ),
+}
+VOLUMES = {
+    "rectangle": 0.5,
+    "disc": np.pi * 0.25,
+    "flat capsule": np.pi * 0.09 + 0.6 * np.sqrt(0.89),
+    "flat cup": 1.2 * 0.9 - 0.8 * 0.7,
+    "polygon": 0.28,
+    "box": 0.35,
+    "sphere": np.pi / 6.0,
+    "capsule": np.pi * (0.036 + 0.09 * np.sqrt(0.93)),
+    "cylinder": np.pi * 0.16 * 0.7,
+    "cup": np.pi * (0.36 * 0.9 - 0.16 * 0.7),
+}
+
+
+def volume_and_middle(faces):
+    """Of what is within faces, by the divergence theorem."""
+    corners = faces.vertices[faces.corners]
+    parts = np.linalg.det(corners)
+    d = corners.shape[2]
+    middle = (parts[:, None] * corners.sum(axis=1)).sum(axis=0) / ((d + 1) * parts.sum())
+    return parts.sum() / {2: 2.0, 3: 6.0}[d], middle
+
+
+def winding(points, faces):
+    """(n,) how often faces go around points: 1 within, 0 outside."""
+    a = faces.vertices[faces.corners][None] - points[:, None, None]
+    if points.shape[1] == 2:
+        (x, y), (z, w) = np.moveaxis(a[:, :, 0], -1, 0), np.moveaxis(a[:, :, 1], -1, 0)
+        return np.arctan2(x * w - y * z, x * z + y * w).sum(axis=1) / (2.0 * np.pi)
+    length = np.linalg.norm(a, axis=-1)
+    one, two, three = (a[:, :, k] for k in range(3))
+    up = np.einsum("nkc,nkc->nk", one, np.cross(two, three))
+    down = length.prod(axis=2)
+    for (p, q), r in (((one, two), 2), ((two, three), 0), ((three, one), 1)):
+        down = down + np.einsum("nkc,nkc->nk", p, q) * length[:, :, r]
+    return 2.0 * np.arctan2(up, down).sum(axis=1) / (4.0 * np.pi)
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_a_shape_has_its_volume_and_its_middle(name):
+    table = SOLIDS[name]
+    volume, middle = volume_and_middle(table.body().faces(0.01))
+    assert volume == pytest.approx(VOLUMES[name], rel=2e-3)
+    wanted = table.shape_about()[1] if table.position is None else table.position
+    np.testing.assert_allclose(middle, wanted, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_distances_and_nearest_points_are_those_of_the_faces(name):
+    solid, random = SOLIDS[name].body(), np.random.default_rng(1)
+    lower, upper = solid.extent()
+    d = len(lower)
+    points = random.uniform(lower - 0.2, upper + 0.2, (300, d))
+    faces = solid.faces(0.02)
+    found = solid.distance(points)
+    np.testing.assert_array_equal(found[np.abs(found) > 0.01] < 0.0, winding(points, faces)[np.abs(found) > 0.01] > 0.5)
+    shares = random.dirichlet(np.ones(d), (4000 // len(faces.corners) + 60, len(faces.corners)))
+    samples = np.einsum("mkc,kcx->mkx", shares, faces.vertices[faces.corners]).reshape(-1, d)
+    apart = np.sqrt(((points[:, None] - samples[None]) ** 2).sum(axis=-1)).min(axis=1)
+    assert (np.abs(found) < apart + 2e-3).all()  # nothing of the surface is nearer
+    near = solid.nearest(points)
+    np.testing.assert_allclose(np.linalg.norm(points - near, axis=1), np.abs(found), atol=1e-12)
+    np.testing.assert_allclose(solid.distance(near), 0.0, atol=1e-12)
+    assert ((samples >= lower - 1e-9) & (samples <= upper + 1e-9)).all()
+
+
+def scene(solids, dimension=2, kind="projection", spacing=0.05, **tables):
+    corner = [1.0, 1.0, 0.5][:dimension]
+    fluid = {"shape": "box", "lower": [0.0] * dimension, "upper": [0.4, 0.6, 0.5][:dimension], "phase": "water"}
+    return Scene(
+        **{
+            "dimension": dimension,
+            "discretisation": {"spacing": spacing},
+            "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
+            "fluid": [fluid],
+            "container": {"shape": "box", "lower": [0.0] * dimension, "upper": corner},
+            "solver": {"kind": kind, "time_step": 0.001},
+            "solid": [{"name": f"solid {k}", **table} for k, table in enumerate(solids)],
+            **tables,
+        }
+    )
+
+
+PILLAR = {"shape": "box", "lower": [0.55, 0.0], "upper": [0.65, 0.3]}
+LEANING = {"shape": "box", "lower": [0.457, -0.1], "upper": [0.565, 0.317], "rotation": 0.1}
+DISC = {"shape": "sphere", "centre": [0.6, 0.2], "radius": 0.1}
+SHEET = {"shape": "box", "lower": [0.55, 0.0], "upper": [0.6, 0.4], "rotation": 0.1}
+RAMP = {"shape": "polygon", "corners": [[0.6, 0.0], [1.0, 0.0], [1.0, 0.4]]}
+WEDGE = {"shape": "polygon", "corners": [[0.4, 0.0], [1.0, 0.0], [1.0, 0.5]]}
+OBSTACLES = {"pillar": PILLAR, "leaning": LEANING, "disc": DISC, "sheet": SHEET, "ramp": RAMP, "wedge": WEDGE}
+
+
+def full(table, **tables):
+    """A tank full of fluid around, or in, a solid."""
+    block = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0], "phase": "water"}
+    return scene([table], fluid=[block], **tables)
+
+
+def densities(one, discrete):
+    """(n,) those of first particles, over that of the lattice."""
+    kernel, support = smoothing_kernel(one.discretisation.kernel), one.discretisation.support_radius
+    x, walls, d = discrete.fluid.positions, discrete.walls, one.dimension
+    i, _, apart = pairs_within(x, x, support)
+    k, b, from_walls = pairs_within(x, walls.positions, support)
+    sums = np.bincount(i, kernel.weight(apart, d, support), len(x))
+    sums += np.bincount(k, walls.weights[b] * kernel.weight(from_walls, d, support), len(x))
+    return rest_volume(kernel, one.discretisation.spacing, support, d) * sums
+
+
+TURNED_TANK = {"shape": "box", "lower": [0.2, 0.2], "upper": [0.8, 0.8], "rotation": 0.4, "side": "inside"}
+
+
+@pytest.mark.parametrize("kind", ["projection", "pcisph"])
+@pytest.mark.parametrize("table", [*OBSTACLES.values(), TURNED_TANK], ids=[*OBSTACLES, "turned tank"])
+def test_fluid_around_a_solid_starts_at_rest(table, kind):
+    """Wherever its faces are against the lattice; particles off the lattice are packed to less than 1 % below."""
+    one = full(table, kind=kind)
+    found = densities(one, discretise(one))
+    assert found.max() < 1.001 and found.min() > 0.99
+
+
+@pytest.mark.parametrize("kind", ["projection", "pcisph"])
+@pytest.mark.parametrize("name", OBSTACLES)
+def test_a_dam_break_against_a_solid_gains_no_energy_and_does_not_enter_it(name, kind):
+    one = scene([OBSTACLES[name]], kind=kind, spacing=0.025)
+    run = Simulation(one, precision="float64").run(800, record_every=10)
+    energies = (0.5 * (run.velocities**2).sum(axis=-1) + 9.81 * run.positions[..., 1]).mean(axis=1)
+    assert energies.max() < 1.0005 * energies[0]
+    (solid,) = solids_of(one.solid)
+    assert min(solid.distance(x).min() for x in run.positions) > -0.4 * 0.025
+    assert np.ptp(run.positions[-1][:, 0]) > 0.5  # it has moved
+
+
+@pytest.mark.parametrize("rotation", [0.0, 0.2, 0.785])
+def test_a_tank_may_be_turned(rotation):
+    """A block falls into it; no wall is along the lattice."""
+    tank = {"shape": "box", "lower": [-0.6, -0.5], "upper": [0.6, 0.5], "rotation": rotation, "side": "inside"}
+    block = {"shape": "box", "lower": [-0.25, -0.2], "upper": [0.25, 0.2], "phase": "water"}
+    one = scene([tank], spacing=0.05, container={"shape": "none"}, fluid=[block])
+    run = Simulation(one, precision="float64").run(1200, record_every=20)
+    energies = (0.5 * (run.velocities**2).sum(axis=-1) + 9.81 * run.positions[..., 1]).mean(axis=1)
+    assert np.diff(energies).max() < 1e-3 * (energies[0] - energies[-1])
+    (solid,) = solids_of(one.solid)
+    assert min(solid.distance(x).min() for x in run.positions) > 0.0
+
+
+CUP = {
+    "shape": "cup",
+    "base": [0.5, 0.1, 0.5],
+    "radius": 0.3,
+    "height": 0.6,
+    "thickness": 0.1,
+    "rotation": [0.1, 0, 0.2],
+}
+
+
+def test_a_cup_that_leans_holds_water():
+    water = {"shape": "cylinder", "base": [0.5, 0.3, 0.5], "radius": 0.2, "height": 0.3, "phase": "water"}
+    one = scene([CUP], 3, fluid=[water], container={"shape": "none"}, solver={"kind": "projection", "time_step": 0.002})
+    run = Simulation(one).run(500, record_every=50)
+    (solid,) = solids_of(one.solid)
+    assert min(solid.distance(x.astype(float)).min() for x in run.positions) > -0.5 * 0.05
+    assert run.positions[-1][:, 1].min() > 0.1  # nothing has fallen past it
+
+
+def test_what_enters_a_solid_is_lost_and_said(monkeypatch):
+    """With walls that weigh nothing."""
+    from cortado.scene import discrete_scene
+
+    monkeypatch.setattr(discrete_scene, "uneven_changes", lambda sums, wanted: np.full(sums.shape[1], -1.0))
+    above = {"shape": "box", "lower": [0.5, 0.4], "upper": [0.7, 0.6], "phase": "water"}
+    with pytest.raises(DivergedError, match="entered the solid 'solid 0' and was at"):
+        Simulation(scene([PILLAR], fluid=[above])).run(400)
+
+
+@pytest.mark.parametrize("slips", [("no", "free"), ("free", "no")])
+def test_each_solid_has_its_own_slip(slips):
+    """A layer of fluid between two plates that slides along them is held back by the one without slip."""
+    plates = [
+        {"shape": "box", "lower": [0.0, -0.2], "upper": [1.0, 0.0], "slip": slips[0]},
+        {"shape": "box", "lower": [0.0, 0.4], "upper": [1.0, 0.6], "slip": slips[1]},
+    ]
+    layer = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 0.4], "phase": "water", "velocity": [1.0, 0.0]}
+    one = scene(
+        plates,
+        fluid=[layer],
+        container={"shape": "box", "lower": [0.0, -0.5], "upper": [1.0, 1.0], "periodic": [True, False]},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 20.0}],
+        forces={"gravity": [0.0, 0.0]},
+    )
+    run = Simulation(one, precision="float64").run(200)
+    speeds = run.velocities[-1][:, 0]
+    low, high = speeds[run.positions[-1][:, 1] < 0.1].mean(), speeds[run.positions[-1][:, 1] > 0.3].mean()
+    held, free = (low, high) if slips[0] == "no" else (high, low)
+    assert held < 0.5 and free > 0.85
+
+
+@pytest.mark.parametrize("kind", ["projection", "pcisph"])
+def test_gradients_beside_a_solid(kind):
+    """Reverse and forward mode, and differences."""
+    one = scene([LEANING], kind=kind)
+    simulation = Simulation(one, precision="float64")
+    moved = simulation.run(120)
+    problem = Problem(simulation, 20, CentreOfMass([0.5, 0.3]))
+    values = {"initial_positions": moved.positions[-1], "initial_velocities": moved.velocities[-1]}
+    along = {"initial_velocities": np.random.default_rng(2).normal(size=moved.velocities[-1].shape)}
+    _, gradient = problem.value_and_gradient(values)
+    reverse = (gradient["initial_velocities"] * along["initial_velocities"]).sum()
+    assert problem.tangent(values, along) == pytest.approx(reverse, rel=1e-10)
+
+    def value(step):
+        return problem.value(
+            {**values, "initial_velocities": moved.velocities[-1] + step * along["initial_velocities"]}
+        )
+
+    assert (value(1e-6) - value(-1e-6)) / 2e-6 == pytest.approx(reverse, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        ({**PILLAR, "upper": [0.56, 0.3]}, "only 0.01 m thick"),
+        ({**PILLAR, "rotation": [0.1, 0.2, 0.3]}, "one number in 2-D"),
+        ({**PILLAR, "position": [0.1, 0.2, 0.3]}, "a list of 2 components"),
+        ({**PILLAR, "upper": [0.5, 0.3]}, "greater than lower"),
+        ({"shape": "cylinder", "base": [0.0, 0.0], "radius": 0.1, "height": 0.2}, '"box", "sphere", "capsule"'),
+        ({"shape": "polygon", "corners": [[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]]}, "sides that do not cross"),
+        ({"shape": "polygon", "corners": [[0.0, 0.0], [1.0, 1.0]]}, "solid[0].corners"),
+        ({"shape": "cup", "base": [0.5, 0.0], "radius": 0.2, "height": 0.1, "thickness": 0.2}, "less than height, 0.1"),
+        ({"shape": "cone"}, "solid[0].shape is 'cone'"),
+        ({**DISC, "centre": [1e12, 0.0]}, "m from the origin"),
+    ],
+)
+def test_a_bad_solid_is_a_sentence(table, sentence):
+    with pytest.raises(SceneError) as error:
+        scene([table])
+    assert sentence in str(error.value) and "solid[0]" in str(error.value)
+
+
+def test_two_solids_of_one_name_are_refused():
+    with pytest.raises(SceneError, match="another name than those of the solids before"):
+        scene([{**PILLAR, "name": "a"}, {**DISC, "name": "a"}])
+
+
+def test_a_solid_that_leaves_no_room_for_a_fluid_is_said():
+    with pytest.raises(InputError, match=r"fluid.0 has no particle"):
+        discretise(scene([{"shape": "box", "lower": [-0.1, -0.1], "upper": [0.8, 0.8]}]))
+
+
+def test_a_solid_out_of_reach_is_said():
+    with pytest.raises(InputError, match="solid 'solid 0' has no surface that fluid"):
+        discretise(scene([{"shape": "sphere", "centre": [5.0, 5.0], "radius": 0.2}]))
+
+
+def test_positions_in_a_solid_are_refused():
+    simulation = Simulation(scene([PILLAR]))
+    places = simulation.positions.copy()
+    places[3] = [0.6, 0.1]
+    with pytest.raises(InputError, match="outside the container or in a solid"):
+        simulation.run(1, {"initial_positions": places})
