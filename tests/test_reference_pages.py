@@ -39,7 +39,8 @@ def parts(text: str) -> list[tuple[str, str]]:
 def replaced(whole: str, example: str) -> str:
     """A file in which the tables of an example stand in the place of those with the same names."""
     names = {name for name, _ in parts(example)}
-    return "\n".join([part for name, part in parts(whole) if name not in names] + [part for _, part in parts(example)])
+    kept = [(name, part) for name, part in parts(whole) if name not in names]
+    return "\n".join(part for _, part in sorted([*kept, *parts(example)], key=lambda named: named[0] != ""))
 
 
 @pytest.mark.parametrize("model, example", scene_page.examples().items())

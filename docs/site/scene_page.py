@@ -46,6 +46,7 @@ LINKS = {
     "fluid": ("[tables](#bodies-of-fluid-fluid)", "The bodies of fluid; particles come in this order."),
     "emitter": ("[table](#a-jet-emitter)", "An opening out of which fluid comes; its particles come after all others."),
     "container": ("[table](#walls-container)", "What holds the fluid."),
+    "solid": ("[tables](#solids-solid)", "What fluid flows around or is held by, besides the container."),
     "mixture": ("[table](#fluids-that-mix-mixture)", "How phases mix."),
     "forces": ("[table](#forces-forces)", "Which forces act."),
     "force": ("[tables](#forces-of-packages-force)", "Forces of installed packages, which act besides."),
@@ -184,6 +185,49 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "HerschelBulkley",
                 "### The law of Herschel and Bulkley",
                 _with_law('{ kind = "herschel_bulkley", yield_stress = 2.0, flow_index = 0.7 }'),
+            ),
+        ),
+    ),
+    (
+        "## Solids: `[[solid]]`",
+        "What fluid flows around or is held by, besides the container, at rest: pillars, ramps, baffles, cups, tanks "
+        "that lean ([how they work](solids.md)). `shape` decides which other keys a solid has.",
+        (
+            (
+                "BoxSolid",
+                "### A solid box",
+                '[[solid]]\nname = "pillar"\nshape = "box"\nlower = [0.7, 0.0, 0.2]\nupper = [0.8, 0.6, 0.3]\n'
+                "rotation = [0.0, 0.5, 0.0]",
+            ),
+            (
+                "SphereSolid",
+                "### A solid sphere",
+                '[[solid]]\nname = "ball"\nshape = "sphere"\ncentre = [0.75, 0.2, 0.25]\nradius = 0.1',
+            ),
+            (
+                "CapsuleSolid",
+                "### A capsule",
+                '[[solid]]\nname = "rod"\nshape = "capsule"\nstart = [0.75, 0.2, 0.1]\nend = [0.75, 0.4, 0.4]\n'
+                "radius = 0.06",
+            ),
+            (
+                "CylinderSolid",
+                "### A solid cylinder",
+                '[[solid]]\nname = "column"\nshape = "cylinder"\nbase = [0.75, 0.0, 0.25]\nradius = 0.1\n'
+                'height = 0.8\nslip = "no"',
+            ),
+            (
+                "CupSolid",
+                "### A cup",
+                '[container]\nshape = "none"\n\n[[solid]]\nname = "cup"\nshape = "cup"\nbase = [0.25, -0.1, 0.25]\n'
+                "radius = 0.4\nheight = 0.7\nthickness = 0.1\nrotation = [0.0, 0.0, 0.2]",
+            ),
+            (
+                "PolygonSolid",
+                "### A polygon",
+                'name = "a ramp"\ndimension = 2\n\n[[fluid]]\nshape = "box"\nlower = [0.0, 0.0]\nupper = [0.4, 0.6]\n'
+                'phase = "water"\n\n[container]\nshape = "box"\nlower = [0.0, 0.0]\nupper = [1.0, 1.0]\n\n'
+                '[[solid]]\nname = "ramp"\nshape = "polygon"\ncorners = [[0.5, 0.0], [1.0, 0.0], [1.0, 0.4]]',
             ),
         ),
     ),
