@@ -5,8 +5,28 @@ All is in the frame of the picture: y points upwards. Colours are linear.
 
 import warp as wp
 
+from cortado.pictures.lit_surface import LitSurface
+
 NO_GLASS, GLASS_BOX, GLASS_CYLINDER = 0, 1, 2
 FAR = wp.constant(wp.float32(1.0e9))
+
+
+@wp.struct
+class Solids:
+    """What fluid flows around, or is inside of."""
+
+    has_opaque: wp.int32
+    opaque: LitSurface
+    are_cut: wp.int32
+    """Whether opaque ones are shown within the container only."""
+    has_clear: wp.int32
+    clear: LitSurface
+    """Those that are transparent, and tanks, all of space outside of whose cavities is within."""
+    has_tank: wp.int32
+    left: wp.array(dtype=wp.vec2)
+    """(triangles of clear ones,) the part of the light that comes through, seen from within a solid and from outside"""
+    from_edges: wp.array(dtype=wp.mat33)
+    """(triangles of clear ones,) how far corners, the columns, are from up to three sharp edges [m]"""
 
 
 @wp.struct
@@ -51,6 +71,7 @@ class Environment:
     """[m]"""
     panes: wp.mat33
     """1 where the container has a pane, 0 where it is open: rows for lower and upper ends, columns for axes."""
+    solids: Solids
 
 
 @wp.func
