@@ -9,9 +9,16 @@ LIGHT = (-0.45, 0.70, 0.55)
 
 
 def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) -> Points:
-    """(rows, columns, 3) the light of a body that covers a part of each pixel (rows, columns), in a colour that ends in
-    3 components, as if it were thicker in the middle than at its edge, which is ``width`` pixels wide; ``gleaming``: how
-    bright the lamp is in it."""
+    """(rows, columns, 3) the light of a body that covers a part of each pixel (rows, columns).
+
+    The body looks as if it were thicker in the middle than at its edge.
+
+    Args:
+        cover: (rows, columns), from 0 to 1.
+        colour: linear, (rows, columns, 3) or (3,).
+        width: of the edge, in pixels.
+        gleaming: how bright the image of the lamp is in it.
+    """
     from scipy.ndimage import gaussian_filter
 
     height = gaussian_filter(cover, width)

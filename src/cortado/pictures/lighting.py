@@ -11,8 +11,11 @@ BOUNCED = wp.constant(wp.float32(0.45))
 
 @wp.func
 def past_solids(s: Environment, p: wp.vec3, d: wp.vec3, reach: wp.float32, light: wp.vec3):
-    """What is left of light that comes against a direction: of that which solids hide within ``reach`` [m], the more the
-    further they are off; from solids comes a little light in their colour. Points within a solid are not seen."""
+    """The light that comes to a point against a direction d, of ``light``, which comes if no solid is there.
+
+    A solid within ``reach`` [m] hides it, the less the further off it is, and sends a little light in its own colour.
+    Nothing is hidden from points within a solid, which are not seen.
+    """
     hit = wp.mesh_query_ray(s.solids.opaque.mesh, p, d, reach)
     if not hit.result or hit.sign < 0.0:
         return light

@@ -1,5 +1,7 @@
-"""Mirror images of fluid behind the surfaces of solids that it touches: drawn with them, fluid goes on behind a surface,
-which hides it there, and no gap is seen between the two."""
+"""Mirror images of fluid behind the surfaces of solids that it touches.
+
+Drawn with them, fluid goes on behind a surface, which hides it there, and no gap is seen between the two.
+"""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -22,9 +24,12 @@ SAME_SIDE = 0.8
 def mirrored(
     points: Points, solids: Sequence[ShownSolid], touching: float, spacing: float
 ) -> tuple[Points, np.ndarray]:
-    """Mirror images (m, d) [m] of those of the points (n, d) [m] that are nearer to a solid than ``touching`` [m], behind
-    all of its sides that they touch and behind corners between these, and which point each shows (m,). Of a solid that is
-    too thin to hide fluid drawn there they are nearer to the surface, or there are none."""
+    """Mirror images (m, d) [m] of points (n, d) [m] behind solids, and which point each of them shows, (m,).
+
+    Points have images if they are nearer to a solid than ``touching`` [m]: behind each side of it that they touch, and
+    behind corners between these. Where a solid is too thin to hide fluid that is drawn there, images are nearer to the
+    surface, or there are none.
+    """
     dimension = points.shape[1]
     images, of = [np.zeros((0, dimension))], [np.zeros(0, dtype=int)]
     for shown in solids:

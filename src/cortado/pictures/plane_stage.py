@@ -99,8 +99,8 @@ class PlaneStage:
 
     @cached_property
     def shown(self) -> Points:
-        """(rows, columns) the part of each pixel in which fluid is shown if it is there, or hidden by what is drawn over
-        it."""
+        """(rows, columns) the part of each pixel in which fluid is drawn, if it is there: in opaque solids, too, which
+        are drawn over it."""
         return self.free if any(shown.transparency > 0.0 for shown, _ in self._bodies) else self._room
 
     @cached_property

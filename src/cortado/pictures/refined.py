@@ -4,10 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
-
-Numbers = NDArray[np.int64]
-SAME = 1e-9
-"""Of the size of all: how near vertices are that are one."""
+from cortado.pictures.triangles import Numbers, lengths_of, merged, sides_of
 
 
 def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
@@ -29,33 +26,12 @@ def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points,
     return vertices, corners, parents[kept]
 
 
-def merged(vertices: Points, corners: Numbers) -> tuple[Points, Numbers, NDArray[np.bool_]]:
-    """The same triangles, but for those without an area, with one vertex where there were several; and which are kept."""
-    whole = np.rint((vertices - vertices.min(axis=0)) / (SAME * np.ptp(vertices, axis=0).max()))
-    _, first, number = np.unique(whole, axis=0, return_index=True, return_inverse=True)
-    found = number.reshape(-1)[corners]
-    has_area = (found[:, 0] != found[:, 1]) & (found[:, 1] != found[:, 2]) & (found[:, 2] != found[:, 0])
-    return vertices[first], found[has_area], has_area
-
-
-def sides_of(corners: Numbers) -> Numbers:
-    """(3 t, 2) the sides of triangles (t, 3), those across each corner in turn."""
-    return corners[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
-
-
-def lengths_of(vertices: Points, sides: Numbers) -> Points:
-    """(s,) how long sides (s, 2) are [m]."""
-    return np.asarray(np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1))
-
-
 def _parts(lengths: Points, longest: float) -> Numbers:
     """Into how many parts a side is cut."""
     return 2 ** np.ceil(np.log2(np.maximum(lengths / longest, 1.0))).astype(np.int64)
 
 
-def _halved(
-    vertices: Points, corners: Numbers, parents: Numbers, longest: float
-) -> tuple[Points, Numbers, Numbers]:
+def _halved(vertices: Points, corners: Numbers, parents: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
     """Triangles, each of whose long sides is cut in two again and again."""
     while len(corners):
         sides, which = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True)

@@ -11,6 +11,8 @@ from cortado.pictures.stage import Stage
 
 NODES = 320
 """Along either side of the floor that may lie in shadow."""
+ABOVE = 1e-3
+"""In sizes of what is shown: a side of a solid that is no higher lies on the floor."""
 REACH = 1.5
 """Half the width of that part of the floor, in sizes of what is shown."""
 
@@ -38,15 +40,17 @@ def solid_shadow(stage: Stage, solids: Sequence[tuple[ShownSolid, SolidMesh]]) -
     light = np.ones((NODES, NODES, 3))
     for shown, mesh in solids:
         a, b, c = mesh.points[mesh.triangles].transpose(1, 0, 2)
-        middle, area = (a + b + c) / 3.0, 0.5 * np.cross(b - a, c - a)
-        height = middle[:, 1:2] - stage.lower[1]
+        middle = (a + b + c) / 3.0
+        casts = middle[:, 1] > stage.lower[1] + ABOVE * stage.size
+        if stage.cuts_solids:
+            casts &= ((middle >= stage.lower) & (middle <= stage.upper))[:, ::2].all(axis=1)
+        middle, area = middle[casts], 0.5 * np.cross(b - a, c - a)[casts]
+        height, colours = middle[:, 1:2] - stage.lower[1], np.tile(shown.colour, (len(middle), 1))
         cast = middle[:, ::2] - height * stage.sun[::2] / stage.sun[1]
-        near, thick = np.exp(-height[:, 0] / (0.15 * stage.size)), 3.0 * stage.spacing
-        colours = np.tile(shown.colour, (len(middle), 1))
-        key = _thickness(
-            cast, colours, corner, cell, thick * np.abs(area @ stage.sun) / stage.sun[1], 0.022 * stage.size
-        )
-        around = _thickness(middle[:, ::2], colours, corner, cell, thick * near * np.abs(area[:, 1]), 0.05 * stage.size)
+        thick, flat = 3.0 * stage.spacing, np.abs(area[:, 1]) * np.exp(-height[:, 0] / (0.15 * stage.size))
+        towards = np.abs(area @ stage.sun) / stage.sun[1]
+        key = _thickness(cast, colours, corner, cell, thick * towards, 0.022 * stage.size)
+        around = _thickness(middle[:, ::2], colours, corner, cell, thick * flat, 0.05 * stage.size)
         hidden = [1.0 - np.exp(-thickness / (0.75 * stage.spacing)) for thickness, _ in (key, around)]
         kept_off = (1.0 - shown.transparency) * (0.48 * hidden[0] + 0.32 * hidden[1])
         light = np.minimum(light, 1.0 - kept_off[..., None])

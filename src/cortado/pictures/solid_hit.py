@@ -55,8 +55,10 @@ def shaded_solid(s: Environment, met: SurfaceHit, d: wp.vec3, glossy: wp.float32
 
 @wp.func
 def clear_layers(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32, before: Passed):
-    """The surfaces of transparent solids that a ray passes up to the distance ``most`` [m]; those on the floor, which is
-    seen there, are left out."""
+    """The surfaces of transparent solids that a ray passes up to the distance ``most`` [m].
+
+    Those on the floor are left out, as the floor is seen there.
+    """
     passed = before
     start = s.nearest
     for _ in range(LAYERS):

@@ -29,16 +29,16 @@ class SolidSurfaces:
         self._clear = [(one, mesh) for one, mesh in placed if one.is_tank or one.transparency > 0.0]
         self.shadow = solid_shadow(stage, [(one, mesh) for one, mesh in placed if not one.is_tank])
 
-    def on_device(self) -> tuple[Any, list[DeviceSurface]]:
-        """`Solids`, and their surfaces, which must be kept and lit."""
-        found, surfaces = Solids(), []
+    def on_device(self) -> tuple[Any, list[tuple[DeviceSurface, SolidMesh]]]:
+        """`Solids`, and their surfaces, which must be kept and lit, with the meshes that they are of."""
+        found, surfaces = Solids(), list[tuple[DeviceSurface, SolidMesh]]()
         found.are_cut = int(self._are_cut)
         if self._opaque:
             surfaces.append(self._surface(self._opaque))
-            found.has_opaque, found.opaque = 1, surfaces[-1].lit
+            found.has_opaque, found.opaque = 1, surfaces[-1][0].lit
         if self._clear:
             surfaces.append(self._surface(self._clear))
-            found.has_clear, found.clear = 1, surfaces[-1].lit
+            found.has_clear, found.clear = 1, surfaces[-1][0].lit
             found.has_tank = int(any(one.is_tank for one, _ in self._clear))
             left = [np.tile(_left(one), (len(mesh.triangles), 1)) for one, mesh in self._clear]
             found.left = wp.array(np.concatenate(left), dtype=wp.vec2, device=self._device)
@@ -46,18 +46,19 @@ class SolidSurfaces:
             found.from_edges = wp.array(edges, dtype=wp.mat33, device=self._device)
         return found, surfaces
 
-    def _surface(self, solids: Sequence[tuple[ShownSolid, SolidMesh]]) -> DeviceSurface:
+    def _surface(self, solids: Sequence[tuple[ShownSolid, SolidMesh]]) -> tuple[DeviceSurface, SolidMesh]:
         """Several as one."""
         mesh = SolidMesh.joined([one for _, one in solids])
         colours = np.concatenate([np.tile(one.colour, (len(own.points), 1)) for one, own in solids])
-        return DeviceSurface.of(mesh.points, mesh.triangles, mesh.normals, colours, self._device)
+        return DeviceSurface.of(mesh.points, mesh.triangles, mesh.normals, colours, self._device), mesh
 
 
 def _mesh_of(shown: ShownSolid, size: float) -> SolidMesh:
     """That of a solid about its middle; of a tank its outside is within the cavity."""
     own = float(np.ptp(shown.shape.extent(), axis=0).max())
     faces = shown.shape.faces(min(FINE * size, FINE_OWN * own))
-    return SolidMesh.of(faces.reversed() if shown.is_tank else faces, LONGEST * size)
+    longest = np.inf if shown.transparency == 1.0 else LONGEST * size  # what is clear has no light of its own
+    return SolidMesh.of(faces.reversed() if shown.is_tank else faces, longest)
 
 
 def _left(shown: ShownSolid) -> tuple[float, float]:

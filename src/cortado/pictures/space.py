@@ -15,6 +15,7 @@ from cortado.discretise.shapes import Points
 from cortado.pictures.device_surface import DeviceSurface
 from cortado.pictures.lighting import illuminate
 from cortado.pictures.scenery import Scenery, State, processes_for, sceneries, scenery
+from cortado.pictures.solid_mesh import SolidMesh
 from cortado.pictures.solid_surfaces import SolidSurfaces
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.surface import Surface
@@ -31,7 +32,7 @@ LIGHT_RAYS = {"liquid": (20, 4), "spheres": (10, 1)}
 """Rays that find how much light falls on a point of the surface: from all around, and from the lamp."""
 
 
-SOLID_RAYS = 60, 8
+SOLID_RAYS = 40, 6
 """The same for solids, which have fewer points and even sides."""
 
 
@@ -67,17 +68,14 @@ class SpacePainter:
     def _rays(self, surface: Surface, s: Any, shadow: wp.array) -> Points:
         picture, device = self.stage.picture, self.device
         seen = DeviceSurface.of(surface.points, surface.triangles, surface.normals, surface.colours, device)
-        fluid, lit = seen.lit, [seen]
-        fluid.scattering, fluid.reach = self._scattering, 2.0 * self.stage.spacing
+        seen.lit.scattering, seen.lit.reach = self._scattering, 2.0 * self.stage.spacing
+        given, solids = {"s": s, "surface": seen.lit}, list[tuple[DeviceSurface, SolidMesh]]()
         if self._solids is not None:
-            s.solids, surfaces = self._solids.on_device()
-            lit += surfaces
-        given, reach = {"s": s, "surface": fluid}, 0.2 * self.stage.size
-        for one in lit:
-            around, in_lamp = self._lamps if one is seen else self._lamps_of_solids
-            lamps = {"directions": around, "sun_directions": in_lamp, "clearness": self.stage.clearness}
-            own = {"points": one.mesh.points, "normals": one.lit.normals, "light": one.lit.light}
-            self._launch(illuminate, len(one.mesh.points), **given, **own, **lamps, reach=reach)
+            s.solids, solids = self._solids.on_device()
+        self._illuminate(seen, self._lamps, given)
+        for one, mesh in solids:
+            self._illuminate(one, self._lamps_of_solids, given)
+            one.lit.light.assign(mesh.smoothed(one.lit.light.numpy()))
 
         def rays(pixels: np.ndarray, offset: tuple[float, float]) -> wp.array:
             found = wp.zeros(len(pixels), dtype=wp.vec3, device=device)
@@ -95,6 +93,14 @@ class SpacePainter:
         if len(rough):
             image[rough] = np.mean([rays(rough, offset).numpy() for offset in ROTATED_GRID], axis=0)
         return image.reshape(picture.height, picture.width, 3)
+
+    def _illuminate(self, surface: DeviceSurface, lamps: tuple[wp.array, wp.array], given: dict[str, Any]) -> None:
+        """Find the light on a surface, by rays in the directions of lamps."""
+        around, in_lamp = lamps
+        own = {"points": surface.mesh.points, "normals": surface.lit.normals, "light": surface.lit.light}
+        how = {"reach": 0.2 * self.stage.size, "clearness": self.stage.clearness}
+        count = len(surface.mesh.points)
+        self._launch(illuminate, count, **given, **own, **how, directions=around, sun_directions=in_lamp)
 
     def _rays_to_light(self, around: int, lamp: int) -> tuple[wp.array, wp.array]:
         """Directions to all around, and to so many points of the lamp."""

@@ -19,9 +19,9 @@ AIR = 0.1
 """Beside fluid that no container holds, in its widths."""
 FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
 """Elevation of the camera [degrees]: where the fluid is drawn on, as in latte art, and elsewhere."""
-TOUCHING, TOUCHING_ROUND = 0.8, 1.5
-"""In spacings: fluid that is nearer to a flat and to a round wall touches it. A cubic lattice in a round cup ends up to
-one and a half spacings from its wall."""
+TOUCHING, TOUCHING_SOLID, TOUCHING_ROUND = 0.8, 1.1, 1.5
+"""In spacings: fluid that is nearer to a flat wall, to a solid and to a round wall touches it. A cubic lattice in a
+round cup ends up to one and a half spacings from its wall."""
 AZIMUTH = 24.0
 """Of the camera, to the right of the direction towards the viewer [degrees]."""
 
@@ -120,7 +120,7 @@ class Stage:
         shows, (m,): a surface around them all goes on beyond the walls, at which it is cut."""
         of = np.arange(len(points))
         if self.solids:
-            behind, of_those = mirrored(points, self.solids, TOUCHING * self.spacing, self.spacing)
+            behind, of_those = mirrored(points, self.solids, TOUCHING_SOLID * self.spacing, self.spacing)
             points, of = np.concatenate([points, behind]), np.concatenate([of, of_those])
         if not self.cuts:
             return points, of

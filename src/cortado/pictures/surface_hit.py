@@ -26,8 +26,10 @@ def meet_behind_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec
     none.found = False
     none.t = FAR
     start = wp.max(part[0], 0.0)
-    beside_wall = part[0] > 0.0
-    normal = wall_normal(s, o + start * d)
+    beside_container = part[0] > 0.0
+    beside_clear = wp.bool(False)
+    face = wp.int32(0)
+    place = wp.vec2(0.0)
     for _ in range(LAYERS):
         p = o + start * d
         clear = wp.mesh_query_ray(s.solids.clear.mesh, p, d, FAR)
@@ -36,16 +38,21 @@ def meet_behind_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec
             in_solid = s.solids.has_tank > 0
         if not in_solid:
             hit = wp.mesh_query_ray(surface.mesh, p, d, FAR)
-            if hit.result and hit.sign < 0.0 and beside_wall:
-                return at_wall(s, surface, p, d, start, normal)
+            if hit.result and hit.sign < 0.0 and beside_clear:
+                side = at_surface(s.solids.clear, start, d, face, place[0], place[1])
+                return at_wall(s, surface, p, d, start, side.normal)
+            if hit.result and hit.sign < 0.0 and beside_container:
+                return at_wall(s, surface, p, d, start, wall_normal(s, p))
             t = start + hit.t
             if hit.result and t <= part[1] and (not clear.result or hit.t <= clear.t):
                 return at_surface(surface, t, d, hit.face, hit.u, hit.v)
         start = start + clear.t + s.nearest
         if not clear.result or start >= part[1]:
             return none
-        beside_wall = in_solid
-        normal = at_surface(s.solids.clear, start, d, clear.face, clear.u, clear.v).normal
+        beside_container = False
+        beside_clear = in_solid
+        face = clear.face
+        place = wp.vec2(clear.u, clear.v)
     return none
 
 

@@ -132,11 +132,13 @@ def seen(
             r = wp.vec3(d[0], -d[1], d[2])
             p = o + floor_at * d
             image = meet(s, surface, p, r)
+            instead_of = sky(s, r)
             if not image.found:
-                image = meet_solid(s, p, r)
+                image = meet_solid(s, p + wp.vec3(0.0, s.nearest, 0.0), r)
+                instead_of = found
             if image.found:
                 strength = schlick(0.04, -d[1]) * wp.exp(-2.5 * image.t / s.size)
-                found += strength * (wp.cw_mul(image.colour, image.light) - sky(s, r))
+                found += strength * (wp.cw_mul(image.colour, image.light) - instead_of)
         return toned(found)
     p = o + met.t * d
     n = met.normal

@@ -43,7 +43,7 @@ class SolidTable(Table):
     colour: Colour = (0.55, 0.55, 0.58)
     """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light."""
     transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
-    """The part of the light that goes through it in pictures, from 0 to 1; if left out 0, and 1 where fluid is inside."""
+    """The part of the light that goes through it in pictures, from 0 to 1; if left out 0, or 1 if fluid is inside."""
 
     @property
     def sticks(self) -> bool:
