@@ -118,9 +118,10 @@ def background(s: Environment, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d:
     most = FAR
     if s.has_floor > 0 and d[1] < -1.0e-4:
         most = wp.max((s.floor_height - o[1]) / d[1], 0.0)
-    met = meet_solid(s, o, d)
-    if met.found and met.t < most:
-        before = glass(s, o, d, met.t + 2.0 * s.nearest, spread)
-        return before.light + before.through * shaded_solid(s, met, d, 1.0)
+    if s.solids.has_opaque > 0:
+        met = meet_solid(s, o, d)
+        if met.found and met.t < most:
+            before = glass(s, o, d, met.t + 2.0 * s.nearest, spread)
+            return before.light + before.through * shaded_solid(s, met, d, 1.0)
     passed = glass(s, o, d, most, spread)
     return passed.light + passed.through * open_background(s, shadow, o, d, spread)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from cortado.pictures.lit_surface import LitSurface
-from cortado.pictures.surroundings import FAR, Environment
+from cortado.pictures.surroundings import FAR, OPAQUE, Environment
 
 BOUNCED = wp.constant(wp.float32(0.45))
 """The part of the light around that falls on solids, and back from them."""
@@ -16,10 +16,11 @@ def past_solids(s: Environment, p: wp.vec3, d: wp.vec3, reach: wp.float32, light
     A solid within ``reach`` [m] hides it, the less the further off it is, and sends a little light in its own colour.
     Nothing is hidden from points within a solid, which are not seen.
     """
-    hit = wp.mesh_query_ray(s.solids.opaque.mesh, p, d, reach)
+    hit = wp.mesh_query_ray(s.solids.opaque, p, d, reach)
     if not hit.result or hit.sign < 0.0:
         return light
-    colour = s.solids.opaque.colours[s.solids.opaque.corners[3 * hit.face]]
+    point = s.solids.surfaces[OPAQUE].corners[3 * hit.face]
+    colour = s.solids.surfaces[OPAQUE].colours[point]
     return wp.lerp(BOUNCED * wp.cw_mul(colour, s.horizon), light, 0.35 * hit.t / reach)
 
 
@@ -64,7 +65,7 @@ def illuminate(
             if hit.result:
                 arriving_sun = clearness
             if s.solids.has_opaque > 0:
-                solid = wp.mesh_query_ray(s.solids.opaque.mesh, p, sun_directions[k], FAR)
+                solid = wp.mesh_query_ray(s.solids.opaque, p, sun_directions[k], FAR)
                 if solid.result and solid.sign > 0.0:
                     arriving_sun = 0.0
             sunlight += arriving_sun

@@ -5,7 +5,7 @@ import warp as wp
 from cortado.pictures.container_room import wall_normal, within_walls
 from cortado.pictures.lit_surface import SurfaceHit, at_surface
 from cortado.pictures.pane import Passed, pane, rim_of
-from cortado.pictures.surroundings import FAR, Environment, mirrored, schlick, sky
+from cortado.pictures.surroundings import CLEAR, FAR, OPAQUE, Environment, mirrored, schlick, sky
 
 LAYERS = 8
 """Surfaces of transparent solids that a ray passes at most."""
@@ -25,14 +25,14 @@ def meet_solid(s: Environment, o: wp.vec3, d: wp.vec3):
     start = wp.max(part[0] - s.nearest, 0.0)  # a side that lies in a wall is seen
     if part[1] <= start:
         return met
-    hit = wp.mesh_query_ray(s.solids.opaque.mesh, o + start * d, d, FAR)
+    hit = wp.mesh_query_ray(s.solids.opaque, o + start * d, d, FAR)
     if not hit.result:
         return met
     t = start + hit.t
     is_cut = hit.sign < 0.0 and part[0] > 0.0  # it reaches through the wall
     if not is_cut and t > part[1] - 2.0 * s.nearest:
         return met
-    met = at_surface(s.solids.opaque, t, d, hit.face, hit.u, hit.v)
+    met = at_surface(s.solids.surfaces[OPAQUE], t, d, hit.face, hit.u, hit.v)
     met.is_solid = True
     if is_cut:
         n = wall_normal(s, o + part[0] * d)
@@ -64,16 +64,17 @@ def clear_layers(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, sprea
     for _ in range(LAYERS):
         if start >= most:
             break
-        hit = wp.mesh_query_ray(s.solids.clear.mesh, o + start * d, d, most - start)
+        hit = wp.mesh_query_ray(s.solids.clear, o + start * d, d, most - start)
         if not hit.result:
             break
         t = start + hit.t
         if s.has_floor == 0 or o[1] + t * d[1] > s.floor_height + 2.0 * s.nearest:
-            met = at_surface(s.solids.clear, t, d, hit.face, hit.u, hit.v)
-            off = s.solids.from_edges[hit.face] * wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
+            met = at_surface(s.solids.surfaces[CLEAR], t, d, hit.face, hit.u, hit.v)
+            off = s.solids.surfaces[CLEAR].from_edges[hit.face] * wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
             rim = rim_of(wp.min(off[0], wp.min(off[1], off[2])), wp.max(0.006 * s.size, 1.2 * spread * t))
             passed = pane(s, d, met.normal, rim, 1.0, passed)
-            left = wp.where(hit.sign < 0.0, s.solids.left[hit.face][0], s.solids.left[hit.face][1])
+            both = s.solids.surfaces[CLEAR].left[hit.face]
+            left = wp.where(hit.sign < 0.0, both[0], both[1])
             passed.light += passed.through * (1.0 - left) * wp.cw_mul(met.colour, met.light)
             passed.through = passed.through * left
         start = t + s.nearest

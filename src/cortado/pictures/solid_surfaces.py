@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from cortado.pictures.device_surface import DeviceSurface
+from cortado.pictures.lit_surface import LitSurface
 from cortado.pictures.shadow import solid_shadow
 from cortado.pictures.shown_solids import ShownSolid
 from cortado.pictures.solid_mesh import SolidMesh
@@ -31,19 +32,21 @@ class SolidSurfaces:
 
     def on_device(self) -> tuple[Any, list[tuple[DeviceSurface, SolidMesh]]]:
         """`Solids`, and their surfaces, which must be kept and lit, with the meshes that they are of."""
-        found, surfaces = Solids(), list[tuple[DeviceSurface, SolidMesh]]()
+        found, surfaces, lit = Solids(), list[tuple[DeviceSurface, SolidMesh]](), [LitSurface(), LitSurface()]
         found.are_cut = int(self._are_cut)
         if self._opaque:
             surfaces.append(self._surface(self._opaque))
-            found.has_opaque, found.opaque = 1, surfaces[-1][0].lit
+            lit[0] = surfaces[-1][0].lit
+            found.has_opaque, found.opaque = 1, lit[0].mesh
         if self._clear:
             surfaces.append(self._surface(self._clear))
-            found.has_clear, found.clear = 1, surfaces[-1][0].lit
+            lit[1] = surfaces[-1][0].lit
+            found.has_clear, found.clear = 1, lit[1].mesh
             found.has_tank = int(any(one.is_tank for one, _ in self._clear))
             left = [np.tile(_left(one), (len(mesh.triangles), 1)) for one, mesh in self._clear]
-            found.left = wp.array(np.concatenate(left), dtype=wp.vec2, device=self._device)
-            edges = np.concatenate([mesh.from_edges for _, mesh in self._clear])
-            found.from_edges = wp.array(edges, dtype=wp.mat33, device=self._device)
+            lit[1].left = wp.array(np.concatenate(left), dtype=wp.vec2, device=self._device)
+            lit[1].from_edges = wp.array(surfaces[-1][1].from_edges, dtype=wp.mat33, device=self._device)
+        found.surfaces = wp.array(lit, dtype=LitSurface, device=self._device)
         return found, surfaces
 
     def _surface(self, solids: Sequence[tuple[ShownSolid, SolidMesh]]) -> tuple[DeviceSurface, SolidMesh]:

@@ -5,7 +5,7 @@ import warp as wp
 from cortado.pictures.container_room import room, wall_normal
 from cortado.pictures.lit_surface import LitSurface, SurfaceHit, at_surface
 from cortado.pictures.solid_hit import LAYERS, meet_solid
-from cortado.pictures.surroundings import FAR, Environment
+from cortado.pictures.surroundings import CLEAR, FAR, Environment
 
 
 @wp.func
@@ -32,14 +32,14 @@ def meet_behind_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec
     place = wp.vec2(0.0)
     for _ in range(LAYERS):
         p = o + start * d
-        clear = wp.mesh_query_ray(s.solids.clear.mesh, p, d, FAR)
+        clear = wp.mesh_query_ray(s.solids.clear, p, d, FAR)
         in_solid = clear.sign < 0.0
         if not clear.result:
             in_solid = s.solids.has_tank > 0
         if not in_solid:
             hit = wp.mesh_query_ray(surface.mesh, p, d, FAR)
             if hit.result and hit.sign < 0.0 and beside_clear:
-                side = at_surface(s.solids.clear, start, d, face, place[0], place[1])
+                side = at_surface(s.solids.surfaces[CLEAR], start, d, face, place[0], place[1])
                 return at_wall(s, surface, p, d, start, side.normal)
             if hit.result and hit.sign < 0.0 and beside_container:
                 return at_wall(s, surface, p, d, start, wall_normal(s, p))
@@ -83,12 +83,14 @@ def meet(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3):
     part = room(s, o, d)
     if part[1] <= wp.max(part[0], 0.0):
         return none
+    if s.solids.has_clear == 0 and s.solids.has_opaque == 0:
+        return meet_without_solids(s, surface, o, d, part)
     met = none
     if s.solids.has_clear > 0:
         met = meet_behind_clear(s, surface, o, d, part)
     else:
         met = meet_without_solids(s, surface, o, d, part)
-    if met.found:
+    if met.found and s.solids.has_opaque > 0:
         solid = meet_solid(s, o, d)
         if solid.found and solid.t < met.t + 3.0 * s.nearest:  # a solid covers fluid that goes on behind its side
             return none
@@ -109,10 +111,11 @@ def leave(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3):
         met.t = part[1]
         met.normal = -wall_normal(s, o + part[1] * d)
     if s.solids.has_clear > 0 and met.found:
-        clear = wp.mesh_query_ray(s.solids.clear.mesh, o, d, met.t)
+        clear = wp.mesh_query_ray(s.solids.clear, o, d, met.t)
         if clear.result and clear.sign > 0.0:
-            met = at_surface(s.solids.clear, clear.t, d, clear.face, clear.u, clear.v)
-    solid = meet_solid(s, o, d)
-    if solid.found and (not met.found or solid.t < met.t):
-        return solid
+            met = at_surface(s.solids.surfaces[CLEAR], clear.t, d, clear.face, clear.u, clear.v)
+    if s.solids.has_opaque > 0:
+        solid = meet_solid(s, o, d)
+        if solid.found and (not met.found or solid.t < met.t):
+            return solid
     return met

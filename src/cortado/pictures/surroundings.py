@@ -7,6 +7,8 @@ import warp as wp
 
 from cortado.pictures.lit_surface import LitSurface
 
+OPAQUE, CLEAR = wp.constant(0), wp.constant(1)
+"""Which of the surfaces of solids."""
 NO_GLASS, GLASS_BOX, GLASS_CYLINDER = 0, 1, 2
 FAR = wp.constant(wp.float32(1.0e9))
 
@@ -16,17 +18,16 @@ class Solids:
     """What fluid flows around, or is inside of."""
 
     has_opaque: wp.int32
-    opaque: LitSurface
+    opaque: wp.uint64
+    """The mesh of opaque ones."""
     are_cut: wp.int32
     """Whether opaque ones are shown within the container only."""
     has_clear: wp.int32
-    clear: LitSurface
-    """Those that are transparent, and tanks, all of space outside of whose cavities is within."""
+    clear: wp.uint64
+    """The mesh of those that are transparent and of tanks, which all of space outside of a cavity is within."""
     has_tank: wp.int32
-    left: wp.array(dtype=wp.vec2)
-    """(triangles of clear ones,) the part of the light that comes through, seen from within a solid and from outside"""
-    from_edges: wp.array(dtype=wp.mat33)
-    """(triangles of clear ones,) how far corners, the columns, are from up to three sharp edges [m]"""
+    surfaces: wp.array(dtype=LitSurface)
+    """(2,) of opaque and of clear ones, if there are any; in an array, as functions get a copy of their arguments"""
 
 
 @wp.struct

@@ -128,12 +128,15 @@ def seen(
         floor_at = (s.floor_height - o[1]) / d[1]
     if met.t > floor_at or not met.found:
         found = background(s, shadow, o, d, spread)
-        if floor_at < FAR and meet_solid(s, o, d).t > floor_at:  # the floor is a little glossy
+        if s.solids.has_opaque > 0:
+            if meet_solid(s, o, d).t < floor_at:
+                return toned(found)
+        if floor_at < FAR:  # the floor is a little glossy
             r = wp.vec3(d[0], -d[1], d[2])
             p = o + floor_at * d
             image = meet(s, surface, p, r)
             instead_of = sky(s, r)
-            if not image.found:
+            if not image.found and s.solids.has_opaque > 0:
                 image = meet_solid(s, p + wp.vec3(0.0, s.nearest, 0.0), r)
                 instead_of = found
             if image.found:
