@@ -3,6 +3,7 @@
 import warp as wp
 
 from cortado.pictures.container_room import between, within_tube
+from cortado.pictures.lit_surface import SurfaceHit
 from cortado.pictures.pane import Passed, pane, rim_of
 from cortado.pictures.solid_hit import clear_layers, meet_solid, shaded_solid
 from cortado.pictures.surroundings import FAR, Environment, open_background
@@ -118,10 +119,13 @@ def background(s: Environment, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d:
     most = FAR
     if s.has_floor > 0 and d[1] < -1.0e-4:
         most = wp.max((s.floor_height - o[1]) / d[1], 0.0)
+    met = SurfaceHit()
     if s.solids.has_opaque > 0:
         met = meet_solid(s, o, d)
-        if met.found and met.t < most:
-            before = glass(s, o, d, met.t + 2.0 * s.nearest, spread)
-            return before.light + before.through * shaded_solid(s, met, d, 1.0)
+        met.found = met.found and met.t < most
+    if met.found:
+        most = met.t + 2.0 * s.nearest
     passed = glass(s, o, d, most, spread)
+    if met.found:
+        return passed.light + passed.through * shaded_solid(s, met, d, 1.0)
     return passed.light + passed.through * open_background(s, shadow, o, d, spread)
