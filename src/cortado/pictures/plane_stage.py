@@ -46,7 +46,8 @@ class PlaneStage:
         if container is not None:
             lower, upper = (np.asarray(end) for end in container.extent())
         else:
-            ends = np.array([(lower - spacing, upper + spacing), *(one.body.extent() for one in solids)])
+            paper = 0.0 if any(one.is_tank for one in solids) else spacing
+            ends = np.array([(lower - paper, upper + paper), *(one.body.extent() for one in solids)])
             lower, upper = ends[:, 0].min(axis=0), ends[:, 1].max(axis=0)
         return cls(scene.picture or Picture(), container, lower, upper, spacing, solids)
 
@@ -114,12 +115,12 @@ class PlaneStage:
         return [(one, self._distance(one)) for one in self.solids if one.is_tank]
 
     def _distance(self, shown: ShownSolid, drop: float = 0.0) -> Points:
-        """(rows, columns) how far a place ``drop`` [m] above each pixel is outside of a body, negative inside [m]; only
-        near to it is that computed."""
+        """(rows, columns) how far a place ``drop`` [m] above each pixel is outside of a body, negative inside [m];
+        infinite where it is far."""
         (x, y), (lower, upper), margin = self.pixels, shown.body.extent(), AROUND * self._size
         columns = np.flatnonzero((x[0] > lower[0] - margin) & (x[0] < upper[0] + margin))
         rows = np.flatnonzero((y[:, 0] + drop > lower[1] - margin) & (y[:, 0] + drop < upper[1] + margin))
-        found, near = np.full(x.shape, margin), np.ix_(rows, columns)
+        found, near = np.full(x.shape, np.inf), np.ix_(rows, columns)
         points = np.stack([x[near].ravel(), y[near].ravel() + drop], axis=1)
         found[near] = shown.body.distance(points).reshape(len(rows), len(columns))
         return found

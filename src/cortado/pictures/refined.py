@@ -8,9 +8,11 @@ from cortado.pictures.triangles import Numbers, lengths_of, merged, sides_of
 
 
 def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
-    """Triangles (t, 3) of vertices (v, 3) [m] in parts none of whose sides is longer than ``longest`` [m], and of which
-    triangle each is a part (p,). Every side of the former ones has a power of two of equal parts, as many as it needs,
-    so that triangles beside each other fit."""
+    """Triangles (t, 3) of vertices (v, 3) [m] cut into smaller ones, and of which triangle each is a part, (p,).
+
+    Every side has a power of two of equal parts, as many as it needs to have none longer than ``longest`` [m], so that
+    triangles beside each other fit; other sides of the parts are at most the square root of 2 longer.
+    """
     parts = _parts(lengths_of(vertices, sides_of(corners)), longest).reshape(-1, 3)
     thin = (parts.min(axis=1) == 1) & (np.sort(parts, axis=1)[:, 1] > 1)
     found = [_halved(vertices, corners[~thin], np.flatnonzero(~thin), longest)]

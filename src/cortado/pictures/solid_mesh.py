@@ -33,7 +33,7 @@ class SolidMesh:
 
     @classmethod
     def of(cls, faces: Faces, longest: float) -> "SolidMesh":
-        """Of the surface of a solid in 3-D, with sides no longer than ``longest`` [m]."""
+        """Of the surface of a solid in 3-D, with sides no longer than about ``longest`` [m]."""
         flat_points, flat_corners, _ = merged(faces.vertices, faces.corners)
         points, corners, parents = refined(flat_points, flat_corners, longest)
         across = across_of(points, corners)

@@ -63,6 +63,7 @@ class Stage:
         frame = upright(np.asarray(scene.forces.gravity))
         if ends is None:
             air = 0.5 * scene.discretisation.spacing + AIR * (1.0 - np.abs(frame[1])) * (upper - lower)
+            air = 0.0 * air if any(one.is_tank for one in solids) else air
             ends_of_all = np.array([(lower - air, upper + air), *(one.body.extent() for one in solids)])
             lower, upper = ends_of_all[:, 0].min(axis=0), ends_of_all[:, 1].max(axis=0)
         else:
