@@ -139,12 +139,9 @@ def test_light_goes_no_further_than_to_a_solid(monkeypatch):
     np.testing.assert_allclose(light[0], light[1], atol=0.004)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("place", [(0.0, -9.0, 0.0), (0.0, 0.0, -0.7)])
+@pytest.mark.parametrize(("dimension", "place"), [(2, (0.0, -9.0, 0.0)), (3, (0.0, -9.0, 0.0)), (3, (0.0, 0.0, -0.7))])
 def test_a_solid_that_is_not_seen_changes_no_bit(dimension, place):
     """Far below a closed container, or behind it: what draws solids draws the rest as it is drawn without any."""
-    if dimension == 2 and place[1] == 0.0:
-        pytest.skip("in the plane nothing is behind the container")
     away = {**PILLAR, **{end: (np.array(PILLAR[end]) + place).tolist() for end in ("lower", "upper")}}
     images = [drawn(scene_of(dimension, *solids), COLUMN[dimension]) for solids in ((), (away,))]
     np.testing.assert_array_equal(images[0], images[1])
@@ -219,7 +216,7 @@ def test_a_transparent_solid_lets_light_through():
         scene = scene_of(3, {**PILLAR, "transparency": clear}, picture={"transparency": 0.0, **FRONT})
         light.append(seen(scene, behind, place))
     assert is_orange(light[0]) and is_blue(light[2])
-    red = [one[0] for one in light]
+    red = [float(one[0]) for one in light]
     assert red[1] == pytest.approx(0.5 * (red[0] + red[2]), abs=0.15 * (red[0] - red[2]))
     plane = [seen(scene_of(2, {**PILLAR, "transparency": c}), COLUMN[2], (0.4, 0.2)) for c in (0.0, 0.5)]
     assert plane[1][2] > plane[0][2] + 0.2
