@@ -10,7 +10,7 @@ from cortado.discretise.smoothing import smoothing_kernel
 from cortado.losses import CentreOfMass
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.room import solids_of
-from cortado.scene.solids import (
+from cortado.scene.solid_shapes import (
     BoxSolid,
     CapsuleSolid,
     CupSolid,

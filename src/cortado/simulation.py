@@ -95,7 +95,7 @@ class Simulation(Stepping, Measuring, Picturing):
         self.own_solver = None if self._given[1] is None and scene.solver.kind in OWN else self._maker
         """What makes the solver, if it is not Cortado's own."""
         self._called = called(scene.solver, self._given[1])
-        self.known = known_of(self.forces, self._maker)
+        self.known = known_of(self.forces, self._maker, scene.solid)
         """Its parameters."""
         self.device = device_named(device)
         self.precision = precision_named(precision)
