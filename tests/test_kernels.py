@@ -149,7 +149,7 @@ def cloud(name: str, seed: int = 7) -> Cloud:
     weights, layout = random.uniform(0.5, 1.5, WALLS), Layout(N, 1, FLOAT64, CPU)
     feet = np.stack([0.0 * walls[:, 0], -walls[:, 1], 0.0 * walls[:, 2]], axis=1)
     search = NeighbourSearch(
-        DISCRETISATION, grid, WallArrays(walls, weights, weights, feet, np.full(WALLS, -1)), layout, 100
+        DISCRETISATION, grid, WallArrays(walls, weights, weights, feet, 0.0 * feet, np.full(WALLS, -1)), layout, 100
     )
     s = neighbourhood_type(FLOAT64)()
     s.particles = N

@@ -88,7 +88,7 @@ def lists(
     search = NeighbourSearch(
         discretisation,
         grid,
-        WallArrays(padded(walls), names, names, 0.0 * padded(walls), np.full(len(walls), -1)),
+        WallArrays(padded(walls), names, names, 0.0 * padded(walls), 0.0 * padded(walls), np.full(len(walls), -1)),
         Layout(n, 1, precision, device),
         capacity,
     )
@@ -364,7 +364,9 @@ def test_lists_that_are_too_short_say_how_long_they_must_be(capacity, precision)
 def test_room_can_be_made():
     discretisation = Discretisation(CUBIC_SPLINE, FLOAT64)
     grid = Grid.around(np.zeros(3), np.ones(3), np.zeros(3), REACH, 1000)
-    nothing = WallArrays(np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros(0, dtype=int))
+    nothing = WallArrays(
+        np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=int)
+    )
     search = NeighbourSearch(discretisation, grid, nothing, Layout(10, 1, FLOAT64, CPU), 4)
     search.allocate(9)
     assert search.capacity == 12  # the next multiple of UNROLL

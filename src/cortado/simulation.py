@@ -228,7 +228,7 @@ class Simulation(Stepping, Measuring, Picturing):
             warnings.warn(sentence, CortadoWarning, stacklevel=5)
         fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
         own = {name: np.array([one[name] for one in looks]) for name in watch.names}
-        found = recorded(rollout, np.array(steps), fields, self.constants(rollout), own)
+        found = recorded(rollout, self.scene, np.array(steps), fields, self.constants(rollout), own)
         return replace(found, sensors=watch.readings()) if isinstance(found, Trajectory) else found  # type: ignore[return-value]  # of a batch
 
     def frame(self, state: State) -> dict[str, np.ndarray]:

@@ -53,6 +53,7 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any]:
     module = wp.get_module(f"cortado_moving_walls_{precision.name}")
     module.options["enable_backward"] = False
     vectors = {f"wall_{name}": vector for name in ("positions", "feet", "velocities")}
+    own_of: Any = bundle(own=vector, own_feet=vector, own_slides=vector, own_weights=real, own_grips=real)
     walls_of: Any = bundle(**vectors, wall_weights=real, wall_grips=real)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -77,10 +78,7 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any]:
         first: int,
         order: wp.array(dtype=wp.int32),
         time_step: wp.array(dtype=real),
-        own: wp.array(dtype=vector),
-        own_feet: wp.array(dtype=vector),
-        own_weights: wp.array(dtype=real),
-        own_grips: wp.array(dtype=real),
+        of: own_of,
         solid: wp.array(dtype=wp.int32),
         before: wp.array2d(dtype=vector),
         turns_before: wp.array2d(dtype=matrix),
@@ -94,12 +92,12 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any]:
         member = j // count
         b = j - member * count
         k = solid[b]
-        moved = x[j] - before[member, k] - turns_before[member, k] * own[b]
+        moved = x[j] - before[member, k] - turns_before[member, k] * of.own[b]
         walls.wall_positions[first + p] = x[j]
-        walls.wall_feet[first + p] = turns[member, k] * own_feet[b]
-        walls.wall_velocities[first + p] = moved / time_step[member]
-        walls.wall_weights[first + p] = own_weights[b]
-        walls.wall_grips[first + p] = own_grips[b]
+        walls.wall_feet[first + p] = turns[member, k] * of.own_feet[b]
+        walls.wall_velocities[first + p] = moved / time_step[member] + turns[member, k] * of.own_slides[b]
+        walls.wall_weights[first + p] = of.own_weights[b]
+        walls.wall_grips[first + p] = of.own_grips[b]
 
     @wp.kernel(module=module, enable_backward=False)
     def shift(
@@ -125,7 +123,7 @@ class MovingWalls:
         precision, device, count = layout.precision, layout.device, len(walls)
         self._device, self._first, self._all = device, first, layout.members * count
         self._kernels = _kernels(precision)
-        vectors = {"own": walls.positions, "own_feet": walls.feet}
+        vectors = {"own": walls.positions, "own_feet": walls.feet, "own_slides": walls.slides}
         numbers = {"own_weights": walls.weights, "own_grips": walls.grips}
         self._own: dict[str, Any] = {
             "count": count,

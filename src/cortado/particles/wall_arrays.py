@@ -17,6 +17,8 @@ class WallArrays:
     """(b,) the same of those without slip, and 0 of those along which fluid slips freely"""
     feet: np.ndarray
     """(b, 3) from each to the surface [m]"""
+    slides: np.ndarray
+    """(b, 3) how fast their surface slides along the solid [m/s]"""
     solid: np.ndarray
     """(b,) the number of the solid that moves whose each is; -1 of those at rest"""
 

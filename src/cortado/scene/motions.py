@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.scene.parameters.parameter import Axis, Changing, Parameter, Role
+from cortado.errors import MissingDerivativeError
+from cortado.scene.parameters.parameter import Axis, Parameter, Role
 from cortado.scene.solids import SolidTable
 
 
@@ -22,9 +23,13 @@ class Steady:
         """(n,) or (n, components) at times (n,) [s]"""
         return np.multiply.outer(times, self.rate)
 
+    def greatest(self) -> float:
+        """Size of the rate."""
+        return float(np.linalg.norm(self.rate))
+
     def rates(self, times: NDArray) -> NDArray:
-        """The derivatives with respect to time, of the same shape."""
-        return np.multiply.outer(np.ones_like(times), self.rate)
+        """See `_no_rates`."""
+        raise _no_rates()
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +47,23 @@ class Knots:
         found = np.stack([np.interp(times, self.times, column) for column in columns], axis=-1)
         return found.reshape(len(times), *self.values.shape[1:])
 
+    def greatest(self) -> float:
+        """Size of the greatest rate."""
+        changes = np.diff(self.values.reshape(len(self.times), -1), axis=0)
+        return float((np.linalg.norm(changes, axis=1) / np.diff(self.times)).max())
+
     def rates(self, times: NDArray) -> NDArray:
-        """The derivatives with respect to time; at a knot that of what comes after."""
-        slopes = np.zeros((len(self.times) + 1, *self.values.shape[1:]))
-        slopes[1:-1] = (np.diff(self.values, axis=0).T / np.diff(self.times)).T
-        return slopes[np.searchsorted(self.times, times, side="right")]
+        """See `_no_rates`."""
+        raise _no_rates()
+
+
+def _no_rates() -> MissingDerivativeError:
+    """What asks for derivatives of a path with respect to time asks for those of a run with respect to when its steps
+    are, through where solids are, which nobody computes yet."""
+    return MissingDerivativeError(
+        "solids that move have no derivative with respect to the time step, or to when a run begins: leave time_step "
+        "out of the parameters, or let solids be fixed."
+    )
 
 
 def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
@@ -60,6 +77,21 @@ def solid_frames(scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     tables, d = moving(scene.solid), scene.dimension
     middles = np.array([table.middle() for table in tables]).reshape(-1, d)
     return middles, np.array([table.turn(d) for table in tables]).reshape(-1, d, d)
+
+
+def greatest_speed(solids: Sequence[SolidTable]) -> float:
+    """How fast the fastest point of a solid moves at most [m/s]."""
+    found = [0.0]
+    for solid in moving(solids):
+        shape, middle = solid.shape_about()
+        reach = float(np.linalg.norm(np.abs(shape.extent()).max(axis=0)))
+        d = len(middle)
+        shift, turn = (
+            _course(solid, "positions", "velocity", d),
+            _course(solid, "rotations", "angular_velocity", 2 * d - 3),
+        )
+        found.append(shift.greatest() + reach * turn.greatest())
+    return max(found)
 
 
 def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
@@ -107,7 +139,7 @@ def _turn(solid: SolidTable) -> Parameter:
     )
 
 
-def _course(solid: SolidTable, values: str, rate: str, components: int) -> Changing:
+def _course(solid: SolidTable, values: str, rate: str, components: int) -> Steady | Knots:
     shape = () if components == 1 else (components,)
     known: Any = getattr(solid, values)
     if known is not None:

@@ -54,6 +54,9 @@ class SolidTable(Table):
     """(d,) Of the middle, if it is steady [m/s]."""
     angular_velocity: Turning | None = None
     """About the middle, if it is steady: in 3-D a vector, in 2-D one number, counterclockwise [rad/s]."""
+    surface_velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
+    """(d,) How fast its surface slides while its shape stays, as that of a belt does, in the frame of the solid
+    [m/s]."""
     side: Literal["outside", "inside"] = "outside"
     """Where fluid may be: outside of the shape, or inside of it, as in a tank."""
     slip: Literal["free", "no"] = "free"
@@ -68,8 +71,8 @@ class SolidTable(Table):
 
     @property
     def moves(self) -> bool:
-        """Whether it does not stay where it is."""
-        return self.motion != "fixed"
+        """Whether it or its surface moves."""
+        return self.motion != "fixed" or self.surface_velocity is not None
 
     def middle(self) -> Points:
         """(d,) where its middle is at the start [m]."""
@@ -111,6 +114,10 @@ class SolidTable(Table):
         if self.position is not None and len(self.position) != dimension:
             wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
             raise field_error((*path, "position"), self.position, wanted)
+        for name in ("velocity", "surface_velocity"):
+            if (value := getattr(self, name)) is not None and len(value) != dimension:
+                wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
+                raise field_error((*path, name), value, wanted)
         for name in ("rotation", "angular_velocity"):
             if (value := getattr(self, name)) is not None and len(value) != 2 * dimension - 3:
                 wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
@@ -132,7 +139,7 @@ def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
     """What a path has fits together."""
     rows, steady = ("positions", "rotations"), ("velocity", "angular_velocity")
     given = [name for name in ("times", *rows, *steady) if getattr(solid, name) is not None]
-    if not solid.moves:
+    if solid.motion == "fixed":
         if given:
             raise field_error((*path, given[0]), Words("given"), 'left out, as motion is "fixed"')
         return
@@ -145,8 +152,6 @@ def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
         _check_knots(solid, dimension, path)
         if wrong := [name for name in steady if name in given]:
             raise field_error((*path, wrong[0]), Words("given"), "left out, as there are times")
-    if solid.velocity is not None and len(solid.velocity) != dimension:
-        raise field_error((*path, "velocity"), solid.velocity, f"a list of {dimension} components")
 
 
 def _check_knots(solid: SolidTable, dimension: int, path: FieldPath) -> None:

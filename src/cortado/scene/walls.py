@@ -1,7 +1,7 @@
 """The wall particles of a scene: of its container and of its solids."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ from cortado.scene.room import resting_room
 from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
 
+WHOLE = 1e-6
+"""By how much, relative, a solid may be shorter than a period that it fills."""
 NEAREST_PLACE = 0.4
 """In spacings: places that are looked at for the weights of walls are no nearer to any surface."""
 
@@ -37,13 +39,15 @@ class Walls:
     """(b, d) from each to the nearest point of its surface [m]."""
     sticks: NDArray[np.bool_]
     """(b,) whether fluid has no slip along each."""
+    slides: Points
+    """(b, d) how fast their surface slides along the solid, in its own frame [m/s]"""
     solid: NDArray[np.int64]
     """(b,) whose they are: the number of a solid among those that move; -1 of those at rest."""
 
     @classmethod
-    def of(cls, points: WallPoints, weights: Points, sticks: NDArray[np.bool_], solid: int = -1) -> "Walls":
-        """With the weights that were found."""
-        return cls(points.positions, weights, points.feet, sticks, np.full(len(points), solid))
+    def of(cls, points: WallPoints, weights: Points, sticks: NDArray[np.bool_]) -> "Walls":
+        """Those at rest, with the weights that were found."""
+        return cls(points.positions, weights, points.feet, sticks, 0.0 * points.feet, np.full(len(points), -1))
 
     @classmethod
     def joined(cls, parts: Sequence["Walls"]) -> "Walls":
@@ -54,7 +58,8 @@ class Walls:
 def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     """Those of a scene. Raises `InputError` for a solid that no fluid can touch."""
     still = _around(scene, layers, lattice) if resting_room(scene).solids else _container_walls(scene, layers, lattice)
-    return Walls.joined([still, *(_alone(solid, k, layers, lattice) for k, solid in enumerate(moving(scene.solid)))])
+    periods, tables = scene.container.periods(scene.dimension)[1], moving(scene.solid)
+    return Walls.joined([still, *(_alone(table, k, periods, layers, lattice) for k, table in enumerate(tables))])
 
 
 def _container_walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
@@ -88,15 +93,18 @@ def _around(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     return Walls.of(points, weights, np.array([table.sticks for table in tables])[surface.owners(points)])
 
 
-def _alone(table: SolidTable, number: int, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Those of one solid that moves, as if nothing else were there."""
-    solid = table.solid()
-    dimension = len(solid.extent()[0])
-    room = Room(Region.everywhere(dimension), (solid,), np.zeros(dimension))
-    surface = ExposedSurface.of(room, (solid,), room.periods, lattice.support, lattice.spacing)
+def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, lattice: RestLattice) -> Walls:
+    """Those of one solid that moves, as if nothing else were there, but for its own images where it fills a period."""
+    solid, dimension = table.solid(), len(periods)
+    lower, upper = solid.extent()
+    filled = np.where(upper - lower > periods * (1.0 - WHOLE), periods, 0.0)
+    room = Room(Region.everywhere(dimension), (solid,), filled)
+    surface = ExposedSurface.of(room, room.images(solid), lower, lattice.support, lattice.spacing)
     nothing = Places.upright(np.zeros((0, dimension)))
     points, weights = _weighed(surface, nothing, room.solids, layers, lattice)
-    return Walls.of(points, weights, np.full(len(points), table.sticks), number)
+    found = Walls.of(points, weights, np.full(len(points), table.sticks))
+    slides = np.tile(table.surface_velocity or (0.0,) * dimension, (len(points), 1))
+    return replace(found, slides=slides, solid=np.full(len(points), number))
 
 
 def _weighed(

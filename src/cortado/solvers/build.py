@@ -91,7 +91,7 @@ def _search(scene: Scene, discrete: DiscreteScene, discretisation: Discretisatio
         own = walls.solid == number
         positions[own], feet[own] = (positions[own] - middle) @ turn, feet[own] @ turn
     grips = walls.weights * walls.sticks
-    arrays = WallArrays(padded(positions), walls.weights, grips, padded(feet), walls.solid)
+    arrays = WallArrays(padded(positions), walls.weights, grips, padded(feet), padded(walls.slides), walls.solid)
     begun = Poses.still(layout.members, padded(middles), _in_space(turns), layout.precision, layout.device)
     return NeighbourSearch(discretisation, grid, arrays, layout, room, begun if len(middles) else None)
 
