@@ -133,6 +133,7 @@ SLOW_TESTS = {
         "test_the_discretisation_is_without_warp",
     },
     "test_leaderboard": {"test_the_standard_error_of_the_truth_is_right"},
+    "test_meshes": {"test_two_hundred_thousand_triangles_are_read_sampled_and_asked_a_million_times"},
     "test_mixture": {
         "test_a_parameter_alone_has_the_gradient_that_it_has_among_all",
         "test_gradient_equals_tangent_and_differences",
