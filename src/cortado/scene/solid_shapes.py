@@ -1,14 +1,17 @@
 """The shapes that solids may have."""
 
+from dataclasses import replace
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from cortado.discretise.shapes import Points
+from cortado.discretise.solids.mesh import Mesh
+from cortado.discretise.solids.mesh_files import mesh_in_file
 from cortado.discretise.solids.solid import Box, Polygon, Revolved, Round, Solid
-from cortado.scene.fields import FieldPath, Length, Vector, field_error, quantity
-from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
+from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
+from cortado.scene.fluids import INDEX_OF_AXIS, beside_scene, check_order, refuse_plane
 from cortado.scene.solids import SolidTable
 
 Size = Annotated[float, quantity("m", gt=0.0)]
@@ -179,8 +182,42 @@ class PolygonSolid(SolidTable):
         return np.inf
 
 
+class MeshSolid(SolidTable):
+    """What a mesh of triangles holds, in 3-D."""
+
+    shape: Literal["mesh"] = "mesh"
+    file: Text
+    """Its name: STL, OBJ, PLY, glTF or GLB; beside the scene file, and absolute once read."""
+    scale: Annotated[float, quantity(gt=0.0)] = 1.0
+    """What its lengths are multiplied with, such as 0.001 where they are millimetres."""
+
+    @field_validator("file")
+    @classmethod
+    def _make_absolute(cls, file: str, info: ValidationInfo) -> str:
+        return beside_scene(file, info)
+
+    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
+        if dimension == 2:
+            raise field_error((*path, "shape"), "mesh", '"box", "sphere", "capsule", "cup" or "polygon" in 2-D')
+        return super().in_dimension(dimension, path)
+
+    def mesh(self) -> Mesh:
+        """As it is in the file, but for the scale; raises `InputError`."""
+        found = mesh_in_file(self.file).mesh
+        return replace(found, vertices=self.scale * found.vertices)
+
+    def shape_about(self) -> tuple[Solid, Points]:
+        mesh = self.mesh()
+        middle = mesh.middle()
+        return replace(mesh, vertices=mesh.vertices - middle), middle
+
+    def thinnest(self) -> float:
+        return np.inf
+
+
 AnySolid = Annotated[
-    BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid, Field(discriminator="shape")
+    BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid | MeshSolid,
+    Field(discriminator="shape"),
 ]
 
 

@@ -17,8 +17,9 @@ from cortado.particles.moving_walls import MovingWalls, Poses
 from cortado.particles.state import Layout, State
 from cortado.solvers.containment_kernels import NO_PARTICLE, bounds_type, lost_kernel, solids_type
 
-THINNEST = 0.4
-"""Of the thickness of a solid: particles that are deeper in it are lost."""
+DEEPEST, THINNEST = 1.0, 0.45
+"""In spacings, and of the thickness of a solid: particles that are deeper in it are lost. Sharp edges, behind which
+there are few wall particles, let some in by half a spacing."""
 REACH = 4.0
 """In spacings: how far from a surface particles are looked at."""
 HEIGHT = 100.0
@@ -65,7 +66,7 @@ class Walled:
 
     def tolerance(self, one: Obstacle) -> float:
         """How deep in a solid a particle may be [m]."""
-        return min(TOLERANCE * self.spacing, THINNEST * one.thickness)
+        return min(DEEPEST * self.spacing, THINNEST * one.thickness)
 
     def furthest(self, precision: Precision) -> Region:
         """The box that positions must not leave [m]: far away, and as far from the origin as a precision resolves; what

@@ -104,6 +104,11 @@ class Mesh(Solid):
         seen = self._looked_up(points + SEEN * fine * outward, SEEN * fine)[1] > 0.0
         return points[seen], outward[seen]
 
+    def middle(self) -> Points:
+        """(3,) the centroid of what it holds; overlapping parts count as often as they overlap [m]."""
+        volumes = np.linalg.det(self.corners)
+        return np.asarray((volumes[:, None] * self.corners.sum(axis=1)).sum(axis=0) / (4.0 * volumes.sum()))
+
     def normals(self) -> Points:
         """(k, 3) unit vectors outwards from each triangle; 0 where it has no area."""
         across = self._across
