@@ -13,12 +13,14 @@ from cortado.gradients import GradientEstimator
 from cortado.optimisation.layers import calls
 from cortado.optimisation.layers.with_torch import TorchBridge, torch
 from cortado.problem import Problem
+from cortado.render import Renderer
 from cortado.rollout.device_states import DeviceState
 from cortado.rollout.host_states import Given, States
+from cortado.runs.sensors.sensor import Sensor
 from cortado.scene.parameters.values import Values
 from cortado.simulation import Simulation
 
-__all__ = ["Steps", "restart_state", "rollout", "state", "step", "value"]
+__all__ = ["Steps", "measure", "picture", "restart_state", "rollout", "state", "step", "value"]
 
 Tensors = Mapping[str, Any]
 """By name."""
@@ -74,6 +76,26 @@ def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callab
     `gradients.Exact` by default, with the bits of `Problem.value_and_gradient`.
     """
     return calls.value(_BRIDGE, problem, gradient)
+
+
+def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "torch.Tensor"]:
+    """A sensor, such as one of `cortado.sensors`, or by its name a quantity of the particles, such as "pressure", as a
+    function ``reading(state, parameters=None)`` of tensors.
+
+    It returns (k,), a number for each column of the sensor, or the quantity (n,) or (n, d). Parameters are those of the
+    step that begins at the state: the pressure is that step's. Raises `InputError` for a simulation that is a batch.
+    """
+    return calls.measure(_BRIDGE, simulation, what)
+
+
+def picture(renderer: Renderer, positions: Any, fractions: Any = None, colours: Any = None) -> "torch.Tensor":
+    """A picture (rows, columns, 3) of particles, linear RGB: `Renderer.render` as a function of tensors.
+
+    ``positions`` (n, d) [m], ``fractions`` (n, phases), which may be left out with one phase, and ``colours``
+    (phases, 3), those of the renderer if left out. It passes through the host, and has derivatives in reverse mode
+    only. Raises `InputError` for what does not fit.
+    """
+    return calls.picture(_BRIDGE, renderer, positions, fractions, colours)
 
 
 class Steps(torch.nn.Module):

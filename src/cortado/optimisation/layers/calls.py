@@ -6,15 +6,19 @@ from typing import Any, Protocol
 import numpy as np
 
 from cortado.arrays import require_table, whole_number
-from cortado.device.threads import WARP
 from cortado.errors import InputError, shown
 from cortado.gradients import GradientEstimator
 from cortado.optimisation.layers.layer import PARAMETER, STATE, Layer, Named, named, part
-from cortado.optimisation.layers.steps import Steps, check_state
+from cortado.optimisation.layers.measure import READING, Measure
+from cortado.optimisation.layers.picture import PICTURE, Picture
+from cortado.optimisation.layers.states import check_state
+from cortado.optimisation.layers.steps import Steps
 from cortado.optimisation.layers.value import LOSS, Value
 from cortado.problem import Problem
+from cortado.render import Renderer
 from cortado.rollout.device_states import DeviceState
 from cortado.rollout.host_states import Given
+from cortado.runs.sensors.sensor import Sensor
 from cortado.scene.parameters.values import Values
 from cortado.scene.restart import RestartState
 from cortado.simulation import Simulation
@@ -62,7 +66,7 @@ def steps_layer(simulation: Simulation, steps: int) -> Steps:
 def state(bridge: Bridge, simulation: Simulation, given: Given | DeviceState, parameters: Values | None) -> Any:
     """A state of Cortado's, the first one if left out, as a table of arrays."""
     layer = steps_layer(simulation, 1)
-    with WARP:
+    with layer.turn:
         return bridge.made(layer.states.of(given, dict(parameters or {})), layer)
 
 
@@ -121,6 +125,29 @@ def value(bridge: Bridge, problem: Problem, gradient: GradientEstimator | None) 
         return _applied(bridge, layer, given, parameters)[LOSS]
 
     return loss
+
+
+def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Callable[[Table, Table | None], Any]:
+    """A sensor or a quantity of the particles as a function of a state and of parameters."""
+    if not isinstance(simulation, Simulation):
+        raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")
+    layer = Measure(simulation, what)
+
+    def reading(given: Table, parameters: Table | None = None) -> Any:
+        """What is read of a state, of which the pressure is that of the step that begins there."""
+        return _applied(bridge, layer, given, parameters)[READING]
+
+    return reading
+
+
+def picture(bridge: Bridge, renderer: Renderer, positions: Any, fractions: Any, colours: Any) -> Any:
+    """A picture of particles."""
+    layers: dict[str, Picture] = renderer.__dict__.setdefault("_layers", {})
+    layer = layers.setdefault(PICTURE, Picture(renderer)) if isinstance(renderer, Renderer) else Picture(renderer)
+    given = {"positions": positions, "fractions": fractions, "colours": colours}
+    found = {name: bridge.array(name, value, layer) for name, value in given.items() if value is not None}
+    layer.check({name: tuple(array.shape) for name, array in found.items()})
+    return bridge.apply(layer, found)[PICTURE]
 
 
 def _applied(bridge: Bridge, layer: Layer, given: Table | None, parameters: Table | None) -> dict[str, Any]:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.threads import Turn
 from cortado.errors import InputError
 from cortado.words import counted
 
@@ -39,11 +38,6 @@ class Layer(ABC):
 
     def __init__(self) -> None:
         self._batched: dict[int, Layer] = {}
-
-    @property
-    @abstractmethod
-    def turn(self) -> Turn:
-        """What a thread holds that uses it."""
 
     @abstractmethod
     def check(self, given: Shapes) -> None:
@@ -93,10 +87,6 @@ class OneByOne(Layer):
         self._layer, self._size = layer, size
         self.real, self.device, self.on_device = layer.real, layer.device, layer.on_device
         self.kept_bytes = size * layer.kept_bytes
-
-    @property
-    def turn(self) -> Turn:
-        return self._layer.turn
 
     def check(self, given: Shapes) -> None:
         self._layer.check({name: shape[1:] for name, shape in given.items()})

@@ -6,7 +6,8 @@ from hashlib import blake2b
 import numpy as np
 import warp as wp
 
-from cortado.optimisation.layers.layer import Array, Named, on_host
+from cortado.errors import InputError
+from cortado.optimisation.layers.layer import Array, Named, Shapes, on_host
 from cortado.particles.fields import Entry
 from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState, DeviceStates
@@ -146,6 +147,22 @@ class NamedStates:
             self._known[_checksum(arrays)] = origins
             while len(self._known) > MOST_KNOWN:
                 self._known.popitem(last=False)
+
+
+def check_state(given: Shapes, wanted: Shapes) -> None:
+    """Raises `InputError` for arrays of other names or shapes than those of a state."""
+    if given.keys() != wanted.keys():
+        raise InputError(f"state has {', '.join(given)}, but must have {', '.join(wanted)} in this scene.")
+    for name, shape in wanted.items():
+        if given[name] != shape:
+            raise InputError(f"state {name} has shape {given[name]}, but must be {shape}.")
+
+
+def named_states(simulation: Simulation) -> NamedStates:
+    """What makes the states of a simulation for all of its layers."""
+    found: NamedStates = simulation.__dict__.get("_named_states") or NamedStates(simulation)
+    simulation.__dict__["_named_states"] = found
+    return found
 
 
 def _checksum(arrays: State) -> bytes:

@@ -7,10 +7,9 @@ import numpy as np
 
 from cortado.arrays import check_steps
 from cortado.device.threads import Turn, in_turn
-from cortado.errors import InputError
 from cortado.optimisation.layers.layer import STATE, Array, Layer, Named, Shapes, named, on_host, part, unbatched
 from cortado.optimisation.layers.parameters import LayerParameters
-from cortado.optimisation.layers.states import LAST_STEP, NamedStates
+from cortado.optimisation.layers.states import LAST_STEP, check_state, named_states
 from cortado.rollout.device_states import DeviceState
 from cortado.rollout.parameter_space import STATE_TIME
 from cortado.rollout.rollout import MEMORY_BUDGET
@@ -25,7 +24,7 @@ class Steps(Layer):
         """``each`` as that of `LayerParameters`."""
         super().__init__()
         self._simulation, self._steps, self._each = simulation, check_steps(steps), each
-        self.states = NamedStates(simulation)
+        self.states = named_states(simulation)
         """What makes states of named arrays."""
         self._parameters = LayerParameters(simulation, steps, each)
         self.real, self.device = simulation.precision.numpy, simulation.device
@@ -35,6 +34,7 @@ class Steps(Layer):
 
     @property
     def turn(self) -> Turn:
+        """What a thread holds that uses it."""
         return self._simulation.turn
 
     @cached_property
@@ -88,12 +88,3 @@ class Steps(Layer):
         """The other way round. What steps were chosen by has no derivative."""
         last = {LAST_STEP: np.zeros(self.states.shapes[LAST_STEP])} if LAST_STEP in self.states.shapes else {}
         return named(STATE, {**self.states.narrowed(found), STATE_TIME: np.asarray(found[STATE_TIME]), **last})
-
-
-def check_state(given: Shapes, wanted: Shapes) -> None:
-    """Raises `InputError` for arrays of other names or shapes than those of a state."""
-    if given.keys() != wanted.keys():
-        raise InputError(f"state has {', '.join(given)}, but must have {', '.join(wanted)} in this scene.")
-    for name, shape in wanted.items():
-        if given[name] != shape:
-            raise InputError(f"state {name} has shape {given[name]}, but must be {shape}.")

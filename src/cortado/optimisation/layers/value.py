@@ -21,8 +21,7 @@ from cortado.optimisation.layers.layer import (
     unbatched,
 )
 from cortado.optimisation.layers.parameters import LayerParameters
-from cortado.optimisation.layers.states import LAST_STEP, NamedStates
-from cortado.optimisation.layers.steps import check_state
+from cortado.optimisation.layers.states import LAST_STEP, check_state, named_states
 from cortado.problem import Problem
 from cortado.scene.parameters.values import Arrays
 
@@ -76,7 +75,7 @@ class Value(Layer):
         self._problem, self._each = problem, each
         self._estimator = Exact() if gradient is None else checked_estimator(gradient)
         simulation = problem.simulation
-        self._states = NamedStates(simulation)
+        self._states = named_states(simulation)
         self._parameters = LayerParameters(simulation, problem.steps, each)
         self.real, self.device = simulation.precision.numpy, simulation.device
         own = sum(array.capacity for array in simulation.initial.arrays())
@@ -84,6 +83,7 @@ class Value(Layer):
 
     @property
     def turn(self) -> Turn:
+        """What a thread holds that uses it."""
         return self._problem.turn
 
     def check(self, given: Shapes) -> None:
