@@ -67,7 +67,8 @@ def state(bridge: Bridge, simulation: Simulation, given: Given | DeviceState, pa
     """A state of Cortado's, the first one if left out, as a table of arrays."""
     layer = steps_layer(simulation, 1)
     with layer.turn:
-        return bridge.made(layer.states.of(given, dict(parameters or {})), layer)
+        found = layer.states.of(given, dict(_table("parameters", parameters)))
+        return part(bridge.made(named(STATE, found), layer), STATE)
 
 
 def restart_state(
@@ -75,10 +76,9 @@ def restart_state(
 ) -> RestartState | tuple[RestartState, ...]:
     """The other way round."""
     layer = steps_layer(simulation, 1)
-    require_table("state", given, "{'positions': array, ...}")
-    arrays = {name: bridge.numbers(f"state {name}", value) for name, value in given.items()}
+    arrays = {name: bridge.numbers(f"state {name}", value) for name, value in _table("state", given).items()}
     check_state({name: array.shape for name, array in arrays.items()}, layer.states.shapes)
-    own = {name: np.asarray(value, dtype=np.float64) for name, value in (parameters or {}).items()}
+    own = {name: bridge.numbers(f"parameter {name}", value) for name, value in _table("parameters", parameters).items()}
     with layer.turn:
         return simulation.on_host(layer.states.state(arrays, own))
 
@@ -96,8 +96,8 @@ def rollout(
     if steps % every:
         raise InputError(f"record_every is {every}, but must divide the {steps} steps.")
     layer, count = steps_layer(simulation, every), steps // every
-    require_table("parameters", parameters or {}, "{'gravity': array}")
-    arrays = {name: bridge.array(PARAMETER + name, value, layer) for name, value in (parameters or {}).items()}
+    table = _table("parameters", parameters)
+    arrays = {name: bridge.array(PARAMETER + name, value, layer) for name, value in table.items()}
     if simulation.batch is not None and any(name in simulation.known.over_time for name in arrays):
         over_time = ", ".join(name for name in arrays if name in simulation.known.over_time)
         raise InputError(f"parameter {over_time} is given, but must be left out in a rollout of a batch: chain steps.")
@@ -108,7 +108,7 @@ def rollout(
             raise InputError(f"parameter {name} has {array.shape[0]} rows, but must have {steps}, one for each step.")
     pieces = {name: array.reshape((count, every, *array.shape[1:])) for name, array in rows.items()}
     others = {name: array for name, array in arrays.items() if name not in rows}
-    first = {name: bridge.array(STATE + name, value, layer) for name, value in _table(given).items()}
+    first = {name: bridge.array(STATE + name, value, layer) for name, value in _table("state", given).items()}
 
     def advance(before: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
         return part(_applied(bridge, layer, before, {**others, **own}), STATE)
@@ -151,14 +151,15 @@ def picture(bridge: Bridge, renderer: Renderer, positions: Any, fractions: Any, 
 
 
 def _applied(bridge: Bridge, layer: Layer, given: Table | None, parameters: Table | None) -> dict[str, Any]:
-    require_table("parameters", parameters or {}, "{'gravity': array}")
-    own = {} if given is None else _table(given)
-    arrays = {**named(STATE, own), **named(PARAMETER, dict(parameters or {}))}
+    own, others = _table("state", given), _table("parameters", parameters)
+    arrays = {**named(STATE, own), **named(PARAMETER, others)}
     found = {name: bridge.array(name, value, layer) for name, value in arrays.items()}
     layer.check({name: tuple(array.shape) for name, array in found.items()})
     return bridge.apply(layer, found)
 
 
-def _table(given: Table) -> Table:
-    require_table("state", given, "{'positions': array, ...}, such as state(simulation) makes")
-    return given
+def _table(what: str, given: Table | None) -> Table:
+    """What was given, nothing if it was left out; raises `InputError` for anything but a table by names."""
+    found = {} if given is None else given
+    require_table(what, found, "{'gravity': array}" if what == "parameters" else "{'positions': array, ...}")
+    return found

@@ -13,7 +13,7 @@ from cortado.particles.state import State
 from cortado.rollout.device_states import DeviceState, DeviceStates
 from cortado.rollout.host_states import Given
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
-from cortado.rollout.restarts import origin_of
+from cortado.rollout.restarts import check_clock, origin_of
 from cortado.scene.parameters.values import Arrays
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.simulation import Simulation
@@ -62,6 +62,8 @@ class NamedStates:
         own = parameters.get("time_step", 1.0 if solver.chooses else solver.time_step)
         steps = np.broadcast_to(np.float64(own), times.shape)
         clocks = [self._clock(*own) for own in zip(times.tolist(), steps.tolist(), sizes.tolist(), strict=True)]
+        for clock in clocks:
+            check_clock(clock)
         origins = self._judged(arrays, clocks, parameters)
         scenes = tuple(RestartState({}, *own) for own in zip(clocks, origins, strict=True))
         self._simulation.judged_states.update(scenes)
@@ -151,6 +153,8 @@ class NamedStates:
 
 def check_state(given: Shapes, wanted: Shapes) -> None:
     """Raises `InputError` for arrays of other names or shapes than those of a state."""
+    if not given:
+        raise InputError(f"state is left out, but must have {', '.join(wanted)} in this scene.")
     if given.keys() != wanted.keys():
         raise InputError(f"state has {', '.join(given)}, but must have {', '.join(wanted)} in this scene.")
     for name, shape in wanted.items():

@@ -132,7 +132,7 @@ def _evaluate_forward(arrays: Arrays, dots: Arrays, *, keep: bool, **options: An
     tangents = push_p.bind(number, *arrays, *own, along=along, **options)
     if not keep:
         return found, tangents
-    return [*found, number], [*tangents, ad.Zero.from_primal_value(number)]
+    return [*found, number], [*tangents, ad.Zero(jax.core.ShapedArray(number.shape, jax.dtypes.float0))]
 
 
 def _push_transposed(bars: Arrays, number: Any, *given: Any, names: Names, along: Names, **options: Any) -> list[Any]:
@@ -195,10 +195,7 @@ class JaxBridge:
 
     def made(self, found: Named, layer: Layer) -> dict[str, Any]:
         """Arrays of a layer as JAX's."""
-        first = {
-            name: jnp.array(array.numpy() if isinstance(array, wp.array) else array) for name, array in found.items()
-        }
-        return {name: self.array(name, array.astype(layer.real), layer) for name, array in first.items()}
+        return {name: self.array(name, np.array(on_host(array)), layer) for name, array in found.items()}
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
         """An array on the host, in float64."""
@@ -209,6 +206,11 @@ class JaxBridge:
     ) -> dict[str, Any]:
         """The states that a step leads to again and again, with the next row of each array, and the first one, along a
         first axis."""
+        if not any(isinstance(array, jax.core.Tracer) for array in jax.tree.leaves((state, rows))):
+            states = [state]
+            for k in range(count):
+                states.append(step(states[-1], {name: row[k] for name, row in rows.items()}))
+            return {name: jnp.stack([one[name] for one in states]) for name in state}
 
         def body(before: Any, own: Any) -> tuple[Any, Any]:
             after = step(before, own)

@@ -40,10 +40,9 @@ class Call:
 
     def evaluate(self, tensors: Tensors, keep: bool) -> Tensors:
         """What the layer returns, as tensors."""
-        device = _device(self.layer)
-        with _stream(device):
+        with _stream(_device(self.layer)):
             found, self.residual = self.layer.evaluate(_arrays(self.names, tensors), keep)
-            return _tensors(self.layer, found, self.layer.outputs(), device)
+            return _tensors(self.layer, found, self.layer.outputs())
 
     def kept(self, tensors: Tensors) -> Any:
         """What derivatives need, which is computed now where nobody said before that it would be needed."""
@@ -60,10 +59,9 @@ class Call:
 
     def push(self, tensors: Tensors, dots: Tensors) -> Tensors:
         """The tangents of what the layer returns."""
-        device = _device(self.layer)
-        with _stream(device):
+        with _stream(_device(self.layer)):
             found = self.layer.push(self.kept(tensors), _arrays(self.names, dots))
-            return _tensors(self.layer, found, self.layer.outputs(), device)
+            return _tensors(self.layer, found, self.layer.outputs())
 
     def batched(self, size: int) -> "Call":
         """The application to so many of each tensor."""
@@ -191,11 +189,8 @@ class TorchBridge:
 
     def made(self, found: Named, layer: Layer) -> dict[str, Any]:
         """Arrays of a layer as tensors of their own."""
-        device = _device(layer)
-        return {
-            name: _tensor(array, array.shape, _dtype(layer), device if isinstance(array, wp.array) else "cpu").clone()
-            for name, array in found.items()
-        }
+        shapes = {name: tuple(array.shape) for name, array in found.items()}
+        return {name: own.clone() for name, own in zip(shapes, _tensors(layer, found, shapes), strict=True)}
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
         """A tensor, or what else it may be, on the host."""
@@ -238,13 +233,11 @@ def _array(tensor: Any) -> Array:
     return tensor.numpy() if tensor.device.type == "cpu" else wp.from_torch(tensor.reshape(tensor.shape or (1,)))
 
 
-def _tensors(layer: Layer, found: Named, shapes: dict[str, tuple[int, ...]], device: Any) -> Tensors:
-    """What a layer returned; small numbers stay on the host."""
-    real = _dtype(layer)
-    return tuple(
-        _tensor(found[name], shape, real, device if isinstance(found[name], wp.array) else "cpu")
-        for name, shape in shapes.items()
-    )
+def _tensors(layer: Layer, found: Named, shapes: dict[str, tuple[int, ...]]) -> Tensors:
+    """What a layer returned; what may be elsewhere than on its device is on the host."""
+    real, device = _dtype(layer), _device(layer)
+    each = ((found[name], shape, device if name in layer.on_device else "cpu") for name, shape in shapes.items())
+    return tuple(_tensor(array, shape, real, place) for array, shape, place in each)
 
 
 def _tensor(array: Array, shape: Sequence[int], dtype: Any, device: Any) -> Any:
