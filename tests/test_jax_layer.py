@@ -371,6 +371,21 @@ def test_what_is_measured_has_the_derivatives_of_differences(jax, layer, simulat
         np.testing.assert_array_equal(read(*arguments), wanted)
 
 
+def test_readings_are_gone_back_through_in_any_order(jax, layer):
+    """With the clock and the schedule of each."""
+    simulation = Simulation(scheduled(), precision="float64")
+    early, late = (layer.state(simulation, simulation.run(steps).last_state) for steps in (5, 22))
+    reading = layer.measure(simulation, "pressure")
+
+    def gradient(*states):
+        return jax.grad(lambda own: sum((reading(state) ** 2).sum() for state in own))(states)
+
+    both, alone = gradient(early, late), (*gradient(early), *gradient(late))
+    for one, other in zip(both, alone, strict=True):
+        same_bits(one, other)
+    assert alone[0]["time"] != 0.0 != alone[1]["time"]
+
+
 def test_a_picture_has_the_derivatives_of_differences_in_reverse_mode(jax, layer):
     from jax.test_util import check_grads
 
