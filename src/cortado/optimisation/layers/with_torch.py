@@ -157,7 +157,7 @@ class Push(_Linear):
 
 
 for _one in (Pull, Push):
-    _one.vmap = staticmethod(_mapped(_one))  # type: ignore[method-assign]
+    _one.vmap = staticmethod(_mapped(_one))
 
 
 class TorchBridge:
