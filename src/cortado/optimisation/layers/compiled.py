@@ -4,18 +4,18 @@ a GPU, in its stream."""
 import inspect
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from itertools import count
 from typing import Any
 from uuid import uuid4
 from weakref import finalize
 
-import numpy as np
 import warp as wp
 
 from cortado.device.threads import WARP
 from cortado.errors import CortadoError
-from cortado.optimisation.layers.layer import Array
+from cortado.optimisation.layers.layer import Array, on_host
 
 Kind = tuple[int, str]
 """How many axes an array has, and the name of its type."""
@@ -61,15 +61,16 @@ def _callable(given: tuple[Kind, ...], made: tuple[Kind, ...]) -> Any:
 
     def call(*arguments: Any) -> None:
         arrays, number, results = arguments[: len(given)], arguments[len(given)], arguments[len(given) + 1 :]
-        try:
-            found = _FUNCTIONS[number]([_as_array(array) for array in arrays])
-        except CortadoError as error:  # Warp prints where it comes from
-            raise error.with_traceback(None) from None
-        for result, own in zip(results, found, strict=True):
-            if isinstance(own, wp.array) and own.dtype == result.dtype and own.device == result.device:
-                wp.copy(result, own.reshape(result.shape))
-            else:
-                result.assign((own.numpy() if isinstance(own, wp.array) else np.asarray(own)).reshape(result.shape))
+        with WARP, _in_order(results[0].device):
+            try:
+                found = _FUNCTIONS[number]([_as_array(array) for array in arrays])
+            except CortadoError as error:  # Warp prints where it comes from
+                raise error.with_traceback(None) from None
+            for result, own in zip(results, found, strict=True):
+                if isinstance(own, wp.array) and own.dtype == result.dtype and own.device == result.device:
+                    wp.copy(result, own.reshape(result.shape))
+                else:
+                    result.assign(on_host(own).reshape(result.shape))
 
     types = {f"in_{k}": _annotation(*kind) for k, kind in enumerate(given)}
     types |= {"number": int} | {f"out_{k}": _annotation(*kind) for k, kind in enumerate(made)}
@@ -79,6 +80,16 @@ def _callable(given: tuple[Kind, ...], made: tuple[Kind, ...]) -> Any:
     call.__annotations__ = types
     call.__qualname__ = f"call_{uuid4().hex}"  # a program that was kept on disk does not find it in another process
     return wp.jax_callable(call, len(made), wp.JaxCallableGraphMode.NONE, vmap_method=None)
+
+
+def _in_order(device: Any) -> AbstractContextManager[Any]:
+    """On a GPU, in a stream of ours, after and before what is in that of the program, which cannot be captured."""
+    return nullcontext() if device.is_cpu else wp.ScopedStream(_stream(device.alias), sync_enter=True, sync_exit=True)
+
+
+@cache
+def _stream(device: str) -> Any:
+    return wp.Stream(device)
 
 
 def _annotation(axes: int, dtype: str) -> Any:

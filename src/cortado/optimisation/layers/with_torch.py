@@ -1,7 +1,7 @@
 """Layers as functions of PyTorch's tensors: both modes of its automatic differentiation, and `torch.vmap`."""
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import prod
 from typing import Any
@@ -40,7 +40,7 @@ class Call:
 
     def evaluate(self, tensors: Tensors, keep: bool) -> Tensors:
         """What the layer returns, as tensors."""
-        with _stream(_device(self.layer)):
+        with _in_order(_device(self.layer)):
             found, self.residual = self.layer.evaluate(_arrays(self.names, tensors), keep)
             return _tensors(self.layer, found, self.layer.outputs())
 
@@ -52,14 +52,14 @@ class Call:
 
     def pull(self, tensors: Tensors, bars: Tensors) -> Tensors:
         """The adjoints of all tensors, each on its device."""
-        with _stream(_device(self.layer)):
+        with _in_order(_device(self.layer)):
             found = self.layer.pull(self.kept(tensors), _arrays(self.layer.outputs(), bars))
             each = zip(self.names, tensors, strict=True)
             return tuple(_tensor(found[name], tensor.shape, tensor.dtype, tensor.device) for name, tensor in each)
 
     def push(self, tensors: Tensors, dots: Tensors) -> Tensors:
         """The tangents of what the layer returns."""
-        with _stream(_device(self.layer)):
+        with _in_order(_device(self.layer)):
             found = self.layer.push(self.kept(tensors), _arrays(self.names, dots))
             return _tensors(self.layer, found, self.layer.outputs())
 
@@ -215,11 +215,16 @@ def _device(layer: Layer) -> Any:
     return torch.device(layer.device.alias)
 
 
-def _stream(device: Any) -> AbstractContextManager[Any]:
-    """On a GPU the stream that PyTorch computes in."""
+@contextmanager
+def _in_order(device: Any) -> Iterator[None]:
+    """On a GPU, after what PyTorch computes in its stream, and before what it computes there next."""
     if device.type != "cuda":
-        return nullcontext()
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)))
+        yield
+        return
+    theirs, own = wp.stream_from_torch(torch.cuda.current_stream(device)), wp.get_stream(str(device))
+    own.wait_stream(theirs)
+    yield
+    theirs.wait_stream(own)
 
 
 def _arrays(names: Any, tensors: Tensors) -> dict[str, Array]:
