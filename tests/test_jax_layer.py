@@ -511,6 +511,7 @@ def test_other_bad_uses_are_refused_in_a_sentence(jax, layer, simulation, proble
         (lambda: layer.measure(simulation, 3), "sensor is 3, but must be a sensor"),
         (lambda: layer.measure(Simulation(plane(), batch=2), "density"), "simulation is a batch of 2, but must be"),
         (lambda: layer.picture(simulation, state["positions"]), "renderer is .*, but must be one such as"),
+        (lambda: layer.picture(None, state["positions"]), "renderer is None, but must be one such as"),
         (lambda: layer.restart_state(simulation, other), "state positions has shape"),
         (lambda: layer.state(simulation, "last"), "state is 'last', but must be a RestartState"),
     ]:

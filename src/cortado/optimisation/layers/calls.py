@@ -142,8 +142,8 @@ def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Calla
 
 def picture(bridge: Bridge, renderer: Renderer, positions: Any, fractions: Any, colours: Any) -> Any:
     """A picture of particles."""
-    layers: dict[str, Picture] = renderer.__dict__.setdefault("_layers", {})
-    layer = layers.setdefault(PICTURE, Picture(renderer)) if isinstance(renderer, Renderer) else Picture(renderer)
+    layer = getattr(renderer, "_layer", None) or Picture(renderer)
+    renderer.__dict__["_layer"] = layer
     given = {"positions": positions, "fractions": fractions, "colours": colours}
     found = {name: bridge.array(name, value, layer) for name, value in given.items() if value is not None}
     layer.check({name: tuple(array.shape) for name, array in found.items()})
