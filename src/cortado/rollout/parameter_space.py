@@ -73,6 +73,12 @@ class ParameterSpace:
             check_known(name, self._simulation.scene, what, self._known)
         return found
 
+    def shapes(self, name: str) -> list[tuple[int, ...]]:
+        """The shapes that a parameter may have; raises `InputError` for one that the scene does not have."""
+        check_known(name, self._simulation.scene, known=self._known)
+        own = self._one.shapes(name)
+        return [*own, *self._batched(own)]
+
     def members(self, values: Arrays) -> list[Arrays]:
         """Checked values as those of each scene of a batch; of a single scene they are the only ones."""
         different = self._different(values)
