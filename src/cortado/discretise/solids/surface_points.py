@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.device.cores import usable_cores
 from cortado.discretise.shapes import Points, block_about
 from cortado.discretise.solids.solid import Solid, Which
 
@@ -58,19 +59,17 @@ def evenly_chosen(candidates: Points, areas: Points, spacing: float) -> SurfaceP
     dimension = candidates.shape[1]
     if not len(candidates):
         return SurfacePoints(candidates, np.zeros(0))
-    from scipy.spatial import cKDTree
-
     order, nothing = np.random.default_rng(SEED).permutation(len(candidates)), np.zeros(0, dtype=np.int64)
     chosen = candidates[_chosen(candidates, order, APART * spacing, nothing)]
     for _ in range(ROUNDS[dimension]):
-        owner = cKDTree(chosen).query(candidates)[1]
+        owner = _nearest(chosen, candidates)[1]
         total = np.bincount(owner, areas, len(chosen))
         sums = np.stack([np.bincount(owner, areas * x, len(chosen)) for x in candidates.T], axis=1)
         chosen = sums[total > 0.0] / total[total > 0.0, None]
-    moved = np.unique(cKDTree(candidates).query(chosen)[1])
+    moved = np.unique(_nearest(candidates, chosen)[1])
     kept = _chosen(candidates, moved, LEAST_APART * spacing, nothing)
     chosen = candidates[np.sort(_chosen(candidates, order, APART * spacing, kept))]
-    owner = cKDTree(chosen).query(candidates)[1]
+    owner = _nearest(chosen, candidates)[1]
     shares = np.bincount(owner, areas, len(chosen)) / spacing ** (dimension - 1)
     return SurfacePoints(chosen, shares)
 
@@ -169,17 +168,23 @@ def _within_cells(cells: Points, fine: float) -> Iterator[Points]:
 def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Numbers:
     """Numbers of points (n, d) [m]: those chosen already, and of those in an order all that are further than ``apart``
     [m] from them and from those that come before."""
-    from scipy.spatial import cKDTree
-
     size = int(FIRST * len(order)) + 1
     while len(order):
         some, order, size = order[:size], order[size:], int(GROWTH * size) + 1
         if len(chosen):
-            near = cKDTree(points[chosen]).query(points[some], distance_upper_bound=apart)[0]
-            some = some[np.isinf(near)]
+            some = some[np.isinf(_nearest(points[chosen], points[some], apart)[0])]
         if len(some):
             chosen = np.append(chosen, some[_first_of_all_near(points[some], apart)])
     return chosen
+
+
+def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Points, Numbers]:
+    """How far points (n, d) [m] are from the nearest of some (m, d) [m], and which it is; infinite from a reach [m]
+    on."""
+    from scipy.spatial import cKDTree
+
+    distances, numbers = cKDTree(some).query(points, distance_upper_bound=reach, workers=usable_cores())
+    return distances, numbers
 
 
 def _first_of_all_near(points: Points, apart: float) -> Which:
