@@ -1,6 +1,6 @@
 """Points on surfaces at a depth beneath that of a solid, or at a height above it, evenly spaced, in float64."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -13,10 +13,12 @@ from cortado.discretise.shapes import Points, block_about
 from cortado.discretise.solids.solid import Solid, Which
 
 Numbers = NDArray[np.int64]
+Near = Callable[[Points, float], Which]
+"""Whether points (n, d) [m] are less than a length [m] from something."""
 FINE = 3
 """Points of a surface along a spacing, among which those that stay are chosen."""
-COARSE = 4
-"""Spacings in the cells in which a surface is looked for."""
+CELLS = (3, 4)
+"""Into how many parts, along each axis, cells are cut in which a surface is looked for, until these are fine."""
 APART, LEAST_APART = 0.78, 0.65
 """In spacings: points are chosen wherever none is nearer than the first; then they are moved, none nearer to another
 than the second."""
@@ -74,17 +76,6 @@ def evenly_chosen(candidates: Points, areas: Points, spacing: float) -> SurfaceP
     return SurfacePoints(chosen, shares)
 
 
-def thin_share(solid: Solid, spacing: float, thickness: float) -> tuple[float, Points]:
-    """The share of a solid's surface beneath which it is less thick than ``thickness`` [m], and a point (d,) [m] of
-    that share."""
-    points = surface_points(solid, spacing, 0.0)
-    inwards = -_normals(solid, points.points, spacing)
-    thin = solid.distance(points.points + thickness * inwards) > 0.0
-    if not thin.any():
-        return 0.0, np.zeros(points.points.shape[1])
-    return float(points.shares[thin].sum() / points.shares.sum()), points.points[thin][0]
-
-
 def _normals(solid: Solid, feet: Points, spacing: float) -> Points:
     """(n, d) outward unit vectors at points of the surface (n, d) [m], by differences of the distance."""
     step, steps = 1e-3 * spacing, np.eye(feet.shape[1])
@@ -137,10 +128,11 @@ def _reached(solid: Solid, feet: Points, away: Points, depth: float) -> Points:
 def _near(solid: Solid, fine: float, reach: float) -> Points:
     """(n, d) points of a lattice less than ``reach`` [m] from the surface."""
     lower, upper = (np.asarray(end) for end in solid.extent())
-    coarse = COARSE * FINE * fine
-    cells = block_about(0.5 * (lower + upper), 0.5 * (upper - lower) + reach + coarse, coarse).points()
-    cells = cells[np.abs(solid.distance(cells)) < reach + 0.5 * coarse * np.sqrt(len(lower))]
-    found = [points[np.abs(solid.distance(points)) < reach] for points in _within_cells(cells, fine)]
+
+    def is_near(points: Points, furthest: float) -> Which:
+        return np.asarray(np.abs(solid.distance_up_to(points, furthest)) < furthest)
+
+    found = [points[is_near(points, reach)] for points in _lattice(lower, upper, reach, fine, is_near)]
     return np.concatenate([np.zeros((0, len(lower))), *found])
 
 
@@ -149,20 +141,35 @@ def lattice_about(feet: Points, reach: float, fine: float, tree: Any) -> Iterato
     [m], of which there is a tree, are all; in parts."""
     if not len(feet):
         return
-    lower, upper, coarse = feet.min(axis=0), feet.max(axis=0), COARSE * FINE * fine
-    cells = block_about(0.5 * (lower + upper), 0.5 * (upper - lower) + reach + coarse, coarse).points()
-    furthest = reach + 0.5 * coarse * np.sqrt(len(lower))
-    near = np.isfinite(tree.query(cells, distance_upper_bound=furthest)[0])
-    yield from _within_cells(cells[near], fine)
+
+    def is_near(points: Points, furthest: float) -> Which:
+        found = tree.query(points, distance_upper_bound=furthest, workers=usable_cores())[0]
+        return np.isfinite(found)
+
+    yield from _lattice(feet.min(axis=0), feet.max(axis=0), reach, fine, is_near)
 
 
-def _within_cells(cells: Points, fine: float) -> Iterator[Points]:
-    """Points (n, d), ``fine`` [m] apart, that fill cells whose middles (m, d) [m] are given; in parts."""
-    along = fine * (np.arange(COARSE * FINE) + 0.5) - 0.5 * COARSE * FINE * fine
-    inside = np.array(list(product(along, repeat=cells.shape[1]))) + fine * np.array(OFF_FACES[: cells.shape[1]])
-    chunk = max(MOST // len(inside), 1)
+def _lattice(lower: Points, upper: Points, reach: float, fine: float, is_near: Near) -> Iterator[Points]:
+    """Points (n, d) of a lattice, ``fine`` [m] apart, of which those no further than ``reach`` [m] from what is near
+    are all, in parts: of cells of the box between two corners and as far around it, and of parts of those, all whose
+    middles are near enough."""
+    dimension, size = len(lower), int(np.prod(CELLS)) * fine
+    cells = block_about(0.5 * (lower + upper), 0.5 * (upper - lower) + reach + size, size).points()
+    *coarse, last = CELLS
+    for parts in coarse:
+        cells = _divided(cells[is_near(cells, reach + 0.5 * size * np.sqrt(dimension))], size, parts)
+        size /= parts
+    cells = cells[is_near(cells, reach + 0.5 * size * np.sqrt(dimension))]
+    chunk = max(MOST // last**dimension, 1)
     for start in range(0, len(cells), chunk):
-        yield (cells[start : start + chunk, None] + inside).reshape(-1, cells.shape[1])
+        yield _divided(cells[start : start + chunk], size, last) + fine * np.array(OFF_FACES[:dimension])
+
+
+def _divided(cells: Points, size: float, parts: int) -> Points:
+    """(n, d) middles of so many parts along each axis of cells of a size [m], whose middles (m, d) [m] are given."""
+    along = size / parts * (np.arange(parts) + 0.5) - 0.5 * size
+    inside = np.array(list(product(along, repeat=cells.shape[1])))
+    return (cells[:, None] + inside).reshape(-1, cells.shape[1])
 
 
 def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Numbers:
