@@ -24,6 +24,7 @@ from cortado.fixed import fixed
 from cortado.particles.state import State
 from cortado.pictures.notebook import with_picture
 from cortado.pictures.particle_sets import particles
+from cortado.pictures.solid_lines import solid_outline
 from cortado.rollout.durations import end_after, expected_frames, steps_of_run
 from cortado.rollout.outcome import trouble
 from cortado.rollout.parameter_checks import check_sizes
@@ -159,8 +160,9 @@ class Simulation(Stepping, Measuring, Picturing):
 
     def _repr_html_(self) -> str:
         """With a picture of its first particles."""
-        shown, extent = self.positions[: self.free_particles or None], self.scene.container.extent()
-        return with_picture(self, lambda path: particles([shown], ["t = 0 s"], path, container=extent))
+        shown, held = self.positions[: self.free_particles or None], self.scene.container.extent()
+        solids = solid_outline(self.scene)
+        return with_picture(self, lambda path: particles([shown], ["t = 0 s"], path, container=held, lines=solids))
 
     @property
     def _points(self) -> str:

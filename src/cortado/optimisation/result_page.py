@@ -11,6 +11,7 @@ from cortado.errors import CortadoError
 from cortado.losses import FinalPositions, Frames, Image, Snapshot
 from cortado.pictures.figures import images, loss_curve, particles
 from cortado.pictures.notebook import as_words, picture, table
+from cortado.pictures.solid_lines import solid_outline
 from cortado.problem import Problem
 from cortado.scene.parameters.values import UNITS
 
@@ -47,7 +48,8 @@ def _draw_ends(problem: Problem, points: Sequence[Mapping[str, Any]], path: Path
     sets = [end.positions for end in ends]
     if isinstance(loss, FinalPositions):
         sets, titles = [*sets, loss.target], [*titles, "target"]
-    particles(sets, titles, path, container=problem.simulation.scene.container.extent())
+    scene = problem.simulation.scene
+    particles(sets, titles, path, container=scene.container.extent(), lines=solid_outline(scene))
 
 
 def _row(name: str, unit: str, first: Any, found: Any) -> tuple[str, ...]:

@@ -1,70 +1,12 @@
-"""The container of glass, as Warp functions: what it adds to the light on a ray and takes away, and the room within."""
+"""Glass on a ray, of the container and of transparent solids, as Warp functions; and what is behind it."""
 
 import warp as wp
 
-from cortado.pictures.surroundings import FAR, Environment, mirrored, open_background, schlick, sky, smooth_step
-
-
-@wp.struct
-class Passed:
-    """What the glass on a way adds and leaves."""
-
-    light: wp.vec3
-    through: wp.float32
-
-
-@wp.func
-def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, span: wp.vec2):
-    """The part of a ray's span, from where to where, between two planes across an axis; o and d along that axis."""
-    if wp.abs(d) > 1.0e-9:
-        t1 = (lower - o) / d
-        t2 = (upper - o) / d
-        return wp.vec2(wp.max(span[0], wp.min(t1, t2)), wp.min(span[1], wp.max(t1, t2)))
-    if o < lower or o > upper:
-        return wp.vec2(span[0], -FAR)
-    return span
-
-
-@wp.func
-def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
-    """From where to where a ray is within the upright cylinder, open at its ends, that a box holds; from FAR to -FAR
-    where it is not."""
-    radius = 0.5 * (upper[0] - lower[0])
-    x = o[0] - 0.5 * (lower[0] + upper[0])
-    z = o[2] - 0.5 * (lower[2] + upper[2])
-    a = d[0] * d[0] + d[2] * d[2]
-    b = x * d[0] + z * d[2]
-    c = x * x + z * z - radius * radius
-    if a <= 1.0e-12 and c <= 0.0:
-        return wp.vec2(-FAR, FAR)
-    discriminant = b * b - a * c
-    if a <= 1.0e-12 or discriminant <= 0.0:
-        return wp.vec2(FAR, -FAR)
-    root = wp.sqrt(discriminant)
-    return wp.vec2((-b - root) / a, (-b + root) / a)
-
-
-@wp.func
-def pane(s: Environment, d: wp.vec3, normal: wp.vec3, rim: wp.float32, is_pane: wp.float32, behind: Passed):
-    """One more sheet of glass, behind what is passed already; ``rim``: how much of its edge is seen, 0 to 1."""
-    cosine = wp.abs(wp.dot(d, normal))
-    f = schlick(0.04, cosine)
-    reflectance = 0.7 * is_pane * 2.0 * f / (1.0 + f)
-    r = mirrored(d, normal)
-    seen = sky(s, wp.vec3(r[0], wp.abs(r[1]), r[2]))
-    seen = wp.vec3(wp.min(seen[0], 1.8), wp.min(seen[1], 1.8), wp.min(seen[2], 1.8))
-    edge = wp.vec3(0.50, 0.62, 0.64) * 0.75 + 0.25 * seen
-    light = behind.light + behind.through * (rim * edge + (1.0 - rim) * reflectance * seen)
-    passed = Passed()
-    passed.light = light
-    passed.through = behind.through * (1.0 - rim) * (1.0 - reflectance) * (1.0 - 0.015 * is_pane)
-    return passed
-
-
-@wp.func
-def rim_of(off: wp.float32, width: wp.float32):
-    """How much of an edge is seen at a distance from it."""
-    return 0.8 * (1.0 - smooth_step(0.55 * width, width, off))
+from cortado.pictures.container_room import between, within_tube
+from cortado.pictures.lit_surface import SurfaceHit
+from cortado.pictures.pane import Passed, pane, rim_of
+from cortado.pictures.solid_hit import clear_layers, meet_solid, shaded_solid
+from cortado.pictures.surroundings import FAR, Environment, open_background
 
 
 @wp.func
@@ -157,16 +99,18 @@ def cylinder_glass(
 @wp.func
 def glass(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32):
     """The glass that a ray passes up to the distance ``most`` [m]."""
-    nothing = Passed()
-    nothing.light = wp.vec3(0.0)
-    nothing.through = 1.0
+    passed = Passed()
+    passed.light = wp.vec3(0.0)
+    passed.through = 1.0
     own_o = s.glass_frame * o
     own_d = s.glass_frame * d
     if s.glass == 1:
-        return box_glass(s, own_o, own_d, d, s.nearest, most, spread, nothing)
+        passed = box_glass(s, own_o, own_d, d, s.nearest, most, spread, passed)
     if s.glass == 2:
-        return cylinder_glass(s, own_o, own_d, d, s.nearest, most, spread, nothing)
-    return nothing
+        passed = cylinder_glass(s, own_o, own_d, d, s.nearest, most, spread, passed)
+    if s.solids.has_clear > 0:
+        passed = clear_layers(s, o, d, most, spread, passed)
+    return passed
 
 
 @wp.func
@@ -175,50 +119,13 @@ def background(s: Environment, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d:
     most = FAR
     if s.has_floor > 0 and d[1] < -1.0e-4:
         most = wp.max((s.floor_height - o[1]) / d[1], 0.0)
+    met = SurfaceHit()
+    if s.solids.has_opaque > 0:
+        met = meet_solid(s, o, d)
+        met.found = met.found and met.t < most
+    if met.found:
+        most = met.t + 2.0 * s.nearest
     passed = glass(s, o, d, most, spread)
+    if met.found:
+        return passed.light + passed.through * shaded_solid(s, met, d, 1.0)
     return passed.light + passed.through * open_background(s, shadow, o, d, spread)
-
-
-@wp.func
-def room(s: Environment, o: wp.vec3, d: wp.vec3):
-    """From where to where on a ray fluid is shown; from FAR to -FAR where it is not."""
-    if s.has_room == 0:
-        return wp.vec2(-FAR, FAR)
-    p = s.glass_frame * o
-    q = s.glass_frame * d
-    span = wp.vec2(-FAR, FAR)
-    if s.glass == 2:
-        span = within_tube(s.room_lower, s.room_upper, p, q)
-    for a in range(3):
-        if s.glass == 1 or a == 1:
-            span = between(s.room_lower[a], s.room_upper[a], p[a], q[a], span)
-    if span[0] >= span[1]:
-        return wp.vec2(FAR, -FAR)
-    return span
-
-
-@wp.func
-def wall_normal(s: Environment, p: wp.vec3):
-    """Outwards, of the wall that a point is on."""
-    q = s.glass_frame * p
-    n = wp.vec3(0.0)
-    best = FAR
-    for a in range(3):
-        if s.glass == 1 or a == 1:
-            low = wp.abs(q[a] - s.room_lower[a])
-            high = wp.abs(q[a] - s.room_upper[a])
-            if low < best:
-                best = low
-                n = wp.vec3(0.0)
-                n[a] = -1.0
-            if high < best:
-                best = high
-                n = wp.vec3(0.0)
-                n[a] = 1.0
-    if s.glass == 2:
-        x = q[0] - 0.5 * (s.room_lower[0] + s.room_upper[0])
-        z = q[2] - 0.5 * (s.room_lower[2] + s.room_upper[2])
-        away = wp.sqrt(x * x + z * z)
-        if wp.abs(away - 0.5 * (s.room_upper[0] - s.room_lower[0])) < best:
-            n = wp.vec3(x / away, 0.0, z / away)
-    return wp.transpose(s.glass_frame) * n

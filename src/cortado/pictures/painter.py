@@ -7,6 +7,7 @@ import numpy as np
 
 from cortado.discretise.shapes import Points
 from cortado.pictures.plane import PlanePainter
+from cortado.pictures.plane_stage import PlaneStage
 from cortado.pictures.scenery import State
 from cortado.pictures.space import SpacePainter
 from cortado.pictures.stage import Stage, extent_of
@@ -35,7 +36,7 @@ def painter(scene: Scene, positions: Points, device: Any = "cpu") -> Painter:
     count, particles = np.shape(positions)[-2], np.asarray(positions).reshape(-1, scene.dimension)
     particles = particles[:: max(len(particles) // ENOUGH, 1)]
     if scene.dimension == 2:
-        return PlanePainter.of(scene, *extent_of(particles))
+        return PlanePainter(PlaneStage.of(scene, *extent_of(particles)))
     return SpacePainter(Stage.of(scene, particles), count, device)
 
 

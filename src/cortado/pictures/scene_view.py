@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from cortado.discretise.shapes import Points, corners
 from cortado.pictures.painter import colours_of
 from cortado.pictures.particle_view import Cloud, particle_view, thinned
+from cortado.pictures.solid_lines import solid_outline
 from cortado.pictures.stage import upright
 from cortado.scene.containers import CylinderContainer
 from cortado.scene.fluids import INDEX_OF_AXIS
@@ -48,6 +49,11 @@ def scene_view(scene: Scene, runs: Mapping[str, Iterable[MovingState]], times: A
 
 
 def outline(scene: Scene) -> Points:
+    """(k, 2, d) ends of the lines that draw the container and the solids of a scene [m]; none without both."""
+    return np.concatenate([container_outline(scene), solid_outline(scene)])
+
+
+def container_outline(scene: Scene) -> Points:
     """(k, 2, d) ends of the lines that draw the container of a scene [m]; none without a container."""
     container, ends = scene.container, scene.container.extent()
     if ends is None:

@@ -9,12 +9,15 @@ import warp as wp
 from cortado.device.bands import BandLauncher
 from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points
+from cortado.pictures.device_surface import DeviceSurface
+from cortado.pictures.lighting import illuminate
 from cortado.pictures.scenery import Scenery, State, processes_for, sceneries, scenery
+from cortado.pictures.solid_mesh import SolidMesh
+from cortado.pictures.solid_surfaces import SolidSurfaces
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.surface import Surface
-from cortado.pictures.surface_hit import FluidSurface
 from cortado.pictures.surroundings import GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Environment
-from cortado.pictures.trace import Eye, find_contrast, illuminate, trace
+from cortado.pictures.trace import Eye, find_contrast, trace
 
 ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 """Where in a pixel four more rays go, in pixels from its middle."""
@@ -24,6 +27,10 @@ LIGHT_RAYS = {"liquid": (20, 4), "spheres": (10, 1)}
 """Rays that find how much light falls on a point of the surface: from all around, and from the lamp."""
 
 
+SOLID_RAYS = 40, 6
+"""The same for solids, which have fewer points and even sides."""
+
+
 class SpacePainter:
     """Draws states of one scene of so many particles: `image` and `images`."""
 
@@ -31,11 +38,9 @@ class SpacePainter:
         self.stage, self.device, self.at_once = stage, wp.get_device(device), processes_for(particles)
         self._launch = BandLauncher(self.device)
         self._surroundings, self._eye = _surroundings(stage), _eye(stage)
-        around, lamp = LIGHT_RAYS[stage.picture.surface]
-        self._around = wp.array(_directions(around), dtype=wp.vec3, device=self.device)
-        in_lamp = stage.sun + (0.16 if lamp > 1 else 0.0) * _directions(lamp)
-        in_lamp /= np.linalg.norm(in_lamp, axis=1)[:, None]
-        self._in_lamp = wp.array(in_lamp, dtype=wp.vec3, device=self.device)
+        self._solids = SolidSurfaces(stage, self.device) if stage.solids else None
+        self._lamps = self._rays_to_light(*LIGHT_RAYS[stage.picture.surface])
+        self._lamps_of_solids = self._rays_to_light(*SOLID_RAYS)
 
     def image(self, positions: Points, colours: Points) -> Points:
         """A picture (rows, columns, 3), linear from 0 to 1: particles at positions (n, 3) [m] with colours (n, 3)."""
@@ -49,25 +54,23 @@ class SpacePainter:
         s = self._surroundings
         light, corner, cell = fluid.shadow
         s.shadow_corner, s.shadow_cell = wp.vec3(*corner), cell
+        if self._solids is not None:
+            light = np.minimum(light, self._solids.shadow)
         shadow = wp.array(light, dtype=wp.vec3, device=self.device)
         with WARP:
             return self._rays(fluid.surface, s, shadow)
 
     def _rays(self, surface: Surface, s: Any, shadow: wp.array) -> Points:
         picture, device = self.stage.picture, self.device
-        points = wp.array(surface.points, dtype=wp.vec3, device=device)
-        corners = wp.array(surface.triangles.ravel(), dtype=wp.int32, device=device)
-        mesh = wp.Mesh(points, corners)
-        fluid = FluidSurface()
-        fluid.mesh, fluid.corners, fluid.scattering = mesh.id, corners, self._scattering
-        fluid.reach = 2.0 * self.stage.spacing
-        fluid.normals = wp.array(surface.normals, dtype=wp.vec3, device=device)
-        fluid.colours = wp.array(surface.colours, dtype=wp.vec3, device=device)
-        fluid.light = wp.zeros(len(points), dtype=wp.vec3, device=device)
-        given = {"s": s, "surface": fluid}
-        lit = {"points": points, "directions": self._around, "sun_directions": self._in_lamp, "light": fluid.light}
-        reach = 0.2 * self.stage.size
-        self._launch(illuminate, len(points), **given, **lit, reach=reach, clearness=self.stage.clearness)
+        seen = DeviceSurface.of(surface.points, surface.triangles, surface.normals, surface.colours, device)
+        seen.lit.scattering, seen.lit.reach = self._scattering, 2.0 * self.stage.spacing
+        given, solids = {"s": s, "surface": seen.lit}, list[tuple[DeviceSurface, SolidMesh]]()
+        if self._solids is not None:
+            s.solids, solids = self._solids.on_device()
+        self._illuminate(seen, self._lamps, given)
+        for one, mesh in solids:
+            self._illuminate(one, self._lamps_of_solids, given)
+            one.lit.light.assign(mesh.smoothed(one.lit.light.numpy()))
 
         def rays(pixels: np.ndarray, offset: tuple[float, float]) -> wp.array:
             found = wp.zeros(len(pixels), dtype=wp.vec3, device=device)
@@ -85,6 +88,21 @@ class SpacePainter:
         if len(rough):
             image[rough] = np.mean([rays(rough, offset).numpy() for offset in ROTATED_GRID], axis=0)
         return image.reshape(picture.height, picture.width, 3)
+
+    def _illuminate(self, surface: DeviceSurface, lamps: tuple[wp.array, wp.array], given: dict[str, Any]) -> None:
+        """Find the light on a surface, by rays in the directions of lamps."""
+        around, in_lamp = lamps
+        own = {"points": surface.mesh.points, "normals": surface.lit.normals, "light": surface.lit.light}
+        how = {"reach": 0.2 * self.stage.size, "clearness": self.stage.clearness}
+        count = len(surface.mesh.points)
+        self._launch(illuminate, count, **given, **own, **how, directions=around, sun_directions=in_lamp)
+
+    def _rays_to_light(self, around: int, lamp: int) -> tuple[wp.array, wp.array]:
+        """Directions to all around, and to so many points of the lamp."""
+        in_lamp = self.stage.sun + (0.16 if lamp > 1 else 0.0) * _directions(lamp)
+        in_lamp /= np.linalg.norm(in_lamp, axis=1)[:, None]
+        found = [wp.array(one, dtype=wp.vec3, device=self.device) for one in (_directions(around), in_lamp)]
+        return found[0], found[1]
 
     @property
     def _scattering(self) -> float:

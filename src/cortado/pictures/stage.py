@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 
 from cortado.discretise.shapes import Points, corners
+from cortado.pictures.mirrored import mirrored
+from cortado.pictures.shown_solids import ShownSolid, shown_solids
 from cortado.scene.containers import BoxContainer, Container, CylinderContainer
 from cortado.scene.fluids import INDEX_OF_AXIS
 from cortado.scene.picture import Picture
@@ -17,9 +19,9 @@ AIR = 0.1
 """Beside fluid that no container holds, in its widths."""
 FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
 """Elevation of the camera [degrees]: where the fluid is drawn on, as in latte art, and elsewhere."""
-TOUCHING, TOUCHING_ROUND = 0.8, 1.5
-"""In spacings: fluid that is nearer to a flat and to a round wall touches it. A cubic lattice in a round cup ends up to
-one and a half spacings from its wall."""
+TOUCHING, TOUCHING_SOLID, TOUCHING_ROUND = 0.8, 1.1, 1.5
+"""In spacings: fluid that is nearer to a flat wall, to a solid and to a round wall touches it. A cubic lattice in a
+round cup ends up to one and a half spacings from its wall."""
 AZIMUTH = 24.0
 """Of the camera, to the right of the direction towards the viewer [degrees]."""
 
@@ -48,17 +50,22 @@ class Stage:
     """From 0 to 1."""
     cuts: bool
     """Whether fluid is shown within the container only."""
+    solids: tuple[ShownSolid, ...]
+    """In the frame of the picture."""
 
     @classmethod
     def of(cls, scene: Scene, positions: Points) -> "Stage":
         """That of a scene in 3-D, whose fluid will be at positions (n, 3) [m]."""
         lower, upper = extent_of(positions)
+        solids = shown_solids(scene)
         picture = scene.picture or Picture()
         ends = scene.container.extent()
         frame = upright(np.asarray(scene.forces.gravity))
         if ends is None:
             air = 0.5 * scene.discretisation.spacing + AIR * (1.0 - np.abs(frame[1])) * (upper - lower)
-            lower, upper = lower - air, upper + air
+            air = 0.0 * air if any(one.is_tank for one in solids) else air
+            ends_of_all = np.array([(lower - air, upper + air), *(one.body.extent() for one in solids)])
+            lower, upper = ends_of_all[:, 0].min(axis=0), ends_of_all[:, 1].max(axis=0)
         else:
             lower, upper = np.minimum(lower, ends[0]), np.maximum(upper, ends[1])
         origin = 0.5 * (lower + upper)
@@ -66,7 +73,9 @@ class Stage:
         low, high = shown.min(axis=0), shown.max(axis=0)
         several = len(scene.phase) > 1
         from_above = several and (scene.render is None or scene.render.view == "top")
-        elevation = FROM_ABOVE if from_above and isinstance(scene.container, CylinderContainer) else FROM_THE_SIDE
+        into_cup = from_above and isinstance(scene.container, CylinderContainer)
+        into_cup |= any(table.shape == "cup" and not table.transparency for table in scene.solid)
+        elevation = FROM_ABOVE if into_cup else FROM_THE_SIDE
         eye, look_at = fitted(low, high, elevation, picture)
         if picture.look_at is not None:
             eye, look_at = eye + frame @ (picture.look_at - origin) - look_at, frame @ (picture.look_at - origin)
@@ -77,7 +86,15 @@ class Stage:
             transparency = 0.0 if several or picture.colour_by is not None else 0.9
         spacing = scene.discretisation.spacing
         cuts = ends is not None and not spilled(scene.container, positions, spacing)
-        return cls(frame, origin, low, high, eye, look_at, picture, scene.container, spacing, transparency, cuts)
+        placed = tuple(one.within(frame, origin) for one in solids)
+        return cls(
+            frame, origin, low, high, eye, look_at, picture, scene.container, spacing, transparency, cuts, placed
+        )
+
+    @property
+    def cuts_solids(self) -> bool:
+        """Whether solids are shown within the container only: not beside a cup without a lid."""
+        return bool(getattr(self.container, "lid", self.container.extent() is not None))
 
     @property
     def size(self) -> float:
@@ -103,12 +120,15 @@ class Stage:
         """Points (n, 3) [m] in the frame of the picture and others behind walls that they touch, and which point each
         shows, (m,): a surface around them all goes on beyond the walls, at which it is cut."""
         of = np.arange(len(points))
+        if self.solids:
+            behind, of_those = mirrored(points, self.solids, TOUCHING_SOLID * self.spacing, self.spacing)
+            points, of = np.concatenate([points, behind]), np.concatenate([of, of_those])
         if not self.cuts:
             return points, of
         own, box = points @ self.glass_frame.T, isinstance(self.container, BoxContainer)
         if not box:
             more, shown = self._behind_round_wall(own)
-            own, of = np.concatenate([own, more]), np.concatenate([of, shown])
+            own, of = np.concatenate([own, more]), np.concatenate([of, of[shown]])
         for axis, place in ((k, end[k]) for k in range(3) for end in self.room if box or k == 1):
             if np.isfinite(place):
                 near = np.abs(own[:, axis] - place) < TOUCHING * self.spacing

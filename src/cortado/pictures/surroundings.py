@@ -5,8 +5,29 @@ All is in the frame of the picture: y points upwards. Colours are linear.
 
 import warp as wp
 
+from cortado.pictures.lit_surface import LitSurface
+
+OPAQUE, CLEAR = wp.constant(0), wp.constant(1)
+"""Which of the surfaces of solids."""
 NO_GLASS, GLASS_BOX, GLASS_CYLINDER = 0, 1, 2
 FAR = wp.constant(wp.float32(1.0e9))
+
+
+@wp.struct
+class Solids:
+    """What fluid flows around, or is inside of."""
+
+    has_opaque: wp.int32
+    opaque: wp.uint64
+    """The mesh of opaque ones."""
+    are_cut: wp.int32
+    """Whether opaque ones are shown within the container only."""
+    has_clear: wp.int32
+    clear: wp.uint64
+    """The mesh of those that are transparent and of tanks, which all of space outside of a cavity is within."""
+    has_tank: wp.int32
+    surfaces: wp.array(dtype=LitSurface)
+    """(2,) of opaque and of clear ones, if there are any; in an array, as functions get a copy of their arguments"""
 
 
 @wp.struct
@@ -51,6 +72,7 @@ class Environment:
     """[m]"""
     panes: wp.mat33
     """1 where the container has a pane, 0 where it is open: rows for lower and upper ends, columns for axes."""
+    solids: Solids
 
 
 @wp.func

@@ -9,7 +9,9 @@ and of what remains fluid takes away the colours that it does not have.
 import warp as wp
 
 from cortado.pictures.glass import background, glass
-from cortado.pictures.surface_hit import FluidSurface, leave, meet
+from cortado.pictures.lit_surface import LitSurface
+from cortado.pictures.solid_hit import meet_solid, shaded_solid
+from cortado.pictures.surface_hit import leave, meet
 from cortado.pictures.surroundings import FAR, Environment, mirrored, schlick, sky
 
 SEGMENTS = 4
@@ -47,7 +49,7 @@ def toned(colour: wp.vec3):
 def within(
     s: Environment,
     shadow: wp.array2d(dtype=wp.vec3),
-    surface: FluidSurface,
+    surface: LitSurface,
     start: wp.vec3,
     direction: wp.vec3,
     colour: wp.vec3,
@@ -73,6 +75,8 @@ def within(
                 wp.pow(wp.max(c[0], 0.02), taken), wp.pow(wp.max(c[1], 0.02), taken), wp.pow(wp.max(c[2], 0.02), taken)
             )
             through = wp.cw_mul(through, tint) * left
+            if met.is_solid:
+                return found + wp.cw_mul(through, shaded_solid(s, met, d, 0.0))
         else:
             met = meet(s, surface, o, d)
         if not met.found or wp.max(wp.max(through[0], through[1]), through[2]) < 0.02:
@@ -112,7 +116,7 @@ def within(
 def seen(
     s: Environment,
     shadow: wp.array2d(dtype=wp.vec3),
-    surface: FluidSurface,
+    surface: LitSurface,
     o: wp.vec3,
     d: wp.vec3,
     spread: wp.float32,
@@ -124,12 +128,20 @@ def seen(
         floor_at = (s.floor_height - o[1]) / d[1]
     if met.t > floor_at or not met.found:
         found = background(s, shadow, o, d, spread)
+        if s.solids.has_opaque > 0:
+            if meet_solid(s, o, d).t < floor_at:
+                return toned(found)
         if floor_at < FAR:  # the floor is a little glossy
             r = wp.vec3(d[0], -d[1], d[2])
-            image = meet(s, surface, o + floor_at * d, r)
+            p = o + floor_at * d
+            image = meet(s, surface, p, r)
+            instead_of = sky(s, r)
+            if not image.found and s.solids.has_opaque > 0:
+                image = meet_solid(s, p + wp.vec3(0.0, s.nearest, 0.0), r)
+                instead_of = found
             if image.found:
                 strength = schlick(0.04, -d[1]) * wp.exp(-2.5 * image.t / s.size)
-                found += strength * (wp.cw_mul(image.colour, image.light) - sky(s, r))
+                found += strength * (wp.cw_mul(image.colour, image.light) - instead_of)
         return toned(found)
     p = o + met.t * d
     n = met.normal
@@ -153,7 +165,7 @@ def trace(
     first: wp.int32,
     eye: Eye,
     s: Environment,
-    surface: FluidSurface,
+    surface: LitSurface,
     shadow: wp.array2d(dtype=wp.vec3),
     pixels: wp.array(dtype=wp.int32),
     offset: wp.vec2,
@@ -190,44 +202,3 @@ def find_contrast(
     if i < image.shape[0] - columns:
         greatest = wp.max(greatest, wp.max(wp.abs(image[i] - image[i + columns])))
     found[i] = greatest > contrast
-
-
-@wp.kernel(module=wp.get_module("cortado_shading"), enable_backward=False)
-def illuminate(
-    first: wp.int32,
-    s: Environment,
-    surface: FluidSurface,
-    points: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    sun_directions: wp.array(dtype=wp.vec3),
-    reach: wp.float32,
-    clearness: wp.float32,
-    light: wp.array(dtype=wp.vec3),
-):
-    """The light that falls on each point of the surface: from all around, as far as no other fluid is within ``reach``
-    [m], and from the lamp; ``clearness``: the part of it that goes through fluid, from 0 to 1."""
-    i = first + wp.tid()
-    n = surface.normals[i]
-    p = points[i] + s.nearest * n
-    around = wp.vec3(0.0)
-    for k in range(directions.shape[0]):
-        d = wp.normalize(n + 0.999 * directions[k])  # cosine-weighted
-        arriving = wp.lerp(s.horizon, s.zenith, wp.max(d[1], 0.0))
-        if d[1] < 0.0:
-            arriving = 0.55 * s.floor_colour
-        hit = wp.mesh_query_ray(surface.mesh, p, d, reach)
-        if hit.result:
-            arriving = arriving * wp.max(clearness, 0.35 * hit.t / reach)
-        around += arriving
-    around = around / wp.float32(directions.shape[0])
-    cosine = wp.max(wp.dot(n, s.sun), 0.0)
-    sunlight = wp.float32(0.0)
-    if cosine > 0.0:
-        for k in range(sun_directions.shape[0]):
-            hit = wp.mesh_query_ray(surface.mesh, p, sun_directions[k], FAR)
-            if hit.result:
-                sunlight += clearness
-            else:
-                sunlight += 1.0
-        sunlight = sunlight * cosine / wp.float32(sun_directions.shape[0])
-    light[i] = 0.70 * around + wp.vec3(0.62, 0.60, 0.57) * sunlight

@@ -63,6 +63,8 @@ class SolidTable(Table):
     """"no": the viscous force acts between fluid and solid; "free": it does not."""
     colour: Colour = (0.55, 0.55, 0.58)
     """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light."""
+    transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
+    """The part of the light that goes through it in pictures, from 0 to 1; if left out 0, or 1 if fluid is inside."""
 
     @property
     def sticks(self) -> bool:

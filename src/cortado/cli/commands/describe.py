@@ -20,6 +20,7 @@ from cortado.optimisation.inverse.in_words import task_in_words
 from cortado.optimisation.inverse.task import load_task
 from cortado.pictures.figures import particles
 from cortado.pictures.painter import colours_of
+from cortado.pictures.solid_lines import solid_outline
 from cortado.rollout.rollout import MEMORY_BUDGET, Rollout
 from cortado.scene.in_words import vector
 from cortado.scene.scene import Scene, load_scene
@@ -177,7 +178,8 @@ def _drawn(simulation: Simulation, path: Path) -> Path:
     scene = simulation.scene
     colours = colours_of(scene, simulation.mass_fractions, simulation.particles)
     title = f"{scene.name}, the first state{', seen along the third axis' * (scene.dimension == 3)}"
-    return particles([simulation.positions], [title], path, colours=[colours], container=scene.container.extent())
+    ends, lines = scene.container.extent(), solid_outline(scene)
+    return particles([simulation.positions], [title], path, colours=[colours], container=ends, lines=lines)
 
 
 def _as_text(found: dict[str, Any]) -> str:

@@ -12,6 +12,7 @@ from cortado.files.terminal import say
 from cortado.files.video import MOST_FRAMES, write_video
 from cortado.pictures.figures import images, particles
 from cortado.pictures.film import lacking
+from cortado.pictures.solid_lines import solid_outline
 from cortado.rollout.outcome import not_converged_sentence
 from cortado.rollout.rollout import Rollout
 from cortado.runs.measuring import coloured_by
@@ -73,6 +74,7 @@ def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Fi
         colours=[np.linalg.norm(trajectory.velocities[frame], axis=1) for frame in shown],
         colour_label="speed [m/s]",
         container=scene.container.extent(),
+        lines=solid_outline(scene),
     )
     along = ", seen along the third axis" * (scene.dimension == 3)
     figures: Figures = [(f"The fluid at the start, half-way and at the end{along}.", path)]

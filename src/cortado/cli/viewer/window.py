@@ -10,7 +10,9 @@ import numpy as np
 from cortado.discretise.shapes import Points
 from cortado.errors import CortadoError, InputError
 from cortado.files.srgb import to_srgb
-from cortado.pictures.scene_view import outline
+from cortado.pictures.scene_view import container_outline, outline
+from cortado.pictures.shown_solids import ShownSolid, shown_solids
+from cortado.pictures.solid_lines import own_faces, own_lines
 from cortado.pictures.stage import upright
 from cortado.scene.scene import Scene
 
@@ -30,6 +32,9 @@ BESIDE_ARROWS = 0.4
 """Of the size of particles, where they would hide arrows."""
 ARROWS = (170, 30, 15)
 """sRGB"""
+LINES = (130, 125, 118)
+"""sRGB, of the container and of solids"""
+THIN: Any = {"thickness": 1.5, "thickness_units": "screen"}
 PULL = "pull of the loss"
 
 Quantity = Callable[[], np.ndarray]
@@ -80,7 +85,9 @@ class Window:
         self.arrows_legend = gui.add_html("")
         for choice in (self.colour, self.arrows):
             choice.on_update(lambda _: setattr(self, "_stale", True))  # in a thread of viser's, which computes nothing
-        self._frame_container()
+        self._draw_container()
+        for number, solid in enumerate(shown_solids(scene)):
+            self._draw_solid(f"/solids/{number}", solid)
 
     @property
     def address(self) -> str:
@@ -174,17 +181,26 @@ class Window:
 
     def _space(self, points: Points) -> np.ndarray:
         """(..., 3) float32, of points (..., d), with y up."""
-        turned = np.asarray(points, dtype=np.float32) @ self._turn.T.astype(np.float32)
-        return np.pad(turned, [(0, 0)] * (turned.ndim - 1) + [(0, 3 - turned.shape[-1])])
+        return _padded(np.asarray(points, dtype=np.float32) @ self._turn.T.astype(np.float32))
 
-    def _frame_container(self) -> None:
-        lines = self._space(outline(self.scene))
+    def _draw_container(self) -> None:
+        lines = self._space(container_outline(self.scene))
         if len(lines):
-            style = {"thickness": 1.5, "thickness_units": "screen"}
-            self.server.scene.add_line_segments("/container", lines, (130, 125, 118), **style)
+            self.server.scene.add_line_segments("/container", lines, LINES, **THIN)
+
+    def _draw_solid(self, name: str, solid: ShownSolid) -> None:
+        """As lines about its middle, and in 3-D its faces where fluid is outside of them, in the solid's pose."""
+        pose = {"position": self._space(solid.position), "wxyz": _quaternion(self._turn @ solid.turn)}
+        lines = _padded(own_lines(solid))
+        self.server.scene.add_line_segments(f"{name}/edges", lines, LINES, **THIN, **pose)
+        if self.scene.dimension == 3 and not solid.is_tank:
+            faces, colour = own_faces(solid), tuple(to_srgb(solid.colour[None, None])[0, 0].tolist())
+            look = {"color": colour, "opacity": 1.0 - solid.transparency, "flat_shading": True}
+            vertices = faces.vertices.astype(np.float32)
+            self.server.scene.add_mesh_simple(f"{name}/faces", vertices, faces.corners, **look, **pose)
 
     def look_at(self, positions: Points) -> None:
-        """Put the camera where the container, or else the particles (n, d) [m], fill the window."""
+        """Put the camera where the container and solids, or else the particles (n, d) [m], fill the window."""
         lines = self._space(outline(self.scene)).reshape(-1, 3)
         points = lines if len(lines) else self._space(positions)
         lower, upper = points.min(axis=0), points.max(axis=0)
@@ -193,6 +209,21 @@ class Window:
         camera = self.server.initial_camera
         camera.look_at = middle
         camera.position = middle + DISTANCE * radius * away / np.linalg.norm(away)
+
+
+def _padded(points: np.ndarray) -> np.ndarray:
+    """(..., 3) float32, of points (..., d)."""
+    found = np.asarray(points, dtype=np.float32)
+    return np.pad(found, [(0, 0)] * (found.ndim - 1) + [(0, 3 - found.shape[-1])])
+
+
+def _quaternion(turn: Points) -> np.ndarray:
+    """(4,) w, x, y and z, of a rotation matrix (d, d)."""
+    from scipy.spatial.transform import Rotation
+
+    whole = np.eye(3)
+    whole[: len(turn), : len(turn)] = turn
+    return np.roll(Rotation.from_matrix(whole).as_quat(), 1)
 
 
 def _upper_end(values: np.ndarray, percentile: float) -> float:

@@ -12,6 +12,7 @@ from cortado.optimisation.inverse.task_figures import TaskFigures
 from cortado.optimisation.optimise import Result
 from cortado.pictures.figures import images, loss_curve, panels, particles
 from cortado.pictures.painter import colours_of
+from cortado.pictures.solid_lines import solid_outline
 from cortado.runs.report import Figures
 from cortado.scene.parameters.parameter import Axis
 from cortado.scene.parameters.tilt import Tilt
@@ -44,7 +45,8 @@ def _particles(made: Setup, result: Result, folder: Path) -> tuple[str, Path]:
     shown = [before, after, made.targets[made.problem.steps]]
     several = len(scene.phase) > 1
     colours = [colours_of(scene, simulation.mass_fractions, simulation.particles)] * len(shown) if several else None
-    path = particles(shown, TITLES, folder / "particles.png", colours=colours, container=scene.container.extent())
+    ends, lines = scene.container.extent(), solid_outline(scene)
+    path = particles(shown, TITLES, folder / "particles.png", colours=colours, container=ends, lines=lines)
     return "Where the fluid ends: with the first guess, as found, and the target.", path
 
 

@@ -1,0 +1,206 @@
+"""Everything around the fluid in the plane: paper, the walls of a container or a tank, their shadow, and solids."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from cortado.discretise.shapes import Points
+from cortado.pictures.gloss import glossy
+from cortado.pictures.shown_solids import ShownSolid, shown_solids
+from cortado.scene.containers import BoxContainer
+from cortado.scene.picture import Picture
+from cortado.scene.scene import Scene
+
+FILLED = 0.80
+"""The part of the picture's width or height that the container takes."""
+GLASS = (0.40, 0.50, 0.55)
+"""Linear, of the walls of a container."""
+SOLID_SHADOW = 0.25
+"""How much darker paper is behind a solid."""
+BLUR, DROP, AROUND = 0.022, 0.020, 0.12
+"""Of shadows: how soft and how far down they are, and beyond which distance from a body there is none; in sizes."""
+Layer = tuple[Points, Points]
+"""How much something hides of what is behind it (rows, columns, 1), and what light it adds (rows, columns, 3)."""
+
+
+@dataclass(frozen=True)
+class PlaneStage:
+    """What is around the fluid, on the pixels of a picture; what is there at rest is drawn once."""
+
+    picture: Picture
+    container: BoxContainer | None
+    lower: Points
+    """(2,) of what is shown [m]"""
+    upper: Points
+    """(2,) [m]"""
+    spacing: float
+    """[m]"""
+    solids: tuple[ShownSolid, ...] = ()
+
+    @classmethod
+    def of(cls, scene: Scene, lower: Points, upper: Points) -> "PlaneStage":
+        """That of a scene in 2-D, the fluid of which is between lower and upper (2,) [m]."""
+        container = scene.container if isinstance(scene.container, BoxContainer) else None
+        spacing, solids = scene.discretisation.spacing, shown_solids(scene)
+        if container is not None:
+            lower, upper = (np.asarray(end) for end in container.extent())
+        else:
+            paper = 0.0 if any(one.is_tank for one in solids) else spacing
+            ends = np.array([(lower - paper, upper + paper), *(one.body.extent() for one in solids)])
+            lower, upper = ends[:, 0].min(axis=0), ends[:, 1].max(axis=0)
+        return cls(scene.picture or Picture(), container, lower, upper, spacing, solids)
+
+    @cached_property
+    def pixel(self) -> float:
+        """The width of a pixel [m]."""
+        size = np.array([self.picture.width, self.picture.height])
+        return float(((self.upper - self.lower) / (FILLED * size)).max())
+
+    @cached_property
+    def pixels(self) -> tuple[Points, Points]:
+        """(rows, columns) where the middle of each pixel is [m]: x, and y."""
+        columns, rows, middle = self.picture.width, self.picture.height, 0.5 * (self.lower + self.upper)
+        x = middle[0] + (np.arange(columns) - 0.5 * (columns - 1)) * self.pixel
+        y = middle[1] - (np.arange(rows) - 0.5 * (rows - 1)) * self.pixel
+        return np.meshgrid(x, y)
+
+    @property
+    def gloss_width(self) -> float:
+        """How wide the edges of bodies are drawn, in pixels."""
+        return max(0.55 * self.spacing / self.pixel, 1.5)
+
+    @cached_property
+    def behind(self) -> Points:
+        """(rows, columns, 3) what is behind the fluid: the paper, the shadows on it, and the inside of a container."""
+        paper = self._paper()
+        if self.container is not None or self._tanks:
+            outside = paper * (1.0 - self._shadow() * (1.0 - self._room))[..., None]
+            paper = outside + (1.0 - paper) * (0.40 * self._room)[..., None]
+        for shown, _ in self._bodies:
+            darker = SOLID_SHADOW * (1.0 - shown.transparency) * self._below(shown) * self._room
+            paper = paper * (1.0 - darker)[..., None]
+        return paper
+
+    @cached_property
+    def before(self) -> list[Layer]:
+        """What is drawn over the fluid, one over the other: solids, then the walls of a container and of tanks."""
+        layers = [self._body(shown, distance) for shown, distance in self._bodies]
+        if self.container is not None:
+            layers.append(self._container_walls(self.container))
+        return layers + [self._walls(distance, 1.0, shown.colour) for shown, distance in self._tanks]
+
+    @cached_property
+    def free(self) -> Points:
+        """(rows, columns) the part of each pixel that is within the container and in no solid."""
+        free = self._room
+        for _, distance in self._bodies:
+            free = free * (1.0 - self._covered(distance))
+        return free
+
+    @cached_property
+    def shown(self) -> Points:
+        """(rows, columns) the part of each pixel in which fluid is drawn, if it is there: in opaque solids, too, which
+        are drawn over it."""
+        return self.free if any(shown.transparency > 0.0 for shown, _ in self._bodies) else self._room
+
+    @cached_property
+    def _bodies(self) -> list[tuple[ShownSolid, Points]]:
+        """Solids that fluid flows around, and how far pixels are from each."""
+        return [(one, self._distance(one)) for one in self.solids if not one.is_tank]
+
+    @cached_property
+    def _tanks(self) -> list[tuple[ShownSolid, Points]]:
+        """Solids that fluid is inside of, and how far pixels are outside of the cavity of each."""
+        return [(one, self._distance(one)) for one in self.solids if one.is_tank]
+
+    def _distance(self, shown: ShownSolid, drop: float = 0.0) -> Points:
+        """(rows, columns) how far a place ``drop`` [m] above each pixel is outside of a body, negative inside [m];
+        infinite where it is far."""
+        (x, y), (lower, upper), margin = self.pixels, shown.body.extent(), AROUND * self._size
+        columns = np.flatnonzero((x[0] > lower[0] - margin) & (x[0] < upper[0] + margin))
+        rows = np.flatnonzero((y[:, 0] + drop > lower[1] - margin) & (y[:, 0] + drop < upper[1] + margin))
+        found, near = np.full(x.shape, np.inf), np.ix_(rows, columns)
+        points = np.stack([x[near].ravel(), y[near].ravel() + drop], axis=1)
+        found[near] = shown.body.distance(points).reshape(len(rows), len(columns))
+        return found
+
+    def _covered(self, distance: Points) -> Points:
+        """(rows, columns) the part of each pixel that a body covers."""
+        return np.clip(0.5 - distance / self.pixel, 0.0, 1.0)
+
+    def _paper(self) -> Points:
+        """The background, a little brighter in the middle and darker in the corners."""
+        x, y = self.pixels
+        middle, half = 0.5 * (self.lower + self.upper), 0.5 * self.pixel * self.picture.width
+        away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
+        return np.asarray(self.picture.background) * (1.12 - 0.20 * away)[..., None]
+
+    @cached_property
+    def _room(self) -> Points:
+        """(rows, columns) the part of each pixel that is within the container and tanks."""
+        room = np.ones(self.pixels[0].shape)
+        if self.container is not None:
+            x, y = self.pixels
+            off = np.minimum.reduce([x - self.lower[0], self.upper[0] - x, y - self.lower[1], self.upper[1] - y])
+            room = np.clip(off / self.pixel + 0.5, 0.0, 1.0)
+        for _, distance in self._tanks:
+            room = room * self._covered(distance)
+        return room
+
+    @property
+    def _size(self) -> float:
+        """The longer side of what is shown [m]."""
+        return float((self.upper - self.lower).max())
+
+    @property
+    def _wall(self) -> float:
+        """How thick the walls are drawn [m]."""
+        return 0.010 * self._size
+
+    def _shadow(self) -> Points:
+        """(rows, columns) how much darker the paper is behind the container and tanks."""
+        tanks = [0.28 * self._below(shown) for shown, _ in self._tanks]
+        if self.container is None:
+            return np.max(tanks, axis=0)
+        x, y = self.pixels
+        blur, drop = BLUR * self._size, DROP * self._size
+
+        def edge(distance: Points) -> Points:
+            return 0.5 * (1.0 + np.tanh(distance / blur))
+
+        across = edge(x - self.lower[0]) * edge(self.upper[0] - x)
+        return np.max([0.28 * across * edge(y + drop - self.lower[1]) * edge(self.upper[1] - y - drop), *tanks], axis=0)
+
+    def _below(self, shown: ShownSolid) -> Points:
+        """(rows, columns) the part of the light that a body keeps off the paper."""
+        distance = self._distance(shown, DROP * self._size)
+        return 0.5 * (1.0 - np.tanh(distance / (BLUR * self._size)))
+
+    def _body(self, shown: ShownSolid, distance: Points) -> Layer:
+        """A solid that fluid flows around, where it is within the container."""
+        cover = self._covered(distance)
+        light = glossy(np.where(self._room > 0.5, cover, 1.0), shown.colour, self.gloss_width, gleaming=0.12)
+        opacity = ((1.0 - shown.transparency) * cover * self._room)[..., None]
+        return opacity, opacity * light
+
+    def _container_walls(self, container: BoxContainer) -> Layer:
+        x, y = self.pixels
+        half = 0.5 * (self.upper - self.lower)
+        off = np.stack([x, y]) - (0.5 * (self.lower + self.upper))[:, None, None]
+        beyond = np.abs(off) - half[:, None, None]
+        outside = np.hypot(*np.maximum(beyond, 0.0))
+        distance = np.where(outside > 0.0, outside, beyond.max(axis=0))  # from the inner side, outwards
+        part: Points | float = 1.0
+        for axis in range(2):
+            if container.periodic[axis]:
+                part = part * (beyond[axis] < 0.0)
+        return self._walls(distance, part, np.array(GLASS))
+
+    def _walls(self, distance: Points, part: Points | float, colour: Points) -> Layer:
+        """Walls, by the distance [m] of pixels from their inner side, outwards; ``part``: of them that is there."""
+        wall = self._wall
+        band = np.clip(distance / self.pixel + 0.5, 0.0, 1.0) * np.clip((wall - distance) / self.pixel + 0.5, 0.0, 1.0)
+        shine = 1.0 - 0.35 * np.clip(distance / wall, 0.0, 1.0)
+        opacity = 0.85 * (band * part)[..., None]
+        return opacity, opacity * colour * shine[..., None]

@@ -1,0 +1,68 @@
+"""The solids of a scene as pictures show them: shapes in poses, with colours."""
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from cortado.discretise.shapes import Points
+from cortado.discretise.solids.solid import Hollow, Placed, Solid
+from cortado.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class ShownSolid:
+    """A solid in a pose."""
+
+    shape: Solid
+    """About its middle, not turned; of a tank the cavity."""
+    position: Points
+    """(d,) where its middle is [m]"""
+    turn: Points
+    """(d, d) rotation matrix"""
+    colour: Points
+    """(3,) linear"""
+    transparency: float
+    """From 0 to 1."""
+    is_tank: bool
+    """Whether fluid is inside of it."""
+
+    @property
+    def body(self) -> Solid:
+        """The shape in its place."""
+        return Placed(self.shape, self.position, self.turn)
+
+    @property
+    def solid(self) -> Solid:
+        """Where fluid cannot be."""
+        return Hollow(self.body) if self.is_tank else self.body
+
+    def moved(self, position: Points, turn: Points) -> "ShownSolid":
+        """In another pose: its middle at a position (d,) [m], turned by a matrix (d, d)."""
+        return replace(self, position=position, turn=turn)
+
+    def within(self, frame: Points, origin: Points) -> "ShownSolid":
+        """In other axes: those of a frame (d, d), from an origin (d,) [m]."""
+        return self.moved(frame @ (self.position - origin), frame @ self.turn)
+
+
+def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
+    """Those of a scene, at rest, with the images of them that are a period away and reach into the container."""
+    found = []
+    for table in scene.solid:
+        shape, middle = table.shape_about()
+        position, is_tank = middle if table.position is None else np.array(table.position), table.side == "inside"
+        clear = table.transparency if table.transparency is not None else float(is_tank)
+        turn, colour = table.turn(scene.dimension), np.array(table.colour)
+        found.append(ShownSolid(shape, position, turn, colour, clear, is_tank))
+    ends, lengths = scene.container.extent(), scene.container.periods(scene.dimension)[1]
+    if ends is None or not lengths.any():
+        return tuple(found)
+    shifts = list(product(*[(0.0, -length, length) if length else (0.0,) for length in lengths]))
+    images = [one.moved(one.position + np.array(shift), one.turn) for one in found for shift in shifts]
+    return tuple(one for one in images if _overlap(one.body.extent(), ends))
+
+
+def _overlap(one: tuple[Points, Points], other: tuple[Points, Points]) -> bool:
+    """Whether two boxes do."""
+    return bool((one[0] < other[1]).all() and (other[0] < one[1]).all())

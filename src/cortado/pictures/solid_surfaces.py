@@ -1,0 +1,70 @@
+"""The surfaces of solids on the device that traces rays."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.pictures.device_surface import DeviceSurface
+from cortado.pictures.lit_surface import LitSurface
+from cortado.pictures.shadow import solid_shadow
+from cortado.pictures.shown_solids import ShownSolid
+from cortado.pictures.solid_mesh import SolidMesh
+from cortado.pictures.stage import Stage
+from cortado.pictures.surroundings import Solids
+
+FINE, FINE_OWN = 0.03, 0.05
+"""How wide faces of round solids are: in sizes of what is shown, and of the solid itself, if that is less."""
+LONGEST = 0.04
+"""Of the sides of triangles, at whose corners light is found, in sizes of what is shown."""
+
+
+class SolidSurfaces:
+    """Those of the solids of a stage, in their poses."""
+
+    def __init__(self, stage: Stage, device: Any):
+        placed = [(one, _mesh_of(one, stage.size).moved(one.turn, one.position)) for one in stage.solids]
+        self._device, self._are_cut = device, stage.cuts_solids
+        self._opaque = [(one, mesh) for one, mesh in placed if not one.is_tank and one.transparency == 0.0]
+        self._clear = [(one, mesh) for one, mesh in placed if one.is_tank or one.transparency > 0.0]
+        self.shadow = solid_shadow(stage, [(one, mesh) for one, mesh in placed if not one.is_tank])
+
+    def on_device(self) -> tuple[Any, list[tuple[DeviceSurface, SolidMesh]]]:
+        """`Solids`, and their surfaces, which must be kept and lit, with the meshes that they are of."""
+        found, surfaces, lit = Solids(), list[tuple[DeviceSurface, SolidMesh]](), [LitSurface(), LitSurface()]
+        found.are_cut = int(self._are_cut)
+        if self._opaque:
+            surfaces.append(self._surface(self._opaque))
+            lit[0] = surfaces[-1][0].lit
+            found.has_opaque, found.opaque = 1, lit[0].mesh
+        if self._clear:
+            surfaces.append(self._surface(self._clear))
+            lit[1] = surfaces[-1][0].lit
+            found.has_clear, found.clear = 1, lit[1].mesh
+            found.has_tank = int(any(one.is_tank for one, _ in self._clear))
+            left = [np.tile(_left(one), (len(mesh.triangles), 1)) for one, mesh in self._clear]
+            lit[1].left = wp.array(np.concatenate(left), dtype=wp.vec2, device=self._device)
+            lit[1].from_edges = wp.array(surfaces[-1][1].from_edges, dtype=wp.mat33, device=self._device)
+        found.surfaces = wp.array(lit, dtype=LitSurface, device=self._device)
+        return found, surfaces
+
+    def _surface(self, solids: Sequence[tuple[ShownSolid, SolidMesh]]) -> tuple[DeviceSurface, SolidMesh]:
+        """Several as one."""
+        mesh = SolidMesh.joined([one for _, one in solids])
+        colours = np.concatenate([np.tile(one.colour, (len(own.points), 1)) for one, own in solids])
+        return DeviceSurface.of(mesh.points, mesh.triangles, mesh.normals, colours, self._device), mesh
+
+
+def _mesh_of(shown: ShownSolid, size: float) -> SolidMesh:
+    """That of a solid about its middle; of a tank its outside is within the cavity."""
+    own = float(np.ptp(shown.shape.extent(), axis=0).max())
+    faces = shown.shape.faces(min(FINE * size, FINE_OWN * own))
+    longest = np.inf if shown.transparency == 1.0 else LONGEST * size  # what is clear has no light of its own
+    return SolidMesh.of(faces.reversed() if shown.is_tank else faces, longest)
+
+
+def _left(shown: ShownSolid) -> tuple[float, float]:
+    """The part of the light that comes through one surface, seen from within a solid and from outside: one looks into a
+    tank whatever its walls are."""
+    return (1.0, shown.transparency) if shown.is_tank else (shown.transparency**0.5,) * 2

@@ -1,0 +1,350 @@
+"""Solids in pictures: seen where they are, in front of what is behind them, without changing scenes that have none."""
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado.discretise.shapes import corners
+from cortado.pictures.mirrored import mirrored
+from cortado.pictures.painter import colours_of, painter
+from cortado.pictures.particle_sets import particles
+from cortado.pictures.scene_view import container_outline, outline, scene_view
+from cortado.pictures.shown_solids import shown_solids
+from cortado.pictures.solid_lines import solid_outline
+from cortado.pictures.solid_mesh import FAR, SolidMesh
+from cortado.pictures.solid_surfaces import SolidSurfaces
+from cortado.pictures.stage import Stage, screen_axes
+
+BLUE, ORANGE = (0.05, 0.1, 0.8), (0.7, 0.3, 0.05)
+PILLAR = {"name": "pillar", "shape": "box", "lower": [0.35, 0.0, 0.15], "upper": [0.45, 0.4, 0.25], "colour": ORANGE}
+BALL = {"name": "ball", "shape": "sphere", "centre": [0.4, 0.2, 0.2], "radius": 0.1, "colour": ORANGE}
+CAVITY = {"name": "tank", "shape": "box", "lower": [0.0] * 3, "upper": [0.6, 0.5, 0.4], "side": "inside"}
+CUP = {"name": "cup", "shape": "cup", "base": [0.3, 0.0, 0.2], "radius": 0.2, "height": 0.4, "thickness": 0.05}
+SHAPES = [
+    PILLAR,
+    BALL,
+    CUP,
+    {"name": "rod", "shape": "capsule", "start": [0.3, 0.2, 0.2], "end": [0.5, 0.3, 0.2], "radius": 0.08},
+    {"name": "drum", "shape": "cylinder", "base": [0.4, 0.0, 0.2], "radius": 0.1, "height": 0.3, "axis": "x"},
+]
+
+
+def scene_of(dimension, *solids, picture=None, **tables):
+    """A box with a column of blue fluid on its left, and solids."""
+    d = dimension
+    cut = [{k: v[:d] if isinstance(v, list) and k != "rotation" else v for k, v in one.items()} for one in solids]
+    given = {
+        "dimension": d,
+        "discretisation": {"spacing": 0.05},
+        "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.05, "colour": BLUE}],
+        "fluid": [{"shape": "box", "lower": [0.0] * d, "upper": [0.2, 0.3, 0.4][:d], "phase": "water"}],
+        "container": {"shape": "box", "lower": [0.0] * d, "upper": [0.6, 0.5, 0.4][:d]},
+        "solid": cut,
+        "solver": {"time_step": 0.002},
+        "picture": {"width": 240, "height": 160, **(picture or {})},
+    }
+    return cortado.Scene(**{**given, **tables})
+
+
+def lattice(lower, upper, spacing=0.05):
+    """Particles that fill a box, half a spacing from its sides."""
+    axes = [np.arange(low + 0.5 * spacing, high, spacing) for low, high in zip(lower, upper, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+
+
+def drawn(scene, positions):
+    positions = np.asarray(positions, dtype=float)
+    return painter(scene, positions).image(positions, colours_of(scene, None, len(positions)))
+
+
+def pixel_of(scene, positions, place):
+    """Row and column where a place (d,) [m] is seen."""
+    artist = painter(scene, np.asarray(positions, dtype=float))
+    stage, picture = artist.stage, artist.stage.picture
+    if scene.dimension == 2:
+        x, y = stage.pixels
+        return int(np.argmin(np.abs(y[:, 0] - place[1]))), int(np.argmin(np.abs(x[0] - place[0])))
+    off = stage.placed(np.asarray(place)) - stage.eye
+    forward = stage.look_at - stage.eye
+    forward /= np.linalg.norm(forward)
+    right, up = screen_axes(forward)
+    half = np.tan(0.5 * np.radians(picture.field_of_view)) * (off @ forward)
+    column = 0.5 * picture.width * (1.0 + off @ right / half)
+    return round(0.5 * picture.height - 0.5 * picture.width * (off @ up / half)), round(column)
+
+
+def seen(scene, positions, place):
+    """(3,) the light from a place (d,) [m]."""
+    return drawn(scene, positions)[pixel_of(scene, positions, place)]
+
+
+def is_orange(light):
+    return light[..., 0] > 1.5 * light[..., 2]
+
+
+def is_blue(light):
+    return light[..., 2] > 1.5 * light[..., 0]
+
+
+FRONT = {"camera": [0.4, 0.25, 3.0], "look_at": [0.4, 0.25, 0.2]}
+COLUMN = {2: lattice([0.0, 0.0], [0.2, 0.3]), 3: lattice([0.0] * 3, [0.2, 0.3, 0.4])}
+
+
+def test_a_solid_in_the_plane_has_its_colour_where_it_is():
+    scene = scene_of(2, PILLAR, picture={"width": 480, "height": 320})
+    image = drawn(scene, COLUMN[2])
+    row, column = pixel_of(scene, COLUMN[2], (0.4, 0.2))
+    np.testing.assert_allclose(image[row, column], ORANGE, atol=0.02)
+    x, y = painter(scene, COLUMN[2]).stage.pixels
+    off = np.maximum(np.abs(x - 0.4) - 0.05, np.abs(y - 0.2) - 0.2)
+    assert is_orange(image)[off < -0.005].all() and not is_orange(image)[off > 0.005].any()
+
+
+def test_a_solid_in_space_has_its_colour_where_it_is():
+    scene = scene_of(3, BALL, picture=FRONT)
+    image = is_orange(drawn(scene, COLUMN[3]))
+    row, column = pixel_of(scene, COLUMN[3], (0.4, 0.2, 0.2))
+    radius = pixel_of(scene, COLUMN[3], (0.5, 0.2, 0.2))[1] - column
+    rows, columns = np.mgrid[:160, :240]
+    off = np.hypot(rows - row, columns - column)
+    assert radius > 10 and image[off < radius - 2].all()
+    assert not image[(off > radius + 2) & (rows < row)].any()  # below it the floor shows its image
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_solid_hides_what_is_behind_it(dimension):
+    behind = lattice([0.35, 0.1, 0.0][:dimension], [0.45, 0.3, 0.1][:dimension], 0.04)
+    place, positions = (0.4, 0.2, 0.25)[:dimension], np.concatenate([COLUMN[dimension], behind])
+    with_it, without = (
+        scene_of(dimension, *solids, picture=FRONT if dimension == 3 else {}) for solids in ((PILLAR,), ())
+    )
+    assert is_blue(seen(without, positions, place)) and is_orange(seen(with_it, positions, place))
+
+
+def test_a_solid_is_seen_through_fluid():
+    before = np.concatenate([COLUMN[3], lattice([0.3, 0.0, 0.3], [0.5, 0.3, 0.4])])
+    scene = scene_of(3, PILLAR, picture=FRONT)
+    wet, dry = seen(scene, before, (0.4, 0.15, 0.25)), seen(scene, before, (0.4, 0.38, 0.25))
+    assert is_orange(dry) and wet[2] / wet[0] > 2.0 * dry[2] / dry[0]
+    without = seen(scene_of(3, picture=FRONT), before, (0.4, 0.15, 0.25))
+    assert without[1] > wet[1] + 0.1
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_solid_that_is_not_seen_changes_no_bit(dimension):
+    """Far below a closed container: what draws solids draws the rest as it is drawn without any."""
+    buried = {**PILLAR, "lower": [0.2, -9.0, 0.1], "upper": [0.4, -8.0, 0.3]}
+    images = [drawn(scene_of(dimension, *solids), COLUMN[dimension]) for solids in ((), (buried,))]
+    np.testing.assert_array_equal(images[0], images[1])
+
+
+def test_fluid_touches_a_solid_without_a_gap():
+    scene = scene_of(2, PILLAR, picture={"width": 480, "height": 320})
+    image = drawn(scene, lattice([0.0, 0.0], [0.35, 0.3]))
+    row, column = pixel_of(scene, COLUMN[2], (0.35, 0.15))
+    beside = image[row - 30 : row + 30, column - 12 : column + 12]
+    assert beside.min(axis=2).max() < 0.4  # neither paper nor the inside of the container
+
+
+@pytest.mark.parametrize("flush", [{}, {"lower": [0.35, 0.0, 0.3], "upper": [0.45, 0.4, 0.4]}])
+@pytest.mark.parametrize("shift", [0.0, 0.013])
+def test_a_side_in_a_wall_does_not_flicker(flush, shift):
+    """The side of a pillar that stands on the floor, and lies in a pane of the container: it is of one colour, whatever
+    the camera, though the wall, the floor and fluid that touches it are as far off as the side."""
+    around = np.concatenate([lattice([0.0, 0.0, 0.0], [0.35, 0.3, 0.4]), lattice([0.45, 0.0, 0.0], [0.6, 0.3, 0.4])])
+    picture = {"camera": [0.4 + shift, 0.25 + shift, 3.0], "look_at": [0.4, 0.25, 0.2], "transparency": 0.0}
+    scene = scene_of(3, {**PILLAR, **flush}, picture=picture)
+    if not flush:
+        around = COLUMN[3]
+    image, front = drawn(scene, around), 0.4 if flush else 0.25
+    (bottom, left), (top, right) = (pixel_of(scene, around, (x, y, front)) for x, y in ((0.36, 0.01), (0.44, 0.39)))
+    side = image[top:bottom, left:right]
+    assert side.size > 1000 and is_orange(side).all()
+    assert np.abs(np.diff(side, axis=0)).max() < 0.05 and np.abs(np.diff(side, axis=1)).max() < 0.05
+
+
+def test_a_solid_is_cut_at_the_walls_of_a_closed_container():
+    through = {**PILLAR, "lower": [0.5, 0.1, 0.1], "upper": [0.9, 0.3, 0.3]}
+    scene = scene_of(3, through, picture={"camera": [0.6, 0.2, 3.0], "look_at": [0.6, 0.2, 0.2]})
+    image = is_orange(drawn(scene, COLUMN[3]))
+    row, wall = pixel_of(scene, COLUMN[3], (0.6, 0.2, 0.3))
+    assert image[row, wall - 10 : wall - 2].all() and not image[row, wall + 2 :].any()
+    plane = scene_of(2, through)
+    image = is_orange(drawn(plane, COLUMN[2]))
+    row, wall = pixel_of(plane, COLUMN[2], (0.6, 0.2))
+    assert image[row, wall - 10 : wall - 2].all() and not image[row, wall + 2 :].any()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_tank_shows_what_is_in_it(dimension):
+    """As a container of the same shape does."""
+    tank, box = scene_of(dimension, CAVITY, container={"shape": "none"}), scene_of(dimension)
+    within = (0.1, 0.1, 0.4)[:dimension]
+    for scene in (tank, box):
+        assert is_blue(seen(scene, COLUMN[dimension], within))
+    alike = np.abs(drawn(tank, COLUMN[dimension]) - drawn(box, COLUMN[dimension])).max(axis=2)
+    assert np.mean(alike > 0.1) < 0.02
+
+
+def test_fluid_ends_at_the_sides_of_a_tank():
+    turned = {**CAVITY, "rotation": [0.0, 0.0, 0.3]}
+    scene = scene_of(3, turned, container={"shape": "none"}, picture={"transparency": 0.0, **FRONT})
+    (shown,) = shown_solids(scene)
+    full = shown.position + lattice([-0.3, -0.25, -0.2], [0.3, 0.05, 0.2]) @ shown.turn.T
+    image = is_blue(drawn(scene, full))
+    cavity = np.array([pixel_of(scene, full, shown.position + shown.turn @ (x, -0.1, 0.2)) for x in (-0.3, 0.3)])
+    (row, left), (other, right) = cavity
+    slope = (other - row) / (right - left)
+    on_it = [image[round(row + slope * (column - left)), column] for column in range(left - 15, right + 15)]
+    assert np.flatnonzero(on_it).min() == pytest.approx(15, abs=2)
+    assert np.flatnonzero(on_it).max() == pytest.approx(15 + right - left, abs=2)
+
+
+def test_a_transparent_solid_lets_light_through():
+    behind = np.concatenate([COLUMN[3], lattice([0.3, 0.1, 0.0], [0.5, 0.3, 0.1])])
+    place, light = (0.4, 0.2, 0.25), []
+    for clear in (0.0, 0.5, 1.0):
+        scene = scene_of(3, {**PILLAR, "transparency": clear}, picture={"transparency": 0.0, **FRONT})
+        light.append(seen(scene, behind, place))
+    assert is_orange(light[0]) and is_blue(light[2])
+    assert np.all(np.sort([one[0] for one in light])[::-1] == [one[0] for one in light])
+    plane = [seen(scene_of(2, {**PILLAR, "transparency": c}), COLUMN[2], (0.4, 0.2)) for c in (0.0, 0.5)]
+    assert plane[1][2] > plane[0][2] + 0.2
+
+
+def test_fluid_in_a_cup_of_glass_is_cut_at_its_inside():
+    """Also behind its side, where mirror images of particles are, no fluid is seen beyond the inner radius."""
+    glass, water = {**CUP, "transparency": 1.0}, lattice([0.1, 0.05, 0.0], [0.5, 0.3, 0.4], 0.04)
+    water = water[np.hypot(water[:, 0] - 0.3, water[:, 2] - 0.2) < 0.19]
+    picture = {"camera": [0.3, 0.2, 30.0], "look_at": [0.3, 0.2, 0.2], "field_of_view": 1.6, "transparency": 0.0}
+    scene = scene_of(3, glass, container={"shape": "none"}, picture=picture)
+    row, middle = pixel_of(scene, water, (0.3, 0.15, 0.2))
+    reach = pixel_of(scene, water, (0.5, 0.15, 0.2))[1] - middle
+    blue = np.flatnonzero(is_blue(drawn(scene, water)[row]))
+    assert reach > 20 and blue.max() - middle == pytest.approx(reach, abs=4)
+    assert middle - blue.min() == pytest.approx(reach, abs=4)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_without_a_container_solids_are_in_the_picture(dimension):
+    far = {**PILLAR, "lower": [1.9, 0.0, 0.1], "upper": [2.0, 1.0, 0.3]}
+    scene = scene_of(dimension, far, container={"shape": "none"})
+    assert is_orange(seen(scene, COLUMN[dimension], (1.95, 0.5, 0.3)[:dimension]))
+    if dimension == 3:
+        stage = Stage.of(scene, COLUMN[3])
+        assert stage.upper[1] - stage.lower[1] >= 1.0 and stage.upper[0] - stage.lower[0] >= 1.95
+
+
+def test_solids_cast_a_shadow_on_the_floor():
+    stage = Stage.of(scene_of(3, BALL), COLUMN[3])
+    light = SolidSurfaces(stage, "cpu").shadow
+    assert 0.1 < light.min() < 0.5 and light[0, 0].min() == 1.0
+    clear = Stage.of(scene_of(3, {**BALL, "transparency": 1.0}), COLUMN[3])
+    assert SolidSurfaces(clear, "cpu").shadow.min() == 1.0
+
+
+def test_a_solid_lies_in_the_shadow_of_another():
+    roof = {**PILLAR, "name": "roof", "lower": [0.0, 0.42, 0.0], "upper": [0.6, 0.48, 0.4]}
+    light = [
+        seen(scene_of(3, *solids, picture=FRONT), COLUMN[3], (0.4, 0.2, 0.25)) for solids in ((PILLAR,), (PILLAR, roof))
+    ]
+    assert light[1][0] < 0.85 * light[0][0] and light[1][0] > 0.1
+
+
+def test_a_solid_comes_again_with_every_period():
+    """One that leaves on the right comes in on the left."""
+    container = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.5], "periodic": [True, False]}
+    scene = scene_of(2, {**PILLAR, "lower": [0.55, 0.1], "upper": [0.65, 0.3]}, container=container, fluid=[
+        {"shape": "box", "lower": [0.1, 0.0], "upper": [0.3, 0.3], "phase": "water"}])  # fmt: skip
+    water = lattice([0.1, 0.0], [0.3, 0.3])
+    for x in (0.03, 0.57):
+        assert is_orange(seen(scene, water, (x, 0.2)))
+    assert len(shown_solids(scene)) == 2
+
+
+@pytest.mark.parametrize("table", SHAPES, ids=lambda table: table["shape"])
+def test_a_mesh_is_closed_smooth_and_fine(table):
+    (shown,) = shown_solids(scene_of(3, table, container={"shape": "none"}, fluid=[
+        {"shape": "box", "lower": [2.0] * 3, "upper": [2.2] * 3, "phase": "water"}]))  # fmt: skip
+    faces = shown.shape.faces(0.02)
+    mesh = SolidMesh.of(faces, 0.03)
+    a, b, c = mesh.points[mesh.triangles].transpose(1, 0, 2)
+    places = np.unique(np.rint(mesh.points * 1e7), axis=0, return_inverse=True)[1].reshape(-1)[mesh.triangles]
+    sides = places[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    there, back = (np.unique(one, axis=0, return_counts=True) for one in (sides, sides[:, ::-1]))
+    np.testing.assert_array_equal(there[0], back[0])  # triangles on either hand of a side turn the other way
+    assert (there[1] == 1).all()
+    lengths = [np.linalg.norm(b - a, axis=1), np.linalg.norm(c - b, axis=1), np.linalg.norm(a - c, axis=1)]
+    assert np.max(lengths) <= 2.0**0.5 * 0.03
+    x, y, z = faces.vertices[faces.corners].transpose(1, 0, 2)
+    volumes = [np.einsum("tk,tk->", one, np.cross(two, three)) / 6.0 for one, two, three in ((a, b, c), (x, y, z))]
+    assert volumes[0] == pytest.approx(volumes[1], rel=1e-9) and volumes[0] > 0.0
+    flat = np.cross(b - a, c - a)
+    flat /= np.linalg.norm(flat, axis=1)[:, None]
+    assert np.einsum("tck,tk->tc", mesh.normals[mesh.triangles], flat).min() > 0.9
+    off = np.abs(shown.shape.distance(mesh.points + 0.01 * mesh.normals) - 0.01)
+    assert np.mean(off < 0.002) > 0.97  # normals are those of the solid, not of its faces
+    assert table is CUP or (off < 0.002).all()  # in which a side goes on along another
+
+
+def test_edges_are_found_where_a_solid_is_sharp():
+    stage = scene_of(3, PILLAR, BALL)
+    box, ball = (SolidMesh.of(one.shape.faces(0.02), 0.03) for one in shown_solids(stage))
+    assert (ball.from_edges == FAR).all()
+    a, b, c = box.points[box.triangles].transpose(1, 0, 2)
+    middle, half = (a + b + c) / 3.0, np.array([0.05, 0.2, 0.05])
+    from_sides = half - np.abs(middle)
+    wanted = np.sort(from_sides, axis=1)[:, 1]  # the first is how far it is from its own face: 0
+    found = box.from_edges.mean(axis=2).min(axis=1)
+    assert (found >= wanted - 1e-12).all() and np.mean(found < wanted + 1e-12) > 0.8
+
+
+def images_of(points, table, spacing=0.05, **changes):
+    scene = scene_of(len(points[0]), {**table, **changes}, container={"shape": "none"})
+    return mirrored(np.asarray(points, dtype=float), shown_solids(scene), 0.9 * spacing, spacing)
+
+
+def test_fluid_is_mirrored_behind_sides_and_corners():
+    beside, of = images_of([[0.33, 0.2], [0.1, 0.2]], {**PILLAR, "upper": [0.55, 0.4, 0.25]})
+    np.testing.assert_allclose(beside, [[0.37, 0.2]])
+    assert of.tolist() == [0]
+    corner, of = images_of([[0.02, 0.03]], CAVITY)
+    assert {tuple(np.round(one, 9)) for one in corner} == {(-0.02, 0.03), (0.02, -0.03), (-0.02, -0.03)}
+    assert of.tolist() == [0, 0, 0]
+    edge, _ = images_of([[0.02, 0.03, 0.01]], CAVITY)
+    assert len(edge) == 7
+
+
+def test_thin_solids_hide_what_is_mirrored_behind_them():
+    """Fluid is drawn some 0.7 spacings beyond particles."""
+    for spacing, deepest in ((0.02, 0.015), (0.05, 0.015), (0.1, None)):
+        solids = shown_solids(scene_of(2, {**PILLAR, "upper": [0.4, 0.4]}))
+        found, _ = mirrored(np.array([[0.335, 0.2]]), solids, 0.9 * spacing, spacing)
+        assert len(found) == 0 if deepest is None else 0.0 < found[0, 0] - 0.35 <= deepest + 1e-12
+
+
+def test_outlines_are_the_edges_and_the_cuts_of_solids():
+    assert solid_outline(scene_of(2)).shape == (0, 2, 2) and solid_outline(scene_of(3)).shape == (0, 2, 3)
+    turned = scene_of(2, {**PILLAR, "rotation": 0.4})
+    (shown,) = shown_solids(turned)
+    wanted = shown.position + corners(np.array([-0.05, -0.2]), np.array([0.05, 0.2])) @ shown.turn.T
+    found = np.unique(np.round(solid_outline(turned).reshape(-1, 2), 9), axis=0)
+    np.testing.assert_allclose(found, np.unique(np.round(wanted, 9), axis=0))
+    assert solid_outline(scene_of(3, PILLAR)).shape == (12, 2, 3)
+    circles = solid_outline(scene_of(3, BALL)) - np.array([0.4, 0.2, 0.2])
+    np.testing.assert_allclose(np.linalg.norm(circles, axis=2), 0.1, atol=1e-3)
+    assert (np.abs(circles).min(axis=2) < 1e-9).all()  # of three great circles
+    scene = scene_of(3, PILLAR)
+    np.testing.assert_array_equal(outline(scene), np.concatenate([container_outline(scene), solid_outline(scene)]))
+
+
+def test_figures_and_views_have_the_lines_of_solids(tmp_path):
+    scene = scene_of(2, PILLAR)
+    paths = [
+        particles([COLUMN[2]], ["now"], tmp_path / name, container=scene.container.extent(), lines=lines)
+        for name, lines in (("with.png", solid_outline(scene)), ("without.png", solid_outline(scene_of(2))))
+    ]
+    images = [cortado.pictures.read_picture(path) for path in paths]
+    assert images[0].shape == images[1].shape and 1e-4 < (images[0] != images[1]).any(axis=2).mean() < 0.05
+    views = [scene_view(one, {"run": [cortado.Simulation(one).run(1)[0]]}, [0.0]) for one in (scene, scene_of(2))]
+    assert views[0].count("[[") >= views[1].count("[[") and len(views[0]) > len(views[1])
