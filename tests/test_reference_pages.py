@@ -5,10 +5,10 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
-import trimesh
 import pytest
 import scene_page
 import task_page
+import trimesh
 
 from cortado.optimisation.inverse.tables import TaskTables
 from cortado.optimisation.inverse.task import load_task

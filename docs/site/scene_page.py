@@ -203,7 +203,8 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
             (
                 "SphereSolid",
                 "### A solid sphere",
-                '[[solid]]\nname = "ball"\nshape = "sphere"\ncentre = [0.75, 0.2, 0.25]\nradius = 0.1\nmotion = "path"\n'
+                '[[solid]]\nname = "ball"\nshape = "sphere"\ncentre = [0.75, 0.2, 0.25]\nradius = 0.1\n'
+                'motion = "path"\n'
                 "times = [0.0, 0.5, 1.0]\npositions = [[0.75, 0.2, 0.25], [0.75, 0.5, 0.25], [0.75, 0.2, 0.25]]",
             ),
             (
