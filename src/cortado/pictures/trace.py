@@ -128,7 +128,7 @@ def seen(
         floor_at = (s.floor_height - o[1]) / d[1]
     if met.t > floor_at or not met.found:
         found = background(s, shadow, o, d, spread)
-        if s.solids.has_opaque > 0:
+        if s.solids.has_opaque > 0:  # noqa: SIM102  (kernels evaluate both sides of an "and")
             if meet_solid(s, o, d).t < floor_at:
                 return toned(found)
         if floor_at < FAR:  # the floor is a little glossy
