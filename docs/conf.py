@@ -4,6 +4,7 @@ import logging
 import os
 import sys
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
 
 import cortado
@@ -53,6 +54,7 @@ autoclass_content = "both"
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
+autodoc_mock_imports = [name for name in ("torch",) if find_spec(name) is None]  # it is optional, and large
 napoleon_numpy_docstring = False
 default_role = "py:obj"
 add_module_names = False

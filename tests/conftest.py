@@ -128,11 +128,19 @@ SLOW_TESTS = {
         "test_the_whole_chain_from_gravity_to_the_picture",
     },
     "test_interruption": {"test_workers_that_begin_are_interrupted_in_one_sentence"},
+    "test_jax_layer": {
+        "test_a_map_is_a_batch_with_the_bits_of_single_evaluations",
+        "test_both_modes_agree_for_every_field_of_a_state",
+        "test_compiled_scanned_and_recomputed_segments_have_the_same_gradient",
+        "test_jacobians_by_both_modes_agree_and_are_mapped",
+        "test_optax_and_optimistix_search",
+    },
     "test_lanes": {"test_kernels_for_lanes_compile_for_a_gpu_that_is_not_there"},
     "test_layers": {
         "test_the_discretisation_is_without_warp",
     },
     "test_leaderboard": {"test_the_standard_error_of_the_truth_is_right"},
+    "test_meshes": {"test_two_hundred_thousand_triangles_are_read_sampled_and_asked_a_million_times"},
     "test_mixture": {
         "test_a_parameter_alone_has_the_gradient_that_it_has_among_all",
         "test_gradient_equals_tangent_and_differences",
@@ -195,6 +203,10 @@ SLOW_TESTS = {
     },
     "test_tilt": {
         "test_a_problem_takes_a_tilt_in_the_place_of_gravity",
+    },
+    "test_torch_layer": {
+        "test_chained_segments_pass_the_check_of_gradients",
+        "test_residuals_of_a_graph_go_with_it",
     },
     "test_walls": {
         "test_the_side_of_a_cup_stops_a_particle_alone",

@@ -33,7 +33,11 @@ class Projection:
         """Beside the walls of a simulation."""
         solver, scene, d = simulation.solver, simulation.scene, simulation.dimension
         search, lattice = solver.search, solver.lattice
-        walls = search.wall_positions.numpy()[:, :d], search.wall_weights.numpy(), search.wall_feet.numpy()[:, :d]
+        walls = (
+            search.walls["wall_positions"].numpy()[:, :d],
+            search.walls["wall_weights"].numpy(),
+            search.walls["wall_feet"].numpy()[:, :d],
+        )
         kernel, spacing = solver.discretisation.smoothing, scene.discretisation.spacing
         periods = np.array(scene.container.periods(d)[1])
         return cls(kernel, lattice.support, lattice.volume, spacing, *walls, periods)

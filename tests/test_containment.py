@@ -159,7 +159,7 @@ def test_the_device_finds_the_particles_that_numpy_finds(name, precision):
     device = wp.get_device("cpu")
     near = Region.between(np.full(d, -2.0), np.full(d, 3.0))
     layout, launch = Layout(n, 1, real, device), KernelLauncher(n, device, record_tape=False)
-    containment = Containment(Walled(region, near, spacing, (), np.zeros(d)), layout, launch, n)
+    containment = Containment(Walled(region, near, spacing, (), (), np.zeros(d)), layout, launch, n, None)
     order = random.permutation(n)
     state = layout.state((POSITIONS, VELOCITIES))
     state.set({"positions": after})

@@ -144,8 +144,11 @@ def test_kernels_can_be_read(module):
     assert module in LOOPS or "s.fluid_count[" not in text, "sums over neighbours are made: cortado.particles.pair_sums"
 
 
+HEAVY = ("warp", "matplotlib", "scipy", "jax", "torch")
+
+
 def test_import_is_light():
-    program = "import sys, cortado; print(*(n for n in ('warp', 'matplotlib', 'scipy') if n in sys.modules))"
+    program = f"import sys, cortado; print(*(n for n in {HEAVY} if n in sys.modules))"
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     assert not found, f"import cortado alone imports {', '.join(found)}"
 

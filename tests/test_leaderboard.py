@@ -13,6 +13,7 @@ from benchmarks.gradients.cells import Cell
 from benchmarks.gradients.certificates import main as certificates
 from benchmarks.gradients.controls import CONTROLS, VelocityModes
 from benchmarks.gradients.coverage import REFERENCE, Intervals, coverage, intervals
+from benchmarks.gradients.losses import LOSSES
 from benchmarks.gradients.over_scenes import over_scenes
 from benchmarks.gradients.resolution import resolution
 from benchmarks.gradients.results import Results
@@ -20,6 +21,7 @@ from benchmarks.gradients.table import ceiling, cosine, table
 from benchmarks.gradients.truth import DIRECTIONS, FEW, SAMPLES, directions, smoothed
 from cortado import InputError, Problem, Scene, Simulation
 from cortado.gradients import EnsembleMean, Exact, RandomizedSmoothing
+from cortado.losses import CentreOfMass
 from cortado.optimisation.transforms import Transformed
 
 TINY = scenes.dam(0.1, (3, 3))
@@ -101,6 +103,18 @@ class Product:
 
     def value_and_adjoint(self, end):
         return self.value(end), (end.velocities, end.positions + end.velocities)
+
+
+@pytest.mark.parametrize(("name", "seen"), [("picture", False), ("side-picture", True)])
+def test_the_height_of_water_that_covers_the_floor_is_seen_from_the_side_alone(name, seen):
+    covered = scenes.dam(0.1, (8, 5, 4))
+    box = {**covered["fluid"][0], "upper": [1.6, 0.5, 0.4]}
+    simulation = Simulation(Scene(**{**covered, "fluid": [box]}), precision="float64")
+    at = {"initial_positions": simulation.positions}
+    problem = Problem(simulation, 0, CentreOfMass([0.0, 0.0, 0.0]))
+    loss = LOSSES[name](simulation, problem.end(at))
+    higher = simulation.positions * [1.0, 1.1, 1.0]
+    assert (Problem(simulation, 0, loss).value({"initial_positions": higher}) > 1e-4) == seen
 
 
 def test_the_standard_error_of_the_truth_is_right(simulation):

@@ -16,8 +16,9 @@ from cortado.discretise.smoothing import CUBIC_SPLINE
 from cortado.particles import candidates
 from cortado.particles.cells import Grid
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type
-from cortado.particles.neighbours import NeighbourSearch, WallArrays
+from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout
+from cortado.particles.wall_arrays import WallArrays
 
 SUPPORT = 0.1
 REACH = (1 + SKIN) * SUPPORT
@@ -37,7 +38,7 @@ def around(search: NeighbourSearch, period: np.ndarray, precision: Precision) ->
     s.particles = search.particles
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count
-    s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
+    s.wall_positions, s.wall_weights = search.walls["wall_positions"], search.walls["wall_weights"]
     s.support, s.reach = SUPPORT, REACH
     s.period = precision.vector(*padded(period[None])[0])
     s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in padded(period[None])[0]))
@@ -87,7 +88,7 @@ def lists(
     search = NeighbourSearch(
         discretisation,
         grid,
-        WallArrays(padded(walls), names, names, 0.0 * padded(walls)),
+        WallArrays(padded(walls), names, names, 0.0 * padded(walls), 0.0 * padded(walls), np.full(len(walls), -1)),
         Layout(n, 1, precision, device),
         capacity,
     )
@@ -102,7 +103,7 @@ def lists(
     rows = memory.numpy() if device.is_cpu else memory.numpy().T
     fluid_count, count = search.fluid_count.numpy(), search.count.numpy()
     own = fluid_count - search.filling.numpy()
-    wall_names = search.wall_weights.numpy().astype(int)
+    wall_names = search.walls["wall_weights"].numpy().astype(int)
     fluid: list[np.ndarray] = [np.zeros(0)] * n
     near_walls: list[np.ndarray] = [np.zeros(0)] * n
     for i in range(n):
@@ -363,7 +364,9 @@ def test_lists_that_are_too_short_say_how_long_they_must_be(capacity, precision)
 def test_room_can_be_made():
     discretisation = Discretisation(CUBIC_SPLINE, FLOAT64)
     grid = Grid.around(np.zeros(3), np.ones(3), np.zeros(3), REACH, 1000)
-    nothing = WallArrays(np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 3)))
+    nothing = WallArrays(
+        np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=int)
+    )
     search = NeighbourSearch(discretisation, grid, nothing, Layout(10, 1, FLOAT64, CPU), 4)
     search.allocate(9)
     assert search.capacity == 12  # the next multiple of UNROLL

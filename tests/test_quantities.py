@@ -134,7 +134,7 @@ def cubic_spline(simulation, positions):
     """Of all pairs of positions (n, d) and of them and the walls: separations, W and the gradient of W."""
     lattice, kernel, d = simulation.lattice, simulation.smoothing, simulation.dimension
     found = []
-    walls = simulation.solver.search.wall_positions.numpy()[:, :d]
+    walls = simulation.solver.search.walls["wall_positions"].numpy()[:, :d]
     for others in (positions, walls):
         apart = positions[:, None] - others[None]
         weight = kernel.weight(np.linalg.norm(apart, axis=-1), d, lattice.support)
@@ -148,7 +148,7 @@ def test_values_are_those_of_sums_over_all_pairs(make):
     simulation = cortado.Simulation(make(), precision="float64")
     state = simulation.run(5, {"initial_velocities": np.random.default_rng(1).normal(size=simulation.velocities.shape)})
     state, volume = state.last_state, simulation.lattice.volume
-    x, v, weights = state["positions"], state["velocities"], simulation.solver.search.wall_weights.numpy()
+    x, v, weights = state["positions"], state["velocities"], simulation.solver.search.walls["wall_weights"].numpy()
     (w, slope), (wall_w, wall_slope) = cubic_spline(simulation, x)
     n = volume * (w.sum(axis=1) + wall_w @ weights)
     density = simulation.quantity("density", state)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scene_page
 import task_page
+import trimesh
 
 from cortado.optimisation.inverse.tables import TaskTables
 from cortado.optimisation.inverse.task import load_task
@@ -46,6 +47,8 @@ def replaced(whole: str, example: str) -> str:
 @pytest.mark.parametrize("model, example", scene_page.examples().items())
 def test_an_example_of_a_scene_is_one(model, example, tmp_path):
     np.save(tmp_path / "drop.npy", np.full((2, 3), 0.3) + [[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]])
+    block = trimesh.creation.box(extents=[200.0, 200.0, 200.0])
+    block.export(tmp_path / "block.stl")
     file = tmp_path / "scene.toml"
     file.write_text(replaced(scene_page.WHOLE, example))
     scene = load_scene(file)

@@ -363,7 +363,7 @@ def test_pictures_change_neither_results_nor_whether_a_search_goes_on(tmp_path):
     assert prints[0] == prints[1]
     folder = RunFolder.create(tmp_path / "run", plain.to_json(), [], kind="optimise")
     folder.require(other.to_json(), "optimise")
-    aside = ("picture", "sensor", "force")
+    aside = ("picture", "sensor", "force", "solid")
     former = {name: table for name, table in json.loads(plain.to_json()).items() if name not in aside}
     for table, key in UNUSED:
         del former[table][key]

@@ -16,7 +16,10 @@ from reference_stress import Stress
 def twin(simulation):
     """The slow twin of a simulation's solver, in the simulation's own dimension."""
     lattice, search, d = simulation.solver.lattice, simulation.solver.search, simulation.dimension
-    walls = search.wall_positions.numpy()[:, :d].astype(np.float64), search.wall_weights.numpy().astype(np.float64)
+    walls = (
+        search.walls["wall_positions"].numpy()[:, :d].astype(np.float64),
+        search.walls["wall_weights"].numpy().astype(np.float64),
+    )
     viscous = [force for force in simulation.solver.forces if isinstance(force, Viscosity)]
     return reference.Pcisph(
         simulation.solver.discretisation.smoothing,
@@ -38,7 +41,7 @@ def stress_twin(simulation, walls, wall_weights):
     """The slow twin of its viscosity as a stress, given its walls (b, d) and their weights."""
     solver, scene, d = simulation.solver, simulation.scene, simulation.dimension
     lattice, spacing = solver.lattice, scene.discretisation.spacing
-    feet = solver.search.wall_feet.numpy()[:, :d].astype(np.float64)
+    feet = solver.search.walls["wall_feet"].numpy()[:, :d].astype(np.float64)
     return Stress(
         lattice.volume,
         stress_control(solver.discretisation.smoothing, spacing, lattice.support, d),

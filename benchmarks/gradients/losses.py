@@ -2,10 +2,14 @@
 `LOSSES`."""
 
 from collections.abc import Callable
+from typing import Any
+
+import numpy as np
 
 from cortado import Simulation
 from cortado.losses import CentreOfMass, FinalPositions, Image, Loss, Snapshot
 from cortado.losses.image_losses import Pyramid
+from cortado.scene.containers import BoxContainer
 
 PIXELS = 32
 """Of the shorter side of a picture."""
@@ -18,7 +22,24 @@ def centre_of_mass(simulation: Simulation, hidden: Snapshot) -> Loss:
 
 def picture(simulation: Simulation, hidden: Snapshot) -> Loss:
     """Pyramid of the difference of two pictures, in the plane or from above."""
-    renderer = simulation.renderer(resolution=(2 * PIXELS, PIXELS))
+    return _picture(simulation, hidden, resolution=(2 * PIXELS, PIXELS))
+
+
+def side_picture(simulation: Simulation, hidden: Snapshot) -> Loss:
+    """The same through a camera that looks along the depth of the container and sees its whole front, so that the
+    picture has the surface in it also where fluid covers the floor; in the plane it is `picture`."""
+    if simulation.dimension == 2:
+        return picture(simulation, hidden)
+    container = simulation.scene.container
+    assert isinstance(container, BoxContainer)
+    lower, upper = np.array(container.lower), np.array(container.upper)
+    middle, (width, height, depth) = (lower + upper) / 2.0, upper - lower
+    camera = middle + [0.0, 0.0, depth / 2.0 + 1.4 * max(width, height)]
+    return _picture(simulation, hidden, view="volume", position=camera, look_at=middle, resolution=(PIXELS, PIXELS))
+
+
+def _picture(simulation: Simulation, hidden: Snapshot, **settings: Any) -> Loss:
+    renderer = simulation.renderer(**settings)
     blank = Image(renderer, renderer.render(hidden.state.positions, hidden.state.mass_fractions, hidden.colours))
     return Image(renderer, blank.target, Pyramid())
 
@@ -31,5 +52,6 @@ def positions(simulation: Simulation, hidden: Snapshot) -> Loss:
 LOSSES: dict[str, Callable[[Simulation, Snapshot], Loss]] = {
     "centre-of-mass": centre_of_mass,
     "picture": picture,
+    "side-picture": side_picture,
     "positions": positions,
 }

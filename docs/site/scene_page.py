@@ -190,8 +190,9 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
     ),
     (
         "## Solids: `[[solid]]`",
-        "What fluid flows around or is held by, besides the container, at rest: pillars, ramps, baffles, cups, tanks "
-        "that lean ([how they work](solids.md)). `shape` decides which other keys a solid has.",
+        "What fluid flows around or is held by, besides the container: pillars, ramps, baffles, cups, tanks that lean, "
+        "pistons, rotors, belts, meshes from files ([how they work](solids.md)). `shape` decides which other keys a "
+        "solid has.",
         (
             (
                 "BoxSolid",
@@ -202,13 +203,15 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
             (
                 "SphereSolid",
                 "### A solid sphere",
-                '[[solid]]\nname = "ball"\nshape = "sphere"\ncentre = [0.75, 0.2, 0.25]\nradius = 0.1',
+                '[[solid]]\nname = "ball"\nshape = "sphere"\ncentre = [0.75, 0.2, 0.25]\nradius = 0.1\n'
+                'motion = "path"\n'
+                "times = [0.0, 0.5, 1.0]\npositions = [[0.75, 0.2, 0.25], [0.75, 0.5, 0.25], [0.75, 0.2, 0.25]]",
             ),
             (
                 "CapsuleSolid",
                 "### A capsule",
                 '[[solid]]\nname = "rod"\nshape = "capsule"\nstart = [0.75, 0.2, 0.1]\nend = [0.75, 0.4, 0.4]\n'
-                "radius = 0.06",
+                'radius = 0.06\nmotion = "path"\nangular_velocity = [0.0, 3.0, 0.0]',
             ),
             (
                 "CylinderSolid",
@@ -221,6 +224,12 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "### A cup",
                 '[container]\nshape = "none"\n\n[[solid]]\nname = "cup"\nshape = "cup"\nbase = [0.25, -0.1, 0.25]\n'
                 "radius = 0.4\nheight = 0.7\nthickness = 0.1\nrotation = [0.0, 0.0, 0.2]",
+            ),
+            (
+                "MeshSolid",
+                "### A mesh from a file",
+                '[[solid]]\nname = "block"\nshape = "mesh"\nfile = "block.stl"\nscale = 0.001\n'
+                "position = [0.75, 0.1, 0.25]",
             ),
             (
                 "PolygonSolid",

@@ -12,11 +12,13 @@ if TYPE_CHECKING:
     from cortado import forces as forces
     from cortado import gradients as gradients
     from cortado import image_losses as image_losses
+    from cortado import jax as jax
     from cortado import losses as losses
     from cortado import optimisers as optimisers
     from cortado import pictures as pictures
     from cortado import render as render
     from cortado import sensors as sensors
+    from cortado import torch as torch
     from cortado.certificate import certify as certify
     from cortado.errors import ComputationError as ComputationError
     from cortado.errors import CortadoError as CortadoError

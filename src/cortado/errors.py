@@ -113,3 +113,15 @@ class EngineMissingError(CortadoError, ImportError):
             "The reference engine is not installed: pip install cortado-reference, or from a clone of the repository "
             "pip install ./reference, which needs a C++17 compiler (g++, for all precisions)."
         )
+
+
+class LibraryMissingError(CortadoError, ImportError):
+    """A library that Cortado can do without is not installed."""
+
+    def __init__(self, name: str, package: str):
+        super().__init__(name, package)
+        self.package = package
+        """What it is installed as."""
+
+    def __str__(self) -> str:
+        return f"{self.args[0]} is not installed, which cortado.{self.package} needs: pip install {self.package}"

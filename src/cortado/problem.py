@@ -237,7 +237,7 @@ class Problem:
         require_points(points)
         if estimator is not None:
             checked_reverse(estimator)
-        problem = self._batch_of(len(points))
+        problem = self.batch_of(len(points))
         known = self.simulation.known
         over_time = {n for n in points[0] if n in known.over_time and np.ndim(points[0][n]) == known[n].rank}
         rows = [{name: [value] if name in over_time else value for name, value in point.items()} for point in points]
@@ -247,7 +247,14 @@ class Problem:
         lost = problem.lost
         return [lost[b] if b in lost else found.member(b, shapes) for b in range(len(points))]
 
-    def _batch_of(self, size: int) -> "Problem":
+    def beginning_at(self, state: RestartState | Sequence[RestartState]) -> "Problem":
+        """The same problem, in the same arrays, that begins at another state."""
+        found, judged = object.__new__(Problem), self.simulation.judged_states
+        states = [one if one in judged else one.fixed() for one in one_for_each(state, self.simulation.batch)]
+        found.__dict__ |= {**self.__dict__, "state": state, "_states": states, "_batches": {}}
+        return found
+
+    def batch_of(self, size: int) -> "Problem":
         """The same problem of so many scenes in one launch; the last few sizes are kept."""
         if size not in self._batches:
             while len(self._batches) >= KEPT:
@@ -291,25 +298,20 @@ class Problem:
 
     def _ends(self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()) -> dict[int, Any]:
         """States by the number of steps before them; ``keep`` checkpoints for a way back."""
-        wanted, dimension = set(steps), self.simulation.dimension
-        ends: dict[int, Any] = {}
-        colours = [self._space.colours(own) for own in self._space.members(values)]
+        wanted, single, ends = set(steps), self.simulation.batch is None, dict[int, Any]()
+        each = np.array([self._space.colours(own) for own in self._space.members(values)])
+        made, colours = (Snapshot, each[0]) if single else (SnapshotBatch, each)
 
         def observe(step: int, state: State) -> None:
-            if step in wanted and state.batch is None:
-                ends[step] = Snapshot(kept := state.copy(), dimension, colours[0], self._moment(step, kept))
-            elif step in wanted:
+            if step in wanted:
                 kept = state.copy()
-                ends[step] = SnapshotBatch(kept, dimension, np.array(colours), self._moment(step, kept))
+                moment = Moment.of(self._rollout, step, kept, self.simulation.evaluator)
+                ends[step] = made(kept, self.simulation.dimension, colours, moment)
 
         self._space.begin(self._rollout, values, varied, self._states)
         observe(0, self._rollout.initial)
         self._rollout.forward(observe, keep)
         return ends
-
-    def _moment(self, step: int, state: State) -> Moment:
-        """What quantities of a state after so many steps follow from."""
-        return Moment.of(self._rollout, step, state, self.simulation.evaluator)
 
     @property
     def _going(self) -> list[int] | None:

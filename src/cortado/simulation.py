@@ -96,7 +96,7 @@ class Simulation(Stepping, Measuring, Picturing):
         self.own_solver = None if self._given[1] is None and scene.solver.kind in OWN else self._maker
         """What makes the solver, if it is not Cortado's own."""
         self._called = called(scene.solver, self._given[1])
-        self.known = known_of(self.forces, self._maker)
+        self.known = known_of(self.forces, self._maker, scene.solid)
         """Its parameters."""
         self.device = device_named(device)
         self.precision = precision_named(precision)
@@ -230,7 +230,7 @@ class Simulation(Stepping, Measuring, Picturing):
             warnings.warn(sentence, CortadoWarning, stacklevel=5)
         fields = {name: np.array([frame[name] for frame in frames]) for name in frames[0]}
         own = {name: np.array([one[name] for one in looks]) for name in watch.names}
-        found = recorded(rollout, np.array(steps), fields, self.constants(rollout), own)
+        found = recorded(rollout, self.scene, np.array(steps), fields, self.constants(rollout), own)
         return replace(found, sensors=watch.readings()) if isinstance(found, Trajectory) else found  # type: ignore[return-value]  # of a batch
 
     def frame(self, state: State) -> dict[str, np.ndarray]:

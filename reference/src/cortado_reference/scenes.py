@@ -32,8 +32,8 @@ def check_scene(scene: Scene) -> None:
         raise InputError("scene has phase[0].rheology, but must leave it out for the reference engine.")
     if scene.force:
         raise InputError("scene has [[force]], but must leave it out for the reference engine.")
-    slips = {table.slip for table in scene.solid} | ({scene.container.slip} if scene.container.extent() else set())
-    if len(slips) > 1:
+    walls = [*scene.solid, *([scene.container] if scene.container.extent() is not None else [])]
+    if len({wall.sticks for wall in walls}) > 1:
         raise InputError("scene has walls with and without slip, but must have one kind for the reference engine.")
     if scene.schedule.courses:
         raise InputError(

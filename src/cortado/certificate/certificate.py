@@ -170,17 +170,18 @@ def certify(
     sizes = scales(problem, chosen, perturbation)
     asked = {} if wrong else chosen
     perturbations = coherent_directions(problem, chosen, sizes, random)
-    time = float(values["time_step"]) * max(problem.steps, 1)
+    known = {**problem.simulation.parameters(), **values}
+    time = float(known["time_step"]) * max(problem.steps, 1)
     return Certificate(
         particles=problem.simulation.particles,
         steps=problem.steps,
-        time_step=float(values["time_step"]),
+        time_step=float(known["time_step"]),
         loss=exact.loss,
         loss_changes={name: abs(float((exact.gradient[name] * along[name]).sum())) for name in along},
         consistency=consistency,
         wrong=wrong,
         norms=np.hypot(norms.numpy()[:, 0], norms.numpy()[:, 1] / time),
-        growth=growth(norms.numpy(), float(values["time_step"])) / max(problem.steps, 1),
+        growth=growth(norms.numpy(), float(known["time_step"])) / max(problem.steps, 1),
         horizons=tuple(horizon(history, chosen, name, perturbations[name]) for name in asked),
         alignment=alignment(problem, asked, sizes, _of(chosen, exact.gradient)) if asked else None,
     )

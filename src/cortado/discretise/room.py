@@ -25,25 +25,28 @@ class Room:
         """2 or 3."""
         return len(self.periods)
 
-    def from_solids(self, points: Points) -> Points:
-        """(n,) how far points (n, d) [m] are from the nearest solid, negative inside one [m]; infinite without any."""
+    def from_solids(self, points: Points, reach: float = np.inf) -> Points:
+        """(n,) how far points (n, d) [m] are from the nearest solid, negative inside one [m]; infinite without any.
+        What is not less than a reach [m] in size may be any other number of its sign that is not."""
         if not self.solids:
             return np.full(len(points), np.inf)
-        return np.min([solid.distance(image) for image in self._images(points) for solid in self.solids], axis=0)
+        images = self._images(points)
+        return np.min([solid.distance_up_to(image, reach) for image in images for solid in self.solids], axis=0)
 
-    def distance(self, points: Points) -> Points:
-        """(n,) how far points (n, d) [m] are outside of the room, negative inside [m]."""
-        return np.maximum(self.region.distance(points), -self.from_solids(points))
+    def distance(self, points: Points, reach: float = np.inf) -> Points:
+        """(n,) how far points (n, d) [m] are outside of the room, negative inside [m]. What is not less than a reach
+        [m] in size may be any other number of its sign that is not."""
+        return np.maximum(self.region.distance(points), -self.from_solids(points, reach))
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
         """(n,) whether points (n, d) [m] are within, or outside by no more than the tolerance [m]."""
-        return self.region.contains(points, tolerance) & (self.from_solids(points) >= -tolerance)
+        return self.region.contains(points, tolerance) & (self.from_solids(points, abs(tolerance)) >= -tolerance)
 
     def cell_shares(self, points: Points, spacing: float) -> Points:
         """(n,) the part of the cell, a spacing [m] wide, around each of the points (n, d) [m] that is within the room;
         along the surfaces of solids the cell counts as turned with them."""
         within = self.region.cell_shares(points, spacing)
-        return within * np.clip(self.from_solids(points) / spacing + 0.5, 0.0, 1.0)
+        return within * np.clip(self.from_solids(points, 0.5 * spacing) / spacing + 0.5, 0.0, 1.0)
 
     def images(self, solid: Solid) -> list[Solid]:
         """A solid, and those a period from it."""

@@ -1,6 +1,6 @@
 """What a particle sees: its neighbours and the walls, as one argument of every kernel that sums over them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -29,8 +29,15 @@ class Discretisation:
     """Threads for each particle, in kernels that are made for them: see `cortado.device.lanes`."""
     periodic: bool = False
     """Whether particles see the nearest images of one another: see ``period`` in the neighbourhood."""
+    moving: bool = False
+    """Whether walls move: sums know their velocities."""
     taped: bool = False
     """Whether a tape can differentiate the forward kernels: they get Warp's own adjoint, which takes one lane."""
+
+    @property
+    def still(self) -> "Discretisation":
+        """The same where walls do not move, for what is linear in the velocities of the fluid alone."""
+        return replace(self, moving=False)
 
     def module(self, forward: bool, topic: str) -> Any:
         """The Warp module of forward kernels, or of those of the adjoint; `tangent_module` has the others. ``topic``
@@ -42,7 +49,7 @@ class Discretisation:
         return self._module("tangent", topic, False)
 
     def _module(self, kind: str, topic: str, enable_backward: bool) -> Any:
-        images = "_periodic" if self.periodic else ""
+        images = "_periodic" * self.periodic + "_moving" * self.moving
         lanes = "" if self.lanes == 1 else f"_{self.lanes}_lanes"
         beside = f"{images}{lanes}_beside_taped" if self.taped and not enable_backward else f"{images}{lanes}"
         module = wp.get_module(f"cortado_{topic}_{kind}_{self.smoothing.name}_{self.precision.name}{beside}")
@@ -76,6 +83,8 @@ def neighbourhood_type(precision: Precision) -> Any:
         """w_b [-]: what a wall particle counts for in the density, a fluid particle being 1."""
         wall_grips: wp.array(dtype=real)
         """w_b of walls without slip, 0 of those that slip freely [-]."""
+        wall_velocities: wp.array(dtype=vector)
+        """How fast a wall particle moves [m/s]; read where the `Discretisation` is moving."""
         wall_feet: wp.array(dtype=vector)
         """From a wall particle to the nearest point of the container's surface [m]."""
         support: real
@@ -123,6 +132,7 @@ class PairFunctions:
     wall_weight: Any
     wall_grip: Any
     wall_foot: Any
+    wall_velocity: Any
     vectors: Any
     numbers: Any
 
@@ -135,9 +145,9 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
     (grad a . u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x);
     ``per_size`` (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction
     per_size x . G, of second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the
-    list of i), ``wall_position``, ``wall_weight``, ``wall_grip`` and ``wall_foot``; and ``vectors`` and ``numbers``,
-    which load what `UNROLL` neighbours have before any of it is used, so that the loads do not wait for one another
-    (on a GPU a tenth of a whole step).
+    list of i), ``wall_position``, ``wall_weight``, ``wall_grip``, ``wall_foot`` and ``wall_velocity``; and ``vectors``
+    and ``numbers``, which load what `UNROLL` neighbours have before any of it is used, so that the loads do not wait
+    for one another (on a GPU a tenth of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
@@ -224,6 +234,10 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         return load_vector(s.wall_feet, b)
 
     @wp.func
+    def wall_velocity(b: int, s: neighbourhood) -> vector:
+        return load_vector(s.wall_velocities, b)
+
+    @wp.func
     def vectors(a: wp.array(dtype=vector), k: int, i: int, s: neighbourhood) -> rows:
         return wp.matrix_from_rows(
             load_vector(a, neighbour(k, i, s)),
@@ -257,6 +271,7 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         wall_weight=wall_weight,
         wall_grip=wall_grip,
         wall_foot=wall_foot,
+        wall_velocity=wall_velocity,
         vectors=vectors,
         numbers=numbers,
     )

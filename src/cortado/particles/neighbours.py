@@ -8,7 +8,6 @@ The list holds j for i exactly when it holds i for j, because |x_i - x_j| is com
 sides.
 """
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -20,8 +19,10 @@ from cortado.device.lanes import lane_functions
 from cortado.device.launching import MOST_PARTS, KernelLauncher
 from cortado.particles.candidates import scan_around
 from cortado.particles.cells import CellSort, Grid, cell_functions, cell_grid_type
+from cortado.particles.moving_walls import MovingWalls, Poses
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type
 from cortado.particles.state import Layout
+from cortado.particles.wall_arrays import WallArrays
 
 
 @cache
@@ -40,6 +41,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
         s: neighbourhood,
         grid: grid_type,
         wall_grid: grid_type,
+        moving_grid: grid_type,
         near_walls: wp.array(dtype=wp.bool),
         bad_step: wp.array(dtype=wp.int32),
         x: wp.array(dtype=vector),
@@ -70,6 +72,8 @@ def fill_kernel(discretisation: Discretisation) -> Any:
         found = filled
         if near_walls[(c[2] * grid.shape[1] + c[1]) * grid.shape[0] + c[0]]:
             found = scan(i, -1, 0, c, found, x_i, s.wall_positions, wall_grid, s)
+        if wp.static(discretisation.moving):
+            found = scan(i, -1, member * grid.shape[2], c, found, x_i, s.wall_positions, moving_grid, s)
         if lane() > 0:
             return
         filling[i] = to_fill
@@ -79,20 +83,6 @@ def fill_kernel(discretisation: Discretisation) -> Any:
             wp.atomic_max(needed, s.part, found)
 
     return fill
-
-
-@dataclass(frozen=True)
-class WallArrays:
-    """Wall particles, in any order."""
-
-    positions: np.ndarray
-    """(b, 3) [m]"""
-    weights: np.ndarray
-    """(b,) what each counts for in the density, a fluid particle being 1 [-]"""
-    grips: np.ndarray
-    """(b,) the same of those without slip, and 0 of those along which fluid slips freely"""
-    feet: np.ndarray
-    """(b, 3) from each to the surface [m]"""
 
 
 def _near_walls(grid: Grid, starts: np.ndarray) -> np.ndarray:
@@ -118,8 +108,10 @@ class NeighbourSearch:
         walls: WallArrays,
         layout: Layout,
         capacity: int,
+        begun: Poses | None = None,
     ):
-        """``walls`` are the same ones for all scenes of a batch."""
+        """``walls`` at rest are the same ones for all scenes of a batch; those that move stand behind them, one scene
+        after the other, and are written by `MovingWalls.write`. Solids that move begin with poses ``begun``."""
         precision, device, particles = discretisation.precision, layout.device, layout.all_particles
         self.particles, self.device = particles, device
         self._fill = fill_kernel(discretisation)
@@ -131,12 +123,16 @@ class NeighbourSearch:
         self._launch = KernelLauncher(particles, device, record_tape=False)
         self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
         self._seen = HostCopy(self._needed)
-        self.wall_positions = wp.array(walls.positions, dtype=precision.vector, device=device)
-        self.wall_weights = wp.array(walls.weights, dtype=precision.real, device=device)
-        self.wall_grips = wp.array(walls.grips, dtype=precision.real, device=device)
-        self.wall_feet = wp.array(walls.feet, dtype=precision.vector, device=device)
-        self._wall_sort = CellSort(grid, len(walls.positions), precision, device)
-        self._unsorted_walls: WallArrays | None = walls
+        still, moving = walls.some(walls.solid < 0), walls.some(walls.solid >= 0)
+        count = len(still) + layout.members * len(moving)
+        kinds = {"positions": precision.vector, "feet": precision.vector, "velocities": precision.vector}
+        kinds |= {"weights": precision.real, "grips": precision.real}
+        self.walls = {f"wall_{name}": wp.zeros(count, dtype=kind, device=device) for name, kind in kinds.items()}
+        """What kernels know of wall particles, those at rest first."""
+        self._wall_sort = CellSort(grid, len(still), precision, device)
+        self._unsorted_walls: WallArrays | None = still
+        self.moving = None if begun is None else MovingWalls(moving, len(still), begun, grid, layout)
+        """Those of solids that move."""
         self._grid, self._near_walls = grid, wp.zeros(grid.cells, dtype=wp.bool, device=device)
         self.allocate(capacity)
 
@@ -158,12 +154,13 @@ class NeighbourSearch:
         self._sort(positions)
 
     def _sort_walls(self, walls: WallArrays) -> None:
-        self._wall_sort(self.wall_positions)
-        sorted_to_given = self._wall_sort.order.numpy()
-        self.wall_positions.assign(walls.positions[sorted_to_given])
-        self.wall_weights.assign(walls.weights[sorted_to_given])
-        self.wall_grips.assign(walls.grips[sorted_to_given])
-        self.wall_feet.assign(walls.feet[sorted_to_given])
+        positions, device = self.walls["wall_positions"], self.device
+        self._wall_sort(wp.array(walls.positions, dtype=positions.dtype, device=device))
+        order = self._wall_sort.order.numpy()
+        for name in ("positions", "weights", "grips", "feet"):
+            array, values = self.walls[f"wall_{name}"], getattr(walls, name)[order]
+            if len(values):
+                wp.copy(array, wp.array(values, dtype=array.dtype, device=device), count=len(values))
         self._near_walls.assign(_near_walls(self._grid, self._wall_sort.grid.starts.numpy()))
 
     def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:
@@ -174,6 +171,7 @@ class NeighbourSearch:
             s=neighbourhood,
             grid=self._sort.grid,
             wall_grid=self._wall_sort.grid,
+            moving_grid=self._wall_sort.grid if self.moving is None else self.moving.grid,
             near_walls=self._near_walls,
             bad_step=bad_step,
             x=positions,

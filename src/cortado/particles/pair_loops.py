@@ -62,9 +62,11 @@ def over_fluid(
 
 
 def over_walls(d: Discretisation, arrays: Types, body: Body, footed: bool, rubs: bool) -> str:
-    """A loop over the walls, whose particles have nothing but a place, a weight _w_b and a way to the surface, which
-    ``footed`` loops know as _foot. Where it ``rubs``, walls that slip freely have no weight."""
+    """A loop over the walls, whose particles have nothing but a place, a weight _w_b, a way to the surface, which
+    ``footed`` loops know as _foot, and, where walls move, a velocity, which is their entry of the array v. Where it
+    ``rubs``, walls that slip freely have no weight."""
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
+    of_b |= {"v": "_wall_velocity(_b, s)"} if d.moving and "v" in arrays else {}
     foot = "_foot = _wall_foot(_b, s)" if footed else ""
     return OVER_WALLS.format(
         weight="_wall_grip" if rubs else "_wall_weight",
@@ -118,7 +120,17 @@ def _is_vector_of(real: Any, kind: Any) -> bool:
 
 def _known(d: Discretisation) -> dict[str, Any]:
     pair = pair_functions(d)
-    used = ("separation", "neighbour", "vectors", "numbers", "wall_position", "wall_weight", "wall_grip", "wall_foot")
+    used = (
+        "separation",
+        "neighbour",
+        "vectors",
+        "numbers",
+        "wall_position",
+        "wall_weight",
+        "wall_grip",
+        "wall_foot",
+        "wall_velocity",
+    )
     return {
         **{f"_{name}": getattr(pair, name) for name in used},
         **{"_real": d.precision.real, "_vector": d.precision.vector, "_neighbourhood": neighbourhood_type(d.precision)},

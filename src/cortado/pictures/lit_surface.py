@@ -21,8 +21,7 @@ class LitSurface:
     reach: wp.float32
     """How far behind a wall the triangles of fluid that touches it are, at most [m]."""
     left: wp.array(dtype=wp.vec2)
-    """(triangles,) of transparent solids: the part of the light that comes through, seen from within and from outside
-    of them"""
+    """(triangles,) of transparent solids: the part of the light that comes through, seen from within and outside"""
     from_edges: wp.array(dtype=wp.mat33)
     """(triangles,) of transparent solids: how far corners, the columns, are from up to three sharp edges [m]"""
 

@@ -1,16 +1,13 @@
 """Pictures of fluid in 3-D, by a ray tracer on the device of the run."""
 
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import wait
-from functools import partial
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from cortado.device.cores import usable_cores
-from cortado.device.launching import launch
-from cortado.device.threads import MOST_CORES, WARP, helpers
+from cortado.device.bands import BandLauncher
+from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points
 from cortado.pictures.device_surface import DeviceSurface
 from cortado.pictures.lighting import illuminate
@@ -26,8 +23,6 @@ ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.12
 """Where in a pixel four more rays go, in pixels from its middle."""
 CONTRAST = 0.03
 """Between neighbouring pixels, in linear light: above, four more rays go through both."""
-BANDS = 8
-"""Parts of a picture for each core, and one core may do more of them than another."""
 LIGHT_RAYS = {"liquid": (20, 4), "spheres": (10, 1)}
 """Rays that find how much light falls on a point of the surface: from all around, and from the lamp."""
 
@@ -41,7 +36,7 @@ class SpacePainter:
 
     def __init__(self, stage: Stage, particles: int, device: Any = "cpu"):
         self.stage, self.device, self.at_once = stage, wp.get_device(device), processes_for(particles)
-        self._compiled: set[Any] = set()
+        self._launch = BandLauncher(self.device)
         self._surroundings, self._eye = _surroundings(stage), _eye(stage)
         self._solids = SolidSurfaces(stage, self.device) if stage.solids else None
         self._lamps = self._rays_to_light(*LIGHT_RAYS[stage.picture.surface])
@@ -112,40 +107,6 @@ class SpacePainter:
     @property
     def _scattering(self) -> float:
         return self.stage.scattering if self.stage.picture.surface == "liquid" else 1e3 / self.stage.spacing
-
-    def _launch(self, kernel: wp.Kernel, count: int, **arguments: Any) -> None:
-        """On a CPU Warp launches in one thread: there the work is cut into bands, which all cores take in turn."""
-        cores = min(usable_cores(), MOST_CORES) if self.device.is_cpu else 1
-        bands = BANDS * cores if cores > 1 and count > 10_000 else 1
-        bounds = [count * band // bands for band in range(bands + 1)]
-
-        def work(band: int) -> None:
-            launch(kernel, bounds[band + 1] - bounds[band], self.device, first=bounds[band], **arguments)
-
-        begin = 0
-        if kernel not in self._compiled:
-            work(0)
-            self._compiled.add(kernel)
-            begin = 1
-        _shared(partial(map, work), range(begin, bands), cores)
-
-
-def _shared(work: Callable[[Any], Any], items: Any, cores: int) -> None:
-    """Do work for each item, on so many cores."""
-    waiting = iter(items)
-
-    def take() -> None:
-        for _ in work(waiting):
-            pass
-
-    called = [helpers().submit(take) for _ in range(cores - 1)]
-    try:
-        take()
-    finally:
-        begun = [helper for helper in called if not helper.cancel()]
-        wait(begun)
-    for helper in begun:
-        helper.result()
 
 
 def _directions(count: int) -> Points:

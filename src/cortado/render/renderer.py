@@ -142,6 +142,22 @@ class Renderer:
         columns, rows = self.view.camera.resolution
         return rows, columns, 3
 
+    @property
+    def precision(self) -> Precision:
+        """That it computes in."""
+        return self._precision
+
+    @property
+    def device(self) -> Any:
+        """Where it computes."""
+        return self._device
+
+    @property
+    def inputs(self) -> dict[str, tuple[int, ...]]:
+        """The shapes of what `render` takes, by name."""
+        n, phases = self._particles, self._phases
+        return {"positions": (n, self._dimension), "fractions": (n, phases), "colours": (phases, 3)}
+
     @WARP
     def render(self, positions: Any, fractions: Any = None, colours: Any = None) -> np.ndarray:
         """The picture (rows, columns, 3), in float64, row 0 at the top: ``render(trajectory[-1])``.

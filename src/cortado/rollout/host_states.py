@@ -64,7 +64,7 @@ class HostStates:
     def write(self, what: str, given: Values, to: State) -> np.ndarray:
         """Write derivatives of a state's fields, 0 for those that are left out, and return that of its time; raises
         `InputError`."""
-        fields, shapes = require_fields(what, given, to), self._shapes()
+        fields, shapes = require_fields(what, given, to), self.shapes()
         arrays = {name: as_numbers(f"{what} {name}", value) for name, value in fields.items()}
         for name, array in arrays.items():
             if array.shape != shapes[name]:
@@ -88,7 +88,8 @@ class HostStates:
         found = {name: array.astype(np.float64) for name, array in state.numpy(self._simulation.dimension).items()}
         return without_lost(rollout, found)
 
-    def _shapes(self) -> dict[str, tuple[int, ...]]:
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of the fields of a state, by name; of a batch with a first axis for the scenes."""
         simulation = self._simulation
         sizes = len(simulation.positions), simulation.dimension, len(simulation.scene.phase)
         members = () if simulation.batch is None else (simulation.batch,)

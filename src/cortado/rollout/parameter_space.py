@@ -16,7 +16,6 @@ from cortado.rollout.restarts import check_state, origin_of
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
 from cortado.rollout.step_bounds import greatest_step
-from cortado.scene.parameters.known import TIME
 from cortado.scene.parameters.parameter import Role
 from cortado.scene.parameters.registry import names
 from cortado.scene.parameters.values import Arrays, Values, check_known, checked_value, scene_values
@@ -74,6 +73,12 @@ class ParameterSpace:
             check_known(name, self._simulation.scene, what, self._known)
         return found
 
+    def shapes(self, name: str) -> list[tuple[int, ...]]:
+        """The shapes that a parameter may have; raises `InputError` for one that the scene does not have."""
+        check_known(name, self._simulation.scene, known=self._known)
+        own = self._one.shapes(name)
+        return [*own, *self._batched(own)]
+
     def members(self, values: Arrays) -> list[Arrays]:
         """Checked values as those of each scene of a batch; of a single scene they are the only ones."""
         different = self._different(values)
@@ -83,7 +88,7 @@ class ParameterSpace:
         """Every parameter that the scene has, as runs of so many steps take it where it is not given: parameters that
         the scene's schedule or a force changes with a row for each step, others as `Simulation.parameters` has them."""
         found = {**scene_values(self._simulation, self._known), **self._one.scheduled({})}
-        return {name: value for name, value in found.items() if name != TIME.name}
+        return {name: value for name, value in found.items() if self._known[name].role is not Role.CLOCK}
 
     def colours(self, values: Arrays) -> np.ndarray:
         """(phases, 3) the colours of the phases in one scene."""

@@ -63,7 +63,7 @@ def check_state(
     if state.fields.keys() != shapes.keys():
         raise InputError(f"state has {', '.join(state.fields)}, but must have {', '.join(shapes)} in this scene.")
     fields = {name: _numbers(name, state[name], wanted, simulation) for name, wanted in shapes.items()}
-    _check_clock(state.clock)
+    check_clock(state.clock)
     scene, positions = simulation.scene, fields["positions"]
     if state.origin is None:
         _check_spacing(positions[: simulation.free_particles], simulation)
@@ -92,7 +92,8 @@ def _numbers(name: str, value: object, shape: tuple[int, ...], simulation: Simul
     return array
 
 
-def _check_clock(clock: Clock) -> None:
+def check_clock(clock: Clock) -> None:
+    """A clock is one of a state; raises `InputError`."""
     if not isinstance(clock, Clock):
         raise InputError(f"state clock is {shown(clock)}, but must be a Clock, such as that of trajectory.last_state.")
     if not is_whole(clock.steps) or clock.steps < 0:

@@ -11,7 +11,7 @@ from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.scale import Scale
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import Pictured, scene_renderer
-from cortado.runs.trajectory import Frame
+from cortado.runs.frame import Frame
 from cortado.scene.parameters.parameter import Axis
 from cortado.scene.picture import Picture
 from cortado.scene.quantities import NAMES, sizes

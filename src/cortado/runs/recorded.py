@@ -5,16 +5,18 @@ from typing import Any
 import numpy as np
 
 from cortado.rollout.rollout import Rollout
+from cortado.runs.solid_motion import solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.runs.trajectory_batch import TrajectoryBatch
 from cortado.scene.parameters.values import Arrays
+from cortado.scene.scene import Scene
 
 
 def recorded(
-    rollout: Rollout, steps: np.ndarray, fields: Arrays, constants: Arrays, quantities: Arrays
+    rollout: Rollout, scene: Scene, steps: np.ndarray, fields: Arrays, constants: Arrays, quantities: Arrays
 ) -> Trajectory | TrajectoryBatch:
-    """Of fields (frames, ...) after so many steps (frames,), in a batch (frames, batch, ...), and of the fields of the
-    rollout's states that no step changes, with ``quantities`` (frames, ...) of the same frames."""
+    """Of a scene, from fields (frames, ...) after so many steps (frames,), in a batch (frames, batch, ...), and of the
+    fields of the rollout's states that no step changes, with ``quantities`` (frames, ...) of the same frames."""
 
     def one(number: int, kept: slice, at: tuple[Any, ...]) -> Trajectory:
         own = {name: array[kept][at] for name, array in fields.items()}
@@ -27,6 +29,7 @@ def recorded(
             diagnostics={name: column[at] for name, column in rollout.diagnostics.items()},
             mass_fractions=own.pop("mass_fractions", None),
             others=own,
+            solids=solid_motions(scene, own),
             constants={name: array[at[1:]] for name, array in constants.items()},
             substeps=rollout.substeps,
             origin=rollout.origins[number],

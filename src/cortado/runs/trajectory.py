@@ -16,9 +16,11 @@ from cortado.files import vtkhdf
 from cortado.files.input_files import as_path
 from cortado.pictures.notebook import as_text, with_view
 from cortado.pictures.particle_view import Cloud, particle_view, thinned
+from cortado.runs.frame import Frame, chosen
 from cortado.runs.frame_file import FRACTION, append_frame, fraction_names, frame_writer
 from cortado.runs.sensors.log import Readings
-from cortado.scene.quantities import QUANTITIES, check_quantity
+from cortado.runs.solid_motion import SolidMotion
+from cortado.scene.quantities import QUANTITIES
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.words import counted
 
@@ -28,37 +30,6 @@ MANY = 2000
 """Particles of which the nearest others are looked for."""
 SUFFIXES = (".vtkhdf", ".hdf")
 """By which ParaView knows a trajectory."""
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One recorded state of a run, ``trajectory[k]``; n particles in d dimensions."""
-
-    positions: NDArray[Any]
-    """(n, d) [m]"""
-    velocities: NDArray[Any]
-    """(n, d) [m/s]"""
-    mass_fractions: NDArray[Any] | None
-    """(n, phases) [-]; None with one phase"""
-    time: float
-    """[s]"""
-    quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """(n,) or (n, k) by name: those that were recorded, such as ``density``"""
-    others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """further fields of the state by name, such as those that parts keep; see `Trajectory`"""
-
-    def __getitem__(self, name: str) -> NDArray[Any]:
-        """A quantity of the particles by its name, one that was recorded or the speed, or a field of the state.
-
-        Raises:
-            InputError: it was not recorded, or there is no such quantity.
-        """
-        fractions = {} if self.mass_fractions is None else {"mass_fractions": self.mass_fractions}
-        fields = {"positions": self.positions, "velocities": self.velocities, **fractions, **self.others}
-        return chosen(self.quantities, name, fields)
-
-    def __repr__(self) -> str:
-        return f"Frame({counted(len(self.positions), 'particle')}, t = {self.time:.4g} s)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +69,8 @@ class Trajectory:
     """(frames, n) or (frames, n, k) by name: those that were recorded, such as ``density``"""
     sensors: Mapping[str, Readings] = field(default_factory=dict)
     """what sensors have read in every step, by their names; it is not in files"""
+    solids: Mapping[str, SolidMotion] = field(default_factory=dict)
+    """where solids that move are, by their names; it is not in files"""
     begun: int | None = None
     """[-] steps taken before the first one of the ``diagnostics``; those of the first frame if left out"""
 
@@ -183,6 +156,7 @@ class Trajectory:
         kept: dict[str, Any] = {name: None if array is None else array[frames] for name, array in arrays.items()}
         each = {name: getattr(self, name) for name in ("others", "quantities")}
         kept |= {key: {name: array[frames] for name, array in own.items()} for key, own in each.items()}
+        kept["solids"] = {name: motion[frames] for name, motion in self.solids.items()}
         return replace(self, **kept)
 
     @property
@@ -295,20 +269,6 @@ def _spacing(positions: NDArray[Any]) -> float:
     if len(positions) < 2:
         return 1.0
     return float(np.median(KDTree(positions).query(positions[:MANY], k=2)[0][:, 1])) or 1.0
-
-
-def chosen(quantities: Mapping[str, NDArray[Any]], name: str, fields: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """A quantity that was recorded, the speed, or one of ``fields``; raises `InputError` for any other name."""
-    check_quantity(name, others=tuple(fields))
-    if name in fields:
-        return fields[name]
-    if name == "speed" and name not in quantities:
-        return np.linalg.norm(fields["velocities"], axis=-1)
-    if name not in quantities:
-        found = f"{', '.join(quantities)} and the speed are" if quantities else "only the speed is"
-        advice = f'record it, as in simulation.run(steps, record=["{name}"]), or ask simulation.quantity for it'
-        raise InputError(f"{name} was not recorded, {found} there: {advice}.")
-    return quantities[name]
 
 
 def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:

@@ -22,6 +22,8 @@ LOOSENESS, MOST_LOOSENESS = 0.05, 0.008
 lattice see each other as denser than as many on it, by 4 % with the Wendland kernels and a support of 2 spacings."""
 ALIGNED = 1e-3
 """In spacings: by how much the surface of a solid may be off the faces of the cells that are outside of it."""
+FAR = 4.0
+"""In spacings: how deep in a body depths are told apart."""
 DIGITS = 6
 """Decimals of distances [spacings] by which particles are ordered: what is equal but for round-off stays in order."""
 
@@ -31,7 +33,7 @@ def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGua
     it is no further than ``reach`` [m] from a solid."""
     if not isinstance(fluid, RegionFluid) or isinstance(fluid, RoundFluid):
         return isinstance(fluid, RoundFluid)
-    return bool(len(room.solids) and (room.from_solids(fluid.particles(spacing)) < reach).any())
+    return bool(len(room.solids) and (room.from_solids(fluid.particles(spacing), reach) < reach).any())
 
 
 @dataclass(frozen=True)
@@ -43,23 +45,25 @@ class CutBody:
     spacing: float
     """[m]"""
 
-    def distance(self, points: Points) -> Points:
-        """(n,) how far points (n, d) [m] are outside of the body, negative inside [m]."""
-        return np.maximum(self.fluid.region(self.spacing).distance(points), self.room.distance(points))
+    def distance(self, points: Points, reach: float) -> Points:
+        """(n,) how far points (n, d) [m] are outside of the body, negative inside [m]. What is not less than a reach
+        [m] in size may be any other number of its sign that is not."""
+        return np.maximum(self.fluid.region(self.spacing).distance(points), self.room.distance(points, reach))
 
     def shares(self, points: Points) -> Points:
         """(n,) the part of the cell around each of the points (n, d) [m] that is within the body."""
-        return np.clip(0.5 - self.distance(points) / self.spacing, 0.0, 1.0)
+        return np.clip(0.5 - self.distance(points, 0.5 * self.spacing) / self.spacing, 0.0, 1.0)
 
     def volume(self, depth: float = 0.0) -> float:
         """[m^d] of what is more than a depth [m] below the surface."""
         dimension, fine = self.room.dimension, self.spacing / FINER
-        cells = self.fluid.block(self.spacing).grown(1).points()
-        distances = self.distance(cells) + depth
+        cells, reach = self.fluid.block(self.spacing).grown(1).points(), depth + self.spacing
+        distances = self.distance(cells, reach) + depth
         cut = cells[np.abs(distances) < 0.5 * self.spacing * np.sqrt(dimension)]
-        whole = np.count_nonzero(distances < 0.0) - np.count_nonzero(self.distance(cut) + depth < 0.0)
+        whole = np.count_nonzero(distances < 0.0) - np.count_nonzero(self.distance(cut, reach) + depth < 0.0)
         parts = grid([np.asarray(fine * (np.arange(FINER) + 0.5) - 0.5 * self.spacing)] * dimension)
-        shares = sum(np.clip(0.5 - (self.distance(cut + part) + depth) / fine, 0.0, 1.0).sum() for part in parts)
+        reach = depth + fine
+        shares = sum(np.clip(0.5 - (self.distance(cut + part, reach) + depth) / fine, 0.0, 1.0).sum() for part in parts)
         return float(whole * self.spacing**dimension + shares * fine**dimension)
 
     @cached_property
@@ -75,14 +79,14 @@ class CutBody:
         if not self._cuts_cells():
             return self.fluid.particles_in(self.room, self.spacing)
         points = self.fluid.lattice(self.spacing, self.spacing)
-        depths = np.round(self.distance(points) / self.spacing, DIGITS)
+        depths = np.round(self.distance(points, FAR * self.spacing) / self.spacing, DIGITS)
         return points[np.sort(np.argsort(depths, kind="stable")[: self.count])]
 
     def _cuts_cells(self) -> bool:
         """Whether a surface goes through cells: that of a round body, or that of a solid."""
         if isinstance(self.fluid, RoundFluid):
             return True
-        from_solids = self.room.from_solids(self.fluid.particles(self.spacing))
+        from_solids = self.room.from_solids(self.fluid.particles(self.spacing), self.spacing)
         return bool((np.abs(from_solids) < (0.5 - ALIGNED) * self.spacing).any())
 
 
@@ -110,11 +114,12 @@ class Surroundings:
         points = body.fluid.lattice(body.spacing, reach + body.spacing)
         middle = 0.5 * np.sum(body.fluid.extent(body.spacing), axis=0)
         within = ((self.lengths == 0.0) | (np.abs(points - middle) < 0.5 * self.lengths)).all(axis=1)
-        points = points[within & (np.abs(body.distance(points)) < reach + body.spacing)]
-        nearest = np.argmin([self._distance(other, points) for other in self.bodies], axis=0)
+        furthest = reach + body.spacing
+        points = points[within & (np.abs(body.distance(points, furthest)) < furthest)]
+        nearest = np.argmin([self._distance(other, points, furthest) for other in self.bodies], axis=0)
         points = points[nearest == self.bodies.index(body)]
         fluid = self._shares(points, body.spacing)
-        walls = np.clip(0.5 + body.room.distance(points) / body.spacing, 0.0, 1.0)
+        walls = np.clip(0.5 + body.room.distance(points, body.spacing) / body.spacing, 0.0, 1.0)
         return points, np.clip(1.0 - fluid - walls, 0.0, 1.0)
 
     def _images(self, points: Points) -> list[Points]:
@@ -122,8 +127,8 @@ class Surroundings:
         shifts = product(*[(0.0, -length, length) if length else (0.0,) for length in self.lengths])
         return [points + np.array(shift) for shift in shifts]
 
-    def _distance(self, body: CutBody, points: Points) -> Points:
-        return np.min([body.distance(image) for image in self._images(points)], axis=0)
+    def _distance(self, body: CutBody, points: Points, reach: float) -> Points:
+        return np.min([body.distance(image, reach) for image in self._images(points)], axis=0)
 
     def _shares(self, points: Points, spacing: float) -> Points:
         """(n,) the part of the cell around each of the points that is fluid."""

@@ -6,6 +6,7 @@ from pydantic_core import PydanticCustomError
 from cortado.device.memory import sampling_parts, shortage
 from cortado.discretise.region import TOLERANCE
 from cortado.discretise.shapes import Points
+from cortado.discretise.solids.mesh_files import read_mesh
 from cortado.errors import InputError, Words, shown
 from cortado.scene.containers import check_length
 from cortado.scene.emitter import EmitterTable
@@ -17,6 +18,7 @@ from cortado.scene.overlaps import check_distinct, check_overlaps
 from cortado.scene.parameters.registry import BY_NAME
 from cortado.scene.room import room_of
 from cortado.scene.sentences import point_in_words
+from cortado.scene.solid_shapes import MeshSolid
 from cortado.scene.solids import check_solid
 from cortado.scene.stability import chosen_limits
 
@@ -88,6 +90,14 @@ def _check_phases(scene: SceneTables) -> None:
 
 
 def _check_files(scene: SceneTables) -> None:
+    for index, solid in enumerate(scene.solid):
+        if isinstance(solid, MeshSolid):
+            try:
+                size = scene.discretisation.spacing, scene.discretisation.support_radius
+                read_mesh(solid.file, solid.scale, *size, scene.container.extent())
+            except InputError as error:
+                sentence = f"cannot be used: {error}"
+                raise field_error(("solid", index, "file"), solid.file, "a file of a mesh", sentence) from None
     for index, fluid in enumerate(scene.fluid):
         if isinstance(fluid, PointsFluid):
             try:

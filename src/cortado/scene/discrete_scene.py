@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cortado.discretise.calibration import (
     lattice_laplacian_correction,
@@ -21,19 +20,14 @@ from cortado.discretise.packing import Packing
 from cortado.discretise.region import Region
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
-from cortado.discretise.solids.walls import ExposedSurface, WallPoints, solid_places
-from cortado.discretise.walls.layers import Planes, WallLayers, wall_layers
-from cortado.discretise.walls.places import Places
-from cortado.discretise.walls.weights import RestLattice, WallSurface, even_changes, uneven_changes
-from cortado.errors import CortadoWarning, InputError
+from cortado.discretise.walls.layers import WallLayers, wall_layers
+from cortado.discretise.walls.weights import RestLattice
+from cortado.errors import CortadoWarning
 from cortado.scene.bodies import Surroundings
 from cortado.scene.fluids import PointsFluid
-from cortado.scene.room import room_of
 from cortado.scene.sampling import FluidSample, fluid_particles, period
 from cortado.scene.scene import Scene
-
-NEAREST_PLACE = 0.4
-"""In spacings: places that are looked at for the weights of walls are no nearer to any surface."""
+from cortado.scene.walls import Walls, walls_of
 
 
 @dataclass(frozen=True)
@@ -70,20 +64,6 @@ class Lattice:
 
 
 @dataclass(frozen=True)
-class Walls:
-    """Wall particles."""
-
-    positions: Points
-    """(b, d) [m]"""
-    weights: Points
-    """(b,) w_b [-]: what each counts for in the density, a fluid particle being 1."""
-    feet: Points
-    """(b, d) from each to the nearest point of its surface [m]."""
-    sticks: NDArray[np.bool_]
-    """(b,) whether fluid has no slip along each."""
-
-
-@dataclass(frozen=True)
 class DiscreteScene:
     """What a solver starts from, besides what the scene says itself."""
 
@@ -116,7 +96,7 @@ def discretise(scene: Scene) -> DiscreteScene:
     lattice = Lattice.of(kernel, spacing, support, dimension)
     fluid = fluid_particles(scene)
     at_rest = RestLattice(kernel, spacing, support)
-    walls = _walls(scene, layers, at_rest)
+    walls = walls_of(scene, layers, at_rest)
     fluid = replace(fluid, positions=_packed(fluid, walls, at_rest, *period(scene)))
     if scene.discretisation.jitter:
         fluid = replace(fluid, positions=fluid.jittered(scene.discretisation.jitter * spacing))
@@ -136,38 +116,3 @@ def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Point
     air, shares = Surroundings(fluid.bodies, fluid.positions[stays], lower, lengths).air(lattice.support)
     fixed, weights = np.concatenate([air, walls.positions]), np.append(shares, walls.weights)
     return Packing(lattice, fixed, weights, len(air), lower, lengths).packed(fluid.positions, stays)
-
-
-def _walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Those of the container and of all solids, whose weights are found together."""
-    room, (lower, lengths) = room_of(scene), period(scene)
-    spacing, reach = lattice.spacing, lattice.support
-    beside = scene.container.places(scene.dimension, spacing, reach)
-    if not room.solids:
-        points, places, fit = _container_walls(scene, layers), beside, even_changes
-        sticks = np.full(len(points), scene.container.sticks)
-    else:
-        sides = scene.container.solids(scene.dimension, reach)
-        images = [image for solid in room.solids for image in room.images(solid)]
-        surface = ExposedSurface.of(room, [*sides, *images], lower, reach, spacing)
-        planes = Planes(lattice.kernel, spacing, reach, scene.dimension)
-        points, fit = surface.walls(layers, planes), uneven_changes
-        several = len(images) // len(scene.solid)
-        tables = [*(scene.container for _ in sides), *(table for table in scene.solid for _ in range(several))]
-        for table in scene.solid:
-            if not any(tables[number] is table for number in np.unique(surface.owner)):
-                raise InputError(f"solid {table.name!r} has no surface that fluid in the container can touch.")
-        sticks = np.array([table.sticks for table in tables])[surface.owners(points)]
-        about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
-        places = about.some(room.contains(about.points, -NEAREST_PLACE * spacing))
-    found = WallSurface(points.positions, points.flat, lattice, room, lower, lengths, fit)
-    return Walls(points.positions, found.weights(places), points.feet, sticks)
-
-
-def _container_walls(scene: Scene, layers: WallLayers) -> WallPoints:
-    """Those of the container, in layers of even particles."""
-    spacing, region = scene.discretisation.spacing, scene.container.region(scene.dimension).opened(period(scene)[1])
-    particles = [scene.container.walls(scene.dimension, spacing, depth) for depth in layers.depths]
-    positions = np.concatenate(particles)
-    flat = np.repeat(layers.weights, [len(layer) for layer in particles])
-    return WallPoints(positions, flat, region.nearest(positions) - positions)

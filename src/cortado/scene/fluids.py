@@ -191,11 +191,7 @@ class PointsFluid(Fluid):
     @field_validator("file")
     @classmethod
     def _make_absolute(cls, file: str, info: ValidationInfo) -> str:
-        folder = Path((info.context or {}).get("folder", "."))
-        try:
-            return str((folder / file).absolute())
-        except (OSError, ValueError):
-            raise field_error((), file, "the name of a file") from None
+        return beside_scene(file, info)
 
     def points(self) -> Points:
         """(n, d) [m]; raises `InputError`."""
@@ -212,6 +208,15 @@ class PointsFluid(Fluid):
 
 
 AnyFluid = Annotated[BoxFluid | CylinderFluid | SphereFluid | PointsFluid, Field(discriminator="shape")]
+
+
+def beside_scene(file: str, info: ValidationInfo) -> str:
+    """The absolute name of a file that a scene names, which is beside the scene's own."""
+    folder = Path((info.context or {}).get("folder", "."))
+    try:
+        return str((folder / file).absolute())
+    except (OSError, ValueError):
+        raise field_error((), file, "the name of a file") from None
 
 
 def check_order(lower: tuple[float, ...], upper: tuple[float, ...]) -> None:

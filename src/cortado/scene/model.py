@@ -20,7 +20,7 @@ from cortado.scene.render import Render
 from cortado.scene.rheology import AnyRheology
 from cortado.scene.schedule import Schedule
 from cortado.scene.sensors import AnySensor
-from cortado.scene.solids import AnySolid
+from cortado.scene.solid_shapes import AnySolid
 from cortado.scene.solvers import AnySolver, smoothing_of
 from cortado.scene.tables import Table
 

@@ -1,21 +1,20 @@
-"""Solids, which fluid flows around or is held by, each with its shape."""
+"""Solids, which fluid flows around or is held by: what all have, whatever their shape."""
 
 from abc import abstractmethod
+from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field
 
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.solid import Box, Hollow, Placed, Polygon, Revolved, Round, Solid
-from cortado.errors import Words
-from cortado.scene.fields import Colour, FieldPath, Length, Text, Vector, field_error, quantity
-from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
+from cortado.discretise.solids.solid import Hollow, Placed, Solid
+from cortado.errors import Words, shown
+from cortado.scene.fields import MISSING, Colour, FieldPath, Length, Text, field_error, quantity
 from cortado.scene.tables import Table
 
 Angle = Annotated[float, quantity("rad")]
-Size = Annotated[float, quantity("m", gt=0.0)]
 
 
 def _in_a_list(value: Any) -> Any:
@@ -23,7 +22,11 @@ def _in_a_list(value: Any) -> Any:
 
 
 Rotation = Annotated[tuple[Angle, ...], Field(min_length=1, max_length=3, fail_fast=True), BeforeValidator(_in_a_list)]
-Axis = Literal["x", "y", "z"]
+Turning = Annotated[
+    tuple[Annotated[float, quantity("rad/s")], ...],
+    Field(min_length=1, max_length=3, fail_fast=True),
+    BeforeValidator(_in_a_list),
+]
 
 
 class SolidTable(Table):
@@ -36,6 +39,24 @@ class SolidTable(Table):
     rotation: Rotation | None = None
     """How it is turned about its middle [rad], not at all if left out: in 3-D a rotation vector, in 2-D one number,
     counterclockwise."""
+    motion: Literal["fixed", "path"] = "fixed"
+    """Whether it stays where it is, or moves as it is told: by `times` with `positions`, `rotations` or both, or with a
+    steady `velocity`, `angular_velocity` or both."""
+    times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
+    """(k,) Times of the path, from 0 on, each greater than the one before [s]; between them it goes in straight lines,
+    and after the last it rests."""
+    positions: tuple[tuple[Length, ...], ...] | None = None
+    """(k, d) Where the middle is at these times [m]; the first is where it begins."""
+    rotations: tuple[Rotation, ...] | None = None
+    """(k, 3) By which rotation vectors it is turned from how it begins at these times, in 2-D (k,) by which angles; the
+    first is 0 [rad]."""
+    velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
+    """(d,) Of the middle, if it is steady [m/s]."""
+    angular_velocity: Turning | None = None
+    """About the middle, if it is steady: in 3-D a vector, in 2-D one number, counterclockwise [rad/s]."""
+    surface_velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
+    """(d,) How fast its surface slides while its shape stays, as that of a belt does, in the frame of the solid
+    [m/s]."""
     side: Literal["outside", "inside"] = "outside"
     """Where fluid may be: outside of the shape, or inside of it, as in a tank."""
     slip: Literal["free", "no"] = "free"
@@ -49,6 +70,15 @@ class SolidTable(Table):
     def sticks(self) -> bool:
         """Whether fluid has no slip along it."""
         return self.slip == "no"
+
+    @property
+    def moves(self) -> bool:
+        """Whether it or its surface moves."""
+        return self.motion != "fixed" or self.surface_velocity is not None
+
+    def middle(self) -> Points:
+        """(d,) where its middle is at the start [m]."""
+        return self.shape_about()[1] if self.position is None else np.array(self.position)
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
@@ -68,10 +98,15 @@ class SolidTable(Table):
         """Where fluid may not be."""
         return Hollow(self.body()) if self.side == "inside" else self.body()
 
+    def own_solid(self) -> Solid:
+        """The same about its middle, not turned."""
+        shape = self.shape_about()[0]
+        return Hollow(shape) if self.side == "inside" else shape
+
     def body(self) -> Solid:
         """The shape in its place."""
-        shape, middle = self.shape_about()
-        return Placed(shape, middle if self.position is None else np.array(self.position), self.turn(len(middle)))
+        middle = self.middle()
+        return Placed(self.shape_about()[0], middle, self.turn(len(middle)))
 
     def turn(self, dimension: int) -> NDArray[np.float64]:
         """(d, d) the rotation matrix."""
@@ -81,179 +116,16 @@ class SolidTable(Table):
         if self.position is not None and len(self.position) != dimension:
             wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
             raise field_error((*path, "position"), self.position, wanted)
-        if self.rotation is not None and len(self.rotation) != 2 * dimension - 3:
-            wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
-            raise field_error((*path, "rotation"), self.rotation, wanted)
+        for name in ("velocity", "surface_velocity"):
+            if (value := getattr(self, name)) is not None and len(value) != dimension:
+                wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
+                raise field_error((*path, name), value, wanted)
+        for name in ("rotation", "angular_velocity"):
+            if (value := getattr(self, name)) is not None and len(value) != 2 * dimension - 3:
+                wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
+                raise field_error((*path, name), value, wanted)
+        _check_motion(self, dimension, path)
         return super().in_dimension(dimension, path)
-
-
-class BoxSolid(SolidTable):
-    """A box, or a rectangle in 2-D."""
-
-    shape: Literal["box"] = "box"
-    lower: Vector[Length]
-    """(d,) Corner with the least coordinates, before it is turned [m]."""
-    upper: Vector[Length]
-    """(d,) Corner with the greatest coordinates [m]."""
-
-    @model_validator(mode="after")
-    def _check_order(self) -> Self:
-        check_order(self.lower, self.upper)
-        return self
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        lower, upper = np.array(self.lower), np.array(self.upper)
-        return Box(0.5 * (upper - lower)), 0.5 * (lower + upper)
-
-    def thinnest(self) -> float:
-        return float(np.subtract(self.upper, self.lower).min())
-
-
-class SphereSolid(SolidTable):
-    """A sphere, or a disc in 2-D."""
-
-    shape: Literal["sphere"] = "sphere"
-    centre: Vector[Length]
-    """(d,) Middle [m]."""
-    radius: Size
-    """From the middle to the surface [m]."""
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        centre = np.array(self.centre)
-        return Round(np.zeros_like(centre), self.radius), centre
-
-    def thinnest(self) -> float:
-        return 2.0 * self.radius
-
-
-class CapsuleSolid(SolidTable):
-    """All that is no further than a radius from a segment."""
-
-    shape: Literal["capsule"] = "capsule"
-    start: Vector[Length]
-    """(d,) One end of the segment [m]."""
-    end: Vector[Length]
-    """(d,) The other end [m]."""
-    radius: Size
-    """From the segment to the surface [m]."""
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        start, end = np.array(self.start), np.array(self.end)
-        return Round(0.5 * (end - start), self.radius), 0.5 * (start + end)
-
-    def thinnest(self) -> float:
-        return 2.0 * self.radius
-
-
-class CylinderSolid(SolidTable):
-    """A cylinder, in 3-D."""
-
-    shape: Literal["cylinder"] = "cylinder"
-    base: Vector[Length]
-    """(3,) Middle of the bottom [m]."""
-    radius: Size
-    """From the axis to the side [m]."""
-    height: Size
-    """From the base, along the axis [m]."""
-    axis: Axis = "y"
-    """The axis of space along which it stands, before it is turned."""
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        refuse_plane(dimension, path, '"box", "sphere", "capsule", "cup" or "polygon"')
-        return super().in_dimension(dimension, path)
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        axis = INDEX_OF_AXIS[self.axis]
-        profile = Box(np.array([self.radius, 0.5 * self.height]))
-        return Revolved(profile, axis), np.array(self.base) + 0.5 * self.height * np.eye(3)[axis]
-
-    def thinnest(self) -> float:
-        return min(2.0 * self.radius, self.height)
-
-
-class CupSolid(SolidTable):
-    """A cup that is open at the top; in 2-D its cut through the axis."""
-
-    shape: Literal["cup"] = "cup"
-    base: Vector[Length]
-    """(d,) Middle of the bottom, outside [m]."""
-    radius: Size
-    """From the axis to the side, inside [m]."""
-    height: Size
-    """From the bottom, outside, to the rim [m]."""
-    thickness: Size
-    """Of the side and the bottom [m]."""
-    axis: Axis = "y"
-    """The axis of space along which it stands, before it is turned; in 2-D it stands along y."""
-
-    @model_validator(mode="after")
-    def _check_height(self) -> Self:
-        if self.thickness >= self.height:
-            raise field_error(("thickness",), self.thickness, f"less than height, {self.height:g}")
-        return self
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        if dimension == 2 and self.axis != "y":
-            raise field_error((*path, "axis"), self.axis, '"y" in 2-D')
-        return super().in_dimension(dimension, path)
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        dimension, middle = len(self.base), self._middle()
-        outside, rim, bottom = self.radius + self.thickness, self.height - middle, self.thickness - middle
-        half = [(outside, -middle), (outside, rim), (self.radius, rim), (self.radius, bottom)]
-        profile = Polygon(np.array([*half, *((-x, y) for x, y in half[::-1])]))
-        up = np.eye(dimension)[INDEX_OF_AXIS[self.axis]]
-        shape = profile if dimension == 2 else Revolved(profile, INDEX_OF_AXIS[self.axis])
-        return shape, np.array(self.base) + middle * up
-
-    def thinnest(self) -> float:
-        return self.thickness
-
-    def _middle(self) -> float:
-        """How high its centroid is above the base [m]."""
-        power = len(self.base) - 1
-        solid, hollow = (self.radius + self.thickness) ** power, self.radius**power
-        whole, cavity = solid * self.height, hollow * (self.height - self.thickness)
-        moment = 0.5 * whole * self.height - 0.5 * cavity * (self.height + self.thickness)
-        return moment / (whole - cavity)
-
-
-class PolygonSolid(SolidTable):
-    """A polygon, in 2-D."""
-
-    shape: Literal["polygon"] = "polygon"
-    corners: Annotated[
-        tuple[Annotated[tuple[Length, ...], Field(min_length=2, max_length=2)], ...], Field(min_length=3)
-    ]
-    """(m, 2) The corners, one after the other along the edge, either way round [m]."""
-
-    @model_validator(mode="after")
-    def _check_sides(self) -> Self:
-        if crossing := _crossing(np.array(self.corners)):
-            first, second = crossing
-            wanted = f"corners of sides that do not cross, as sides {first} and {second} do"
-            raise field_error(("corners",), self.corners, wanted)
-        return self
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        if dimension == 3:
-            raise field_error((*path, "shape"), "polygon", '"box", "sphere", "capsule", "cylinder" or "cup" in 3-D')
-        return super().in_dimension(dimension, path)
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        corners = np.array(self.corners)
-        following = np.roll(corners, -1, axis=0)
-        parts = corners[:, 0] * following[:, 1] - following[:, 0] * corners[:, 1]
-        middle = ((corners + following) * parts[:, None]).sum(axis=0) / (3.0 * parts.sum())
-        return Polygon(corners - middle), middle
-
-    def thinnest(self) -> float:
-        return np.inf
-
-
-AnySolid = Annotated[
-    BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid, Field(discriminator="shape")
-]
 
 
 def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
@@ -265,31 +137,48 @@ def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
     return np.asarray(Turn.from_rotvec(rotation).as_matrix())
 
 
+def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
+    """What a path has fits together."""
+    rows, steady = ("positions", "rotations"), ("velocity", "angular_velocity")
+    given = [name for name in ("times", *rows, *steady) if getattr(solid, name) is not None]
+    if solid.motion == "fixed":
+        if given:
+            raise field_error((*path, given[0]), Words("given"), 'left out, as motion is "fixed"')
+        return
+    if solid.times is None:
+        if wrong := [name for name in rows if name in given]:
+            raise field_error((*path, "times"), MISSING, f"a list of times, as there are {wrong[0]}")
+        if not given:
+            raise field_error((*path, "velocity"), MISSING, 'given, or times with positions, as motion is "path"')
+    else:
+        _check_knots(solid, dimension, path)
+        if wrong := [name for name in steady if name in given]:
+            raise field_error((*path, wrong[0]), Words("given"), "left out, as there are times")
+
+
+def _check_knots(solid: SolidTable, dimension: int, path: FieldPath) -> None:
+    times = solid.times or ()
+    if len(times) < 2 or times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
+        raise field_error((*path, "times"), times, "at least two times, from 0 on, each greater than the one before")
+    for name, size in (("positions", dimension), ("rotations", 2 * dimension - 3)):
+        values = getattr(solid, name)
+        if values is None:
+            continue
+        if len(values) != len(times):
+            raise field_error((*path, name), Words(f"a list of {len(values)}"), f"a list of {len(times)}, as are times")
+        for index, row in enumerate(values):
+            if len(row) != size:
+                wanted = "one number in 2-D" if size == 1 else f"a list of {size} components"
+                raise field_error((*path, name, index), row, wanted)
+    if solid.positions is not None and np.abs(np.subtract(solid.positions[0], solid.middle())).max() > 1e-9:
+        wanted = f"{shown([float(f'{x:.9g}') for x in solid.middle()])}, where its middle is at the start"
+        raise field_error((*path, "positions", 0), solid.positions[0], wanted)
+    if solid.rotations is not None and any(solid.rotations[0]):
+        raise field_error((*path, "rotations", 0), solid.rotations[0], "0, as it is not turned yet")
+
+
 def check_solid(path: FieldPath, solid: SolidTable, spacing: float) -> None:
     """A solid is at least one spacing thick, so that there is room for the particles of its walls."""
     if solid.side == "outside" and solid.thinnest() < spacing * (1.0 - 1e-6):
         found = Words(f"only {solid.thinnest():g} m thick")
         raise field_error(path, found, f"at least one spacing, {spacing:g} m, thick")
-
-
-def _crossing(corners: Points) -> tuple[int, int] | None:
-    """The numbers of two sides of a polygon that meet beside its corners, or of one without a length."""
-    count, sides = len(corners), np.roll(corners, -1, axis=0) - corners
-
-    def turned(a: Points, b: Points) -> float:
-        return float(a[0] * b[1] - a[1] * b[0])
-
-    for first in range(count):
-        if not sides[first].any():
-            return first, first
-        for second in range(first + 1, count):
-            apart = corners[second] - corners[first]
-            across = turned(sides[first], sides[second])
-            if (second - first) in (1, count - 1):  # neighbours, which may only lie on each other
-                if across == 0.0 and sides[first] @ sides[second] < 0.0:
-                    return first, second
-            elif across != 0.0:
-                along = turned(apart, sides[second]) / across, turned(apart, sides[first]) / across
-                if all(0.0 <= part <= 1.0 for part in along):
-                    return first, second
-    return None

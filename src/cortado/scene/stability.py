@@ -8,6 +8,7 @@ from cortado.discretise.calibration import laplacian_rate, pairwise_rate, stress
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import smoothing_kernel
 from cortado.scene.model import SceneTables
+from cortado.scene.motions import greatest_speed
 from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.parameters.tilt import Tilt
 from cortado.scene.parameters.values import Arrays
@@ -26,6 +27,10 @@ The bottom is compressed until pressure has come down to it, by more the deeper 
 deep in the plane and up to 32 in space, held at the limit and was lost at 1.1 to 1.4 times it, with 5 to 200 pressure
 iterations a step; only 5 of them were too few at 20 spacings.
 """
+
+
+SOLID_STEP = 0.2
+"""In spacings: how far a solid may move in a step."""
 
 
 def stability_limit(scene: SceneTables, values: Arrays | None = None) -> float:
@@ -88,7 +93,8 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     proportion to the support. In a container that leans, H is the depth in the lowest corner once the surface is level:
     the height of the fluid and half its width, each along gravity.
 
-    Optional forces have limits of their own, in the registry of parameters.
+    Solids that move go no further than a fifth of a spacing in a step. Optional forces have limits of their own, in
+    the registry of parameters.
 
     ``values``: parameters by name that replace the scene's and its schedule's; of a gravity that changes the strongest
     counts.
@@ -104,6 +110,8 @@ def standing_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
     """Those of the `stability_limits` [s] that do not depend on how fast the fluid is."""
     viscous = inf if is_implicit(scene) else viscous_limit(scene, values)
     own = {**_other_limits(scene, values), "viscosity": viscous}
+    if (fastest := greatest_speed(scene.solid)) > 0.0:
+        own["the speed of solids"] = SOLID_STEP * scene.discretisation.spacing / fastest
     return {name: own[name] for name in ("gravity", "depth", "viscosity", *own)}
 
 

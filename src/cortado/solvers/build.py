@@ -5,20 +5,25 @@ from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cortado.device.lanes import lanes_for
 from cortado.discretise.calibration import SKIN
+from cortado.discretise.solids.solid import Solid
 from cortado.errors import InputError
 from cortado.particles.arrays import padded
 from cortado.particles.cells import Grid
+from cortado.particles.moving_walls import Poses
 from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.neighbours import NeighbourSearch, WallArrays
+from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout
+from cortado.particles.wall_arrays import WallArrays
 from cortado.scene.containers import NoContainer
 from cortado.scene.discrete_scene import DiscreteScene
+from cortado.scene.motions import moving, solid_frames
 from cortado.scene.parameters.registry import PARAMETERS
-from cortado.scene.room import solids_of
 from cortado.scene.scene import Scene
+from cortado.scene.solids import SolidTable
 from cortado.solvers.containment import Obstacle, Walled
 from cortado.solvers.makers import SolverSetting
 from cortado.solvers.particles import ParticleSystem
@@ -27,6 +32,7 @@ from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy
 from cortado.sph.makers import ForceMaker
 from cortado.sph.mixture import Phases
+from cortado.sph.moving_solids import MovingSolids
 from cortado.sph.part import Part, PartMaker
 from cortado.sph.parts import Force, Setting
 
@@ -46,7 +52,8 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
     """A scene that is cut into particles, on a device, with the forces of the scene and those that it was given."""
     scene, discrete, precision, device = setting.scene, setting.discrete, setting.precision, setting.device
     layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, setting.batch, setting.known)
-    shared = Discretisation(discrete.kernel, precision, lanes_for(layout.particles, device), any(discrete.periods))
+    lanes, moves = lanes_for(layout.particles, device), bool(moving(scene.solid))
+    shared = Discretisation(discrete.kernel, precision, lanes, any(discrete.periods), moves)
     search = _search(scene, discrete, shared, layout)
 
     def system(discretisation: Discretisation) -> ParticleSystem:
@@ -58,7 +65,7 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
             search,
             _forces(scene, discrete, discretisation, layout, setting.forces),
             [*discrete.periods, *[0.0] * (3 - scene.dimension)],
-            _parts(scene, discrete, discretisation, setting.free_energy),
+            _parts(scene, discrete, discretisation, setting.free_energy, search),
             discrete.fluid.emitted.start,
             _walled(scene, discrete),
             of_one_lane=lambda: system(replace(discretisation, lanes=1, taped=True)),
@@ -78,9 +85,23 @@ def _search(scene: Scene, discrete: DiscreteScene, discretisation: Discretisatio
         most=max(4 * layout.particles, 512),
     )
     room = first_capacity(support / scene.discretisation.spacing, scene.dimension)
-    walls = discrete.walls
-    arrays = WallArrays(padded(walls.positions), walls.weights, walls.weights * walls.sticks, padded(walls.feet))
-    return NeighbourSearch(discretisation, grid, arrays, layout, room)
+    walls, (middles, turns) = discrete.walls, solid_frames(scene)
+    positions, feet = walls.positions.copy(), walls.feet.copy()
+    for number, (middle, turn) in enumerate(zip(middles, turns, strict=True)):
+        own = walls.solid == number
+        positions[own], feet[own] = (positions[own] - middle) @ turn, feet[own] @ turn
+    grips = walls.weights * walls.sticks
+    arrays = WallArrays(padded(positions), walls.weights, grips, padded(feet), padded(walls.slides), walls.solid)
+    begun = Poses.still(layout.members, padded(middles), _in_space(turns), layout.precision, layout.device)
+    return NeighbourSearch(discretisation, grid, arrays, layout, room, begun if len(middles) else None)
+
+
+def _in_space(turns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(k, 3, 3) rotation matrices, also of those in the plane."""
+    dimension = turns.shape[1]
+    whole = np.tile(np.eye(3), (len(turns), 1, 1))
+    whole[:, :dimension, :dimension] = turns
+    return whole
 
 
 def _forces(
@@ -120,11 +141,24 @@ def _check_force(force: Force) -> None:
 
 
 def _parts(
-    scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, free_energy: FreeEnergy
+    scene: Scene,
+    discrete: DiscreteScene,
+    discretisation: Discretisation,
+    free_energy: FreeEnergy,
+    search: NeighbourSearch,
 ) -> list[PartMaker]:
     """The parts that are no forces, in the order in which they end a step."""
-    nozzle = _nozzle(scene, discrete)
-    return [_phases(scene, discretisation, free_energy), *([nozzle] if nozzle else [])]
+    found: list[PartMaker | None] = [_phases(scene, discretisation, free_energy), _nozzle(scene, discrete)]
+    return [part for part in (*found, _moving_solids(scene, search)) if part is not None]
+
+
+def _moving_solids(scene: Scene, search: NeighbourSearch) -> MovingSolids | None:
+    """The solids that move; None without any."""
+    names = [table.name for table in moving(scene.solid)]
+    if not names:
+        return None
+    middles, turns = solid_frames(scene)
+    return MovingSolids(names, padded(middles), _in_space(turns), scene.dimension, search)
 
 
 def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnergy) -> Phases:
@@ -154,9 +188,11 @@ def _walled(scene: Scene, discrete: DiscreteScene) -> Walled:
     """Where particles may go. Walls act through the pressure: without it they hold nothing."""
     holds = scene.container if scene.forces.pressure else NoContainer()
     region = holds.region(scene.dimension).opened(discrete.periods)
-    obstacles = [
-        Obstacle(table.name, solid, table.side == "inside", table.thinnest())
-        for table, solid in zip(scene.solid, solids_of(scene.solid), strict=True)
-        if scene.forces.pressure
-    ]
-    return Walled(region, discrete.near, scene.discretisation.spacing, tuple(obstacles), discrete.periods)
+    still = [_obstacle(table, table.solid()) for table in scene.solid if not table.moves]
+    moved = [_obstacle(table, table.own_solid()) for table in moving(scene.solid)]
+    solids = (tuple(still), tuple(moved)) if scene.forces.pressure else ((), ())
+    return Walled(region, discrete.near, scene.discretisation.spacing, *solids, discrete.periods)
+
+
+def _obstacle(table: SolidTable, solid: Solid) -> Obstacle:
+    return Obstacle(table.name, solid, table.side == "inside", table.thinnest())

@@ -13,11 +13,13 @@ from cortado.discretise.region import TOLERANCE, Region
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.solid import Solid
 from cortado.particles.arrays import padded
+from cortado.particles.moving_walls import MovingWalls, Poses
 from cortado.particles.state import Layout, State
 from cortado.solvers.containment_kernels import NO_PARTICLE, bounds_type, lost_kernel, solids_type
 
-THINNEST = 0.4
-"""Of the thickness of a solid: particles that are deeper in it are lost."""
+DEEPEST, THINNEST = 1.0, 0.45
+"""In spacings, and of the thickness of a solid: particles that are deeper in it are lost. Sharp edges, behind which
+there are few wall particles, let some in by half a spacing."""
 REACH = 4.0
 """In spacings: how far from a surface particles are looked at."""
 HEIGHT = 100.0
@@ -30,7 +32,7 @@ FURTHEST = 1e6
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A solid, in its place."""
+    """A solid, which particles cannot enter."""
 
     name: str
     solid: Solid
@@ -51,7 +53,9 @@ class Walled:
     spacing: float
     """[m]"""
     solids: tuple[Obstacle, ...]
-    """What it cannot enter."""
+    """Solids at rest, in their places."""
+    moving: tuple[Obstacle, ...]
+    """Solids that move, each about its middle."""
     periods: Points
     """(d,) the lengths of the period [m], 0 for axes without one"""
 
@@ -62,7 +66,7 @@ class Walled:
 
     def tolerance(self, one: Obstacle) -> float:
         """How deep in a solid a particle may be [m]."""
-        return min(TOLERANCE * self.spacing, THINNEST * one.thickness)
+        return min(DEEPEST * self.spacing, THINNEST * one.thickness)
 
     def furthest(self, precision: Precision) -> Region:
         """The box that positions must not leave [m]: far away, and as far from the origin as a precision resolves; what
@@ -87,12 +91,19 @@ class Lost:
 class Containment:
     """What one solver asks at the end of each step."""
 
-    def __init__(self, walled: Walled, layout: Layout, launch: KernelLauncher, first_waiting: int):
-        """``first_waiting``: the first particle, in the scene's order, that may wait in a nozzle."""
+    def __init__(
+        self, walled: Walled, layout: Layout, launch: KernelLauncher, first_waiting: int, moving: MovingWalls | None
+    ):
+        """``first_waiting``: the first particle, in the scene's order, that may wait in a nozzle; ``moving`` knows
+        where solids that move are."""
         self.walled, self._precision, self._launch = walled, layout.precision, launch
         self._kernel = lost_kernel(layout.precision)
         members, device = layout.members, layout.device
-        self._meshes = [_mesh(one, walled.spacing, device) for one in walled.solids]
+        self._obstacles = (*walled.solids, *walled.moving)
+        self._meshes = [_mesh(one, walled.spacing, device) for one in self._obstacles]
+        nothing = Poses.still(members, np.zeros((0, 3)), np.zeros((0, 3, 3)), layout.precision, device)
+        self._poses = (nothing, nothing) if moving is None else (moving.before, moving.after)
+        """Before and after a step."""
         self._constants: dict[str, Any] = {
             "bounds": self._made_bounds(),
             "solids": self._made_solids(device),
@@ -156,9 +167,8 @@ class Containment:
             return "has no finite position"
         if not self.walled.region.contains(position[None], TOLERANCE * self.walled.spacing)[0]:
             return f"left the container and was at {place}"
-        for one in self.walled.solids:
-            if one.solid.distance(position[None])[0] < -self.walled.tolerance(one):
-                return f"entered the solid {one.name!r} and was at {place}"
+        if name := self._entered(position):
+            return f"entered the solid {name!r} and was at {place}"
         if self.is_imprecise(position):
             limit = f"{self._precision.furthest:g} spacings from the origin"
             return f"was at {place}, further than positions are precise in {self._precision.name}, {limit}"
@@ -166,18 +176,34 @@ class Containment:
             return f"was at {place}, further than {FURTHEST:g} spacings from the scene"
         return f"at {place} has no finite velocity or no volume"
 
+    def _entered(self, position: np.ndarray) -> str | None:
+        """The name of the solid that holds a position (d,) [m], of those that move as they are after the last step; of
+        a batch, as they are in its first scene."""
+        d = self.walled.dimension
+        after = self._poses[1]
+        poses = zip(after.positions.numpy()[0], after.turns.numpy()[0], strict=True)
+        places = [position for _ in self.walled.solids]
+        places += [(position - middle[:d]) @ turn[:d, :d] for middle, turn in poses]
+        for one, place in zip(self._obstacles, places, strict=True):
+            if one.solid.distance(place[None])[0] < -self.walled.tolerance(one):
+                return one.name
+        return None
+
     def _made_solids(self, device: wp.Device) -> Any:
         precision, walled = self._precision, self.walled
-        solids, middles = solids_type(precision)(), [_middle(one) for one in walled.solids]
+        solids, middles = solids_type(precision)(), [_middle(one) for one in self._obstacles]
         places = padded(np.array(middles)) if middles else np.zeros((0, 3))
         periods = padded(walled.periods[None])[0]
         solids.meshes = wp.array([mesh.id for mesh in self._meshes], dtype=wp.uint64, device=device)
         solids.middles = wp.array(places, dtype=precision.vector, device=device)
-        sides = [-1.0 if one.is_hollow else 1.0 for one in walled.solids]
+        sides = [-1.0 if one.is_hollow else 1.0 for one in self._obstacles]
         solids.sides = wp.array(sides, dtype=precision.real, device=device)
-        tolerances = [walled.tolerance(one) for one in walled.solids]
+        tolerances = [walled.tolerance(one) for one in self._obstacles]
         solids.tolerances = wp.array(tolerances, dtype=precision.real, device=device)
-        solids.reach = REACH * walled.spacing
+        before, after = self._poses
+        solids.before, solids.turns_before = before.positions, before.turns
+        solids.after, solids.turns = after.positions, after.turns
+        solids.reach, solids.still = REACH * walled.spacing, len(walled.solids)
         solids.period = precision.vector(*periods)
         solids.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in periods))
         return solids

@@ -6,6 +6,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.precision import Precision
+from cortado.particles.moving_walls import matrix_of
 
 NO_PARTICLE = 2**31 - 1
 """What stands for 'every particle is well' where the first bad one would be named."""
@@ -36,12 +37,19 @@ def bounds_type(precision: Precision) -> Any:
 @cache
 def solids_type(precision: Precision) -> Any:
     """The Warp struct of solids, as meshes about their middles."""
-    real, vector = precision.real, precision.vector
+    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
 
     class Solids:
         meshes: wp.array(dtype=wp.uint64)
+        still: wp.int32
+        """How many do not move; the others come after them."""
         middles: wp.array(dtype=vector)
-        """[m]"""
+        """About which meshes are, of those at rest in space, of others in their own frame [m]."""
+        before: wp.array2d(dtype=vector)
+        """(members, solids) where the middles of those that move are before a step [m]."""
+        turns_before: wp.array2d(dtype=matrix)
+        after: wp.array2d(dtype=vector)
+        turns: wp.array2d(dtype=matrix)
         sides: wp.array(dtype=real)
         """1 where fluid is outside of a mesh, -1 where it is inside."""
         tolerances: wp.array(dtype=real)
@@ -61,7 +69,7 @@ def solids_type(precision: Precision) -> Any:
 def lost_kernel(precision: Precision) -> Any:
     """The kernel that looks for particles that were lost in a step."""
     real, vector = precision.real, precision.vector
-    bounds_struct, solids_struct = bounds_type(precision), solids_type(precision)
+    bounds_struct, solids_struct, matrix = bounds_type(precision), solids_type(precision), matrix_of(precision)
     module = wp.get_module(f"cortado_containment_{precision.name}")
     module.options["enable_backward"] = False
 
@@ -82,12 +90,26 @@ def lost_kernel(precision: Precision) -> Any:
         return between(x, b.lower, b.upper) and wp.length(wp.cw_mul(x - b.base, b.across)) <= b.radius
 
     @wp.func
-    def is_free(x: vector, solids: solids_struct) -> bool:
+    def nearest_image(y: vector, solids: solids_struct) -> vector:
+        turns = wp.cw_mul(y, solids.frequency)
+        return y - wp.cw_mul(vector(wp.round(turns[0]), wp.round(turns[1]), wp.round(turns[2])), solids.period)
+
+    @wp.func
+    def is_free(
+        x: vector,
+        member: int,
+        positions: wp.array2d(dtype=vector),
+        turns: wp.array2d(dtype=matrix),
+        solids: solids_struct,
+    ) -> bool:
         """Whether x is not deep in any solid; what is far from all surfaces is."""
         for k in range(solids.meshes.shape[0]):
             y = x - solids.middles[k]
-            turns = wp.cw_mul(y, solids.frequency)
-            y -= wp.cw_mul(vector(wp.round(turns[0]), wp.round(turns[1]), wp.round(turns[2])), solids.period)
+            if k < solids.still:
+                y = nearest_image(y, solids)
+            else:
+                away = nearest_image(x - positions[member, k - solids.still], solids)
+                y = wp.transpose(turns[member, k - solids.still]) * away - solids.middles[k]
             place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
             found = wp.mesh_query_point_sign_winding_number(solids.meshes[k], place, solids.reach)
             if found.result:
@@ -138,6 +160,7 @@ def lost_kernel(precision: Precision) -> Any:
             let_go = x[order[i]] == x_i
             x_i = x[order[i]]
         before = x_before[i]
+        was_free = is_free(before, member, solids.before, solids.turns_before, solids)
         good = between(x_i, bounds.nearest, bounds.furthest) and wp.isfinite(v_free[i]) and rho_0[i] > real(0.0)
         escaped = (
             let_go
@@ -146,7 +169,7 @@ def lost_kernel(precision: Precision) -> Any:
             and below_rim(before, bounds)
             and below_rim(x_i, bounds)
         )
-        entered = let_go and good and is_free(before, solids) and not is_free(x_i, solids)
+        entered = let_go and good and was_free and not is_free(x_i, member, solids.after, solids.turns, solids)
         if escaped or entered or not good:
             wp.atomic_min(bad, member, p)
             wp.atomic_add(count, member, 1)

@@ -105,7 +105,7 @@ class ParticleSolver:
         self.loops: tuple[Loop, ...] = ()
         """Those of a step, in the order in which they run."""
         self.step_number = wp.zeros(layout.members, dtype=wp.int32, device=device)
-        self.containment = Containment(system.walled, layout, self.launch, system.waiting)
+        self.containment = Containment(system.walled, layout, self.launch, system.waiting, search.moving)
         self._neighbourhood: Any = None
         self._context: StepContext | None = None
         self.generation = 0
@@ -287,8 +287,8 @@ def _neighbourhood(system: ParticleSystem) -> Any:
     s.particles = system.layout.particles
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count
-    s.wall_positions, s.wall_weights = search.wall_positions, search.wall_weights
-    s.wall_grips, s.wall_feet = search.wall_grips, search.wall_feet
+    for name, array in search.walls.items():
+        setattr(s, name, array)
     s.support, s.per_support, s.reach = lattice.support, 1.0 / lattice.support, (1.0 + SKIN) * lattice.support
     s.normalisation = lattice.normalisation
     s.self_weight, s.volume, s.response_scale = lattice.self_weight, lattice.volume, lattice.response**-0.5

@@ -64,9 +64,10 @@ class ImplicitViscousStress(ViscousStress):
         if setting.discretisation.taped:
             raise MissingDerivativeError("implicit viscosity has no tape: try gradients.Exact.")
         super().__init__(setting, law, parameters)
-        layout, operator = setting.layout, operator_kernels(*self._made_for)
+        layout, (discretisation, *others) = setting.layout, self._made_for
         self._implicit = implicit_kernels(*self._made_for)
-        self._pull, self.solve = operator[0], Solve(layout, operator)
+        self._pull = operator_kernels(*self._made_for)[0]
+        self.solve = Solve(layout, operator_kernels(discretisation.still, *others))
         sizes = {"shape": layout.all_particles, "device": layout.device}
         vectors = (wp.zeros(dtype=layout.precision.vector, **sizes) for _ in range(4))
         self._u, self._r, self._y, self._still = vectors

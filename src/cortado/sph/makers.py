@@ -7,9 +7,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from cortado.errors import InputError, shown
+from cortado.scene.motions import motion_parameters
 from cortado.scene.parameters.known import Known
 from cortado.scene.parameters.parameter import Parameter, Source
 from cortado.scene.parameters.values import checked_value
+from cortado.scene.solids import SolidTable
 from cortado.sph.parts import Force, Setting
 
 
@@ -51,11 +53,12 @@ def checked_parameters(what: str, maker: Any, parameters: Any) -> Sequence[Param
     return parameters
 
 
-def known_of(forces: Sequence[ForceMaker], solver: Any = None) -> Known:
-    """The parameters of a simulation with these forces and the solver that this makes; raises `InputError` where two
-    have one name."""
+def known_of(forces: Sequence[ForceMaker], solver: Any = None, solids: Sequence[SolidTable] = ()) -> Known:
+    """The parameters of a simulation with these forces, the solver that this makes, and solids; raises `InputError`
+    where two have one name."""
     own = [(parameter, "a solver") for parameter in getattr(solver, "parameters", ())]
-    return Known([*own, *((parameter, "a force") for maker in forces for parameter in maker.parameters)])
+    own += [(parameter, "a force") for maker in forces for parameter in maker.parameters]
+    return Known([*own, *((parameter, "a solid") for parameter in motion_parameters(solids))])
 
 
 def check_own(known: Known, source: Source) -> None:

@@ -32,6 +32,16 @@ class Solid(ABC):
     def faces(self, fine: float) -> Faces:
         """Its surface in flat faces, some ``fine`` [m] wide where it is round."""
 
+    def distance_up_to(self, points: Points, reach: float) -> Points:
+        """(n,) the `distance` of points (n, d) [m] where it is less than a reach [m] in size; elsewhere what has its
+        sign and is at least as large as the reach. Solids that have many faces find it sooner."""
+        return self.distance(points)
+
+    def own_feet(self, fine: float) -> tuple[Points, Points] | None:
+        """Points of the surface (n, d) [m], each with an area of ``fine`` [m] to the power of d - 1, and unit vectors
+        (n, d) outwards, where a solid finds them sooner than a lattice around it; None elsewhere."""
+        return None
+
     def outward(self, points: Points) -> Points:
         """(n, d) unit vectors away from the solid at points (n, d) [m] that are not on its surface."""
         across = (points - self.nearest(points)) * np.sign(self.distance(points))[:, None]
@@ -56,11 +66,18 @@ class Placed(Solid):
     def distance(self, points: Points) -> Points:
         return self.solid.distance((points - self.position) @ self.turn)
 
+    def distance_up_to(self, points: Points, reach: float) -> Points:
+        return self.solid.distance_up_to((points - self.position) @ self.turn, reach)
+
     def nearest(self, points: Points) -> Points:
         return self.position + self.solid.nearest((points - self.position) @ self.turn) @ self.turn.T
 
     def faces(self, fine: float) -> Faces:
         return self.solid.faces(fine).moved(self.turn, self.position)
+
+    def own_feet(self, fine: float) -> tuple[Points, Points] | None:
+        found = self.solid.own_feet(fine)
+        return None if found is None else (self.position + found[0] @ self.turn.T, found[1] @ self.turn.T)
 
 
 @dataclass(frozen=True)
@@ -76,6 +93,9 @@ class Union(Solid):
     def distance(self, points: Points) -> Points:
         """As `Solid.distance`; where solids overlap, the depth below the surface of one of them, which is less."""
         return np.min([solid.distance(points) for solid in self.solids], axis=0)
+
+    def distance_up_to(self, points: Points, reach: float) -> Points:
+        return np.min([solid.distance_up_to(points, reach) for solid in self.solids], axis=0)
 
     def nearest(self, points: Points) -> Points:
         first = np.argmin([solid.distance(points) for solid in self.solids], axis=0)
@@ -232,11 +252,18 @@ class Hollow(Solid):
     def distance(self, points: Points) -> Points:
         return -self.cavity.distance(points)
 
+    def distance_up_to(self, points: Points, reach: float) -> Points:
+        return -self.cavity.distance_up_to(points, reach)
+
     def nearest(self, points: Points) -> Points:
         return self.cavity.nearest(points)
 
     def faces(self, fine: float) -> Faces:
         return self.cavity.faces(fine).reversed()
+
+    def own_feet(self, fine: float) -> tuple[Points, Points] | None:
+        found = self.cavity.own_feet(fine)
+        return None if found is None else (found[0], -found[1])
 
 
 @dataclass(frozen=True)

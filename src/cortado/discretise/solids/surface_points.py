@@ -1,23 +1,30 @@
 """Points on surfaces at a depth beneath that of a solid, or at a height above it, evenly spaced, in float64."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cortado.discretise.pairs import pairs_within
+from cortado.device.cores import usable_cores
 from cortado.discretise.shapes import Points, block_about
 from cortado.discretise.solids.solid import Solid, Which
 
+Numbers = NDArray[np.int64]
+Near = Callable[[Points, float], Which]
+"""Whether points (n, d) [m] are less than a length [m] from something."""
 FINE = 3
 """Points of a surface along a spacing, among which those that stay are chosen."""
-COARSE = 4
-"""Spacings in the cells in which a surface is looked for."""
-APART = 0.8
-"""In spacings: no two points of those that are chosen are nearer to each other."""
-ROUNDS = {2: 40, 3: 8}
+CELLS = (3, 4)
+"""Into how many parts, along each axis, cells are cut in which a surface is looked for, until these are fine."""
+APART, LEAST_APART = 0.78, 0.65
+"""In spacings: points are chosen wherever none is nearer than the first; then they are moved, none nearer to another
+than the second."""
+FIRST, GROWTH = 0.05, 1.7
+"""The part of points that is looked at at first, and how many more each time."""
+ROUNDS = {2: 40, 3: 4}
 """In which each point moves to the middle of what is nearest to it, by the number of dimensions."""
 OFF_FACES = (0.31, 0.17, 0.23)
 """Of a cell: how far fine lattices are off the faces of solids that are aligned with them."""
@@ -40,41 +47,33 @@ class SurfacePoints:
 def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
     """Points about a spacing [m] apart, ``depth`` [m] beneath the surface of a solid, above it where negative.
 
-    Where a solid is thinner than twice the depth, they are in its middle. They are chosen among finer ones: no two too
-    near each other, and then each in the middle of those that are nearest to it (Lloyd 1982).
+    Where a solid is thinner than twice the depth, they are in its middle.
     """
     return evenly_chosen(*_candidates(solid, spacing / FINE, depth), spacing)
 
 
 def evenly_chosen(candidates: Points, areas: Points, spacing: float) -> SurfacePoints:
-    """Those of points (n, d) [m] with areas (n,) [m^(d - 1)] that stay, about a spacing [m] apart."""
+    """Those of points (n, d) [m] with areas (n,) [m^(d - 1)] that stay, about a spacing [m] apart.
+
+    First as many as can be so that no two are too near each other; then each is moved to the middle of what is nearest
+    to it (Lloyd 1982), and to a candidate; then any that are too near another are left out, and gaps are filled.
+    """
     dimension = candidates.shape[1]
     if not len(candidates):
         return SurfacePoints(candidates, np.zeros(0))
-    chosen = candidates[_spread(candidates, APART * spacing)]
-    from scipy.spatial import cKDTree
-
+    order, nothing = np.random.default_rng(SEED).permutation(len(candidates)), np.zeros(0, dtype=np.int64)
+    chosen = candidates[_chosen(candidates, order, APART * spacing, nothing)]
     for _ in range(ROUNDS[dimension]):
-        owner = cKDTree(chosen).query(candidates)[1]
+        owner = _nearest(chosen, candidates)[1]
         total = np.bincount(owner, areas, len(chosen))
         sums = np.stack([np.bincount(owner, areas * x, len(chosen)) for x in candidates.T], axis=1)
-        middles = sums / np.maximum(total, 1e-300)[:, None]
-        chosen = middles[total > 0.0]
-    chosen = candidates[np.unique(cKDTree(candidates).query(chosen)[1])]
-    owner = cKDTree(chosen).query(candidates)[1]
+        chosen = sums[total > 0.0] / total[total > 0.0, None]
+    moved = np.unique(_nearest(candidates, chosen)[1])
+    kept = _chosen(candidates, moved, LEAST_APART * spacing, nothing)
+    chosen = candidates[np.sort(_chosen(candidates, order, APART * spacing, kept))]
+    owner = _nearest(chosen, candidates)[1]
     shares = np.bincount(owner, areas, len(chosen)) / spacing ** (dimension - 1)
     return SurfacePoints(chosen, shares)
-
-
-def thin_share(solid: Solid, spacing: float, thickness: float) -> tuple[float, Points]:
-    """The share of a solid's surface beneath which it is less thick than ``thickness`` [m], and a point (d,) [m] of
-    that share."""
-    points = surface_points(solid, spacing, 0.0)
-    inwards = -_normals(solid, points.points, spacing)
-    thin = solid.distance(points.points + thickness * inwards) > 0.0
-    if not thin.any():
-        return 0.0, np.zeros(points.points.shape[1])
-    return float(points.shares[thin].sum() / points.shares.sum()), points.points[thin][0]
 
 
 def _normals(solid: Solid, feet: Points, spacing: float) -> Points:
@@ -88,6 +87,9 @@ def _normals(solid: Solid, feet: Points, spacing: float) -> Points:
 def surface_feet(solid: Solid, fine: float) -> tuple[Points, Points]:
     """Points of the surface (n, d) [m], some ``fine`` [m] apart, each with as much of its area, and unit vectors (n, d)
     away from the solid."""
+    found = solid.own_feet(fine)
+    if found is not None:
+        return found
     near = _near(solid, fine, fine)
     near = near[np.abs(solid.distance(near)) < 0.5 * fine]  # a band of this thickness has fine^d / fine for each point
     feet, away = solid.nearest(near), solid.outward(near)
@@ -102,7 +104,7 @@ def _candidates(solid: Solid, fine: float, depth: float) -> tuple[Points, Points
     points = feet - _reached(solid, feet, away, depth)[:, None] * away
     areas = np.full(len(points), fine ** (points.shape[1] - 1))
     if depth <= 0.0:
-        on_it = np.abs(solid.distance(points) + depth) < 0.25 * fine
+        on_it = np.abs(solid.distance_up_to(points, fine - depth) + depth) < 0.25 * fine
         points, areas = points[on_it], areas[on_it]
     return points, areas
 
@@ -112,23 +114,25 @@ def _reached(solid: Solid, feet: Points, away: Points, depth: float) -> Points:
     nearer to them than these."""
     if depth <= 0.0:
         return np.full(len(feet), depth)
-    low, high = np.zeros(len(feet)), np.full(len(feet), depth)
-    tolerance = 1e-3 * depth
-    reached = solid.distance(feet - depth * away) < -depth + tolerance
+    found, tolerance = np.full(len(feet), depth), 1e-3 * depth
+    thin = np.flatnonzero(solid.distance_up_to(feet - depth * away, depth) >= -depth + tolerance)
+    low, high = np.zeros(len(thin)), np.full(len(thin), depth)
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        good = solid.distance(feet - middle[:, None] * away) < -middle + tolerance
+        good = solid.distance_up_to(feet[thin] - middle[:, None] * away[thin], depth) < -middle + tolerance
         low, high = np.where(good, middle, low), np.where(good, high, middle)
-    return np.where(reached, depth, low)
+    found[thin] = low
+    return found
 
 
 def _near(solid: Solid, fine: float, reach: float) -> Points:
     """(n, d) points of a lattice less than ``reach`` [m] from the surface."""
     lower, upper = (np.asarray(end) for end in solid.extent())
-    coarse = COARSE * FINE * fine
-    cells = block_about(0.5 * (lower + upper), 0.5 * (upper - lower) + reach + coarse, coarse).points()
-    cells = cells[np.abs(solid.distance(cells)) < reach + 0.5 * coarse * np.sqrt(len(lower))]
-    found = [points[np.abs(solid.distance(points)) < reach] for points in _within_cells(cells, fine)]
+
+    def is_near(points: Points, furthest: float) -> Which:
+        return np.asarray(np.abs(solid.distance_up_to(points, furthest)) < furthest)
+
+    found = [points[is_near(points, reach)] for points in _lattice(lower, upper, reach, fine, is_near)]
     return np.concatenate([np.zeros((0, len(lower))), *found])
 
 
@@ -137,37 +141,71 @@ def lattice_about(feet: Points, reach: float, fine: float, tree: Any) -> Iterato
     [m], of which there is a tree, are all; in parts."""
     if not len(feet):
         return
-    lower, upper, coarse = feet.min(axis=0), feet.max(axis=0), COARSE * FINE * fine
-    cells = block_about(0.5 * (lower + upper), 0.5 * (upper - lower) + reach + coarse, coarse).points()
-    furthest = reach + 0.5 * coarse * np.sqrt(len(lower))
-    near = np.isfinite(tree.query(cells, distance_upper_bound=furthest)[0])
-    yield from _within_cells(cells[near], fine)
+
+    def is_near(points: Points, furthest: float) -> Which:
+        found = tree.query(points, distance_upper_bound=furthest, workers=usable_cores())[0]
+        return np.isfinite(found)
+
+    yield from _lattice(feet.min(axis=0), feet.max(axis=0), reach, fine, is_near)
 
 
-def _within_cells(cells: Points, fine: float) -> Iterator[Points]:
-    """Points (n, d), ``fine`` [m] apart, that fill cells whose middles (m, d) [m] are given; in parts."""
-    along = fine * (np.arange(COARSE * FINE) + 0.5) - 0.5 * COARSE * FINE * fine
-    inside = np.array(list(product(along, repeat=cells.shape[1]))) + fine * np.array(OFF_FACES[: cells.shape[1]])
-    chunk = max(MOST // len(inside), 1)
+def _lattice(lower: Points, upper: Points, reach: float, fine: float, is_near: Near) -> Iterator[Points]:
+    """Points (n, d) of a lattice, ``fine`` [m] apart, of which those no further than ``reach`` [m] from what is near
+    are all, in parts: of cells of the box between two corners and as far around it, and of parts of those, all whose
+    middles are near enough."""
+    dimension, size = len(lower), int(np.prod(CELLS)) * fine
+    cells = block_about(0.5 * (lower + upper), 0.5 * (upper - lower) + reach + size, size).points()
+    *coarse, last = CELLS
+    for parts in coarse:
+        cells = _divided(cells[is_near(cells, reach + 0.5 * size * np.sqrt(dimension))], size, parts)
+        size /= parts
+    cells = cells[is_near(cells, reach + 0.5 * size * np.sqrt(dimension))]
+    chunk = max(MOST // last**dimension, 1)
     for start in range(0, len(cells), chunk):
-        yield (cells[start : start + chunk, None] + inside).reshape(-1, cells.shape[1])
+        yield _divided(cells[start : start + chunk], size, last) + fine * np.array(OFF_FACES[:dimension])
 
 
-def _spread(points: Points, apart: float) -> Which:
-    """(n,) as many of the points (n, d) [m] as can be so that no two are nearer than ``apart`` [m]: in rounds, those
-    that come first among all that are near them."""
-    first, second, _ = pairs_within(points, points, apart)
-    different = first != second
-    first, second = first[different], second[different]
-    rank = np.random.default_rng(SEED).permutation(len(points))
-    open_, chosen = np.ones(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
+def _divided(cells: Points, size: float, parts: int) -> Points:
+    """(n, d) middles of so many parts along each axis of cells of a size [m], whose middles (m, d) [m] are given."""
+    along = size / parts * (np.arange(parts) + 0.5) - 0.5 * size
+    inside = np.array(list(product(along, repeat=cells.shape[1])))
+    return (cells[:, None] + inside).reshape(-1, cells.shape[1])
+
+
+def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Numbers:
+    """Numbers of points (n, d) [m]: those chosen already, and of those in an order all that are further than ``apart``
+    [m] from them and from those that come before."""
+    size = int(FIRST * len(order)) + 1
+    while len(order):
+        some, order, size = order[:size], order[size:], int(GROWTH * size) + 1
+        if len(chosen):
+            some = some[np.isinf(_nearest(points[chosen], points[some], apart)[0])]
+        if len(some):
+            chosen = np.append(chosen, some[_first_of_all_near(points[some], apart)])
+    return chosen
+
+
+def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Points, Numbers]:
+    """How far points (n, d) [m] are from the nearest of some (m, d) [m], and which it is; infinite from a reach [m]
+    on."""
+    from scipy.spatial import cKDTree
+
+    distances, numbers = cKDTree(some).query(points, distance_upper_bound=reach, workers=usable_cores())
+    return distances, numbers
+
+
+def _first_of_all_near(points: Points, apart: float) -> Which:
+    """(n,) which points (n, d) [m] stay if each in turn does unless one that stays is nearer than ``apart`` [m]."""
+    from scipy.spatial import cKDTree
+
+    first, second = cKDTree(points).query_pairs(apart, output_type="ndarray").T
+    open_, stays = np.ones(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
     while open_.any():
         active = open_[first] & open_[second]
         first, second = first[active], second[active]
-        beaten = np.zeros(len(points), dtype=bool)
-        beaten[first[rank[second] < rank[first]]] = True
-        new = open_ & ~beaten
-        chosen |= new
-        open_ &= beaten
+        new = open_.copy()
+        new[second] = False
+        stays |= new
+        open_ &= ~new
         open_[second[new[first]]] = False
-    return chosen
+    return stays

@@ -118,7 +118,7 @@ class ExposedSurface:
         for points in lattice_about(self.feet, depth + 0.5 * fine, fine, self._tree):
             near = self._tree.query(points, distance_upper_bound=depth + fine)[0]
             points = points[np.isfinite(near) & (near > depth - fine)]
-            points = points[self.room.distance(points) > 0.0]
+            points = points[self.room.distance(points, fine) > 0.0]
             feet = self._feet_of(points)
             down = points - feet
             distances = np.linalg.norm(down, axis=1)
@@ -131,9 +131,9 @@ class ExposedSurface:
         or where two of them meet."""
         fine, (reach, nearest) = self.spacing / FINE, self._tree.query(points)
         found, owner = self.feet[nearest], self.owner[nearest]
-        best = np.full(len(points), np.inf)
+        best, furthest = np.full(len(points), np.inf), float(reach.max(initial=0.0)) + fine
         for solid in self.solids:
-            near = np.flatnonzero(np.abs(solid.distance(points)) < np.minimum(best, reach + fine))
+            near = np.flatnonzero(np.abs(solid.distance_up_to(points, furthest)) < np.minimum(best, reach + fine))
             feet = solid.nearest(points[near])
             up, distances = feet - points[near], np.linalg.norm(feet - points[near], axis=1)
             free = _is_exposed(feet, up / np.maximum(distances, 1e-300)[:, None], self.room, self.spacing)

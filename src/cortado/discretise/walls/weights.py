@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 STIFFNESS = 3e-3
 """How much a weight resists a change, relative, beside an error of the density: where densities leave a weight open it
 stays that of a flat wall."""
-UNEVEN_STIFFNESS = 0.2
+UNEVEN_STIFFNESS = 0.06
 """The same where particles are not on a lattice. With 0.003 some of them have no weight, and fluid passes there."""
-LEAST, ROUNDS = 0.3, 4
+LEAST, ROUNDS = 0.6, 4
 """Of a weight over that of a flat wall, where particles are not on a lattice; rounds in which weights that would be
 less are set to it, and the others found anew."""
 BALANCE = 0.02
@@ -95,8 +95,8 @@ class WallSurface:
         """
         from scipy.sparse import vstack
 
-        if not len(self.walls):
-            return np.zeros(0)
+        if not len(self.walls) or not len(places.points):
+            return self.flat.copy()
         chunks = range(0, len(places.points), CHUNK)
         demands = [self._demands(places.some(slice(start, start + CHUNK))) for start in chunks]
         sums = vstack([part for part, _ in demands]).tocsr()

@@ -62,7 +62,8 @@ def fixed_point_kernels(discretisation: Discretisation, dimension: int) -> Fixed
     divergence, clamp = projection_sums(discretisation).divergence, pressure_functions(precision)
     wanted, parts = clamp.wanted, clamp.parts
     module = discretisation.module(False, f"fixed_point_{dimension}d")
-    seen = bundle(**{name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "a", "weights")})
+    used = ("L", "gamma", "drift", "a", "weights")
+    seen = bundle(**{name: kind for name, kind in entries(precision).items() if name in used})
     LANES = discretisation.lanes
     lane = lane_functions(precision, LANES).lane
 
@@ -103,7 +104,7 @@ def fixed_point_kernels(discretisation: Discretisation, dimension: int) -> Fixed
         if lane() > 0:
             return
         a = of.a[i]
-        D = total + wp.dot(of.gamma[i], u[i])
+        D = total + wp.dot(of.gamma[i], u[i]) - of.drift[i]
         b = wanted(n[i], of.weights[i][1], time_step[i // s.particles])
         per = omega / a
         rise, fall = parts(y[i] + per * (D - b), y[i] + per * D)

@@ -1,8 +1,9 @@
 """The projection of velocities, by accelerated Jacobi iterations with a leaky clamp.
 
-With k = dt p, the divergence D and its transpose, which is the force,
+With k = dt p, the divergence D, in which walls that move have velocities v_b, and the transpose, which is the force,
 
-    (D v)_i = L_i : sum_j g_ij v_ij^T + gamma_i . v_i,   (D^T k)_i = sum_j (k_i L_i + k_j L_j) g_ij + k_i gamma_i,
+    (D v)_i = L_i : sum_j g_ij v_ij^T + gamma_i . v_i - sum_b gamma_ib . v_b,
+    (D^T k)_i = sum_j (k_i L_i + k_j L_j) g_ij + k_i gamma_i,
 
 an iteration from y, an extrapolation of k (Nesterov 1983), is
 
@@ -94,7 +95,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
     weights4 = weights_type(precision)
-    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "a", "weights")}
+    own = {name: kind for name, kind in entries(precision).items() if name in ("L", "gamma", "drift", "a", "weights")}
     seen = bundle(**own)
     bars = bundle(x=vector, v=vector, n=real, m=real, time_step=real, **own)
     iterate = bundle(u=vector, d=real, y=real, k=real)
@@ -172,7 +173,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         if lane() > 0:
             return
         dt = time_step[i // s.particles]
-        D = total + wp.dot(of.gamma[i], at.u[i])
+        D = total + wp.dot(of.gamma[i], at.u[i]) - of.drift[i]
         b = wanted(n[i], of.weights[i][1], dt)
         per = omega / of.a[i]
         up = at.y[i] + per * (D - b)
@@ -218,7 +219,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
             return
         member = i // s.particles
         dt = time_step[member]
-        D_dot = total + wp.dot(of.gamma[i], dot.u[i]) + wp.dot(dot.gamma[i], at.u[i])
+        D_dot = total + wp.dot(of.gamma[i], dot.u[i]) + wp.dot(dot.gamma[i], at.u[i]) - dot.drift[i]
         D, full = at.d[i], of.weights[i][1]
         b = wanted(n[i], full, dt)
         b_dot = -b * time_step_dot[member] / dt
@@ -273,6 +274,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> Pressure
         bar.a[i] = bar.a[i] - per / a * (D * z_bar - rise * b * new_bar)
         k_bar[i] = -beta * y_bar[i]
         y_bar[i] = z_bar
+        bar.drift[i] = bar.drift[i] - per * z_bar
         d_bar[i] = per * z_bar
         S[i] = (per * z_bar) * pack(of.L[i])
         T[i] = at.y[i] * pack(of.L[i])

@@ -142,17 +142,28 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         return (wp.dot(a, foot) / wp.dot(foot, foot)) * foot
 
     @wall_sum(discretisation)
-    def beside(x_ij: vector, foot: vector, s: neighbourhood) -> tuple[vector, real]:
-        return s.volume * normal_part(gradient(x_ij, s), foot), s.volume * weight(x_ij, s)
+    def beside(x_ij: vector, v_j: vector, foot: vector, s: neighbourhood) -> tuple[vector, real, real]:
+        push = s.volume * normal_part(gradient(x_ij, s), foot)
+        return push, s.volume * weight(x_ij, s), wp.dot(push, v_j)
 
     @wall_sum(discretisation)
-    def beside_tangent(x_ij: vector, x_dot_ij: vector, foot: vector, s: neighbourhood) -> tuple[vector, real]:
+    def beside_tangent(
+        x_ij: vector, x_dot_ij: vector, v_j: vector, foot: vector, s: neighbourhood
+    ) -> tuple[vector, real, real]:
         change = s.volume * normal_part(hessian_product(x_ij, x_dot_ij, s), foot)
-        return change, s.volume * wp.dot(gradient(x_ij, s), x_dot_ij)
+        return change, s.volume * wp.dot(gradient(x_ij, s), x_dot_ij), wp.dot(change, v_j)
 
     @wall_sum(discretisation)
-    def beside_back(x_ij: vector, gamma_bar_i: vector, nu_bar_i: real, foot: vector, s: neighbourhood) -> vector:
-        push = hessian_product(x_ij, normal_part(gamma_bar_i, foot), s)
+    def beside_back(
+        x_ij: vector,
+        v_j: vector,
+        gamma_bar_i: vector,
+        nu_bar_i: real,
+        drift_bar_i: real,
+        foot: vector,
+        s: neighbourhood,
+    ) -> vector:
+        push = hessian_product(x_ij, normal_part(gamma_bar_i + drift_bar_i * v_j, foot), s)
         return s.volume * (push + nu_bar_i * gradient(x_ij, s))
 
     @fluid_sum(discretisation)

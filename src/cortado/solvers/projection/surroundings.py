@@ -51,7 +51,7 @@ def weights_type(precision: Precision) -> Any:
 def entries(precision: Precision) -> dict[str, Any]:
     """Names and types of what is kept of a particle's surroundings."""
     real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
-    own = {"M": matrix, "Q": matrix, "g": vector, "gamma": vector, "nu": real}
+    own = {"M": matrix, "Q": matrix, "g": vector, "gamma": vector, "nu": real, "drift": real}
     return {**own, "L": matrix, "a": real, "weights": weights_type(precision)}
 
 
@@ -191,13 +191,14 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         s: neighbourhood,
         least: real,
         x: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
         m: wp.array(dtype=real),
         # out
         of: around,
     ):
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g = moments(i, x, m, s)
-        gamma, nu = beside(i, x, s)
+        gamma, nu, drift = beside(i, x, v, s)
         if lane() > 0:
             return
         M, Q = whole(diagonal, others), change(square, mixed)
@@ -207,6 +208,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         of.g[i] = g
         of.gamma[i] = gamma
         of.nu[i] = nu
+        of.drift[i] = drift
         of.L[i] = L
         of.a[i] = diagonal_of(L, Q, g, gamma, m[i], least)
         of.weights[i] = weights_of(M, nu)
@@ -217,6 +219,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         least: real,
         x: wp.array(dtype=vector),
         x_dot: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
         m: wp.array(dtype=real),
         m_dot: wp.array(dtype=real),
         of: around,
@@ -226,7 +229,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         """Put together of the gradients of each entry."""
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g_i_dot = moments_tangent(i, x, x_dot, m, m_dot, s)
-        gamma_i_dot, nu_i_dot = beside_tangent(i, x, x_dot, s)
+        gamma_i_dot, nu_i_dot, drift_i_dot = beside_tangent(i, x, x_dot, v, s)
         if lane() > 0:
             return
         M_i_dot, Q_i_dot = change(diagonal, others), change(square, mixed)
@@ -256,6 +259,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         dot.g[i] = g_i_dot
         dot.gamma[i] = gamma_i_dot
         dot.nu[i] = nu_i_dot
+        dot.drift[i] = drift_i_dot
         dot.L[i] = L_dot
         dot.a[i] = a_dot
         dot.weights[i] = weights_dot
@@ -285,6 +289,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def sums_adjoint(
         s: neighbourhood,
         x: wp.array(dtype=vector),
+        v: wp.array(dtype=vector),
         m: wp.array(dtype=real),
         bar: around,
         # in and out
@@ -293,7 +298,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     ):
         i = s.first + wp.tid() // LANES
         x_part, m_part = moments_back(i, x, m, bar.M, bar.Q, bar.g, s)
-        wall_part = beside_back(i, x, bar.gamma, bar.nu, s)
+        wall_part = beside_back(i, x, v, bar.gamma, bar.nu, bar.drift, s)
         if lane() > 0:
             return
         x_bar[i] = x_bar[i] + x_part + wall_part

@@ -1,0 +1,102 @@
+"""Files of triangles: STL, OBJ, PLY and glTF, as trimesh reads them; and meshes as solids out of them."""
+
+import warnings
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cortado.discretise.shapes import Points
+from cortado.discretise.solids.mesh import Mesh
+from cortado.discretise.solids.mesh_checks import FoundMesh, found_mesh
+from cortado.discretise.solids.mesh_fit import check_fit
+from cortado.discretise.solids.triangle_tree import Numbers
+from cortado.errors import CortadoWarning, InputError, Words, shown
+from cortado.files.input_files import reason, regular_file
+
+SUFFIXES = (".stl", ".obj", ".ply", ".gltf", ".glb")
+"""How a file of triangles may end."""
+MOST_BYTES = 2**30
+"""Of a file."""
+
+
+def read_mesh(
+    path: str,
+    scale: float,
+    spacing: float,
+    support: float,
+    container: tuple[Points, Points] | None = None,
+) -> Mesh:
+    """A solid out of a file, beside particles a spacing [m] apart that see each other up to a support [m].
+
+    Raises `InputError`, a sentence that names the file and says what is wrong, where, and what to do; warns with
+    `CortadoWarning` of what is probably not meant.
+
+    Args:
+        path: of the file.
+        scale: what its lengths are multiplied with, 0.001 where they are millimetres.
+        spacing: [m].
+        support: [m].
+        container: lower and upper corner, each (3,) [m], of the box around the container of the fluid, if there is one.
+    """
+    found = mesh_in_file(path)
+    mesh = replace(found.mesh, vertices=scale * found.mesh.vertices)
+    for note in (*found.notes, *check_fit(mesh, repr(path), scale, spacing, support, container)):
+        warnings.warn(note, CortadoWarning, stacklevel=2)
+    return mesh
+
+
+def mesh_in_file(path: str) -> FoundMesh:
+    """What a file holds, in its own unit of length, checked by itself; raises `InputError`."""
+    if Path(path).suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}: export the mesh as one of these.")
+    try:
+        stat = regular_file(path, MOST_BYTES)
+    except OSError as problem:
+        raise InputError(f"{path!r} cannot be opened ({reason(problem)}).") from None
+    if not stat.st_size:
+        raise InputError(f"{path!r} is empty: export the mesh once more.")
+    return _found(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=8)
+def _found(path: str, changed: int, size: int) -> FoundMesh:
+    """Read once for each version of the file: the time of its last change and its size stand for the version."""
+    return found_mesh(*read_triangles(path), repr(path))
+
+
+def read_triangles(path: str) -> tuple[Points, Numbers]:
+    """The vertices (m, 3) of all bodies of a file where its scene puts them, in the file's unit of length, and the
+    triangles (k, 3) between them, of which there is at least one; raises `InputError`."""
+    vertices, triangles, count, others = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0, False
+    scene = _scene(path)
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        body = scene.geometry[name]
+        corners = np.asarray(getattr(body, "faces", np.zeros((0, 3))), dtype=np.int64)
+        others |= not len(corners)
+        if np.linalg.det(transform[:3, :3]) < 0.0:
+            corners = corners[:, ::-1]  # what is mirrored is turned over
+        if len(corners):
+            vertices.append(np.asarray(body.vertices, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3])
+            triangles.append(corners + count)
+            count += len(vertices[-1])
+    if len(triangles) == 1:
+        what = "points or lines, but no triangles" if others else "no triangles that can be read; it may be damaged"
+        raise InputError(f"{path!r} holds {what}: export the mesh as triangles.")
+    return np.concatenate(vertices), np.concatenate(triangles)
+
+
+def _scene(path: str) -> Any:
+    import trimesh
+
+    try:
+        with open(path, "rb") as file, warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            kind, beside = Path(path).suffix.lower()[1:], trimesh.resolvers.FilePathResolver(path)
+            return trimesh.load_scene(file, file_type=kind, resolver=beside, process=False)
+    except Exception as problem:  # of many types, where a file is damaged
+        why = shown(Words(f"{type(problem).__name__}: {reason(problem)}"))
+        raise InputError(f"{path!r} is no mesh that can be read ({why}); it may be damaged.") from None

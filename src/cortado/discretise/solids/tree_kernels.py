@@ -1,0 +1,264 @@
+"""Questions to a tree of triangles, in float64: the nearest point, and how often the surface goes around a point.
+
+Nodes are numbered as in a heap: those below node n are 2 n and 2 n + 1, and from ``leaves`` on nodes are leaves, of
+which the first has triangles ``starts[0]`` to ``starts[1]``.
+"""
+
+import warp as wp
+
+DEPTH = 32
+"""Nodes that may wait on the way down, more than a tree has levels."""
+real, vector = wp.float64, wp.vec3d
+box = wp.types.vector(length=6, dtype=wp.float64)
+"""Lower and upper corner."""
+waiting_nodes, waiting_squares = wp.types.vector(length=DEPTH, dtype=wp.int32), wp.types.vector(DEPTH, wp.float64)
+_module = wp.get_module("cortado_triangle_tree")
+_module.options["enable_backward"] = False
+
+
+@wp.func
+def square_from_box(p: vector, b: box) -> real:
+    """The square of the distance from a box, 0 within."""
+    square = real(0.0)
+    for k in range(3):
+        beyond = wp.max(wp.max(b[k] - p[k], p[k] - b[k + 3]), real(0.0))
+        square += beyond * beyond
+    return square
+
+
+@wp.func
+def nearest_of_triangle(p: vector, a: vector, b: vector, c: vector) -> vector:
+    """The nearest point of a triangle (Ericson, Real-Time Collision Detection, 2005, section 5.1.5)."""
+    zero = real(0.0)
+    ab = b - a
+    ac = c - a
+    d1 = wp.dot(ab, p - a)
+    d2 = wp.dot(ac, p - a)
+    if d1 <= zero and d2 <= zero:
+        return a
+    d3 = wp.dot(ab, p - b)
+    d4 = wp.dot(ac, p - b)
+    if d3 >= zero and d4 <= d3:
+        return b
+    vc = d1 * d4 - d3 * d2
+    if vc <= zero and d1 >= zero and d3 <= zero:
+        return a + (d1 / (d1 - d3)) * ab
+    d5 = wp.dot(ab, p - c)
+    d6 = wp.dot(ac, p - c)
+    if d6 >= zero and d5 <= d6:
+        return c
+    vb = d5 * d2 - d1 * d6
+    if vb <= zero and d2 >= zero and d6 <= zero:
+        return a + (d2 / (d2 - d6)) * ac
+    va = d3 * d6 - d5 * d4
+    if va <= zero and d4 >= d3 and d5 >= d6:
+        return b + ((d4 - d3) / ((d4 - d3) + (d5 - d6))) * (c - b)
+    return a + (vb / (va + vb + vc)) * ab + (vc / (va + vb + vc)) * ac
+
+
+@wp.kernel(module=_module, enable_backward=False)
+def find_nearest(
+    first: wp.int32,
+    points: wp.array(dtype=vector),
+    boxes: wp.array(dtype=box),
+    starts: wp.array(dtype=wp.int32),
+    corners: wp.array2d(dtype=vector),
+    leaves: wp.int32,
+    reach: real,
+    # out
+    nearest: wp.array(dtype=vector),
+    squares: wp.array(dtype=real),
+):
+    """The nearest point of the triangles, and the square of its distance; the point itself and ``reach`` squared where
+    none is nearer than that."""
+    i = first + wp.tid()
+    p = points[i]
+    best = reach * reach
+    place = p
+    node = int(1)
+    waiting = int(0)
+    nodes = waiting_nodes()
+    at_least = waiting_squares()
+    while node > 0:
+        following = int(0)
+        if node >= leaves:
+            for t in range(starts[node - leaves], starts[node - leaves + 1]):
+                found = nearest_of_triangle(p, corners[t, 0], corners[t, 1], corners[t, 2])
+                square = wp.length_sq(found - p)
+                if square < best:
+                    best = square
+                    place = found
+        else:
+            near = 2 * node
+            far = near + 1
+            near_square = square_from_box(p, boxes[near])
+            far_square = square_from_box(p, boxes[far])
+            if far_square < near_square:
+                near = 2 * node + 1
+                far = 2 * node
+                larger = near_square
+                near_square = far_square
+                far_square = larger
+            if near_square < best:
+                following = near
+            if far_square < best:
+                nodes[waiting] = far
+                at_least[waiting] = far_square
+                waiting += 1
+        while following == 0 and waiting > 0:
+            waiting -= 1
+            if at_least[waiting] < best:
+                following = nodes[waiting]
+        node = following
+    nearest[i] = place
+    squares[i] = best
+
+
+@wp.func
+def side_of_edge(p: vector, a: vector, b: vector) -> wp.int32:
+    """1 where an edge that rises along the second axis is ahead of a point on the first one, -1 where one that falls
+    is, 0 elsewhere. Both triangles of an edge find the same but for the sign, whatever is rounded."""
+    upwards = int(1)
+    low = a
+    high = b
+    if b[1] < a[1]:
+        upwards = int(-1)
+        low = b
+        high = a
+    if p[1] < low[1] or p[1] >= high[1]:
+        return int(0)
+    if (high[0] - low[0]) * (p[1] - low[1]) - (high[1] - low[1]) * (p[0] - low[0]) > real(0.0):
+        return upwards
+    return int(0)
+
+
+@wp.func
+def crossing(p: vector, a: vector, b: vector, c: vector) -> wp.int32:
+    """1 where a ray from a point along the last axis leaves through a triangle, -1 where it enters, 0 elsewhere."""
+    around = side_of_edge(p, a, b) + side_of_edge(p, b, c) + side_of_edge(p, c, a)
+    if around == 0 or p[2] > wp.max(a[2], wp.max(b[2], c[2])):
+        return int(0)
+    if p[2] < wp.min(a[2], wp.min(b[2], c[2])):
+        return around
+    if wp.dot(wp.cross(b - a, c - a), p - a) * real(around) > real(0.0):
+        return int(0)
+    return around
+
+
+@wp.kernel(module=_module, enable_backward=False)
+def find_windings(
+    first: wp.int32,
+    points: wp.array(dtype=vector),
+    boxes: wp.array(dtype=box),
+    starts: wp.array(dtype=wp.int32),
+    corners: wp.array2d(dtype=vector),
+    leaves: wp.int32,
+    # out
+    windings: wp.array(dtype=wp.int32),
+):
+    """How often closed surfaces go around a point: 1 within one whose normals point outwards, 0 outside."""
+    i = first + wp.tid()
+    p = points[i]
+    total = int(0)
+    waiting = int(1)
+    nodes = waiting_nodes()
+    nodes[0] = int(1)
+    while waiting > 0:
+        waiting -= 1
+        node = nodes[waiting]
+        b = boxes[node]
+        if p[0] >= b[0] and p[0] <= b[3] and p[1] >= b[1] and p[1] <= b[4] and p[2] <= b[5]:
+            if node >= leaves:
+                for t in range(starts[node - leaves], starts[node - leaves + 1]):
+                    total += crossing(p, corners[t, 0], corners[t, 1], corners[t, 2])
+            else:
+                nodes[waiting] = 2 * node
+                nodes[waiting + 1] = 2 * node + 1
+                waiting += 2
+    windings[i] = total
+
+
+@wp.func
+def pierces(p: vector, q: vector, a: vector, b: vector, c: vector, tolerance: real) -> wp.bool:
+    """Whether a segment goes through the inside of a triangle, and further than a tolerance to both sides."""
+    normal = wp.cross(b - a, c - a)
+    size = wp.length(normal)
+    above = wp.dot(normal, p - a)
+    below = wp.dot(normal, q - a)
+    least = tolerance * size
+    if size == real(0.0) or wp.min(wp.abs(above), wp.abs(below)) <= least or above * below > real(0.0):
+        return wp.bool(False)
+    d = q - p
+    one = wp.dot(d, wp.cross(a - p, b - p))
+    two = wp.dot(d, wp.cross(b - p, c - p))
+    three = wp.dot(d, wp.cross(c - p, a - p))
+    least = wp.min(one, wp.min(two, three))
+    most = wp.max(one, wp.max(two, three))
+    return least > real(0.0) or most < real(0.0)
+
+
+@wp.func
+def has(names: wp.vec3i, name: wp.int32) -> wp.bool:
+    return names[0] == name or names[1] == name or names[2] == name
+
+
+@wp.func
+def some_edge_pierces(
+    corners: wp.array2d(dtype=vector), names: wp.array(dtype=wp.vec3i), s: wp.int32, t: wp.int32, tolerance: real
+) -> wp.bool:
+    """Whether an edge of triangle s that has no vertex of triangle t goes through it."""
+    found = wp.bool(False)
+    for k in range(3):
+        following = (k + 1) % 3
+        if not has(names[t], names[s][k]) and not has(names[t], names[s][following]):
+            p = corners[s, k]
+            q = corners[s, following]
+            found = found or pierces(p, q, corners[t, 0], corners[t, 1], corners[t, 2], tolerance)
+    return found
+
+
+@wp.kernel(module=_module, enable_backward=False)
+def find_crossings(
+    first: wp.int32,
+    points: wp.array(dtype=vector),
+    boxes: wp.array(dtype=box),
+    starts: wp.array(dtype=wp.int32),
+    corners: wp.array2d(dtype=vector),
+    leaves: wp.int32,
+    names: wp.array(dtype=wp.vec3i),
+    tolerance: real,
+    places: wp.array(dtype=wp.int32),
+    # out
+    counts: wp.array(dtype=wp.int32),
+    others: wp.array(dtype=wp.int32),
+):
+    """The triangles behind one that cross it, written to ``others`` from ``places`` on as far as there is room; all
+    have ``names`` of vertices. ``points`` are not looked at."""
+    i = first + wp.tid()
+    low = wp.min(corners[i, 0], wp.min(corners[i, 1], corners[i, 2]))
+    high = wp.max(corners[i, 0], wp.max(corners[i, 1], corners[i, 2]))
+    count = int(0)
+    waiting = int(1)
+    nodes = waiting_nodes()
+    nodes[0] = int(1)
+    while waiting > 0:
+        waiting -= 1
+        node = nodes[waiting]
+        b = boxes[node]
+        apart = wp.bool(False)
+        for k in range(3):
+            apart = apart or low[k] > b[k + 3] or high[k] < b[k]
+        if not apart:
+            if node >= leaves:
+                for t in range(wp.max(starts[node - leaves], i + 1), starts[node - leaves + 1]):
+                    if some_edge_pierces(corners, names, i, t, tolerance) or some_edge_pierces(
+                        corners, names, t, i, tolerance
+                    ):
+                        if places[i] + count < places[i + 1]:
+                            others[places[i] + count] = t
+                        count += 1
+            else:
+                nodes[waiting] = 2 * node
+                nodes[waiting + 1] = 2 * node + 1
+                waiting += 2
+    counts[i] = count

@@ -1,0 +1,144 @@
+"""A tree of boxes around triangles, which finds the nearest of them, in float64."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.discretise.shapes import Points
+
+Numbers = NDArray[np.int64]
+LEAF = 8
+"""Triangles at most in a leaf."""
+BITS = 10
+"""Of each coordinate, by which points that are asked about are sorted: what is near in space is near in memory."""
+SPREAD = ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249))
+"""Shifts and masks that bring so many bits three places apart."""
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleTree:
+    """Triangles, halved again and again across the longest side of the box around their middles.
+
+    `cortado.discretise.solids.tree_kernels` says how nodes are numbered.
+    """
+
+    corners: Points
+    """(k, 3, 3) of the triangles, those of a leaf one after the other [m]"""
+    order: Numbers
+    """(k,) which of the triangles that were given each of them is"""
+    starts: NDArray[np.int32]
+    """(leaves + 1,) the first triangle of each leaf, and one behind the last"""
+    boxes: Points
+    """(2 leaves, 6) lower and upper corner of each node's box [m]; there is no node 0"""
+
+    @classmethod
+    def of(cls, corners: Points) -> "TriangleTree":
+        """Of one triangle or more, by their corners (k, 3, 3) [m]."""
+        count, middles = len(corners), corners.mean(axis=1)
+        levels = max(int(np.ceil(np.log2(count / LEAF))), 0)
+        order = np.arange(count)
+        for level in range(levels):
+            starts = _starts(count, level)
+            node, places = np.repeat(np.arange(2**level), np.diff(starts)), middles[order]
+            sides = np.maximum.reduceat(places, starts[:-1]) - np.minimum.reduceat(places, starts[:-1])
+            order = order[np.lexsort((places[np.arange(count), sides.argmax(axis=1)[node]], node))]
+        starts, ordered = _starts(count, levels), corners[order]
+        lower = np.minimum.reduceat(ordered.min(axis=1), starts[:-1])
+        upper = np.maximum.reduceat(ordered.max(axis=1), starts[:-1])
+        boxes = [np.hstack([lower, upper])]
+        while len(lower) > 1:
+            lower, upper = np.minimum(lower[::2], lower[1::2]), np.maximum(upper[::2], upper[1::2])
+            boxes.append(np.hstack([lower, upper]))
+        return cls(ordered, order, starts.astype(np.int32), np.concatenate([np.zeros((1, 6)), *boxes[::-1]]))
+
+    def nearest(self, points: Points, reach: float = np.inf) -> tuple[Points, Points]:
+        """(n, 3) the nearest points of the triangles [m], and (n,) how far away they are [m], for points (n, 3) [m];
+        the points themselves and ``reach`` [m] where nothing is nearer than that."""
+        order = np.arange(len(points)) if np.isfinite(reach) else _along_a_curve(points)  # these take long enough
+        nearest, squares = np.empty((len(points), 3)), np.empty(len(points))
+        self.ask("find_nearest", points[order], reach=reach, nearest=nearest, squares=squares)
+        found, away = np.empty_like(nearest), np.empty_like(squares)
+        found[order], away[order] = nearest, np.sqrt(squares)
+        return found, away
+
+    def windings(self, points: Points) -> NDArray[np.int32]:
+        """(n,) how often the triangles go around points (n, 3) [m]; they must be closed."""
+        found = np.empty(len(points), dtype=np.int32)
+        self.ask("find_windings", points, windings=found)
+        return found
+
+    def crossings(self, names: Numbers, tolerance: float) -> Numbers:
+        """(m, 2) the pairs of triangles of which an edge of one goes through the other, and further than a tolerance
+        [m] to both sides; ``names`` (k, 3) tell which vertices triangles have in common, at which they do not cross."""
+        count, ordered = len(self.corners), np.ascontiguousarray(names[self.order], dtype=np.int32)
+        counts, places, others = (np.zeros(size, dtype=np.int32) for size in (count, count + 1, 1))
+        given = {"names": ordered, "tolerance": tolerance, "counts": counts}
+        self.ask("find_crossings", self.corners[:, 0], **given, places=places, others=others)  # how many there are
+        places = np.append(0, np.cumsum(counts)).astype(np.int32)
+        others = np.zeros(max(places[-1], 1), dtype=np.int32)
+        self.ask("find_crossings", self.corners[:, 0], **given, places=places, others=others)  # and which
+        pairs = np.column_stack([np.repeat(np.arange(count), counts), others[: places[-1]]])
+        return np.sort(self.order[pairs], axis=1)
+
+    def ask(self, kernel: str, points: Points, **arguments: Any) -> None:
+        """Launch one of the kernels for points (n, d) [m], with what it takes beside the tree; it writes to arrays that
+        it takes."""
+        kernels, launch = _launcher()
+        if not len(points):
+            return
+        from cortado.device.threads import WARP
+
+        with WARP:
+            launch(
+                getattr(kernels, kernel),
+                len(points),
+                points=_shared(np.ascontiguousarray(points, dtype=np.float64)),
+                boxes=_shared(self.boxes, kernels.box),
+                starts=_shared(self.starts),
+                corners=_shared(self.corners),
+                leaves=len(self.starts) - 1,
+                **{name: _shared(x) if isinstance(x, np.ndarray) else x for name, x in arguments.items()},
+            )
+
+
+def _starts(count: int, level: int) -> Numbers:
+    """(2^level + 1,) the first triangle of each node of a level, and the number of all."""
+    return (np.arange(2**level + 1) * count) >> level
+
+
+def _along_a_curve(points: Points) -> Numbers:
+    """(n,) the order of points (n, 3) along a curve through space that stays in a part of it before it leaves (Morton
+    1966)."""
+    if len(points) < 2:
+        return np.arange(len(points))
+    lower, sides = points.min(axis=0), np.ptp(points, axis=0)
+    cells = ((points - lower) * ((2**BITS - 1) / max(sides.max(), 1e-300))).astype(np.int64)
+    for shift, mask in SPREAD:
+        cells = (cells | cells << shift) & mask
+    return np.argsort(cells @ np.array([1, 2, 4]), kind="stable")
+
+
+@cache
+def _launcher() -> Any:
+    """The kernels, and what launches them on the CPU."""
+    from cortado.device.kernel_cache import start_warp
+
+    start_warp()
+    import warp as wp
+
+    from cortado.device.bands import BandLauncher
+    from cortado.discretise.solids import tree_kernels
+
+    return tree_kernels, BandLauncher(wp.get_device("cpu"))
+
+
+def _shared(values: NDArray[Any], dtype: Any = None) -> Any:
+    """An array of Warp's in the memory of one of NumPy's; what has more than one axis is vectors along the last one."""
+    import warp as wp
+
+    types = {"float64": (wp.float64, wp.vec3d), "int32": (wp.int32, wp.vec3i)}
+    found = dtype or types[values.dtype.name][values.ndim > 1]
+    return wp.array(values, dtype=found, device="cpu", copy=False)

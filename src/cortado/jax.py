@@ -1,0 +1,98 @@
+"""Cortado as a layer of JAX: see `docs/layers.md`.
+
+States are dictionaries of arrays by the names of their fields, in the simulation's precision, with their ``time`` [s];
+parameters are dictionaries by the names that `Problem` has. All functions are differentiable in both modes, mapped by
+`jax.vmap` as batches, and may stand within `jax.jit` and `jax.lax.scan`; second derivatives are refused.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from cortado.gradients import GradientEstimator
+from cortado.optimisation.layers import calls
+from cortado.optimisation.layers.with_jax import JaxBridge, jax
+from cortado.problem import Problem
+from cortado.render import Renderer
+from cortado.rollout.device_states import DeviceState
+from cortado.rollout.host_states import Given, States
+from cortado.runs.sensors.sensor import Sensor
+from cortado.scene.parameters.values import Values
+from cortado.simulation import Simulation
+
+__all__ = ["measure", "picture", "restart_state", "rollout", "state", "step", "value"]
+
+Arrays = Mapping[str, Any]
+"""By name."""
+_BRIDGE = JaxBridge()
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+def state(
+    simulation: Simulation, given: Given | DeviceState = None, parameters: Values | None = None
+) -> dict[str, "jax.Array"]:
+    """A state as arrays of JAX: that before the first step, or a ``given`` one, such as ``trajectory.last_state``.
+
+    ``parameters``, as numbers, are any that a first state depends on, such as ``initial_velocities``; those of the run
+    that a given state is of. Returns positions [m] and velocities [m / s] (n, d), mass_fractions (n, phases),
+    reference_density (n,), time () [s], and what else a solver carries; of a batch with a first axis for the scenes.
+    Raises `InputError` for what does not fit.
+    """
+    return calls.state(_BRIDGE, simulation, given, parameters)
+
+
+def restart_state(simulation: Simulation, given: Arrays, parameters: Values | None = None) -> States:
+    """The other way round: what `Simulation.run`, files and other processes take."""
+    return calls.restart_state(_BRIDGE, simulation, given, parameters)
+
+
+def step(
+    simulation: Simulation, given: Arrays, parameters: Arrays | None = None, steps: int = 1
+) -> dict[str, "jax.Array"]:
+    """The state after ``steps`` steps from ``given``: `Simulation.step` as a function of arrays.
+
+    ``parameters`` are any of those of `Problem` but first values, arrays or numbers; one over time has a row for each
+    of these steps. Raises `InputError` for what does not fit, and `DivergedError` when a particle is lost; within a
+    compiled program, where values are known only as it runs, JAX raises an error of its own with the same sentence.
+    """
+    return calls.step(_BRIDGE, simulation, given, parameters, steps)
+
+
+def rollout(
+    simulation: Simulation, given: Arrays, parameters: Arrays | None = None, steps: int = 1, record_every: int = 1
+) -> dict[str, "jax.Array"]:
+    """The states after every ``record_every`` of ``steps`` steps, the first one included, along a first axis
+    (frames, ...); otherwise as `step`."""
+    return calls.rollout(_BRIDGE, simulation, given, parameters, steps, record_every)
+
+
+def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callable[..., "jax.Array"]:
+    """The loss of a problem as a function ``loss(parameters, state=None)`` of arrays by name, whose result is an array
+    (), of a batch (batch,).
+
+    With a state the problem begins there. Reverse mode has the gradient that the estimator ``gradient`` gives,
+    `gradients.Exact` by default, with the bits of `Problem.value_and_gradient`.
+    """
+    return calls.value(_BRIDGE, problem, gradient)
+
+
+def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "jax.Array"]:
+    """A sensor, such as one of `cortado.sensors`, or by its name a quantity of the particles, such as "pressure", as a
+    function ``reading(state, parameters=None)`` of arrays.
+
+    It returns (k,), a number for each column of the sensor, or the quantity (n,) or (n, d). Parameters are those of the
+    step that begins at the state: the pressure is that step's. Raises `InputError` for a simulation that is a batch.
+    """
+    return calls.measure(_BRIDGE, simulation, what)
+
+
+def picture(renderer: Renderer, positions: Any, fractions: Any = None, colours: Any = None) -> "jax.Array":
+    """A picture (rows, columns, 3) of particles, linear RGB: `Renderer.render` as a function of arrays.
+
+    ``positions`` (n, d) [m], ``fractions`` (n, phases), which may be left out with one phase, and ``colours``
+    (phases, 3), those of the renderer if left out. It passes through the host, and has derivatives in reverse mode
+    only. Raises `InputError` for what does not fit.
+    """
+    return calls.picture(_BRIDGE, renderer, positions, fractions, colours)

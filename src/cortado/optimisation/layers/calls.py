@@ -1,0 +1,165 @@
+"""What is the same for every program that has Cortado as a layer: states, steps, rollouts and losses of its arrays."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from cortado.arrays import require_table, whole_number
+from cortado.errors import InputError, shown
+from cortado.gradients import GradientEstimator
+from cortado.optimisation.layers.layer import PARAMETER, STATE, Layer, Named, named, part
+from cortado.optimisation.layers.measure import READING, Measure
+from cortado.optimisation.layers.picture import PICTURE, Picture
+from cortado.optimisation.layers.states import check_state
+from cortado.optimisation.layers.steps import Steps
+from cortado.optimisation.layers.value import LOSS, Value
+from cortado.problem import Problem
+from cortado.render import Renderer
+from cortado.rollout.device_states import DeviceState
+from cortado.rollout.host_states import Given
+from cortado.runs.sensors.sensor import Sensor
+from cortado.scene.parameters.values import Values
+from cortado.scene.restart import RestartState
+from cortado.simulation import Simulation
+
+Table = Mapping[str, Any]
+"""Arrays by name."""
+KEPT = 4
+"""Numbers of steps whose layers a simulation keeps for the next call."""
+
+
+class Bridge(Protocol):
+    """What these functions need of another program."""
+
+    def apply(self, layer: Layer, given: dict[str, Any]) -> dict[str, Any]:
+        """What a layer returns, by name, differentiable."""
+
+    def array(self, what: str, value: Any, layer: Layer) -> Any:
+        """An array of the layer's precision, or numbers as one; raises `InputError`."""
+
+    def made(self, found: Named, layer: Layer) -> dict[str, Any]:
+        """Arrays of a layer as arrays of the other program."""
+
+    def numbers(self, what: str, value: Any) -> np.ndarray:
+        """An array on the host, in float64; raises `InputError`."""
+
+    def repeated(
+        self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
+    ) -> dict[str, Any]:
+        """The states that a step leads to again and again, with the next row of each array, and the first one."""
+
+
+def steps_layer(simulation: Simulation, steps: int) -> Steps:
+    """So many steps; those of the last few numbers of steps are kept."""
+    if not isinstance(simulation, Simulation):
+        raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")
+    steps = whole_number("steps", steps, 1)
+    layers: dict[int, Steps] = simulation.__dict__.setdefault("_layers", {})
+    found = layers.pop(steps, None) or Steps(simulation, steps)
+    layers[steps] = found  # the last one
+    while len(layers) > KEPT:
+        layers.pop(next(iter(layers)))
+    return found
+
+
+def state(bridge: Bridge, simulation: Simulation, given: Given | DeviceState, parameters: Values | None) -> Any:
+    """A state of Cortado's, the first one if left out, as a table of arrays."""
+    layer = steps_layer(simulation, 1)
+    with layer.turn:
+        found = layer.states.of(given, dict(_table("parameters", parameters)))
+        return part(bridge.made(named(STATE, found), layer), STATE)
+
+
+def restart_state(
+    bridge: Bridge, simulation: Simulation, given: Table, parameters: Values | None
+) -> RestartState | tuple[RestartState, ...]:
+    """The other way round."""
+    layer = steps_layer(simulation, 1)
+    arrays = {name: bridge.numbers(f"state {name}", value) for name, value in _table("state", given).items()}
+    check_state({name: array.shape for name, array in arrays.items()}, layer.states.shapes)
+    own = {name: bridge.numbers(f"parameter {name}", value) for name, value in _table("parameters", parameters).items()}
+    with layer.turn:
+        return simulation.on_host(layer.states.state(arrays, own))
+
+
+def step(bridge: Bridge, simulation: Simulation, given: Table, parameters: Table | None, steps: int) -> dict[str, Any]:
+    """The state after so many steps."""
+    return part(_applied(bridge, steps_layer(simulation, steps), given, parameters), STATE)
+
+
+def rollout(
+    bridge: Bridge, simulation: Simulation, given: Table, parameters: Table | None, steps: int, record_every: int
+) -> dict[str, Any]:
+    """The states after every so many steps, the first one included, along a first axis."""
+    steps, every = whole_number("steps", steps, 1), whole_number("record_every", record_every, 1)
+    if steps % every:
+        raise InputError(f"record_every is {every}, but must divide the {steps} steps.")
+    layer, count = steps_layer(simulation, every), steps // every
+    table = _table("parameters", parameters)
+    arrays = {name: bridge.array(PARAMETER + name, value, layer) for name, value in table.items()}
+    if simulation.batch is not None and any(name in simulation.known.over_time for name in arrays):
+        over_time = ", ".join(name for name in arrays if name in simulation.known.over_time)
+        raise InputError(f"parameter {over_time} is given, but must be left out in a rollout of a batch: chain steps.")
+    known = simulation.known
+    rows = {n: a for n, a in arrays.items() if n in known.over_time and len(a.shape) > known[n].rank}
+    for name, array in rows.items():
+        if array.shape[0] != steps:
+            raise InputError(f"parameter {name} has {array.shape[0]} rows, but must have {steps}, one for each step.")
+    pieces = {name: array.reshape((count, every, *array.shape[1:])) for name, array in rows.items()}
+    others = {name: array for name, array in arrays.items() if name not in rows}
+    first = {name: bridge.array(STATE + name, value, layer) for name, value in _table("state", given).items()}
+
+    def advance(before: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+        return part(_applied(bridge, layer, before, {**others, **own}), STATE)
+
+    return bridge.repeated(advance, first, pieces, count)
+
+
+def value(bridge: Bridge, problem: Problem, gradient: GradientEstimator | None) -> Callable[[Table, Table | None], Any]:
+    """The loss of a problem as a function of parameters, and of a state."""
+    layer = Value(problem, gradient)
+
+    def loss(parameters: Table, given: Table | None = None) -> Any:
+        """The loss under these parameters, of the problem that begins at a state if one is given."""
+        return _applied(bridge, layer, given, parameters)[LOSS]
+
+    return loss
+
+
+def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Callable[[Table, Table | None], Any]:
+    """A sensor or a quantity of the particles as a function of a state and of parameters."""
+    if not isinstance(simulation, Simulation):
+        raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")
+    layer = Measure(simulation, what)
+
+    def reading(given: Table, parameters: Table | None = None) -> Any:
+        """What is read of a state, of which the pressure is that of the step that begins there."""
+        return _applied(bridge, layer, given, parameters)[READING]
+
+    return reading
+
+
+def picture(bridge: Bridge, renderer: Renderer, positions: Any, fractions: Any, colours: Any) -> Any:
+    """A picture of particles."""
+    layer = getattr(renderer, "_layer", None) or Picture(renderer)
+    renderer.__dict__["_layer"] = layer
+    given = {"positions": positions, "fractions": fractions, "colours": colours}
+    found = {name: bridge.array(name, value, layer) for name, value in given.items() if value is not None}
+    layer.check({name: tuple(array.shape) for name, array in found.items()})
+    return bridge.apply(layer, found)[PICTURE]
+
+
+def _applied(bridge: Bridge, layer: Layer, given: Table | None, parameters: Table | None) -> dict[str, Any]:
+    own, others = _table("state", given), _table("parameters", parameters)
+    arrays = {**named(STATE, own), **named(PARAMETER, others)}
+    found = {name: bridge.array(name, value, layer) for name, value in arrays.items()}
+    layer.check({name: tuple(array.shape) for name, array in found.items()})
+    return bridge.apply(layer, found)
+
+
+def _table(what: str, given: Table | None) -> Table:
+    """What was given, nothing if it was left out; raises `InputError` for anything but a table by names."""
+    found = {} if given is None else given
+    require_table(what, found, "{'gravity': array}" if what == "parameters" else "{'positions': array, ...}")
+    return found

@@ -1,0 +1,50 @@
+"""Parameters of a layer: their shapes, one for all evaluations or one for each, and their derivatives in these."""
+
+import numpy as np
+
+from cortado.errors import InputError
+from cortado.optimisation.layers.layer import PARAMETER, Array, Named, Shapes, named, on_host, part
+from cortado.rollout.parameter_space import STATE, ParameterSpace
+from cortado.scene.parameters.values import Arrays
+from cortado.simulation import Simulation
+
+
+class LayerParameters:
+    """The parameters of a layer over a number of steps, as its arrays have them and as problems take them.
+
+    ``each``: whether the simulation is a batch of evaluations of a layer, with an entry for each of them in all arrays;
+    a batch that a user made has parameters in all shapes of `docs/batches.md`.
+    """
+
+    def __init__(self, simulation: Simulation, steps: int, each: bool):
+        self._simulation, self._each = simulation, each
+        self._space = ParameterSpace(simulation, steps)
+
+    def check(self, given: Shapes, with_state: bool) -> None:
+        """Raises `InputError` for arrays that no parameters have."""
+        for name, shape in part(given, PARAMETER).items():
+            shapes = self._space.shapes(name)
+            if with_state and name in STATE:
+                raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
+            if shape not in shapes:
+                raise InputError(f"parameter {name} has shape {shape}, but must be {' or '.join(map(str, shapes))}.")
+
+    def values(self, given: Named) -> Arrays:
+        """As problems take them."""
+        return {name: self._value(name, array) for name, array in part(given, PARAMETER).items()}
+
+    def _value(self, name: str, array: Array) -> np.ndarray:
+        """One of them, in float64. Of each evaluation, one that is the same in all steps gets an axis for them."""
+        found, shapes = on_host(array).astype(np.float64), self._space.shapes(name)
+        if self._each and name in self._simulation.known.over_time and found.ndim == len(shapes[0]) + 1:
+            return found[:, None]
+        return found.reshape(()) if found.shape == (1,) and (1,) not in shapes else found
+
+    def adjoints(self, found: Arrays, values: Arrays) -> Named:
+        """Derivatives with respect to values, of a batch with a first axis for the scenes, in their shapes."""
+        return named(PARAMETER, {name: _shared(bar, values[name].shape) for name, bar in found.items()})
+
+
+def _shared(bar: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """A derivative with a first axis for the scenes, added up where the value is the same for all."""
+    return bar.reshape(shape) if bar.size == int(np.prod(shape)) else bar.sum(axis=0).reshape(shape)

@@ -1,0 +1,261 @@
+"""Layers as functions of PyTorch's tensors: both modes of its automatic differentiation, and `torch.vmap`."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from math import prod
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.arrays import as_numbers
+from cortado.errors import InputError, LibraryMissingError, Words
+from cortado.optimisation.layers.layer import Array, Layer, Named
+
+try:
+    import torch
+except ModuleNotFoundError as error:
+    raise LibraryMissingError("PyTorch", "torch") from error
+
+SECOND = (
+    "A second derivative is asked for, but there are first ones only: leave out create_graph=True, or take a gradient "
+    "within torch.no_grad()."
+)
+Tensors = tuple[Any, ...]
+
+
+@dataclass(eq=False)
+class Call:
+    """One application of a layer, and what its derivatives need."""
+
+    layer: Layer
+    names: tuple[str, ...]
+    """Of its tensors, in their order."""
+    keep: bool
+    """Whether derivatives are likely to be asked for."""
+    residual: Any = None
+    many: "Call | None" = field(default=None, repr=False)
+    """The application to several of each tensor that `torch.vmap` has made of it."""
+
+    def evaluate(self, tensors: Tensors, keep: bool) -> Tensors:
+        """What the layer returns, as tensors."""
+        with _in_order(_device(self.layer)):
+            found, self.residual = self.layer.evaluate(_arrays(self.names, tensors), keep)
+            return _tensors(self.layer, found, self.layer.outputs())
+
+    def kept(self, tensors: Tensors) -> Any:
+        """What derivatives need, which is computed now where nobody said before that it would be needed."""
+        if self.residual is None:
+            self.evaluate(tensors, keep=True)
+        return self.residual
+
+    def pull(self, tensors: Tensors, bars: Tensors) -> Tensors:
+        """The adjoints of all tensors, each on its device."""
+        with _in_order(_device(self.layer)):
+            found = self.layer.pull(self.kept(tensors), _arrays(self.layer.outputs(), bars))
+            each = zip(self.names, tensors, strict=True)
+            return tuple(_tensor(found[name], tensor.shape, tensor.dtype, tensor.device) for name, tensor in each)
+
+    def push(self, tensors: Tensors, dots: Tensors) -> Tensors:
+        """The tangents of what the layer returns."""
+        with _in_order(_device(self.layer)):
+            found = self.layer.push(self.kept(tensors), _arrays(self.names, dots))
+            return _tensors(self.layer, found, self.layer.outputs())
+
+    def batched(self, size: int) -> "Call":
+        """The application to so many of each tensor."""
+        if self.many is None or self.many.layer is not self.layer.batched(size):
+            self.many = Call(self.layer.batched(size), self.names, self.keep)
+        return self.many
+
+
+class Evaluate(torch.autograd.Function):
+    """A layer."""
+
+    @staticmethod
+    def forward(call: Call, *tensors: Any) -> Tensors:
+        return call.evaluate(tensors, call.keep)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Tensors, output: Tensors) -> None:
+        ctx.call, *tensors = inputs
+        ctx.save_for_backward(*tensors)
+        ctx.save_for_forward(*tensors)
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    def backward(ctx: Any, *bars: Any) -> Tensors:
+        if all(bar is None for bar in bars):
+            return (None,) * (1 + len(ctx.call.names))
+        return None, *Pull.apply(ctx.call, *ctx.saved_tensors, *bars)
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, *dots: Any) -> Tensors:
+        return Push.apply(ctx.call, *ctx.saved_tensors, *dots)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Sequence[int | None], call: Call, *tensors: Any) -> tuple[Tensors, Any]:
+        own = _in_front(tensors, in_dims[1:], info.batch_size)
+        found = Evaluate.apply(call.batched(info.batch_size), *own)
+        return found, (0,) * len(found)
+
+
+class _Linear(torch.autograd.Function):
+    """A derivative of a layer, which has none of its own. Its tensors are those of the layer, and the adjoints or the
+    tangents behind them."""
+
+    @staticmethod
+    def of(call: Call, tensors: Tensors, given: Tensors) -> Tensors:
+        raise NotImplementedError
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Tensors, output: Tensors) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *bars: Any) -> Tensors:
+        raise InputError(SECOND)
+
+    @staticmethod
+    def jvp(ctx: Any, *dots: Any) -> Tensors:
+        raise InputError(SECOND)
+
+
+def _mapped(function: Any) -> Callable[..., tuple[Tensors, Any]]:
+    """How a derivative is mapped: as one of the application to several tensors where these are mapped too, and else as
+    several derivatives of the one application."""
+
+    def vmap(info: Any, in_dims: Sequence[int | None], call: Call, *tensors: Any) -> tuple[Tensors, Any]:
+        size, count = info.batch_size, len(call.names)
+        if all(dim is None for dim in in_dims[1 : 1 + count]):
+            given = _in_front(tensors[count:], in_dims[1 + count :], size)
+            each = [tuple(None if one is None else one[b] for one in given) for b in range(size)]
+            rows = [function.apply(call, *tensors[:count], *own) for own in each]
+            found = tuple(torch.stack(column) for column in zip(*rows, strict=True))
+        else:
+            found = function.apply(call.batched(size), *_in_front(tensors, in_dims[1:], size))
+        return found, (0,) * len(found)
+
+    return vmap
+
+
+class Pull(_Linear):
+    """The derivative of a layer in reverse mode."""
+
+    @staticmethod
+    def forward(call: Call, *tensors: Any) -> Tensors:
+        return call.pull(tensors[: len(call.names)], tensors[len(call.names) :])
+
+
+class Push(_Linear):
+    """The derivative of a layer in forward mode."""
+
+    @staticmethod
+    def forward(call: Call, *tensors: Any) -> Tensors:
+        return call.push(tensors[: len(call.names)], tensors[len(call.names) :])
+
+
+for _one in (Pull, Push):
+    _one.vmap = staticmethod(_mapped(_one))
+
+
+class TorchBridge:
+    """What calls of layers need of PyTorch."""
+
+    @torch.compiler.disable
+    def apply(self, layer: Layer, given: dict[str, Any]) -> dict[str, Any]:
+        """What a layer returns, by name."""
+        unpack = torch.autograd.forward_ad.unpack_dual
+        tangents = any(unpack(tensor).tangent is not None for tensor in given.values())
+        keep = tangents or (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given.values()))
+        found = Evaluate.apply(Call(layer, tuple(given), keep), *given.values())
+        return dict(zip(layer.outputs(), found, strict=True))
+
+    def array(self, what: str, value: Any, layer: Layer) -> Any:
+        """A tensor of the layer's precision, as it is, or numbers as one; raises `InputError` for any other."""
+        real = _dtype(layer)
+        if not isinstance(value, torch.Tensor):
+            return torch.as_tensor(np.array(as_numbers(what, value)), dtype=real, device=_device(layer))
+        if value.is_floating_point() and value.dtype != real:
+            raise InputError(f"{what} is {value.dtype}, but must be {real}, the simulation's precision.")
+        if value.is_complex() or value.dtype == torch.bool or value.layout != torch.strided:
+            found = Words(f"a tensor of {value.dtype}, {value.layout}")
+            raise InputError(f"{what} is {found}, but must be a dense tensor of real numbers.")
+        if value.device.type == "meta" or (what in layer.on_device and value.device != _device(layer)):
+            wanted = f"{_device(layer)}, where the simulation is"
+            raise InputError(f"{what} is on {value.device}, but must be on {wanted}.")
+        return value.to(real)
+
+    def made(self, found: Named, layer: Layer) -> dict[str, Any]:
+        """Arrays of a layer as tensors of their own."""
+        shapes = {name: tuple(array.shape) for name, array in found.items()}
+        return {name: own.clone() for name, own in zip(shapes, _tensors(layer, found, shapes), strict=True)}
+
+    def numbers(self, what: str, value: Any) -> np.ndarray:
+        """A tensor, or what else it may be, on the host."""
+        return as_numbers(what, value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value)
+
+    def repeated(
+        self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
+    ) -> dict[str, Any]:
+        """The states that a step leads to again and again, with the next row of each array, and the first one, along a
+        first axis."""
+        states = [state]
+        for k in range(count):
+            states.append(step(states[-1], {name: row[k] for name, row in rows.items()}))
+        return {name: torch.stack([one[name] for one in states]) for name in state}
+
+
+def _dtype(layer: Layer) -> Any:
+    return torch.float64 if layer.real is np.float64 else torch.float32
+
+
+def _device(layer: Layer) -> Any:
+    return torch.device(layer.device.alias)
+
+
+@contextmanager
+def _in_order(device: Any) -> Iterator[None]:
+    """On a GPU, after what PyTorch computes in its stream, and before what it computes there next."""
+    if device.type != "cuda":
+        yield
+        return
+    theirs, own = wp.stream_from_torch(torch.cuda.current_stream(device)), wp.get_stream(str(device))
+    own.wait_stream(theirs)
+    yield
+    theirs.wait_stream(own)
+
+
+def _arrays(names: Any, tensors: Tensors) -> dict[str, Array]:
+    """Tensors, but those that are left out, in their memory."""
+    each = zip(names, tensors, strict=True)
+    return {name: _array(tensor) for name, tensor in each if tensor is not None}
+
+
+def _array(tensor: Any) -> Array:
+    tensor = tensor.detach().contiguous()
+    return tensor.numpy() if tensor.device.type == "cpu" else wp.from_torch(tensor.reshape(tensor.shape or (1,)))
+
+
+def _tensors(layer: Layer, found: Named, shapes: dict[str, tuple[int, ...]]) -> Tensors:
+    """What a layer returned; what may be elsewhere than on its device is on the host."""
+    real, device = _dtype(layer), _device(layer)
+    each = ((found[name], shape, device if name in layer.on_device else "cpu") for name, shape in shapes.items())
+    return tuple(_tensor(array, shape, real, place) for array, shape, place in each)
+
+
+def _tensor(array: Array, shape: Sequence[int], dtype: Any, device: Any) -> Any:
+    """An array of the same memory, or where it is of another type or on another device a copy."""
+    own = wp.to_torch(array) if isinstance(array, wp.array) else torch.from_numpy(np.array(array))
+    assert own.numel() == prod(shape)
+    return own.to(dtype=dtype, device=device).reshape(tuple(shape))
+
+
+def _in_front(tensors: Tensors, dims: Sequence[int | None], size: int) -> Tensors:
+    """Tensors with the axis that they are mapped over in front."""
+    each = zip(tensors, dims, strict=True)
+    return tuple(
+        None if tensor is None else tensor.movedim(dim, 0) if dim is not None else tensor.expand(size, *tensor.shape)
+        for tensor, dim in each
+    )

@@ -1,0 +1,41 @@
+"""Where solids that move are in the frames of a run."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.scene.motions import displacement_name, moving, turn_name
+from cortado.scene.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class SolidMotion:
+    """One solid, in every frame."""
+
+    positions: NDArray[Any]
+    """(frames, d) of its middle [m]"""
+    rotations: NDArray[Any]
+    """(frames, 3) rotation vectors, in 2-D (frames,) angles, by which it is turned about its middle [rad]"""
+
+    def __getitem__(self, frames: slice) -> Self:
+        """In some of the frames."""
+        return type(self)(self.positions[frames], self.rotations[frames])
+
+
+def solid_motions(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> dict[str, SolidMotion]:
+    """Of the solids of a scene that move, by their names, from recorded fields (frames, 1, ...) of states."""
+    return {table.name: _motion(table, fields, scene.dimension) for table in moving(scene.solid)}
+
+
+def _motion(table: Any, fields: Mapping[str, NDArray[Any]], dimension: int) -> SolidMotion:
+    positions = table.middle() + fields[displacement_name(table.name)][:, 0].astype(np.float64)
+    turns = fields[turn_name(table.name)][:, 0].astype(np.float64)
+    begun = np.array(table.rotation or (0.0,) * (2 * dimension - 3))
+    if dimension == 2:
+        return SolidMotion(positions, turns + begun[0])
+    from scipy.spatial.transform import Rotation
+
+    return SolidMotion(positions, (Rotation.from_rotvec(turns) * Rotation.from_rotvec(begun)).as_rotvec())

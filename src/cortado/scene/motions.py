@@ -1,0 +1,149 @@
+"""How solids that move are displaced and turned from where they begin, over time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.errors import MissingDerivativeError
+from cortado.scene.parameters.parameter import Axis, Parameter, Role
+from cortado.scene.solids import SolidTable
+
+
+@dataclass(frozen=True, eq=False)
+class Steady:
+    """Something that grows by the same in every second."""
+
+    rate: NDArray[np.float64]
+    """() or (components,)"""
+
+    def at(self, times: NDArray) -> NDArray:
+        """(n,) or (n, components) at times (n,) [s]"""
+        return np.multiply.outer(times, self.rate)
+
+    def greatest(self) -> float:
+        """Size of the rate."""
+        return float(np.linalg.norm(self.rate))
+
+    def rates(self, times: NDArray) -> NDArray:
+        """See `_no_rates`."""
+        raise _no_rates()
+
+
+@dataclass(frozen=True, eq=False)
+class Knots:
+    """Straight lines between values at some times, constant before the first and after the last."""
+
+    times: NDArray[np.float64]
+    """(k,) [s]"""
+    values: NDArray[np.float64]
+    """(k,) or (k, components)"""
+
+    def at(self, times: NDArray) -> NDArray:
+        """(n,) or (n, components) at times (n,) [s]"""
+        columns = self.values.reshape(len(self.times), -1).T
+        found = np.stack([np.interp(times, self.times, column) for column in columns], axis=-1)
+        return found.reshape(len(times), *self.values.shape[1:])
+
+    def greatest(self) -> float:
+        """Size of the greatest rate."""
+        changes = np.diff(self.values.reshape(len(self.times), -1), axis=0)
+        return float((np.linalg.norm(changes, axis=1) / np.diff(self.times)).max())
+
+    def rates(self, times: NDArray) -> NDArray:
+        """See `_no_rates`."""
+        raise _no_rates()
+
+
+def _no_rates() -> MissingDerivativeError:
+    """What asks for derivatives of a path with respect to time asks for those of a run with respect to when its steps
+    are, through where solids are, which nobody computes yet."""
+    return MissingDerivativeError(
+        "solids that move have no derivative with respect to the time step, or to when a run begins: leave time_step "
+        "out of the parameters, or let solids be fixed."
+    )
+
+
+def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
+    """Those that move, in their order."""
+    return [solid for solid in solids if solid.moves]
+
+
+def solid_frames(scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Of the solids of a scene that move: where their middles are at the start, (k, d) [m], and how they are turned,
+    (k, d, d)."""
+    tables, d = moving(scene.solid), scene.dimension
+    middles = np.array([table.middle() for table in tables]).reshape(-1, d)
+    return middles, np.array([table.turn(d) for table in tables]).reshape(-1, d, d)
+
+
+def greatest_speed(solids: Sequence[SolidTable]) -> float:
+    """How fast the fastest point of a solid moves at most [m/s]."""
+    found = [0.0]
+    for solid in moving(solids):
+        shape, middle = solid.shape_about()
+        reach = float(np.linalg.norm(np.abs(shape.extent()).max(axis=0)))
+        d = len(middle)
+        shift, turn = (
+            _course(solid, "positions", "velocity", d),
+            _course(solid, "rotations", "angular_velocity", 2 * d - 3),
+        )
+        found.append(shift.greatest() + reach * turn.greatest())
+    return max(found)
+
+
+def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
+    """What steps depend on of solids that move: where they are at the end of each step, as from where they begin."""
+    return [parameter for solid in moving(solids) for parameter in (_displacement(solid), _turn(solid))]
+
+
+def displacement_name(solid: str) -> str:
+    """Of the parameter, and of the field of a state."""
+    return f"{solid}.displacement"
+
+
+def turn_name(solid: str) -> str:
+    """Of the parameter, and of the field of a state."""
+    return f"{solid}.turn"
+
+
+def _displacement(solid: SolidTable) -> Parameter:
+    return Parameter(
+        displacement_name(solid.name),
+        "m",
+        f"how far the middle of the solid {solid.name} is from where it began, after each step",
+        Axis.STEP,
+        lambda source: np.zeros(source.scene.dimension),
+        components=lambda dimension, phases: dimension,
+        role=Role.CLOCK,
+        moment=1.0,
+        course=_course(solid, "positions", "velocity", len(solid.shape_about()[1])),
+    )
+
+
+def _turn(solid: SolidTable) -> Parameter:
+    dimension = len(solid.shape_about()[1])
+    flat = dimension == 2
+    return Parameter(
+        turn_name(solid.name),
+        "rad",
+        f"how far the solid {solid.name} is turned from how it began, after each step",
+        Axis.STEP,
+        lambda source: np.float64(0.0) if flat else np.zeros(3),
+        components=None if flat else lambda dimension, phases: 3,
+        role=Role.CLOCK,
+        moment=1.0,
+        course=_course(solid, "rotations", "angular_velocity", 2 * dimension - 3),
+    )
+
+
+def _course(solid: SolidTable, values: str, rate: str, components: int) -> Steady | Knots:
+    shape = () if components == 1 else (components,)
+    known: Any = getattr(solid, values)
+    if known is not None:
+        table = np.array(known, dtype=np.float64).reshape(len(known), *shape)
+        return Knots(np.array(solid.times), table - table[0])
+    steady: Any = getattr(solid, rate)
+    return Steady(np.zeros(shape) if steady is None else np.array(steady, dtype=np.float64).reshape(shape))

@@ -1,0 +1,119 @@
+"""The wall particles of a scene: of its container and of its solids."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cortado.discretise.region import Region
+from cortado.discretise.room import Room
+from cortado.discretise.shapes import Points
+from cortado.discretise.solids.solid import Solid
+from cortado.discretise.solids.walls import ExposedSurface, WallPoints, solid_places
+from cortado.discretise.walls.layers import Planes, WallLayers
+from cortado.discretise.walls.places import Places
+from cortado.discretise.walls.weights import RestLattice, WallSurface, even_changes, uneven_changes
+from cortado.errors import InputError
+from cortado.scene.containers import Container
+from cortado.scene.motions import moving
+from cortado.scene.room import resting_room
+from cortado.scene.scene import Scene
+from cortado.scene.solids import SolidTable
+
+WHOLE = 1e-6
+"""By how much, relative, a solid may be shorter than a period that it fills."""
+NEAREST_PLACE = 0.4
+"""In spacings: places that are looked at for the weights of walls are no nearer to any surface."""
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Wall particles, those at rest first."""
+
+    positions: Points
+    """(b, d) [m], at the start"""
+    weights: Points
+    """(b,) w_b [-]: what each counts for in the density, a fluid particle being 1."""
+    feet: Points
+    """(b, d) from each to the nearest point of its surface [m]."""
+    sticks: NDArray[np.bool_]
+    """(b,) whether fluid has no slip along each."""
+    slides: Points
+    """(b, d) how fast their surface slides along the solid, in its own frame [m/s]"""
+    solid: NDArray[np.int64]
+    """(b,) whose they are: the number of a solid among those that move; -1 of those at rest."""
+
+    @classmethod
+    def of(cls, points: WallPoints, weights: Points, sticks: NDArray[np.bool_]) -> "Walls":
+        """Those at rest, with the weights that were found."""
+        return cls(points.positions, weights, points.feet, sticks, 0.0 * points.feet, np.full(len(points), -1))
+
+    @classmethod
+    def joined(cls, parts: Sequence["Walls"]) -> "Walls":
+        """One behind the other."""
+        return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in cls.__dataclass_fields__))
+
+
+def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
+    """Those of a scene. Raises `InputError` for a solid that no fluid can touch."""
+    still = _around(scene, layers, lattice) if resting_room(scene).solids else _container_walls(scene, layers, lattice)
+    periods, tables = scene.container.periods(scene.dimension)[1], moving(scene.solid)
+    return Walls.joined([still, *(_alone(table, k, periods, layers, lattice) for k, table in enumerate(tables))])
+
+
+def _container_walls(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
+    """Those of the container, in layers of even particles."""
+    container, dimension, spacing = scene.container, scene.dimension, lattice.spacing
+    room, lower = resting_room(scene), container.periods(dimension)[0]
+    particles = [container.walls(dimension, spacing, depth) for depth in layers.depths]
+    positions = np.concatenate(particles)
+    flat = np.repeat(layers.weights, [len(layer) for layer in particles])
+    points = WallPoints(positions, flat, room.region.nearest(positions) - positions)
+    surface = WallSurface(positions, flat, lattice, room, lower, room.periods, even_changes)
+    weights = surface.weights(container.places(dimension, spacing, lattice.support))
+    return Walls.of(points, weights, np.full(len(points), container.sticks))
+
+
+def _around(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
+    """Those of the container and of all solids at rest, of what fluid can touch of them together."""
+    room, (lower, _) = resting_room(scene), scene.container.periods(scene.dimension)
+    resting = [solid for solid in scene.solid if not solid.moves]
+    sides = scene.container.solids(scene.dimension, lattice.support)
+    images = [room.images(solid) for solid in room.solids]
+    tables: list[Container | SolidTable] = [scene.container for _ in sides]
+    tables += [table for table, several in zip(resting, images, strict=True) for _ in several]
+    solids = [*sides, *(image for several in images for image in several)]
+    surface = ExposedSurface.of(room, solids, lower, lattice.support, lattice.spacing)
+    for table in resting:
+        if not any(tables[number] is table for number in np.unique(surface.owner)):
+            raise InputError(f"solid {table.name!r} has no surface that fluid in the container can touch.")
+    beside = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
+    points, weights = _weighed(surface, beside, room.solids, layers, lattice)
+    return Walls.of(points, weights, np.array([table.sticks for table in tables])[surface.owners(points)])
+
+
+def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, lattice: RestLattice) -> Walls:
+    """Those of one solid that moves, as if nothing else were there, but for its own images where it fills a period."""
+    solid, dimension = table.solid(), len(periods)
+    lower, upper = solid.extent()
+    filled = np.where(upper - lower > periods * (1.0 - WHOLE), periods, 0.0)
+    room = Room(Region.everywhere(dimension), (solid,), filled)
+    surface = ExposedSurface.of(room, room.images(solid), lower, lattice.support, lattice.spacing)
+    nothing = Places.upright(np.zeros((0, dimension)))
+    points, weights = _weighed(surface, nothing, room.solids, layers, lattice)
+    found = Walls.of(points, weights, np.full(len(points), table.sticks))
+    slides = np.tile(table.surface_velocity or (0.0,) * dimension, (len(points), 1))
+    return replace(found, slides=slides, solid=np.full(len(points), number))
+
+
+def _weighed(
+    surface: ExposedSurface, beside: Places, solids: Sequence[Solid], layers: WallLayers, lattice: RestLattice
+) -> tuple[WallPoints, Points]:
+    """Wall particles beneath a surface, and their weights, by places ``beside`` and those about solids."""
+    room, spacing, reach = surface.room, lattice.spacing, lattice.support
+    points = surface.walls(layers, Planes(lattice.kernel, spacing, reach, room.dimension))
+    about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in solids)])
+    places = about.some(room.contains(about.points, -NEAREST_PLACE * spacing))
+    sought = WallSurface(points.positions, points.flat, lattice, room, surface.lower, room.periods, uneven_changes)
+    return points, sought.weights(places)

@@ -1,0 +1,124 @@
+"""Cortado as a layer of PyTorch: see `docs/torch.md`.
+
+States are dictionaries of tensors by the names of their fields, in the simulation's precision and on its device, with
+their ``time`` [s]; parameters are dictionaries by the names that `Problem` has. Both modes of PyTorch's automatic
+differentiation go through all functions, `torch.vmap` too; second derivatives are refused.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from cortado.errors import InputError
+from cortado.gradients import GradientEstimator
+from cortado.optimisation.layers import calls
+from cortado.optimisation.layers.with_torch import TorchBridge, torch
+from cortado.problem import Problem
+from cortado.render import Renderer
+from cortado.rollout.device_states import DeviceState
+from cortado.rollout.host_states import Given, States
+from cortado.runs.sensors.sensor import Sensor
+from cortado.scene.parameters.values import Values
+from cortado.simulation import Simulation
+
+__all__ = ["Steps", "measure", "picture", "restart_state", "rollout", "state", "step", "value"]
+
+Tensors = Mapping[str, Any]
+"""By name."""
+_BRIDGE = TorchBridge()
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+def state(
+    simulation: Simulation, given: Given | DeviceState = None, parameters: Values | None = None
+) -> dict[str, "torch.Tensor"]:
+    """A state as tensors: that before the first step, or a ``given`` one, such as ``trajectory.last_state``.
+
+    ``parameters``, as numbers, are any that a first state depends on, such as ``initial_velocities``; those of the run
+    that a given state is of. Returns positions [m] and velocities [m / s] (n, d), mass_fractions (n, phases),
+    reference_density (n,), time () [s], and what else a solver carries; of a batch with a first axis for the scenes.
+    Raises `InputError` for what does not fit.
+    """
+    return calls.state(_BRIDGE, simulation, given, parameters)
+
+
+def restart_state(simulation: Simulation, given: Tensors, parameters: Values | None = None) -> States:
+    """The other way round: what `Simulation.run`, files and other processes take."""
+    return calls.restart_state(_BRIDGE, simulation, given, parameters)
+
+
+def step(
+    simulation: Simulation, given: Tensors, parameters: Tensors | None = None, steps: int = 1
+) -> dict[str, "torch.Tensor"]:
+    """The state after ``steps`` steps from ``given``: `Simulation.step` as a function of tensors.
+
+    ``parameters`` are any of those of `Problem` but first values, tensors or numbers; one over time has a row for each
+    of these steps. Raises `InputError` for what does not fit, and `DivergedError` when a particle is lost.
+    """
+    return calls.step(_BRIDGE, simulation, given, parameters, steps)
+
+
+def rollout(
+    simulation: Simulation, given: Tensors, parameters: Tensors | None = None, steps: int = 1, record_every: int = 1
+) -> dict[str, "torch.Tensor"]:
+    """The states after every ``record_every`` of ``steps`` steps, the first one included, along a first axis
+    (frames, ...); otherwise as `step`."""
+    return calls.rollout(_BRIDGE, simulation, given, parameters, steps, record_every)
+
+
+def value(problem: Problem, gradient: GradientEstimator | None = None) -> Callable[..., "torch.Tensor"]:
+    """The loss of a problem as a function ``loss(parameters, state=None)`` of tensors by name, whose result is a tensor
+    (), of a batch (batch,).
+
+    With a state the problem begins there. Reverse mode has the gradient that the estimator ``gradient`` gives,
+    `gradients.Exact` by default, with the bits of `Problem.value_and_gradient`.
+    """
+    return calls.value(_BRIDGE, problem, gradient)
+
+
+def measure(simulation: Simulation, what: Sensor | str) -> Callable[..., "torch.Tensor"]:
+    """A sensor, such as one of `cortado.sensors`, or by its name a quantity of the particles, such as "pressure", as a
+    function ``reading(state, parameters=None)`` of tensors.
+
+    It returns (k,), a number for each column of the sensor, or the quantity (n,) or (n, d). Parameters are those of the
+    step that begins at the state: the pressure is that step's. Raises `InputError` for a simulation that is a batch.
+    """
+    return calls.measure(_BRIDGE, simulation, what)
+
+
+def picture(renderer: Renderer, positions: Any, fractions: Any = None, colours: Any = None) -> "torch.Tensor":
+    """A picture (rows, columns, 3) of particles, linear RGB: `Renderer.render` as a function of tensors.
+
+    ``positions`` (n, d) [m], ``fractions`` (n, phases), which may be left out with one phase, and ``colours``
+    (phases, 3), those of the renderer if left out. It passes through the host, and has derivatives in reverse mode
+    only. Raises `InputError` for what does not fit.
+    """
+    return calls.picture(_BRIDGE, renderer, positions, fractions, colours)
+
+
+class Steps(torch.nn.Module):
+    """So many steps of a simulation as a module, with parameters of the simulation that are trained."""
+
+    def __init__(self, simulation: Simulation, steps: int = 1, trained: Values | None = None):
+        """``trained``: parameters by name with their first values, such as ``{"viscosity": 0.1}``."""
+        super().__init__()
+        layer = calls.steps_layer(simulation, steps)
+        self.simulation, self.steps = simulation, steps
+        made = {name: _BRIDGE.array(f"parameter {name}", value, layer) for name, value in (trained or {}).items()}
+        self.trained = torch.nn.ParameterDict({_key(name): torch.nn.Parameter(own) for name, own in made.items()})
+        self._names = tuple(made)
+
+    def forward(self, given: Tensors, parameters: Tensors | None = None) -> dict[str, "torch.Tensor"]:
+        """The state after the steps; ``parameters`` are further ones."""
+        own = {name: self.trained[_key(name)] for name in self._names}
+        for name in parameters or {}:
+            if name in own:
+                raise InputError(f"parameter {name} is given, but must be left out, as the module has its own.")
+        return step(self.simulation, given, {**own, **(parameters or {})}, self.steps)
+
+
+def _key(name: str) -> str:
+    """What PyTorch calls a parameter, whose name may have a point."""
+    return name.replace(".", "/")

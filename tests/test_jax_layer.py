@@ -1,0 +1,563 @@
+"""Cortado as a layer of JAX: derivatives in both modes, bits, compiled programs, maps, and bad uses in sentences."""
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado import InputError, Simulation, gradients, sensors
+from cortado.optimisation.layers import residuals
+from cortado.optimisation.layers.layer import KEPT
+from layered import POINT, STIFF, matched, scheduled, shear, sheared
+from scenes import jet, plane, scene, two_layers
+
+STEP = 1e-8
+"""Of differences: most directions lead through a kink within a longer one."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def jax():
+    """In float64, as long as tests of this file run."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    yield jax
+    jax.config.update("jax_enable_x64", False)
+
+
+@pytest.fixture(scope="module")
+def layer(jax):
+    import cortado.jax
+
+    return cortado.jax
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return Simulation(sheared(), precision="float64")
+
+
+@pytest.fixture(scope="module")
+def problem(simulation):
+    return matched(simulation)
+
+
+@pytest.fixture(scope="module")
+def chained(layer, simulation):
+    """Three segments of 20 steps, as a function of first positions, velocities, gravity and viscosity."""
+    first = layer.state(simulation)
+
+    def end(positions, velocities, gravity, viscosity):
+        state = {**first, "positions": positions, "velocities": velocities}
+        for _ in range(3):
+            state = layer.step(simulation, state, {"gravity": gravity, "viscosity": STIFF * viscosity}, steps=20)
+        return state["positions"], state["velocities"]
+
+    return end
+
+
+@pytest.fixture(scope="module")
+def point(jax, simulation):
+    values = simulation.positions, shear(simulation), np.array([0.4, -9.0]), np.array(0.7)
+    return tuple(jax.numpy.asarray(value) for value in values)
+
+
+def same_bits(one, other):
+    assert one.keys() == other.keys()
+    for name in one:
+        assert np.asarray(one[name]).tobytes() == np.asarray(other[name]).tobytes(), name
+
+
+# ---- derivatives -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("argument", range(4))
+def test_chained_segments_have_the_derivatives_of_differences(jax, chained, point, argument):
+    """In both modes, with respect to each argument alone, whose derivative is far above the tolerance."""
+    from jax.test_util import check_grads
+
+    def of_one(value):
+        return chained(*point[:argument], value, *point[argument + 1 :])
+
+    check_grads(of_one, (point[argument],), order=1, modes=["fwd", "rev"], eps=STEP, atol=1e-6, rtol=1e-5)
+    _, dots = jax.jvp(of_one, (point[argument],), (jax.numpy.ones_like(point[argument]),))
+    assert all(np.abs(dot).max() > 1e-3 for dot in dots)
+
+
+@pytest.mark.parametrize("made", [two_layers, scheduled, jet])
+def test_both_modes_agree_for_every_field_of_a_state(jax, layer, made):
+    """<bar, J dot> = <J^T bar, dot>, for the time too."""
+    simulation = Simulation(made(), precision="float64")
+    first = layer.state(simulation, simulation.run(5).last_state)
+    run, rng = partial(layer.step, simulation, steps=4), np.random.default_rng(0)
+    dot = {name: jax.numpy.asarray(rng.standard_normal(array.shape)) for name, array in first.items()}
+    end, forward = jax.jvp(run, (first,), (dot,))
+    bar = {name: jax.numpy.asarray(rng.standard_normal(array.shape)) for name, array in end.items()}
+    (back,) = jax.vjp(run, first)[1](bar)
+    for name in first:
+        one = {**{n: jax.numpy.zeros_like(a) for n, a in dot.items()}, name: dot[name]}
+        _, own = jax.jvp(run, (first,), (one,))
+        wanted = sum(float((bar[n] * own[n]).sum()) for n in own)
+        assert float((back[name] * dot[name]).sum()) == pytest.approx(wanted, rel=1e-9, abs=1e-9), name
+    assert float(forward["positions"].std()) > 0.0
+
+
+def test_compiled_scanned_and_recomputed_segments_have_the_same_gradient(jax, layer, simulation, point):
+    first = {**layer.state(simulation), "velocities": point[1]}
+
+    def loss(segments, gravity, viscosity):
+        parameters = {"gravity": gravity, "viscosity": STIFF * viscosity}
+        end = segments(lambda state: layer.step(simulation, state, parameters, steps=10), first)
+        return (end["positions"] ** 2).sum() + (end["velocities"] ** 2).sum()
+
+    def unrolled(advance, state):
+        return advance(advance(advance(state)))
+
+    def scanned(advance, state):
+        return jax.lax.scan(lambda before, _: (advance(before), None), state, None, length=3)[0]
+
+    def recomputed(advance, state):
+        return scanned(jax.checkpoint(advance), state)
+
+    wanted = jax.grad(partial(loss, unrolled), argnums=(0, 1))(*point[2:])
+    assert all(np.abs(one).max() > 1e-2 for one in wanted)
+    for segments in (unrolled, scanned, recomputed):
+        found = jax.jit(jax.grad(partial(loss, segments), argnums=(0, 1)))(*point[2:])
+        for one, other in zip(found, wanted, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+def test_residuals_that_are_gone_are_computed_again(jax, layer, simulation, point, monkeypatch):
+    """And none is left behind by a backward pass."""
+    first = layer.state(simulation)
+
+    def loss(viscosity):
+        state = {**first, "velocities": point[1]}
+        for _ in range(3):
+            state = layer.step(simulation, state, {"viscosity": STIFF * viscosity}, steps=5)
+        return (state["velocities"] ** 2).sum()
+
+    waiting = len(residuals.RESIDUALS)
+    wanted = jax.grad(loss)(point[3])
+    assert len(residuals.RESIDUALS) == waiting
+    monkeypatch.setattr(residuals, "MOST_KEPT", 0)
+    computed = []
+    monkeypatch.setattr(
+        residuals, "evaluate", lambda *a, own=residuals.evaluate, **k: computed.append(1) or own(*a, **k)
+    )
+    assert jax.grad(loss)(point[3]) == wanted and len(computed) == 3 + 2
+
+
+def test_a_gradient_is_taken_twice_from_one_forward_run(jax, problem, layer):
+    _, back = jax.vjp(lambda m: layer.value(problem)({"viscosity": m}), jax.numpy.asarray(10.0))
+    assert back(1.0) == back(1.0) != 0.0
+
+
+# ---- bits --------------------------------------------------------------------------------------------------------
+
+ESTIMATORS = [
+    None,
+    gradients.AdjointViscosity(0.2),
+    gradients.RandomizedSmoothing(samples=4),
+]
+
+
+@pytest.mark.parametrize("gradient", ESTIMATORS, ids=lambda one: type(one).__name__)
+def test_a_value_and_its_gradient_have_the_bits_of_the_problem(jax, layer, problem, gradient):
+    parameters = {name: jax.numpy.asarray(value) for name, value in POINT.items()}
+    wanted, wanted_gradient = problem.value_and_gradient(POINT, gradient)
+    loss = jax.value_and_grad(layer.value(problem, gradient))
+    for evaluate in (loss, jax.jit(loss)):
+        found, found_gradient = evaluate(parameters)
+        assert float(found) == wanted
+        same_bits(found_gradient, wanted_gradient)
+
+
+def test_forward_mode_of_a_value_is_the_tangent_of_the_problem(jax, layer, problem):
+    parameters = {name: jax.numpy.asarray(value) for name, value in POINT.items()}
+    along = {"gravity": jax.numpy.array([1.0, 0.5]), "viscosity": jax.numpy.asarray(3.0)}
+    _, found = jax.jvp(layer.value(problem), (parameters,), (along,))
+    assert float(found) == problem.tangent(POINT, along)
+    gradient = problem.value_and_gradient(POINT, gradients.AdjointViscosity(0.2))[1]
+    _, filtered = jax.jvp(layer.value(problem, gradients.AdjointViscosity(0.2)), (parameters,), (along,))
+    assert float(filtered) == pytest.approx(sum(float((gradient[n] * along[n]).sum()) for n in along), rel=1e-12)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("made", [scheduled, two_layers])
+def test_chained_steps_and_rollouts_have_the_bits_of_one_run(jax, layer, made, precision):
+    simulation = Simulation(made(), precision=precision)
+    wanted, state = simulation.run(12), layer.state(simulation)
+    states = jax.jit(lambda first: layer.rollout(simulation, first, steps=12, record_every=4))(state)
+    for steps in (1, 7, 4):
+        state = layer.step(simulation, state, steps=steps)
+    last = wanted.last_state
+    same_bits({name: state[name] for name in last.fields}, last.fields)
+    same_bits({name: states[name][-1] for name in last.fields}, last.fields)
+    np.testing.assert_array_equal(states["positions"][1], wanted.positions[4])
+    assert states["time"].shape == (4,) and float(state["time"]) == pytest.approx(last.clock.time, rel=1e-6)
+    again = layer.restart_state(simulation, state)
+    same_bits(again.fields, last.fields)
+    np.testing.assert_array_equal(simulation.run(3, state=again).positions[-1], simulation.run(15).positions[-1])
+
+
+def test_a_rollout_gives_each_segment_its_rows(jax, layer, simulation):
+    rows = np.array([0.0, -9.81]) + np.random.default_rng(1).standard_normal((6, 2))
+    wanted = simulation.run(6, {"gravity": rows})
+    found = layer.rollout(simulation, layer.state(simulation), {"gravity": jax.numpy.asarray(rows)}, 6, 2)
+    np.testing.assert_array_equal(found["positions"], wanted.positions[::2])
+
+
+def test_a_value_begins_at_a_state_and_has_its_gradient(jax, layer, simulation, problem):
+    state = layer.step(simulation, layer.state(simulation), steps=9)
+    parameters = {name: jax.numpy.asarray(value) for name, value in POINT.items()}
+    loss, (gradient, initial) = jax.value_and_grad(layer.value(problem), argnums=(0, 1))(parameters, state)
+    begun = problem.beginning_at(layer.restart_state(simulation, state))
+    wanted, wanted_gradient, wanted_initial = begun.value_and_gradients(POINT)
+    assert float(loss) == wanted
+    same_bits(gradient, wanted_gradient)
+    same_bits(initial, {name: wanted_initial[name] for name in initial})
+    along = {name: jax.numpy.ones_like(array) for name, array in state.items()}
+    _, forward = jax.jvp(lambda own: layer.value(problem)(parameters, own), (state,), (along,))
+    assert float(forward) == pytest.approx(sum(float(array.sum()) for array in initial.values()), rel=1e-12)
+
+
+# ---- maps --------------------------------------------------------------------------------------------------------
+
+
+def test_a_map_is_a_batch_with_the_bits_of_single_evaluations(jax, layer, simulation, problem):
+    gravities = jax.numpy.array([[0.4, -9.0], [0.0, -9.81], [-1.0, -8.0]])
+    first = {**layer.state(simulation), "velocities": jax.numpy.asarray(shear(simulation))}
+
+    def end(gravity):
+        state = layer.step(simulation, first, {"gravity": gravity}, steps=3)
+        return layer.step(simulation, state, {"gravity": gravity, "viscosity": 5.0}, steps=3)["positions"]
+
+    def loss(gravity):
+        return layer.value(problem)({"gravity": gravity, "viscosity": 9.0})
+
+    for function in (end, loss, jax.grad(loss), jax.grad(lambda g: (end(g) ** 2).sum())):
+        wanted = np.stack([function(gravity) for gravity in gravities])
+        assert np.abs(wanted).max() > 0.0
+        for mapped in (jax.vmap(function), jax.jit(jax.vmap(function))):
+            assert np.asarray(mapped(gravities)).tobytes() == wanted.tobytes()
+    nested = jax.vmap(jax.vmap(loss))(gravities.reshape(1, 3, 2))
+    assert nested.shape == (1, 3) and nested[0, 1] == loss(gravities[1])
+
+
+def test_constant_rows_of_a_map_are_no_rows_of_steps(jax, layer, simulation):
+    """There are as many maps as steps."""
+    gravities = np.array([[0.4, -9.0], [0.0, -9.81], [-1.0, -8.0]])
+    first = layer.state(simulation)
+    found = jax.vmap(lambda g: layer.step(simulation, first, {"gravity": g}, steps=3)["velocities"])(gravities)
+    wanted = [simulation.run(3, {"gravity": gravity}).last_state["velocities"] for gravity in gravities]
+    np.testing.assert_array_equal(found, wanted)
+
+
+def test_an_estimator_without_batches_is_mapped_one_by_one(jax, layer, problem):
+    estimator = gradients.RandomizedSmoothing(samples=4)
+    loss = layer.value(problem, estimator)
+    viscosities = jax.numpy.array([10.0, 12.0])
+    found = jax.vmap(jax.grad(lambda m: loss({"viscosity": m})))(viscosities)
+    wanted = [problem.value_and_gradient({"viscosity": float(m)}, estimator)[1]["viscosity"] for m in viscosities]
+    np.testing.assert_array_equal(found, wanted)
+
+
+def test_jacobians_by_both_modes_agree_and_are_mapped(jax, layer, simulation):
+    first = {**layer.state(simulation), "velocities": jax.numpy.asarray(shear(simulation))}
+
+    def corner(parameters):
+        return layer.step(simulation, first, parameters, steps=1)["velocities"][0]
+
+    def check(point, mapped):
+        back, forward = mapped(jax.jacrev(corner))(point), mapped(jax.jacfwd(corner))(point)
+        for name in point:
+            np.testing.assert_allclose(back[name], forward[name], rtol=1e-8, atol=1e-13)
+            assert np.abs(forward[name]).max() > 1e-5
+        return forward
+
+    one = {"gravity": jax.numpy.array([0.4, -9.0]), "viscosity": jax.numpy.asarray(14.0)}
+    several = {"gravity": jax.numpy.array([[0.4, -9.0], [1.0, -9.0]]), "viscosity": jax.numpy.array([14.0, 3.0])}
+    alone, both = check(one, lambda f: f), check(several, jax.vmap)
+    for name in one:
+        np.testing.assert_array_equal(both[name][0], alone[name])
+    of_all = jax.jacrev(lambda points: jax.vmap(corner)(points))(several)
+    np.testing.assert_allclose(of_all["viscosity"][1, ..., 1], both["viscosity"][1], rtol=1e-8, atol=1e-13)
+
+
+def test_a_batch_of_a_user_has_parameters_in_all_shapes(jax, layer, simulation):
+    problem = matched(Simulation(sheared(), precision="float64", batch=2))
+    gravity = np.array([[[0.4, -9.0]], [[0.0, -9.81]]])
+    losses, wanted = problem.value_and_gradient({"gravity": gravity, "viscosity": 9.0})
+    loss = layer.value(problem)
+    found, back = jax.vjp(lambda g, m: loss({"gravity": g, "viscosity": m}), jax.numpy.asarray(gravity), 9.0)
+    np.testing.assert_array_equal(found, losses)
+    of_gravity, of_viscosity = back(jax.numpy.array([1.0, 2.0]))
+    np.testing.assert_array_equal(of_gravity, wanted["gravity"] * np.array([1.0, 2.0])[:, None, None])
+    assert float(of_viscosity) == pytest.approx(wanted["viscosity"] @ [1.0, 2.0], rel=1e-14)
+    batch = problem.simulation
+    ends = layer.step(batch, layer.state(batch), {"gravity": jax.numpy.asarray(gravity)}, steps=3)
+    assert ends["positions"].shape == (2, 64, 2) and ends["time"].shape == (2,)
+    with pytest.raises(InputError, match="is a batch of 2 cannot be mapped"):
+        jax.vmap(lambda m: loss({"viscosity": m}))(jax.numpy.array([1.0, 2.0]))
+
+
+# ---- searches, threads, what is looked at ------------------------------------------------------------------------
+
+
+def test_a_descent_finds_the_gravity_that_made_a_target(jax, layer, simulation):
+    """As optimisers of other libraries do: a compiled step of a loss and its gradient, again and again."""
+    target = simulation.run(20, {"gravity": [1.0, -9.0]}).positions[-1]
+    loss = layer.value(cortado.Problem(simulation, 20, cortado.losses.FinalPositions(target)))
+
+    @jax.jit
+    def descend(parameters):
+        value, gradient = jax.value_and_grad(loss)(parameters)
+        return value, {name: parameters[name] - 8e5 * gradient[name] for name in parameters}
+
+    parameters = {"gravity": jax.numpy.array([0.0, -9.81])}
+    losses = []
+    for _ in range(20):
+        value, parameters = descend(parameters)
+        losses.append(float(value))
+    np.testing.assert_allclose(parameters["gravity"], [1.0, -9.0], atol=0.05)
+    assert losses[-1] < 1e-2 * losses[0]
+
+
+def test_optax_and_optimistix_search(jax, layer, simulation):
+    optax, optimistix = pytest.importorskip("optax"), pytest.importorskip("optimistix")
+    target = simulation.run(10, {"gravity": [1.0, -9.0]}).positions[-1]
+    loss = layer.value(cortado.Problem(simulation, 10, cortado.losses.FinalPositions(target)))
+    start = {"gravity": jax.numpy.array([0.0, -9.81])}
+    optimiser, parameters = optax.adam(0.1), start
+    state = optimiser.init(parameters)
+    for _ in range(30):
+        updates, state = optimiser.update(jax.grad(loss)(parameters), state)
+        parameters = optax.apply_updates(parameters, updates)
+    assert loss(parameters) < 0.1 * loss(start)
+    solver = optimistix.BFGS(rtol=1e-6, atol=1e-9)
+    found = optimistix.minimise(lambda own, _: 1e4 * loss(own), solver, start, max_steps=20, throw=False)
+    assert loss(found.value) < 1e-3 * loss(start)
+
+
+def test_threads_that_share_a_layer_get_the_bits_of_one(jax, layer, simulation, problem):
+    loss = jax.jit(jax.value_and_grad(lambda m: layer.value(problem)({"viscosity": m})))
+    points = [jax.numpy.asarray(value) for value in (3.0, 8.0, 12.0, 17.0)]
+    wanted = [loss(one) for one in points]
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(loss, points * 3)) == wanted * 3
+
+
+@pytest.mark.parametrize(
+    "what", ["density", "pressure", "vorticity", "wall_force", sensors.PressureProbe([0.2, 0.1])], ids=str
+)
+def test_what_is_measured_has_the_derivatives_of_differences(jax, layer, simulation, what):
+    from jax.test_util import check_grads
+
+    state = layer.state(simulation, simulation.step(simulation.state(), {"gravity": [0.4, -9.0]}, steps=20))
+    reading = layer.measure(simulation, what)
+
+    def read(positions, velocities, gravity):
+        return reading({**state, "positions": positions, "velocities": velocities}, {"gravity": gravity})
+
+    arguments = state["positions"], state["velocities"], jax.numpy.array([0.4, -9.0])
+    check_grads(read, arguments, order=1, modes=["fwd", "rev"], eps=1e-7)
+    gradient = jax.grad(lambda *own: (read(*own) ** 2).sum(), argnums=(0, 1, 2))(*arguments)
+    assert max(np.abs(one).max() for one in gradient) > 1.0
+    if isinstance(what, str):
+        wanted = simulation.quantity(what, layer.restart_state(simulation, state), {"gravity": [0.4, -9.0]})
+        np.testing.assert_array_equal(read(*arguments), wanted)
+
+
+def test_readings_are_gone_back_through_in_any_order(jax, layer):
+    """With the clock and the schedule of each."""
+    simulation = Simulation(scheduled(), precision="float64")
+    early, late = (layer.state(simulation, simulation.run(steps).last_state) for steps in (5, 22))
+    reading = layer.measure(simulation, "pressure")
+
+    def gradient(*states):
+        return jax.grad(lambda own: sum((reading(state) ** 2).sum() for state in own))(states)
+
+    both, alone = gradient(early, late), (*gradient(early), *gradient(late))
+    for one, other in zip(both, alone, strict=True):
+        same_bits(one, other)
+    assert alone[0]["time"] != 0.0 != alone[1]["time"]
+
+
+def test_a_picture_has_the_derivatives_of_differences_in_reverse_mode(jax, layer):
+    from jax.test_util import check_grads
+
+    simulation = Simulation(two_layers(), precision="float64")
+    renderer, state = simulation.renderer(resolution=(9, 8)), layer.state(simulation)
+    colours = jax.numpy.array([[0.1, 0.4, 0.9], [0.7, 0.2, 0.1]])
+    draw = partial(layer.picture, renderer)
+    arguments = state["positions"], state["mass_fractions"], colours
+    assert np.asarray(draw(*arguments)).tobytes() == renderer.render(*map(np.asarray, arguments)).tobytes()
+    check_grads(draw, arguments, order=1, modes=["rev"], eps=1e-6)
+
+    def through_steps(gravity):
+        end = layer.step(simulation, state, {"gravity": gravity}, steps=3)
+        return (draw(end["positions"], end["mass_fractions"], colours) ** 2).sum()
+
+    gradient = jax.jit(jax.grad(through_steps))(jax.numpy.array([1.0, -9.0, 0.5]))
+    eager = jax.grad(through_steps)(jax.numpy.array([1.0, -9.0, 0.5]))
+    assert np.abs(gradient).max() > 0.0 and np.asarray(gradient).tobytes() == np.asarray(eager).tobytes()
+    other = renderer.render(np.asarray(arguments[0]) + 0.01, *map(np.asarray, arguments[1:]))
+    assert jax.vmap(draw, in_axes=(0, None, None))(arguments[0] + jax.numpy.array([[[0.0]], [[0.01]]]), *arguments[1:])[
+        1
+    ].tobytes() == pytest.approx(other.tobytes())
+    with pytest.raises(InputError, match="reverse mode only"):
+        jax.jvp(draw, arguments, arguments)
+
+
+# ---- bad uses ----------------------------------------------------------------------------------------------------
+
+
+def without(table, name):
+    return {key: value for key, value in table.items() if key != name}
+
+
+BAD_STATES = {
+    "no table": (lambda s: 3.0, "state is 3.0, but must be given by name"),
+    "left out": (lambda s: None, "state is left out, but must have positions"),
+    "without a field": (lambda s: without(s, "velocities"), "state has .*, but must have positions, velocities"),
+    "without its time": (lambda s: without(s, "time"), "state has .*, but must have .* time"),
+    "another field": (lambda s: {**s, "colour": s["time"]}, "state has .*colour.*, but must have positions"),
+    "another shape": (lambda s: {**s, "positions": s["positions"][1:]}, r"state positions has shape \(63, 2\), but"),
+    "transposed": (lambda s: {**s, "velocities": s["velocities"].T}, r"state velocities has shape \(2, 64\), but"),
+    "float32": (lambda s: {**s, "positions": s["positions"].astype("float32")}, "state positions is float32, but"),
+    "complex": (lambda s: {**s, "positions": s["positions"] + 0j}, "state positions is an array of complex128, but"),
+    "truth values": (lambda s: {**s, "positions": s["positions"] > 0}, "state positions is an array of bool, but"),
+    "text": (lambda s: {**s, "positions": "here"}, "state positions is 'here', but must be a number or an array"),
+    "nothing": (lambda s: {**s, "positions": None}, "state positions is None, but must be a number or an array"),
+    "NaN": (lambda s: {**s, "positions": s["positions"] * np.nan}, "state positions has a value that is not finite"),
+    "infinite": (lambda s: {**s, "velocities": s["velocities"] + np.inf}, "state velocities has a value that is not"),
+    "huge": (lambda s: {**s, "velocities": s["velocities"] + 1e60}, "state velocities has a value of size 1e"),
+    "a negative time": (lambda s: {**s, "time": s["time"] - 1.0}, "state clock is at -1.0 s, but must be"),
+    "NaN as time": (lambda s: {**s, "time": s["time"] * np.nan}, "state clock is at nan s, but must be"),
+    "another fluid": (lambda s: {**s, "reference_density": 2.0 * s["reference_density"]}, "state reference_density is"),
+    "outside": (lambda s: {**s, "positions": s["positions"] + 5.0}, "outside the container"),
+    "another spacing": (lambda s: {**s, "positions": 0.5 * s["positions"]}, "spacings of 0.05 m from the nearest"),
+    "at one place": (
+        lambda s: {**s, "positions": s["positions"].at[3].set(s["positions"][5])},
+        "particles 3 and 5 at one place",
+    ),
+}
+BAD_PARAMETERS = {
+    "no table": (lambda: [1.0], r"parameters is \[1.0\], but must be given by name"),
+    "unknown": (lambda: {"gravty": np.zeros(2)}, "parameter 'gravty' is unknown, but must be one of"),
+    "of another scene": (lambda: {"surface_tension": 1.0}, "parameter surface_tension is given, but must be left out"),
+    "another shape": (lambda: {"gravity": np.zeros(3)}, r"parameter gravity has shape \(3,\), but must be \(2,\)"),
+    "another number of steps": (lambda: {"gravity": np.zeros((4, 2))}, r"parameter gravity has shape \(4, 2\), but"),
+    "first values": (lambda: {"initial_velocities": np.zeros((64, 2))}, "must be left out with a state"),
+    "negative": (lambda: {"viscosity": -1.0}, "parameter viscosity is -1.0, but must be at least 0"),
+    "NaN": (lambda: {"viscosity": np.nan}, "parameter viscosity has a value that is not finite"),
+    "text": (lambda: {"viscosity": "thick"}, "parameter viscosity is 'thick', but must be a number"),
+    "complex": (lambda: {"viscosity": 1j}, "parameter viscosity is 1j, but must be a number"),
+    "nothing": (lambda: {"viscosity": None}, "parameter viscosity is None, but must be a number"),
+    "both": (lambda: {"tilt": [3.0], "gravity": [0.0, 1.0]}, "gravity is given, but must be left out, as the tilt"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_STATES)
+def test_a_bad_state_is_refused_in_a_sentence(layer, simulation, problem, name):
+    change, words = BAD_STATES[name]
+    bad = change(layer.state(simulation))
+    for use in (
+        lambda: layer.step(simulation, bad, steps=2),
+        lambda: layer.rollout(simulation, bad, steps=2),
+        lambda: layer.measure(simulation, "density")(bad),
+        *([] if bad is None else [lambda: layer.value(problem)({}, bad)]),
+    ):
+        with pytest.raises(InputError, match=words) as caught:
+            use()
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", BAD_PARAMETERS)
+def test_bad_parameters_are_refused_in_a_sentence(layer, simulation, problem, name):
+    make, words = BAD_PARAMETERS[name]
+    state = layer.state(simulation)
+    for use in (
+        lambda: layer.step(simulation, state, make(), steps=2),
+        lambda: layer.value(problem)(make(), state),
+        *([] if name == "first values" else [lambda: layer.value(problem)(make())]),
+    ):
+        with pytest.raises(InputError, match=words) as caught:
+            use()
+        assert "\n" not in str(caught.value)
+
+
+def test_other_bad_uses_are_refused_in_a_sentence(jax, layer, simulation, problem):
+    state = layer.state(simulation)
+    other = layer.state(Simulation(plane(discretisation={"spacing": 0.04}), precision="float64"))
+    space = layer.state(Simulation(scene(), precision="float64"))
+    gentle = gradients.RandomizedSmoothing(samples=4)
+    single = jax.numpy.float32(2.0)
+    for use, words in [
+        (lambda: layer.step(simulation, other), "state positions has shape"),
+        (lambda: layer.step(simulation, space), "state positions has shape"),
+        (lambda: layer.step(simulation, state, steps=0), "steps is 0, but must be a whole number of at least 1"),
+        (lambda: layer.step(simulation, state, steps=1.5), "steps is 1.5, but must be a whole number"),
+        (lambda: layer.step(problem, state), "simulation is .*, but must be a cortado.Simulation"),
+        (lambda: layer.step(simulation, state, {"viscosity": single}), "parameter viscosity is float32, but must be"),
+        (lambda: layer.rollout(simulation, state, steps=5, record_every=2), "record_every is 2, but must divide the 5"),
+        (lambda: layer.value(simulation), "problem is Simulation.*, but must be a cortado.Problem"),
+        (lambda: layer.value(problem, gradients.Exact), "estimator is .*, but must be an object such as"),
+        (lambda: layer.value(problem, gentle)({}, state), "gradient is a RandomizedSmoothing, but must go back"),
+        (lambda: layer.measure(simulation, "colour"), "quantity is 'colour', but must be one of density"),
+        (lambda: layer.measure(simulation, 3), "sensor is 3, but must be a sensor"),
+        (lambda: layer.measure(Simulation(plane(), batch=2), "density"), "simulation is a batch of 2, but must be"),
+        (lambda: layer.picture(simulation, state["positions"]), "renderer is .*, but must be one such as"),
+        (lambda: layer.picture(None, state["positions"]), "renderer is None, but must be one such as"),
+        (lambda: layer.restart_state(simulation, other), "state positions has shape"),
+        (lambda: layer.state(simulation, "last"), "state is 'last', but must be a RestartState"),
+    ]:
+        with pytest.raises(InputError, match=words) as caught:
+            use()
+        assert "\n" not in str(caught.value)
+
+
+def test_second_derivatives_are_refused_in_a_sentence(jax, layer, problem):
+    loss = layer.value(problem)
+    for second in (jax.hessian, lambda f: jax.grad(jax.grad(f)), lambda f: jax.jacfwd(jax.jacfwd(f))):
+        with pytest.raises(InputError, match="first ones only"):
+            second(lambda m: loss({"viscosity": m}))(jax.numpy.asarray(10.0))
+
+
+def test_within_a_compiled_program_the_error_has_the_sentence(jax, layer, simulation, problem, capfd):
+    loss = jax.jit(lambda m: layer.value(problem)({"viscosity": m}))
+    with pytest.raises(Exception, match=r"InputError: parameter viscosity is -1\.0, but must be at least 0"):
+        loss(jax.numpy.asarray(-1.0)).block_until_ready()
+    fast = jax.numpy.full((64, 2), 400.0)
+    run = jax.jit(lambda v: layer.step(simulation, {**layer.state(simulation), "velocities": v}, steps=2)["positions"])
+    with pytest.raises(Exception, match="DivergedError: The simulation diverged in step 1"):
+        run(fast).block_until_ready()
+    with pytest.raises(InputError, match=r"parameter gravity has shape \(3,\)"):
+        jax.jit(lambda g: layer.value(problem)({"gravity": g}))(jax.numpy.zeros(3))
+    assert loss(jax.numpy.asarray(10.0)) > 0.0
+
+
+def test_float64_needs_a_jax_that_has_it(jax, layer, problem):
+    single = Simulation(sheared())
+    jax.config.update("jax_enable_x64", False)
+    try:
+        end = layer.step(single, layer.state(single), {"viscosity": 3.0})
+        assert end["positions"].dtype == end["time"].dtype == "float32"
+        assert jax.grad(lambda m: layer.value(matched(single))({"viscosity": m}))(3.0) != 0.0
+        for use in (lambda: layer.state(problem.simulation), lambda: layer.value(problem)({"viscosity": 3.0})):
+            with pytest.raises(InputError, match=r"float64, but must be float32 where .*\(\"jax_enable_x64\", True\)"):
+                use()
+    finally:
+        jax.config.update("jax_enable_x64", True)
+
+
+def test_what_layers_keep_is_bounded(jax, layer, simulation, problem):
+    loss = layer.value(problem)
+    for size in (1, 2, 3, 4):
+        jax.vmap(lambda m: loss({"viscosity": m}))(jax.numpy.full(size, 10.0))
+        layer.step(simulation, layer.state(simulation), steps=size)
+    (own,) = {cell.cell_contents for cell in loss.__closure__ if hasattr(cell.cell_contents, "_batched")}
+    assert len(own._batched) == KEPT and len(simulation.__dict__["_layers"]) <= 4

@@ -1,0 +1,523 @@
+"""Meshes as solids: distances against closed forms, and a sentence for each file that is none."""
+
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from bad_scenes import assert_one_sentence
+from cortado.discretise.solids.inside_points import points_inside
+from cortado.discretise.solids.mesh import Mesh
+from cortado.discretise.solids.mesh_files import mesh_in_file, read_mesh, read_triangles
+from cortado.discretise.solids.mesh_fit import thickness_of
+from cortado.discretise.solids.solid import Box, Hollow, Placed, Round, Union
+from cortado.discretise.solids.surface_points import surface_feet, surface_points
+from cortado.errors import CortadoWarning, InputError
+
+MAJOR, MINOR = 0.25, 0.1
+SPACING, SUPPORT = 0.05, 0.1
+ROOM = (np.zeros(3), np.ones(3))
+TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+
+
+def solid(mesh: trimesh.Trimesh) -> Mesh:
+    return Mesh(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64))
+
+
+def torus(around: int = 90, across: int = 40) -> trimesh.Trimesh:
+    return trimesh.creation.torus(MAJOR, MINOR, major_sections=around, minor_sections=across)
+
+
+def from_torus(points: np.ndarray, minor: float = MINOR) -> np.ndarray:
+    return np.hypot(np.hypot(points[:, 0], points[:, 1]) - MAJOR, points[:, 2]) - minor
+
+
+def box(lower, upper) -> trimesh.Trimesh:
+    return trimesh.creation.box(bounds=[lower, upper])
+
+
+def joined(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
+    return trimesh.util.concatenate(meshes)
+
+
+def turned_over(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, np.asarray(mesh.faces)[:, ::-1], process=False)
+
+
+def written(folder: Path, mesh: trimesh.Trimesh, name: str = "mesh.stl") -> str:
+    mesh.export(folder / name)
+    return str(folder / name)
+
+
+def read(path: str, scale: float = 1.0, container=ROOM, support: float = SUPPORT) -> Mesh:
+    return read_mesh(path, scale, SPACING, support, container)
+
+
+def quietly_read(path: str) -> Mesh:
+    """Without a warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return read(path, support=SPACING)
+
+
+def cloud(count: int = 4000, reach: float = 0.6) -> np.ndarray:
+    return np.random.default_rng(5).uniform(-reach, reach, size=(count, 3))
+
+
+# ---- good ones ---------------------------------------------------------------------------------------------------
+
+
+def test_a_box_of_triangles_is_a_box():
+    half, points = np.array([0.2, 0.3, 0.1]), cloud()
+    mesh, same = solid(box(-half, half)), Box(half)
+    position = np.array([0.1, -0.2, 0.05])
+    for one, other in ((mesh, same), (Placed(mesh, position, TURN), Placed(same, position, TURN))):
+        np.testing.assert_allclose(one.distance(points), other.distance(points), atol=1e-15)
+        np.testing.assert_allclose(one.nearest(points), other.nearest(points), atol=1e-15)
+        np.testing.assert_allclose(one.outward(points), other.outward(points), atol=1e-10)
+        np.testing.assert_allclose(one.extent(), other.extent(), atol=1e-15)
+    inside = np.abs(points) < half
+    assert 50 < inside.all(axis=1).sum() < 3950
+    np.testing.assert_array_equal(mesh.holds(points), inside.all(axis=1))
+
+
+@pytest.mark.parametrize(("subdivisions", "error"), [(2, 1.7e-2), (4, 1.1e-3)])
+def test_a_ball_of_triangles_is_within_its_sphere(subdivisions, error):
+    points, sphere = cloud(), Round(np.zeros(3), 0.4)
+    found = solid(trimesh.creation.icosphere(subdivisions, 0.4)).distance(points) - sphere.distance(points)
+    assert found.min() > -1e-12 and error / 4 < found.max() < error
+
+
+def test_a_torus_has_its_distances_nearest_points_and_hole():
+    points, mesh = cloud(), solid(torus(500, 200))
+    exact = from_torus(points)
+    np.testing.assert_allclose(mesh.distance(points), exact, atol=3e-5)
+    assert mesh.distance(np.zeros((1, 3)))[0] > 0.14
+    feet = mesh.nearest(points)
+    np.testing.assert_allclose(from_torus(feet), 0.0, atol=3e-5)
+    np.testing.assert_allclose(np.linalg.norm(points - feet, axis=1), np.abs(mesh.distance(points)), atol=1e-15)
+    bounded = mesh.distance_up_to(points, 0.05)
+    np.testing.assert_array_equal(bounded, np.clip(mesh.distance(points), -0.05, 0.05))
+
+
+def test_distances_are_those_to_the_nearest_of_all_triangles():
+    """Found one by one, by minimising over the corners' weights on a fine grid."""
+    mesh, points = solid(trimesh.creation.icosphere(1, 0.4)), cloud(40)
+    u, v = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, 81), np.linspace(0, 1, 81)))
+    weights = np.stack([1 - u - v, u, v], axis=1)[u + v <= 1.0 + 1e-12]
+    places = np.einsum("wc,kcd->kwd", weights, mesh.corners).reshape(-1, 3)
+    grid = cKDTree(places).query(points)[0]
+    away = np.abs(mesh.distance(points))
+    assert (away <= grid + 1e-15).all() and (grid < away + 2e-4 / np.maximum(away, 0.02)).all()
+
+
+def test_points_beside_corners_edges_and_columns_of_vertices_have_the_right_sign():
+    """Rays that find what is inside go through vertices and along edges here."""
+    mesh = solid(joined(box([-0.2] * 3, [0.2] * 3), trimesh.creation.icosphere(3, 0.1).apply_translation([0.5, 0, 0])))
+    axis = np.linspace(-0.4, 0.7, 45)
+    points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    exact = np.minimum(
+        Box(np.full(3, 0.2)).distance(points), np.linalg.norm(points - np.array([0.5, 0, 0]), axis=1) - 0.1
+    )
+    clear = np.abs(exact) > 1e-3
+    np.testing.assert_array_equal(mesh.holds(points)[clear], exact[clear] < 0.0)
+
+
+def test_points_in_the_planes_of_upright_faces_have_the_right_sign():
+    """Seen along a ray these faces are lines, and round-off may find a ray within them, wherever it begins."""
+    angles = 2.0 * np.pi * np.arange(30) / 30
+    rim = 0.3 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    upright = trimesh.creation.extrude_triangulation(
+        np.append(rim, [[0.0, 0.0]], axis=0), [[k, (k + 1) % 30, 30] for k in range(30)], 0.5
+    )
+    finer, edges, random = upright.subdivide().subdivide(), np.roll(rim, -1, axis=0) - rim, np.random.default_rng(3)
+    vertices = np.array(finer.vertices)
+    for start, edge in zip(rim, edges, strict=True):  # moved along the upright faces that they are in
+        along = (vertices[:, :2] - start) @ edge / (edge @ edge)
+        off = np.linalg.norm(vertices[:, :2] - start - along[:, None] * edge, axis=1)
+        moved = (off < 1e-9) & (along > 1e-3) & (along < 1.0 - 1e-3)
+        vertices[moved, :2] += random.uniform(-0.1, 0.1, size=(moved.sum(), 1)) * edge
+    mesh = Mesh(vertices, np.array(finer.faces, dtype=np.int64))
+    points = (rim + random.uniform(size=(300, 30, 1)) * edges).reshape(-1, 2)
+    for height in (-2.0, -0.1, 0.6, 2.0):
+        assert not mesh.holds(np.column_stack([points, np.full(len(points), height)])).any()
+
+
+def test_the_number_of_cores_changes_no_bit(monkeypatch):
+    mesh, points, found = solid(torus()), cloud(30_000), []
+    for cores in ("1", "2"):
+        monkeypatch.setenv("CORTADO_CORES", cores)
+        found.append((mesh.distance(points), mesh.nearest(points), surface_points(mesh, 0.02, 0.0).points))
+    for one, other in zip(*found, strict=True):
+        assert one.tobytes() == other.tobytes()
+
+
+def cup_with_a_handle() -> trimesh.Trimesh:
+    """Up along z, 0.3 high and 0.2 in radius; its walls are 0.06 thick, and its handle is three bars that overlap."""
+    profile = [[0.0, 0.0], [0.2, 0.0], [0.2, 0.3], [0.14, 0.3], [0.14, 0.06], [0.0, 0.06]]
+    bars = [box([0.17, -0.03, z], [0.4, 0.03, z + 0.06]) for z in (0.05, 0.2)]
+    return joined(trimesh.creation.revolve(profile, sections=64), *bars, box([0.34, -0.03, 0.05], [0.4, 0.03, 0.26]))
+
+
+def test_a_cup_with_a_handle_is_one_solid(tmp_path):
+    cup = read(written(tmp_path, cup_with_a_handle()), support=SPACING)
+    points = np.array(
+        [
+            [0.0, 0.0, 0.2],  # in the cup
+            [0.17, 0.0, 0.1],  # in its wall, where the handle is too
+            [0.0, -0.17, 0.2],
+            [0.3, 0.0, 0.155],  # in the hole of the handle
+            [0.37, 0.0, 0.155],  # in the handle
+            [0.0, 0.0, 0.03],
+        ]
+    )
+    np.testing.assert_array_equal(cup.holds(points), [False, True, True, False, True, True])
+    np.testing.assert_allclose(cup.distance(points[[0, 3, 4]]), [0.14, 0.04, -0.03], atol=2e-3)
+    feet, _ = cup.own_feet(0.01)
+    assert cup.distance(feet).min() > -1e-6  # none where bars go through the wall
+    assert len(cup.parts) == 2  # the upright bar does not reach the cup
+
+
+def test_boxes_that_overlap_or_touch_are_their_union(tmp_path):
+    first, second = ([-0.3, -0.1, -0.1], [0.2, 0.1, 0.1]), ([0.05, -0.3, -0.2], [0.25, 0.2, 0.05])
+    beside = ([0.2, -0.1, -0.1], [0.4, 0.05, 0.05])
+    points = cloud()
+    plate, bar = ([-0.4, -0.05, -0.4], [0.4, 0.05, 0.4]), ([-0.04, -0.5, -0.04], [0.04, 0.5, 0.04])
+    for ends in ((first, second), (first, beside), (plate, bar)):
+        mesh = quietly_read(written(tmp_path, joined(*(box(*end) for end in ends))))
+        halves = [(np.array(end[1]) - end[0]) / 2 for end in ends]
+        boxes = [Placed(Box(half), end[0] + half, np.eye(3)) for half, end in zip(halves, np.array(ends), strict=True)]
+        np.testing.assert_allclose(mesh.distance(points), Union(boxes).distance(points), atol=1e-7)
+        np.testing.assert_allclose(mesh.nearest(points), Union(boxes).nearest(points), atol=1e-7)
+
+
+def test_where_bodies_touch_there_is_no_surface(tmp_path):
+    first, second = box([-0.3, -0.1, -0.1], [0.2, 0.1, 0.1]), box([0.2, -0.1, -0.1], [0.5, 0.1, 0.1])
+    across = trimesh.Trimesh(second.vertices * [-1, 1, 1] + [0.7, 0, 0], np.asarray(second.faces)[:, ::-1])
+    for other in (second, across):  # whose triangles meet those of the first, or cross them
+        mesh = quietly_read(written(tmp_path, joined(first, other)))
+        feet, _ = mesh.own_feet(0.01)
+        assert not (np.abs(feet - [0.2, 0.0, 0.0]) < [1e-3, 0.099, 0.099]).all(axis=1).any()
+        assert len(feet) == pytest.approx(4 * 0.8 * 0.2 / 0.01**2 + 2 * 0.2**2 / 0.01**2, rel=0.01)
+        assert mesh.holds(np.array([[0.1, 0.0, 0.0], [0.3, 0.0, 0.0]])).all()
+
+
+def test_a_cavity_is_outside_and_what_is_in_it_inside(tmp_path):
+    shell = joined(trimesh.creation.icosphere(3, 0.5), turned_over(trimesh.creation.icosphere(3, 0.35)))
+    mesh = quietly_read(written(tmp_path, joined(shell, trimesh.creation.icosphere(3, 0.15))))
+    assert not mesh.parts
+    along = np.zeros((3, 3))
+    along[:, 0] = [0.0, 0.25, 0.42]
+    np.testing.assert_array_equal(mesh.holds(along), [True, False, True])
+
+
+def test_a_body_within_another_is_told(tmp_path):
+    path = written(tmp_path, joined(trimesh.creation.icosphere(3, 0.5), trimesh.creation.icosphere(3, 0.3)))
+    with pytest.warns(CortadoWarning, match="lies inside another one") as told:
+        mesh = read(path)
+    assert_one_sentence(str(told[0].message))
+    np.testing.assert_allclose(mesh.distance(np.zeros((1, 3))), -0.5, atol=5e-3)
+
+
+def crossed_tube() -> trimesh.Trimesh:
+    """A tube along a figure of eight, whose two branches go through one another in the middle."""
+    t, angle = np.linspace(0, 2 * np.pi, 160, endpoint=False), np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    path = 0.4 * np.stack([np.sin(t), 0.5 * np.sin(2 * t), 0 * t], axis=1)
+    along = np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0)
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    aside = np.stack([-along[:, 1], along[:, 0], 0 * t], axis=1)
+    up = np.broadcast_to([0.0, 0.0, 1.0], aside.shape)
+    circle = np.cos(angle)[:, None, None] * aside + np.sin(angle)[:, None, None] * up
+    numbers = np.arange(circle.size // 3).reshape(24, 160)
+    corners = [np.roll(numbers, (-i, -j), axis=(0, 1)) for i, j in ((0, 0), (0, 1), (1, 1), (1, 0))]
+    quads = np.stack(corners, axis=-1).reshape(-1, 4)
+    mesh = trimesh.Trimesh((path + 0.07 * circle).reshape(-1, 3), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
+    return mesh if mesh.volume > 0 else turned_over(mesh)
+
+
+def test_a_mesh_that_crosses_itself_is_told_and_holds_what_it_goes_around_twice(tmp_path):
+    path = written(tmp_path, crossed_tube())
+    with pytest.warns(CortadoWarning, match="crosses itself, for example at") as told:
+        mesh = read(path)
+    assert_one_sentence(str(told[0].message))
+    assert mesh.holds(np.zeros((1, 3))).all()
+    feet, _ = mesh.own_feet(0.01)
+    assert np.linalg.norm(feet, axis=1).min() > 0.06  # none in the middle, where the branches go through one another
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a.STL", "ascii.stl", "a.obj", "a.ply", "ascii.ply", "a.glb"])
+def test_all_kinds_of_files_hold_the_same(tmp_path, name):
+    mesh = torus(20, 12)
+    kinds = {"ascii.stl": {"file_type": "stl_ascii"}, "ascii.ply": {"encoding": "ascii"}, "a.STL": {"file_type": "stl"}}
+    mesh.export(tmp_path / name, **kinds.get(name, {}))
+    found = mesh_in_file(str(tmp_path / name))
+    assert found.mesh.triangles.shape == mesh.faces.shape and found.left_out == 0 and not found.notes
+    points = cloud(500)
+    np.testing.assert_allclose(found.mesh.distance(points), solid(mesh).distance(points), atol=1e-6)
+
+
+def test_bodies_are_where_the_scene_of_a_file_puts_them(tmp_path):
+    mirrored = np.diag([-2.0, 1.0, 1.0, 1.0])
+    mirrored[:3, 3] = [5.0, 0.0, 0.0]
+    scene = trimesh.Scene([trimesh.creation.icosphere(3, 0.5)])
+    scene.add_geometry(box([0, 0, 0], [1, 2, 3]), transform=mirrored)
+    scene.export(str(tmp_path / "two.glb"))
+    for name, content in trimesh.exchange.gltf.export_gltf(scene).items():
+        (tmp_path / name).write_bytes(content)
+    for name in ("two.glb", "model.gltf"):
+        found = mesh_in_file(str(tmp_path / name)).mesh
+        np.testing.assert_allclose(found.extent(), [[-0.5, -0.5, -0.5], [5.0, 2.0, 3.0]], atol=1e-6)
+        inside = found.holds(np.array([[4.0, 1.0, 1.0], [0.0, 0.0, 0.0], [5.5, 1.0, 1.0], [2.0, 1.0, 1.0]]))
+        np.testing.assert_array_equal(inside, [True, True, False, False])
+
+
+def test_vertices_that_float32_rounds_apart_are_one(tmp_path):
+    ball = trimesh.creation.icosphere(3, 0.4)
+    corners = np.array(ball.vertices)[ball.faces].reshape(-1, 3)
+    loose = corners + np.random.default_rng(1).uniform(-1e-8, 1e-8, size=corners.shape)
+    assert len(np.unique(loose, axis=0)) > 2 * len(ball.vertices)
+    path = written(tmp_path, trimesh.Trimesh(loose, np.arange(len(loose)).reshape(-1, 3), process=False), "loose.ply")
+    found = quietly_read(path)
+    assert found.vertices.shape == ball.vertices.shape
+
+
+def test_triangles_without_area_or_that_come_twice_are_left_out_and_counted(tmp_path):
+    ball = trimesh.creation.icosphere(2, 0.4)
+    faces = np.concatenate([ball.faces, ball.faces[:3], [[0, 0, 1], [5, 6, 5]]])
+    found = mesh_in_file(written(tmp_path, trimesh.Trimesh(ball.vertices, faces, process=False), "more.obj"))
+    assert found.left_out == 5 and len(found.mesh.triangles) == len(ball.faces)
+
+
+def test_a_mesh_is_scaled(tmp_path):
+    path = written(tmp_path, torus().apply_scale(1000.0))
+    np.testing.assert_allclose(read(path, 0.001).extent(), solid(torus()).extent(), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "volume"),
+    [(box([0.1, 0.2, 0.3], [0.6, 0.7, 0.5]), 0.05), (torus(), 2 * np.pi**2 * MAJOR * MINOR**2)],
+)
+def test_points_inside_are_on_the_lattice_from_the_lower_corner(mesh, volume):
+    found = points_inside(solid(mesh), 0.02)
+    cells = (found - solid(mesh).extent()[0]) / 0.02 - 0.5
+    np.testing.assert_allclose(cells, np.rint(cells), atol=1e-9)
+    assert len(found) * 0.02**3 == pytest.approx(volume, rel=1e-9 if len(mesh.faces) == 12 else 0.01)
+
+
+# ---- points of a surface -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["torus", "box", "ball"])
+@pytest.mark.parametrize("depth", [0.0, 0.5, -0.5])
+def test_points_of_a_surface_are_even(name, depth):
+    spacing = 0.025
+    makers = {"torus": torus(200, 80), "box": box([-0.2, -0.3, -0.1], [0.2, 0.3, 0.1])}
+    mesh = solid(makers[name] if name in makers else trimesh.creation.icosphere(5, 0.3))
+    found = surface_points(mesh, spacing, depth * spacing)
+    np.testing.assert_allclose(mesh.distance(found.points).min(), -max(depth, depth) * spacing, atol=0.3 * spacing)
+    if depth == 0.0:
+        assert found.shares.sum() * spacing**2 == pytest.approx(mesh.areas().sum(), rel=0.01)
+    nearest = cKDTree(found.points).query(found.points, k=2)[0][:, 1]
+    assert nearest.min() > 0.6 * spacing
+    feet, away = surface_feet(mesh, spacing / 5)
+    surface = feet - depth * spacing * away
+    surface = surface[np.abs(mesh.distance(surface) + depth * spacing) < 1e-3 * spacing]
+    assert cKDTree(found.points).query(surface)[0].max() < spacing
+    assert 0.85 < found.shares.mean() < 1.4
+
+
+def test_feet_stand_for_equal_areas_and_point_outwards():
+    mesh = solid(box([-0.2, -0.3, -0.1], [0.2, 0.3, 0.1]))
+    feet, outward = mesh.own_feet(0.01)
+    assert len(feet) == 8800
+    face = np.argmax(np.abs(outward), axis=1)
+    np.testing.assert_allclose(np.bincount(face) / 8800, np.array([0.24, 0.16, 0.48]) / 0.88, atol=1e-3)
+    np.testing.assert_allclose(mesh.distance(feet + 0.01 * outward), 0.01, atol=1e-12)
+    np.testing.assert_allclose(Hollow(mesh).own_feet(0.01)[1], -outward)
+    placed, turned = Placed(mesh, np.array([1.0, 2.0, 3.0]), TURN).own_feet(0.01)
+    np.testing.assert_allclose(placed, [1.0, 2.0, 3.0] + feet @ TURN.T, atol=1e-14)
+    np.testing.assert_allclose(turned, outward @ TURN.T, atol=1e-14)
+
+
+# ---- bad ones ----------------------------------------------------------------------------------------------------
+
+
+def without(mesh: trimesh.Trimesh, count: int) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[count:], process=False)
+
+
+def half_turned(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    faces = np.array(mesh.faces)
+    faces[7] = faces[7, ::-1]
+    return trimesh.Trimesh(mesh.vertices, faces, process=False)
+
+
+def with_a_fin() -> trimesh.Trimesh:
+    fin = trimesh.Trimesh([[0.2, 0.2, 0.2], [0.2, 0.2, -0.2], [0.4, 0.4, 0.0]], [[0, 1, 2]])
+    return joined(box([-0.2] * 3, [0.2] * 3), fin)
+
+
+def figure_of_eight() -> trimesh.Trimesh:
+    """Turned around an axis: one of its two loops is inside out."""
+    t, around = np.linspace(0, 2 * np.pi, 60, endpoint=False), np.linspace(0, 2 * np.pi, 80, endpoint=False)
+    radius, height = 0.4 + 0.1 * np.sin(t), 0.1 * np.sin(2 * t)
+    ring = np.stack([np.cos(around), np.sin(around)], axis=1)
+    places = np.concatenate([radius[None, :, None] * ring[:, None], np.tile(height[:, None], (80, 1, 1))], axis=2)
+    numbers = np.arange(4800).reshape(80, 60)
+    corners = [np.roll(numbers, (-i, -j), axis=(0, 1)) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    quads = np.stack(corners, axis=-1).reshape(-1, 4)
+    return trimesh.Trimesh(places.reshape(-1, 3), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), process=False)
+
+
+def not_a_number() -> trimesh.Trimesh:
+    vertices = np.array(box([-0.2] * 3, [0.2] * 3).vertices)
+    vertices[3, 1] = np.nan
+    return trimesh.Trimesh(vertices, box([-0.2] * 3, [0.2] * 3).faces, process=False)
+
+
+def back_to_back() -> trimesh.Trimesh:
+    corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]], process=False)
+
+
+BALL = trimesh.creation.icosphere(3, 0.4)
+BAD = {
+    "a hole": (without(BALL, 1), r"is not closed.* 3 open edges, the first at \(.*in the file; close its holes"),
+    "a sheet": (back_to_back(), "holds no volume: all of its 4 triangles"),
+    "half a sheet": (without(back_to_back(), 2), "4 open edges"),
+    "normals inwards": (turned_over(BALL), r"^The normals of .* point inwards, .*all of its triangles over"),
+    "a body inside out": (
+        joined(BALL, turned_over(box([1, 1, 1], [1.3, 1.3, 1.3]))),
+        r"1 of the 2 bodies of .* point inwards, for example at \(1",
+    ),
+    "a triangle turned": (half_turned(BALL), "inwards at some triangles.* change at 3 edges, the first at"),
+    "a fin": (with_a_fin(), r"1 edge at which three triangles or more meet.* \(0.2, 0.2, 0\) in the file"),
+    "a loop inside out": (figure_of_eight(), "of a part of .* point inwards"),
+    "millimetres": (box([0, 0, 0], [300.0, 200.0, 200.0]), "300 times the container; .*millimetres: .*scale = 0.001"),
+    "metres as millimetres": (box([0, 0, 0], [3e-4, 2e-4, 2e-4]), "less than a spacing, 0.05 m; .*larger scale than 1"),
+    "too thin": (
+        box([0, 0, 0], [0.5, 0.5, 0.01]),
+        r"thinner than half a spacing, 0.025 m, at 9[67]% .* make it thicker",
+    ),
+    "a fin too thin": (
+        joined(box([0, 0, 0], [0.5, 0.5, 0.2]), box([0.1, 0.1, 0.1], [0.4, 0.11, 0.5])),
+        r"thinner than half a spacing.* at 1[67]% of its surface, .* at \(0\.[1-4]\d*, 0.1",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_mesh_is_a_sentence_that_says_which_where_and_what_to_do(tmp_path, name):
+    mesh, sentence = BAD[name]
+    path = written(tmp_path, mesh)
+    with pytest.raises(InputError, match=sentence) as caught:
+        read(path)
+    assert repr(path) in str(caught.value)
+    assert_one_sentence(str(caught.value))
+
+
+def test_vertices_that_are_not_finite_are_a_sentence(tmp_path):
+    with pytest.raises(InputError, match=r"1 vertex with coordinates that are not finite.* number \d+") as caught:
+        read(written(tmp_path, not_a_number(), "nan.ply"))
+    assert_one_sentence(str(caught.value))
+
+
+def test_without_a_container_a_mesh_is_held_against_the_spacing(tmp_path):
+    path = written(tmp_path, box([0, 0, 0], [600.0, 200.0, 200.0]))
+    with pytest.raises(InputError, match="12,000 spacings; it looks like millimetres"):
+        read(path, container=None)
+    read(path, scale=0.001, container=None)
+
+
+def test_what_is_thinner_than_the_support_is_told(tmp_path):
+    with pytest.warns(CortadoWarning, match=r"thinner than the support, 0.1 m, at 81% .* 0.06 m at") as told:
+        read(written(tmp_path, box([0, 0, 0], [0.5, 0.5, 0.06])))
+    assert_one_sentence(str(told[0].message))
+
+
+def test_sharp_edges_are_told_and_kept(tmp_path):
+    wedge = trimesh.convex.convex_hull(
+        [[0, 0, 0], [0.5, 0, 0], [0.5, 0, 0.3], [0, 0.5, 0], [0.5, 0.5, 0], [0.5, 0.5, 0.3]]
+    )
+    with pytest.warns(CortadoWarning, match="edges so sharp that it is thinner than half a spacing") as told:
+        read(written(tmp_path, wedge))
+    assert_one_sentence(str(told[0].message))
+
+
+def test_thickness_is_that_of_the_thinnest_sheet():
+    thick, thin = box([0, 0, 0], [1, 1, 0.3]), box([0, 0, 0.6], [1, 1, 0.64])
+    found = thickness_of(solid(joined(thick, thin)), 0.1)
+    assert found.thinnest == pytest.approx(0.04, abs=1e-5)
+    assert found.share(found.is_sheet) == pytest.approx(2.0 / (2 * 2 + 4 * 0.34), abs=0.01)
+    assert thickness_of(solid(thick), 0.1).thinnest == np.inf
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".glb", ".gltf"])
+@pytest.mark.parametrize(
+    "content", [b"", b"rubbish\n\x00\xff" * 20, b"solid x\nendsolid x\n", b"v 0 0 0\nf 1 2 9\n", b"{}"]
+)
+def test_files_of_rubbish_are_a_sentence(tmp_path, suffix, content, capfd):
+    (tmp_path / f"bad{suffix}").write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read(str(tmp_path / f"bad{suffix}"))
+    assert_one_sentence(str(caught.value))
+    assert f"bad{suffix}" in str(caught.value)
+    assert "is empty" in str(caught.value) if not content else "is empty" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("cut", [0.02, 0.2, 0.5, 0.9])
+def test_files_that_are_cut_off_are_a_sentence(tmp_path, cut):
+    for name in ("a.stl", "a.ply", "a.glb"):
+        content = Path(written(tmp_path, box([0, 0, 0], [1, 1, 1]), name)).read_bytes()
+        (tmp_path / f"cut_{name}").write_bytes(content[: int(cut * len(content))])
+        with pytest.raises(InputError, match="may be damaged") as caught:
+            read(str(tmp_path / f"cut_{name}"))
+        assert_one_sentence(str(caught.value))
+
+
+def test_files_without_triangles_are_a_sentence(tmp_path):
+    (tmp_path / "line.obj").write_text("v 0 0 0\nv 1 0 0\nl 1 2\n")
+    with pytest.raises(InputError, match="points or lines, but no triangles"):
+        read_triangles(str(tmp_path / "line.obj"))
+
+
+@pytest.mark.parametrize(
+    ("name", "trouble"), [("a.step", "does not end in one of .stl, "), ("none.stl", "No such file")]
+)
+def test_files_that_cannot_be_meant_are_a_sentence(tmp_path, name, trouble):
+    (tmp_path / "a.step").write_text("")
+    with pytest.raises(InputError, match=trouble) as caught:
+        read(str(tmp_path / name))
+    assert_one_sentence(str(caught.value))
+
+
+def test_a_file_that_changes_is_read_again(tmp_path):
+    first = read(written(tmp_path, torus(), "a.ply")).extent()
+    second = read(written(tmp_path, torus().apply_scale(0.9), "a.ply")).extent()
+    np.testing.assert_allclose(np.multiply(first, 0.9), second, rtol=1e-6)
+
+
+# ---- a large one -------------------------------------------------------------------------------------------------
+
+
+def test_two_hundred_thousand_triangles_are_read_sampled_and_asked_a_million_times(tmp_path):
+    """In seconds of one core, compiling left out."""
+    solid(torus(20, 12)).holds(cloud(10))
+    path, points = written(tmp_path, torus(500, 200)), np.random.default_rng(2).uniform(-0.4, 0.4, (1_000_000, 3))
+    begin = time.process_time()
+    mesh = read_mesh(path, 1.0, 0.01, 0.026, ROOM)
+    spent = [time.process_time() - begin]
+    found = mesh.distance_up_to(points, 0.03)
+    spent.append(time.process_time() - begin)
+    wall = surface_points(mesh, 0.01, 0.005)
+    spent.append(time.process_time() - begin)
+    assert len(mesh.triangles) == 200_000
+    exact = from_torus(points)
+    np.testing.assert_allclose(found, np.clip(exact, -0.03, 0.03), atol=3e-5)
+    assert len(wall.points) > 8000
+    assert spent[-1] < 20.0, spent

@@ -1,0 +1,292 @@
+"""Solids that move as they are told: where they are, what they do to fluid, and derivatives beside them."""
+
+import numpy as np
+import pytest
+
+from cortado import DivergedError, InputError, Problem, Scene, SceneError, Simulation, certify
+from cortado.errors import MissingDerivativeError
+from cortado.gradients import AdjointViscosity, ImplicitPressure
+from cortado.losses import CentreOfMass
+from cortado.scene.motions import greatest_speed
+from cortado.scene.solids import rotation_matrix
+from cortado.scene.stability import stability_limits
+
+WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 1.0}
+ROTOR = {
+    "name": "rotor",
+    "shape": "box",
+    "lower": [0.2, 0.15],
+    "upper": [0.4, 0.25],
+    "motion": "path",
+    "angular_velocity": 6.0,
+    "velocity": [0.2, 0.1],
+    "slip": "no",
+}
+PADDLE = {
+    "name": "paddle",
+    "shape": "capsule",
+    "start": [0.2, 0.25, 0.2],
+    "end": [0.2, 0.45, 0.2],
+    "radius": 0.06,
+    "rotation": [0.3, 0.0, 0.2],
+    "motion": "path",
+    "times": [0.0, 0.05, 0.2],
+    "positions": [[0.2, 0.35, 0.2], [0.22, 0.35, 0.2], [0.2, 0.35, 0.25]],
+    "rotations": [[0.0, 0.0, 0.0], [0.0, 0.3, 0.1], [0.4, 0.3, 0.0]],
+}
+
+
+def plane(*solids, **tables):
+    fluid = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.4], "phase": "water"}
+    return Scene(
+        **{
+            "dimension": 2,
+            "discretisation": {"spacing": 0.05},
+            "phase": [WATER],
+            "fluid": [fluid],
+            "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0], "slip": "no"},
+            "solver": {"kind": "projection", "time_step": 0.001},
+            "solid": list(solids),
+            **tables,
+        }
+    )
+
+
+def space(**tables):
+    fluid = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.4, 0.3, 0.4], "phase": "water"}
+    container = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.5, 0.6, 0.4]}
+    return plane(**{"dimension": 3, "fluid": [fluid], "container": container, "solid": [PADDLE], **tables})
+
+
+def walls_of(simulation):
+    """Those that move, as the device has them: places, feet and velocities."""
+    search = simulation.solver.search
+    first = np.count_nonzero(simulation.solver.search.walls["wall_weights"].numpy()) - search.moving._own["count"]
+    names = ("wall_positions", "wall_feet", "wall_velocities")
+    return [search.walls[name].numpy()[first:] for name in names]
+
+
+@pytest.mark.parametrize("scene", [plane(ROTOR), space()], ids=["plane", "space"])
+def test_walls_are_where_the_path_says_and_move_as_it_does(scene):
+    """Against NumPy: after the last step, as a set."""
+    simulation = Simulation(scene, precision="float64")
+    steps, dt, d = 30, 0.001, scene.dimension
+    run = simulation.run(steps)
+    motion = run.solids[scene.solid[0].name]
+    assert motion.positions.shape == (steps + 1, d) and len(motion.rotations) == steps + 1
+    own = simulation.walls[-len(walls_of(simulation)[0]) :]
+    table = scene.solid[0]
+    frame = (own - table.middle()) @ table.turn(d)
+
+    def placed(k):
+        turn = rotation_matrix(tuple(np.atleast_1d(motion.rotations[k])))
+        return motion.positions[k] + frame @ turn.T
+
+    now, before = placed(steps), placed(steps - 1)
+    found, feet, velocities = (array[:, :d] for array in walls_of(simulation))
+    order = np.lexsort(np.round(now, 9).T), np.lexsort(np.round(found, 9).T)
+    np.testing.assert_allclose(found[order[1]], now[order[0]], atol=1e-12)
+    np.testing.assert_allclose(velocities[order[1]], (now - before)[order[0]] / dt, atol=1e-9)
+    solid = table.solid()
+    turn = rotation_matrix(tuple(np.atleast_1d(motion.rotations[steps]))) @ table.turn(d).T
+    back = table.middle() + (found + feet - motion.positions[steps]) @ turn
+    np.testing.assert_allclose(solid.distance(back), 0.0, atol=1e-9)  # feet turn with it
+
+
+@pytest.mark.parametrize("kind", ["projection", "pcisph"])
+def test_a_piston_pushes_water_before_it(kind):
+    piston = {"name": "piston", "shape": "box", "lower": [-0.3, 0.0], "upper": [0.0, 1.0], "motion": "path"}
+    scene = plane({**piston, "velocity": [0.4, 0.0]}, solver={"kind": kind, "time_step": 0.001})
+    run = Simulation(scene, precision="float64").run(500, record_every=50)
+    assert run.solids["piston"].positions[-1, 0] == pytest.approx(-0.15 + 0.2)
+    assert run.positions[-1][:, 0].min() == pytest.approx(0.2 + 0.5 * 0.05, abs=0.4 * 0.05)
+    assert run.positions[-1].shape == run.positions[0].shape
+
+
+@pytest.mark.parametrize("across", [20, 40])
+def test_a_plate_that_starts_to_slide_draws_fluid_along_as_it_should(across):
+    """Couette flow from rest (Morris, Fox and Zhu 1997, their series), in units of L^2 / nu."""
+    spacing, nu = 1.0 / across, 1.0
+    dt = 0.1 * spacing**2 / nu
+    width = 10.0 * spacing
+    scene = plane(
+        {
+            "name": "plate",
+            "shape": "box",
+            "lower": [0.0, 1.0],
+            "upper": [width, 1.0 + 5.0 * spacing],
+            "motion": "path",
+            "velocity": [1.0, 0.0],
+            "slip": "no",
+        },
+        discretisation={"spacing": spacing},
+        phase=[{**WATER, "viscosity": 1000.0 * nu}],
+        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [width, 1.0], "phase": "water"}],
+        container={"shape": "box", "lower": [0, 0], "upper": [width, 2], "periodic": [True, False], "slip": "no"},
+        forces={"gravity": [0.0, 0.0]},
+        solver={"kind": "projection", "time_step": dt},
+    )
+    run = Simulation(scene, precision="float64").run(int(0.2 / dt), record_every=int(0.0225 / dt))
+    k = np.arange(1, 400)
+    for time, x, v in zip(run.times[1:], run.positions[1:], run.velocities[1:], strict=True):
+        y = x[:, 1]
+        waves = (-1.0) ** k / k * np.sin(np.outer(y, k) * np.pi) * np.exp(-nu * (k * np.pi) ** 2 * time)
+        exact = y + 2.0 / np.pi * waves.sum(axis=1)
+        assert np.abs(v[:, 0] - exact).max() < {20: 0.03, 40: 0.01}[across]
+
+
+def test_a_belt_moves_fluid_and_stays():
+    belt = {"name": "belt", "shape": "box", "lower": [-0.2, -0.2], "upper": [1.2, 0.0], "slip": "no"}
+    scene = plane(
+        {**belt, "surface_velocity": [1.0, 0.0]}, container={"shape": "box", "lower": [0, 0], "upper": [1, 1]}
+    )
+    run = Simulation(scene).run(200)
+    assert np.ptp(run.solids["belt"].positions, axis=0).max() == 0.0
+    near = run.positions[-1][:, 1] < 0.05
+    far = run.positions[-1][:, 1] > 0.25
+    assert run.velocities[-1][near, 0].mean() > 0.4 > run.velocities[-1][far, 0].mean() + 0.2
+
+
+@pytest.mark.parametrize(
+    ("made", "estimator"),
+    [
+        (lambda: plane(ROTOR), None),
+        (lambda: plane(ROTOR), ImplicitPressure()),
+        (lambda: plane(ROTOR, solver={"kind": "pcisph", "time_step": 0.001}), None),
+        (lambda: plane(ROTOR, forces={"viscous_solve": "implicit"}), None),
+        (lambda: plane(ROTOR, forces={"viscosity": "laminar"}, solver={"time_step": 0.001}), None),
+        (space, None),
+    ],
+    ids=["projection", "fixed point", "pcisph", "implicit", "laminar", "space"],
+)
+def test_derivatives_beside_solids_that_move(made, estimator):
+    """Reverse and forward mode to round-off, and differences: of the first state, gravity and viscosity."""
+    simulation = Simulation(made(), precision="float64")
+    random = np.random.default_rng(1)
+    x, d = simulation.positions, simulation.dimension
+    values = {
+        "initial_positions": x + 0.005 * random.uniform(-1.0, 1.0, x.shape),
+        "initial_velocities": 0.1 * random.normal(size=x.shape),
+        "gravity": np.array([0.5, -9.81, 0.2][:d]),
+        "viscosity": np.float64(1.0),
+    }
+    scales = {"initial_positions": 0.05, "initial_velocities": 1.0, "gravity": 1.0, "viscosity": 0.3}
+    along = {name: scale * random.normal(size=np.shape(values[name])) for name, scale in scales.items()}
+    problem = Problem(simulation, 12, CentreOfMass([0.5, 0.3, 0.1][:d]))
+    forward = problem.tangent(values, along)
+    if estimator is None:
+        _, gradient = problem.value_and_gradient(values)
+        reverse = sum((gradient[name] * along[name]).sum() for name in along)
+        assert reverse == pytest.approx(forward, rel=1e-10)
+    else:
+        _, gradient = problem.value_and_gradient(values, gradient=estimator)
+        exact = problem.value_and_gradient(values)[1]["gravity"]
+        assert gradient["gravity"] @ exact > 0.999 * np.linalg.norm(gradient["gravity"]) * np.linalg.norm(exact)
+
+    def value(h):
+        return problem.value({name: values[name] + h * along[name] for name in along})
+
+    assert min(abs((value(h) - value(-h)) / (2.0 * h) / forward - 1.0) for h in (1e-5, 1e-6)) < 1e-6
+
+
+def test_a_certificate_beside_a_rotor():
+    simulation = Simulation(plane(ROTOR), precision="float64")
+    moving = simulation.run(60)
+    given = {"initial_positions": moving.positions[-1], "initial_velocities": moving.velocities[-1]}
+    assert certify(Problem(simulation, 20, CentreOfMass([0.5, 0.3])), given).right
+
+
+def test_an_estimator_goes_on_beside_a_rotor():
+    problem = Problem(Simulation(plane(ROTOR), precision="float64"), 20, CentreOfMass([0.5, 0.3]))
+    exact = problem.value_and_gradient({"gravity": [0.0, -9.81]})[1]["gravity"]
+    viscous = problem.value_and_gradient({"gravity": [0.0, -9.81]}, gradient=AdjointViscosity())[1]["gravity"]
+    assert exact @ viscous > 0.99 * np.linalg.norm(exact) * np.linalg.norm(viscous)
+
+
+def test_a_run_goes_on_from_a_state_with_the_same_bits():
+    simulation = Simulation(plane(ROTOR), precision="float64")
+    whole = simulation.run(60)
+    state = simulation.step(simulation.state(), {}, steps=25)
+    rest = simulation.run(35, state=state)
+    np.testing.assert_array_equal(rest.positions[-1], whole.positions[-1])
+    np.testing.assert_array_equal(rest.solids["rotor"].positions, whole.solids["rotor"].positions[25:])
+    np.testing.assert_array_equal(whole[::10].solids["rotor"].rotations, whole.solids["rotor"].rotations[::10])
+
+
+def test_a_batch_has_the_bits_of_single_runs():
+    one, several = Simulation(plane(ROTOR)), Simulation(plane(ROTOR), batch=2)
+    gravities = np.array([[0.0, -9.81], [2.0, -9.0]])
+    runs = several.run(40, {"gravity": gravities[:, None]})
+    for gravity, run in zip(gravities, runs, strict=True):
+        np.testing.assert_array_equal(run.positions, one.run(40, {"gravity": gravity}).positions)
+
+
+def test_steps_that_are_chosen_know_how_fast_solids_are():
+    fast = {**ROTOR, "angular_velocity": 60.0, "velocity": None}
+    scene = plane(fast)
+    speed = 60.0 * np.hypot(0.1, 0.05)
+    assert greatest_speed(scene.solid) == pytest.approx(speed)
+    assert stability_limits(scene)["the speed of solids"] == pytest.approx(0.2 * 0.05 / speed)
+    chosen = plane(fast, solver={"kind": "projection", "time_step": "auto"})
+    run = Simulation(chosen).run(20)
+    assert np.diff(run.times).max() <= 0.2 * 0.05 / speed * (1.0 + 1e-5)
+
+
+def test_what_a_solid_runs_into_is_lost_and_said(monkeypatch):
+    """With walls that weigh nothing."""
+    from cortado.scene import walls
+
+    monkeypatch.setattr(walls, "uneven_changes", lambda sums, wanted: np.full(sums.shape[1], -1.0))
+    falling = {"name": "block", "shape": "box", "lower": [0.2, 0.5], "upper": [0.4, 0.7], "motion": "path"}
+    with pytest.raises(DivergedError, match="entered the solid 'block' and was at"):
+        Simulation(plane({**falling, "velocity": [0.0, -1.0]})).run(400)
+
+
+@pytest.mark.parametrize("ask", ["value_and_gradient", "tangent"])
+def test_the_time_step_has_no_derivative_where_solids_move(ask):
+    """As walls would have to be differentiated with respect to when they are where."""
+    problem = Problem(Simulation(plane(ROTOR)), 5, CentreOfMass([0.5, 0.3]))
+    given = ({"time_step": 0.001},) * (2 if ask == "tangent" else 1)
+    with pytest.raises(MissingDerivativeError, match="solids that move have no derivative"):
+        getattr(problem, ask)(*given)
+
+
+def test_where_a_solid_is_is_no_parameter_yet():
+    problem = Problem(Simulation(plane(ROTOR)), 5, CentreOfMass([0.5, 0.3]))
+    with pytest.raises(InputError, match=r"'rotor.displacement' is unknown"):
+        problem.value({"rotor.displacement": [0.0, 0.0]})
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"motion": "fixed"}, 'left out, as motion is "fixed"'),
+        ({"velocity": None, "angular_velocity": None}, "given, or times with positions"),
+        ({"velocity": [1.0, 0.0, 0.0]}, "a list of 2 components"),
+        ({"angular_velocity": [0.0, 0.0, 1.0]}, "one number in 2-D"),
+        ({"times": [0.0, 1.0]}, "left out, as there are times"),
+        ({"velocity": None, "angular_velocity": None, "times": [0.1, 1.0]}, "from 0 on"),
+        ({"velocity": None, "angular_velocity": None, "positions": [[0.0, 0.0]]}, "a list of times"),
+        (
+            {"velocity": None, "angular_velocity": None, "times": [0.0, 1.0], "positions": [[0.0, 0.0], [1.0, 0.0]]},
+            "where its middle is at the start",
+        ),
+        (
+            {"velocity": None, "angular_velocity": None, "times": [0.0, 1.0], "rotations": [0.1, 0.2]},
+            "0, as it is not turned yet",
+        ),
+        (
+            {"velocity": None, "angular_velocity": None, "times": [0.0, 1.0], "rotations": [0.0]},
+            "a list of 2, as are times",
+        ),
+    ],
+)
+def test_a_bad_path_is_a_sentence(changes, sentence):
+    with pytest.raises(SceneError) as error:
+        plane({name: value for name, value in {**ROTOR, **changes}.items() if value is not None})
+    assert sentence in str(error.value) and "solid[0]" in str(error.value)
+
+
+def test_a_scene_with_a_path_is_written_and_read():
+    scene = space()
+    assert Scene.from_json(scene.to_json()) == scene

@@ -1,0 +1,453 @@
+"""Cortado as a layer of PyTorch: derivatives in both modes, bits, maps, modules, and bad uses in sentences."""
+
+import gc
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numpy as np
+import pytest
+
+import cortado
+from cortado import DivergedError, InputError, Simulation, gradients, sensors
+from layered import POINT, STIFF, matched, scheduled, shear, sheared
+from scenes import jet, plane, scene, two_layers
+
+torch = pytest.importorskip("torch", reason="PyTorch is not installed: its CPU wheel is optional", exc_type=ImportError)
+STEP = 1e-8
+"""Of differences: most directions lead through a kink within a longer one."""
+
+
+@pytest.fixture(scope="module")
+def layer():
+    import cortado.torch
+
+    return cortado.torch
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return Simulation(sheared(), precision="float64")
+
+
+@pytest.fixture(scope="module")
+def problem(simulation):
+    return matched(simulation)
+
+
+def tensor(values):
+    return torch.tensor(np.asarray(values), dtype=torch.float64)
+
+
+def wanted_of(values):
+    return tensor(values).requires_grad_()
+
+
+def same_bits(one, other):
+    assert one.keys() == other.keys()
+    for name in one:
+        assert np.asarray(one[name]).tobytes() == np.asarray(other[name]).tobytes(), name
+
+
+# ---- derivatives -------------------------------------------------------------------------------------------------
+
+
+def test_chained_segments_pass_the_check_of_gradients(layer, simulation):
+    """60 steps in three segments, in both modes, with respect to positions, velocities, gravity and viscosity, each far
+    above the tolerance."""
+    first = layer.state(simulation)
+
+    def end(positions, velocities, gravity, viscosity):
+        state = {**first, "positions": positions, "velocities": velocities}
+        for _ in range(3):
+            state = layer.step(simulation, state, {"gravity": gravity, "viscosity": STIFF * viscosity}, steps=20)
+        return state["positions"], state["velocities"]
+
+    arguments = tuple(map(wanted_of, (simulation.positions, shear(simulation), [0.4, -9.0], 0.7)))
+    check = partial(torch.autograd.gradcheck, eps=STEP, rtol=1e-4, atol=1e-5, fast_mode=True, check_forward_ad=True)
+    for k in range(4):
+        fixed = [one.detach() for one in arguments]
+
+        def of_one(value, k=k, fixed=fixed):
+            return end(*fixed[:k], value, *fixed[k + 1 :])
+
+        assert check(of_one, (arguments[k],))
+        _, dots = torch.func.jvp(of_one, (fixed[k],), (torch.ones_like(fixed[k]),))
+        assert all(float(dot.abs().max()) > 1e-3 for dot in dots)
+
+    def corner(gravity, viscosity):
+        return end(*[one.detach() for one in arguments[:2]], gravity, viscosity)[1][:2]
+
+    assert torch.autograd.gradcheck(corner, arguments[2:], eps=STEP, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("made", [two_layers, scheduled, jet])
+def test_both_modes_agree_for_every_field_of_a_state(layer, made):
+    """<bar, J dot> = <J^T bar, dot>, for the time too."""
+    simulation = Simulation(made(), precision="float64")
+    first = layer.state(simulation, simulation.run(5).last_state)
+    run, rng = partial(layer.step, simulation, steps=4), np.random.default_rng(0)
+    dot = {name: tensor(rng.standard_normal(array.shape)) for name, array in first.items()}
+    end, pull = torch.func.vjp(run, first)
+    bar = {name: tensor(rng.standard_normal(array.shape)) for name, array in end.items()}
+    (back,) = pull(bar)
+    for name in first:
+        one = {**{n: torch.zeros_like(a) for n, a in dot.items()}, name: dot[name]}
+        _, own = torch.func.jvp(run, (first,), (one,))
+        wanted = sum(float((bar[n] * own[n]).sum()) for n in own)
+        assert float((back[name] * dot[name]).sum()) == pytest.approx(wanted, rel=1e-9, abs=1e-9), name
+
+
+@pytest.mark.parametrize(
+    "gradient",
+    [None, gradients.AdjointViscosity(0.2), gradients.RandomizedSmoothing(samples=4)],
+    ids=lambda one: type(one).__name__,
+)
+def test_a_value_and_its_gradient_have_the_bits_of_the_problem(layer, problem, gradient):
+    parameters = {name: wanted_of(value) for name, value in POINT.items()}
+    wanted, wanted_gradient = problem.value_and_gradient(POINT, gradient)
+    loss = layer.value(problem, gradient)(parameters)
+    loss.backward()
+    assert loss.item() == wanted
+    same_bits({name: one.grad for name, one in parameters.items()}, wanted_gradient)
+    with torch.no_grad():
+        plain = layer.value(problem, gradient)(parameters)
+    assert plain.item() == problem.value(POINT) and not plain.requires_grad
+
+
+def test_forward_mode_of_a_value_is_the_tangent_of_the_problem(layer, problem):
+    parameters = {name: tensor(value) for name, value in POINT.items()}
+    along = {"gravity": tensor([1.0, 0.5]), "viscosity": tensor(3.0)}
+    _, found = torch.func.jvp(layer.value(problem), (parameters,), (along,))
+    assert found.item() == problem.tangent(POINT, along)
+    with torch.autograd.forward_ad.dual_level():
+        dual = {n: torch.autograd.forward_ad.make_dual(parameters[n], along[n]) for n in parameters}
+        assert torch.autograd.forward_ad.unpack_dual(layer.value(problem)(dual)).tangent == found
+
+
+def test_a_value_begins_at_a_state_and_has_its_gradient(layer, simulation, problem):
+    state = {name: one.requires_grad_() for name, one in layer.state(simulation, simulation.run(9).last_state).items()}
+    parameters = {name: wanted_of(value) for name, value in POINT.items()}
+    loss = layer.value(problem)(parameters, state)
+    loss.backward()
+    begun = problem.beginning_at(layer.restart_state(simulation, state))
+    wanted, wanted_gradient, wanted_initial = begun.value_and_gradients(POINT)
+    assert loss.item() == wanted
+    same_bits({name: one.grad for name, one in parameters.items()}, wanted_gradient)
+    same_bits({name: one.grad for name, one in state.items()}, {name: wanted_initial[name] for name in state})
+
+
+def test_a_graph_is_gone_back_through_again_only_where_it_was_kept(layer, problem):
+    viscosity = wanted_of(10.0)
+    loss = layer.value(problem)({"viscosity": viscosity})
+    loss.backward(retain_graph=True)
+    first = viscosity.grad.clone()
+    loss.backward()
+    assert viscosity.grad == 2.0 * first
+    with pytest.raises(RuntimeError, match="backward through the graph a second time"):
+        loss.backward()
+
+
+def test_residuals_of_a_graph_go_with_it(layer, simulation):
+    from cortado.rollout.stepper import StepResidual
+
+    def alive():
+        gc.collect()
+        return sum(isinstance(one, StepResidual) for one in gc.get_objects())
+
+    before, viscosity = alive(), wanted_of(10.0)
+    end = layer.step(simulation, layer.state(simulation), {"viscosity": viscosity}, steps=3)
+    assert alive() == before + 1
+    del end
+    assert alive() == before
+
+
+# ---- bits --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("made", [scheduled, two_layers])
+def test_chained_steps_and_rollouts_have_the_bits_of_one_run(layer, made, precision):
+    simulation = Simulation(made(), precision=precision)
+    wanted, state = simulation.run(12), layer.state(simulation)
+    states = layer.rollout(simulation, state, steps=12, record_every=4)
+    for steps in (1, 7, 4):
+        state = layer.step(simulation, state, steps=steps)
+    last = wanted.last_state
+    same_bits({name: state[name] for name in last.fields}, last.fields)
+    same_bits({name: states[name][-1] for name in last.fields}, last.fields)
+    np.testing.assert_array_equal(states["positions"][1], wanted.positions[4])
+    again = layer.restart_state(simulation, state)
+    np.testing.assert_array_equal(simulation.run(3, state=again).positions[-1], simulation.run(15).positions[-1])
+
+
+def test_a_state_may_be_a_view_and_be_written_to_afterwards(layer, simulation):
+    state = layer.state(simulation)
+    wanted = layer.step(simulation, state, steps=3)
+    across = {**state, "positions": state["positions"].T.contiguous().T, "time": state["time"].expand(())}
+    found = layer.step(simulation, across, steps=3)
+    same_bits(found, wanted)
+    found["positions"].zero_()
+    found["reference_density"].mul_(2.0)
+    same_bits(layer.step(simulation, state, steps=3), wanted)
+
+
+def test_a_rollout_gives_each_segment_its_rows_and_is_differentiated(layer, simulation):
+    rows = np.array([0.0, -9.81]) + np.random.default_rng(1).standard_normal((6, 2))
+    gravity = wanted_of(rows)
+    found = layer.rollout(simulation, layer.state(simulation), {"gravity": gravity}, 6, 2)
+    np.testing.assert_array_equal(found["positions"].detach(), simulation.run(6, {"gravity": rows}).positions[::2])
+    found["positions"][-1].square().mean().backward()
+    assert (gravity.grad.abs() > 0.0).all()
+
+
+# ---- maps, modules, compiled functions, threads ------------------------------------------------------------------
+
+
+def test_a_map_is_a_batch_with_the_bits_of_single_evaluations(layer, simulation, problem):
+    gravities = tensor([[0.4, -9.0], [0.0, -9.81], [-1.0, -8.0]])
+    first = {**layer.state(simulation), "velocities": tensor(shear(simulation))}
+
+    def end(gravity):
+        state = layer.step(simulation, first, {"gravity": gravity}, steps=3)
+        return layer.step(simulation, state, {"gravity": gravity, "viscosity": 5.0}, steps=3)["positions"]
+
+    def loss(gravity):
+        return layer.value(problem)({"gravity": gravity, "viscosity": 9.0})
+
+    for function in (end, loss, torch.func.grad(loss), torch.func.grad(lambda g: (end(g) ** 2).sum())):
+        wanted = torch.stack([function(gravity) for gravity in gravities])
+        assert float(wanted.abs().max()) > 0.0
+        assert torch.vmap(function)(gravities).numpy().tobytes() == wanted.numpy().tobytes()
+    summed = torch.func.grad(lambda g: torch.vmap(loss)(g).sum())(gravities)
+    np.testing.assert_array_equal(summed, torch.vmap(torch.func.grad(loss))(gravities))
+
+
+def test_an_estimator_without_batches_is_mapped_one_by_one(layer, problem):
+    estimator = gradients.RandomizedSmoothing(samples=4)
+    loss = layer.value(problem, estimator)
+    viscosities = tensor([10.0, 12.0])
+    found = torch.vmap(torch.func.grad(lambda m: loss({"viscosity": m})))(viscosities)
+    wanted = [problem.value_and_gradient({"viscosity": float(m)}, estimator)[1]["viscosity"] for m in viscosities]
+    np.testing.assert_array_equal(found, wanted)
+
+
+def test_jacobians_by_both_modes_agree_and_are_mapped(layer, simulation):
+    first = {**layer.state(simulation), "velocities": tensor(shear(simulation))}
+
+    def corner(gravity):
+        return layer.step(simulation, first, {"gravity": gravity}, steps=2)["velocities"][:2]
+
+    gravities = tensor([[0.4, -9.0], [1.0, -9.0]])
+    back, forward = torch.func.jacrev(corner)(gravities[0]), torch.func.jacfwd(corner)(gravities[0])
+    np.testing.assert_allclose(back, forward, rtol=1e-8, atol=1e-13)
+    assert float(forward.abs().max()) > 1e-4
+    both = torch.vmap(torch.func.jacrev(corner))(gravities)
+    np.testing.assert_allclose(both, torch.vmap(torch.func.jacfwd(corner))(gravities), rtol=1e-8, atol=1e-13)
+    np.testing.assert_allclose(both[0], back, rtol=1e-12, atol=1e-15)
+
+
+def test_a_batch_of_a_user_has_parameters_in_all_shapes(layer):
+    problem = matched(Simulation(sheared(), precision="float64", batch=2))
+    gravity, viscosity = wanted_of([[[0.4, -9.0]], [[0.0, -9.81]]]), wanted_of(9.0)
+    losses, wanted = problem.value_and_gradient({"gravity": gravity.detach().numpy(), "viscosity": 9.0})
+    found = layer.value(problem)({"gravity": gravity, "viscosity": viscosity})
+    np.testing.assert_array_equal(found.detach(), losses)
+    found.backward(tensor([1.0, 2.0]))
+    np.testing.assert_array_equal(gravity.grad, wanted["gravity"] * np.array([1.0, 2.0])[:, None, None])
+    assert viscosity.grad.item() == pytest.approx(wanted["viscosity"] @ [1.0, 2.0], rel=1e-14)
+    with pytest.raises(InputError, match="is a batch of 2 cannot be mapped"):
+        torch.vmap(lambda m: layer.value(problem)({"viscosity": m}))(tensor([1.0, 2.0]))
+
+
+def test_a_module_learns_its_parameters(layer, simulation):
+    target = simulation.run(20, {"gravity": [1.0, -9.0]}).positions[-1]
+    module = layer.Steps(simulation, 20, trained={"gravity": [0.0, -9.81]})
+    optimiser, first, losses = torch.optim.LBFGS(module.parameters(), max_iter=10), layer.state(simulation), []
+
+    def closure():
+        optimiser.zero_grad()
+        loss = 1e4 * torch.mean((module(first)["positions"] - tensor(target)) ** 2)
+        loss.backward()
+        losses.append(loss.item())
+        return loss
+
+    optimiser.step(closure)
+    (gravity,) = module.parameters()
+    np.testing.assert_allclose(gravity.detach(), [1.0, -9.0], atol=0.02)
+    assert losses[-1] < 1e-3 * losses[0]
+    again = layer.Steps(simulation, 20, trained={"gravity": [0.0, 0.0]})
+    again.load_state_dict(module.state_dict())
+    with torch.no_grad():
+        same_bits(again(first, {"viscosity": 30.0}), module(first, {"viscosity": 30.0}))
+    with pytest.raises(InputError, match="parameter gravity is given, but must be left out, as the module"):
+        module(first, {"gravity": [0.0, 0.0]})
+
+
+def test_a_compiled_function_leaves_it_as_it_is(layer, problem):
+    def loss(viscosity):
+        return 3.0 * layer.value(problem)({"viscosity": 2.0 * viscosity})
+
+    compiled = torch.compile(loss, backend="eager")
+    one, other = wanted_of(5.0), wanted_of(5.0)
+    assert compiled(one).item() == loss(other).item()
+    compiled(one).backward()
+    loss(other).backward()
+    assert one.grad == other.grad != 0.0
+
+
+def test_threads_that_share_a_layer_get_the_bits_of_one(layer, problem):
+    def gradient(viscosity):
+        own = wanted_of(viscosity)
+        layer.value(problem)({"viscosity": own}).backward()
+        return own.grad.item()
+
+    points = [3.0, 8.0, 12.0, 17.0]
+    wanted = [gradient(one) for one in points]
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(gradient, points * 3)) == wanted * 3
+
+
+def test_what_is_measured_and_drawn_has_the_derivatives_of_differences(layer):
+    simulation = Simulation(two_layers(), precision="float64")
+    state = layer.state(simulation, simulation.step(simulation.state(), steps=5))
+    renderer, colours = simulation.renderer(resolution=(9, 8)), wanted_of([[0.1, 0.4, 0.9], [0.7, 0.2, 0.1]])
+    check = partial(torch.autograd.gradcheck, eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=True)
+    own = state["positions"].clone().requires_grad_(), state["mass_fractions"].clone().requires_grad_()
+    assert check(partial(layer.picture, renderer), (*own, colours), check_forward_ad=False)
+    for what in ("pressure", sensors.PressureProbe([0.1, 0.1, 0.1])):
+        reading = layer.measure(simulation, what)
+
+        def read(positions, reading=reading):
+            return 1e-3 * reading({**state, "positions": positions})
+
+        assert check(read, (own[0],), check_forward_ad=True)
+
+
+# ---- bad uses ----------------------------------------------------------------------------------------------------
+
+
+def without(table, name):
+    return {key: value for key, value in table.items() if key != name}
+
+
+BAD_STATES = {
+    "no table": (lambda s: 3.0, "state is 3.0, but must be given by name"),
+    "without a field": (lambda s: without(s, "velocities"), "state has .*, but must have positions, velocities"),
+    "another field": (lambda s: {**s, "colour": s["time"]}, "state has .*colour, but must have"),
+    "another shape": (lambda s: {**s, "positions": s["positions"][1:]}, r"state positions has shape \(63, 2\), but"),
+    "float32": (lambda s: {**s, "positions": s["positions"].float()}, "state positions is torch.float32, but must be"),
+    "half": (lambda s: {**s, "velocities": s["velocities"].half()}, "state velocities is torch.float16, but must be"),
+    "complex": (lambda s: {**s, "positions": s["positions"] + 0j}, "state positions is a tensor of torch.complex128"),
+    "truth values": (lambda s: {**s, "positions": s["positions"] > 0}, "state positions is a tensor of torch.bool"),
+    "sparse": (lambda s: {**s, "positions": s["positions"].to_sparse()}, "torch.sparse_coo, but must be a dense"),
+    "another device": (lambda s: {**s, "positions": s["positions"].to("meta")}, "state positions is on meta, but must"),
+    "time on another device": (lambda s: {**s, "time": s["time"].to("meta")}, "state time is on meta, but must be on"),
+    "text": (lambda s: {**s, "positions": "here"}, "state positions is 'here', but must be a number or an array"),
+    "NaN": (lambda s: {**s, "positions": s["positions"] * np.nan}, "state positions has a value that is not finite"),
+    "infinite": (lambda s: {**s, "velocities": s["velocities"] + np.inf}, "state velocities has a value that is not"),
+    "a negative time": (lambda s: {**s, "time": s["time"] - 1.0}, "state clock is at -1.0 s, but must be"),
+    "another fluid": (lambda s: {**s, "reference_density": 2.0 * s["reference_density"]}, "state reference_density is"),
+    "outside": (lambda s: {**s, "positions": s["positions"] + 5.0}, "outside the container"),
+    "another spacing": (lambda s: {**s, "positions": 0.5 * s["positions"]}, "spacings of 0.05 m from the nearest"),
+}
+BAD_PARAMETERS = {
+    "no table": (lambda: [1.0], r"parameters is \[1.0\], but must be given by name"),
+    "a tensor": (lambda: torch.ones(3), "parameters is tensor.*, but must be given by name"),
+    "unknown": (lambda: {"gravty": torch.zeros(2).double()}, "parameter 'gravty' is unknown, but must be one of"),
+    "another shape": (lambda: {"gravity": torch.zeros(3).double()}, r"parameter gravity has shape \(3,\), but must"),
+    "float32": (lambda: {"viscosity": torch.tensor(3.0)}, "parameter viscosity is torch.float32, but must be torch"),
+    "another device": (
+        lambda: {"viscosity": torch.zeros((), device="meta").double()},
+        "viscosity is on meta",
+    ),
+    "first values": (lambda: {"initial_velocities": np.zeros((64, 2))}, "must be left out with a state"),
+    "negative": (lambda: {"viscosity": tensor(-1.0)}, "parameter viscosity is -1.0, but must be at least 0"),
+    "NaN": (lambda: {"viscosity": tensor(np.nan)}, "parameter viscosity has a value that is not finite"),
+    "text": (lambda: {"viscosity": "thick"}, "parameter viscosity is 'thick', but must be a number"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_STATES)
+def test_a_bad_state_is_refused_in_a_sentence(layer, simulation, problem, name):
+    change, words = BAD_STATES[name]
+    bad = change(layer.state(simulation))
+    for use in (
+        lambda: layer.step(simulation, bad, steps=2),
+        lambda: layer.rollout(simulation, bad, steps=2),
+        lambda: layer.measure(simulation, "density")(bad),
+        lambda: layer.Steps(simulation)(bad),
+        *([] if name == "another device" else [lambda: layer.value(problem)({}, bad)]),
+    ):
+        with pytest.raises(InputError, match=words) as caught:
+            use()
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", BAD_PARAMETERS)
+def test_bad_parameters_are_refused_in_a_sentence(layer, simulation, problem, name):
+    make, words = BAD_PARAMETERS[name]
+    state = layer.state(simulation)
+    for use in (
+        lambda: layer.step(simulation, state, make(), steps=2),
+        lambda: layer.value(problem)(make(), state),
+        *([] if name == "first values" else [lambda: layer.value(problem)(make())]),
+    ):
+        with pytest.raises(InputError, match=words) as caught:
+            use()
+        assert "\n" not in str(caught.value)
+
+
+def test_other_bad_uses_are_refused_in_a_sentence(layer, simulation, problem):
+    state = layer.state(simulation)
+    other = layer.state(Simulation(plane(discretisation={"spacing": 0.04}), precision="float64"))
+    space = layer.state(Simulation(scene(), precision="float64"))
+    viscosity = wanted_of(10.0)
+    for use, words in [
+        (lambda: layer.step(simulation, other), "state positions has shape"),
+        (lambda: layer.step(simulation, space), "state positions has shape"),
+        (lambda: layer.step(simulation, state, steps=0), "steps is 0, but must be a whole number of at least 1"),
+        (lambda: layer.rollout(simulation, state, steps=5, record_every=2), "record_every is 2, but must divide the 5"),
+        (lambda: layer.value(simulation), "problem is Simulation.*, but must be a cortado.Problem"),
+        (lambda: layer.measure(simulation, "colour"), "quantity is 'colour', but must be one of density"),
+        (lambda: layer.picture(simulation, state["positions"]), "renderer is .*, but must be one such as"),
+        (lambda: layer.Steps(problem), "simulation is .*, but must be a cortado.Simulation"),
+        (lambda: layer.Steps(simulation, trained={"viscosity": "thick"}), "parameter viscosity is 'thick', but must"),
+        (lambda: second(layer, problem, viscosity), "first ones only: leave out create_graph=True"),
+        (lambda: torch.func.hessian(lambda m: layer.value(problem)({"viscosity": m}))(tensor(1.0)), "first ones only"),
+        (lambda: drawn_forward(layer), "reverse mode only"),
+    ]:
+        with pytest.raises(InputError, match=words) as caught:
+            use()
+        assert "\n" not in str(caught.value)
+    with pytest.raises(DivergedError, match="The simulation diverged in step 1"):
+        layer.step(simulation, {**state, "velocities": torch.full((64, 2), 400.0).double()}, steps=2)
+
+
+def second(layer, problem, viscosity):
+    loss = layer.value(problem)({"viscosity": viscosity})
+    (gradient,) = torch.autograd.grad(loss, viscosity, create_graph=True)
+    gradient.backward()
+
+
+def drawn_forward(layer):
+    simulation = Simulation(plane(), precision="float64")
+    positions = layer.state(simulation)["positions"]
+    torch.func.jvp(partial(layer.picture, simulation.renderer(resolution=(9, 8))), (positions,), (positions,))
+
+
+def test_a_float32_simulation_takes_float32(layer):
+    simulation = Simulation(sheared())
+    end = layer.step(simulation, layer.state(simulation), {"viscosity": torch.tensor(3.0), "gravity": [0.0, -9.0]})
+    assert end["positions"].dtype == end["time"].dtype == torch.float32
+    with pytest.raises(InputError, match=r"parameter viscosity is torch.float64, but must be torch.float32"):
+        layer.step(simulation, layer.state(simulation), {"viscosity": tensor(3.0)})
+
+
+def test_where_it_is_not_installed_there_is_one_sentence(monkeypatch):
+    import sys
+
+    for name in [name for name in sys.modules if name.endswith("layers.with_torch") or name == "cortado.torch"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(ImportError, match=r"PyTorch is not installed, which cortado.torch needs: pip install torch$"):
+        cortado.lazy.getter("cortado")("torch")
