@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import cortado
 from bad_tasks import GOOD_TASK, TINY_SCENE
@@ -16,7 +17,9 @@ from cortado.cli.viewer.quantities import AHEAD, upwards
 from cortado.cli.viewer.recorded import RecordedView
 from cortado.cli.viewer.task import TaskView
 from cortado.cli.viewer.window import LONGEST_ARROW, PULL
+from cortado.files.srgb import to_srgb
 from cortado.pictures.scene_view import outline
+from cortado.pictures.solid_lines import solid_outline
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.scene import Scene
 from remembering_force import Memory, U
@@ -278,6 +281,49 @@ def test_a_container_has_its_edges(scene):
     made = cortado.Simulation(scene).scene
     assert outline(made).shape == (4, 2, 2)
     assert isinstance(made, Scene)
+
+
+ROD = """
+[[solid]]
+name = "rod"
+shape = "box"
+lower = [0.5, 0.1, 0.1]
+upper = [0.6, 0.5, 0.2]
+rotation = [0.2, 0.3, 0.4]
+colour = [0.7, 0.3, 0.05]
+"""
+IN_SPACE = (
+    TINY_SCENE.replace("dimension = 2", "dimension = 3")
+    .replace("[0.0, 0.0]", "[0.0, 0.0, 0.0]")
+    .replace("[0.4, 0.4]", "[0.4, 0.4, 0.2]")
+    .replace("[0.7, 0.8]", "[0.7, 0.8, 0.4]")
+)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_solids_are_seen_where_they_are(scene, dimension):
+    """Also where another axis than y is up."""
+    rod = ROD.replace("0.1, 0.1]", "0.1]").replace("0.5, 0.2]", "0.5]").replace("[0.2, 0.3, 0.4]", "0.4")
+    gravity = "\n[forces]\ngravity = [0.0, 0.0, -9.81]\n"
+    scene.write_text(TINY_SCENE + rod if dimension == 2 else IN_SPACE + gravity + ROD)
+    shown = opened(scene, [], "cpu", "float32", PORT + 5)
+    try:
+        window, made = shown.window, shown.simulation.scene
+        (frame,) = window._solids
+        nodes = window.server.scene._handle_from_node_name
+        w, x, y, z = frame.wxyz
+        turn = Rotation.from_quat([x, y, z, w]).as_matrix()
+        lines = np.array(nodes["/solid_0/edges"].points) @ turn.T + frame.position
+        np.testing.assert_allclose(lines, window._space(solid_outline(made)), atol=1e-6)
+        assert ("/solid_0/faces" in nodes) == (dimension == 3)
+        if dimension == 3:
+            mesh = nodes["/solid_0/faces"]
+            places = mesh.vertices @ turn.T + frame.position
+            found = np.unique(np.round(lines.reshape(-1, 3), 5), axis=0)
+            np.testing.assert_allclose(np.unique(np.round(places, 5), axis=0), found, atol=2e-5)
+            assert tuple(mesh.color) == tuple(to_srgb(np.array([[[0.7, 0.3, 0.05]]]))[0, 0])
+    finally:
+        shown.window.close()
 
 
 @pytest.mark.parametrize("path, words", [("absent", "absent does not exist, but"), (".", "There is no run in ")])

@@ -30,7 +30,9 @@ def meet_behind_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec
     beside_clear = wp.bool(False)
     face = wp.int32(0)
     place = wp.vec2(0.0)
-    for _ in range(LAYERS):
+    layers = wp.int32(0)
+    while layers < LAYERS:  # which Warp does not write out
+        layers += 1
         p = o + start * d
         clear = wp.mesh_query_ray(s.solids.clear, p, d, FAR)
         in_solid = clear.sign < 0.0
@@ -76,24 +78,53 @@ def meet_without_solids(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.v
 
 @wp.func
 def meet(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3):
-    """Where a ray from outside of the fluid comes into it, unless it meets an opaque solid before."""
-    none = SurfaceHit()
-    none.found = False
-    none.t = FAR
+    """Where a ray from outside of the fluid comes into it, which it does not do within transparent solids, unless it
+    meets an opaque one before."""
+    met = SurfaceHit()
+    met.found = False
+    met.t = FAR
     part = room(s, o, d)
-    if part[1] <= wp.max(part[0], 0.0):
-        return none
-    if s.solids.has_clear == 0 and s.solids.has_opaque == 0:
-        return meet_without_solids(s, surface, o, d, part)
-    met = none
-    if s.solids.has_clear > 0:
-        met = meet_behind_clear(s, surface, o, d, part)
-    else:
-        met = meet_without_solids(s, surface, o, d, part)
+    start = wp.max(part[0], 0.0)
+    if part[1] <= start:
+        return met
+    beside_container = part[0] > 0.0
+    beside_solid = wp.bool(False)
+    side = wp.vec3(0.0)  # of the transparent solid that the ray comes out of: its triangle, and where on it
+    layers = wp.int32(0)
+    while layers < LAYERS:
+        layers += 1
+        p = o + start * d
+        in_solid = wp.bool(False)
+        next_side = wp.vec3(0.0)
+        next_start = FAR
+        if s.solids.has_clear > 0:
+            clear = wp.mesh_query_ray(s.solids.clear, p, d, FAR)
+            in_solid = s.solids.has_tank > 0
+            if clear.result:
+                in_solid = clear.sign < 0.0
+                next_start = start + clear.t
+                next_side = wp.vec3(wp.float32(clear.face), clear.u, clear.v)
+        if not in_solid:
+            hit = wp.mesh_query_ray(surface.mesh, p, d, FAR)
+            if hit.result and hit.sign < 0.0 and (beside_container or beside_solid):
+                normal = wall_normal(s, p)
+                if beside_solid:
+                    triangle = wp.int32(side[0])
+                    normal = at_surface(s.solids.surfaces[CLEAR], start, d, triangle, side[1], side[2]).normal
+                met = at_wall(s, surface, p, d, start, normal)
+            elif hit.result and start + hit.t <= wp.min(part[1], next_start):
+                met = at_surface(surface, start + hit.t, d, hit.face, hit.u, hit.v)
+        if met.found or next_start >= part[1]:
+            break
+        start = next_start + s.nearest
+        side = next_side
+        beside_container = False
+        beside_solid = in_solid
     if met.found and s.solids.has_opaque > 0:
         solid = meet_solid(s, o, d)
         if solid.found and solid.t < met.t + 3.0 * s.nearest:  # a solid covers fluid that goes on behind its side
-            return none
+            met.found = False
+            met.t = FAR
     return met
 
 

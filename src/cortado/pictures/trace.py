@@ -128,10 +128,10 @@ def seen(
         floor_at = (s.floor_height - o[1]) / d[1]
     if met.t > floor_at or not met.found:
         found = background(s, shadow, o, d, spread)
-        if s.solids.has_opaque > 0:  # noqa: SIM102  (kernels evaluate both sides of an "and")
-            if meet_solid(s, o, d).t < floor_at:
-                return toned(found)
-        if floor_at < FAR:  # the floor is a little glossy
+        solid_at = FAR
+        if s.solids.has_opaque > 0:
+            solid_at = meet_solid(s, o, d).t
+        if floor_at < solid_at:  # the floor is a little glossy
             r = wp.vec3(d[0], -d[1], d[2])
             p = o + floor_at * d
             image = meet(s, surface, p, r)

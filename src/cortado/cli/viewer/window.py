@@ -86,8 +86,7 @@ class Window:
         for choice in (self.colour, self.arrows):
             choice.on_update(lambda _: setattr(self, "_stale", True))  # in a thread of viser's, which computes nothing
         self._draw_container()
-        for number, solid in enumerate(shown_solids(scene)):
-            self._draw_solid(f"/solids/{number}", solid)
+        self._solids = [self._draw_solid(f"/solid_{number}", one) for number, one in enumerate(shown_solids(scene))]
 
     @property
     def address(self) -> str:
@@ -188,16 +187,16 @@ class Window:
         if len(lines):
             self.server.scene.add_line_segments("/container", lines, LINES, **THIN)
 
-    def _draw_solid(self, name: str, solid: ShownSolid) -> None:
-        """As lines about its middle, and in 3-D its faces where fluid is outside of them, in the solid's pose."""
+    def _draw_solid(self, name: str, solid: ShownSolid) -> Any:
+        """Draw the edges of a solid, and in 3-D its faces unless it is a tank; returns the frame that has its pose."""
         pose = {"position": self._space(solid.position), "wxyz": _quaternion(self._turn @ solid.turn)}
-        lines = _padded(own_lines(solid))
-        self.server.scene.add_line_segments(f"{name}/edges", lines, LINES, **THIN, **pose)
+        frame = self.server.scene.add_frame(name, show_axes=False, **pose)
+        self.server.scene.add_line_segments(f"{name}/edges", _padded(own_lines(solid)), LINES, **THIN)
         if self.scene.dimension == 3 and not solid.is_tank:
             faces, colour = own_faces(solid), tuple(to_srgb(solid.colour[None, None])[0, 0].tolist())
             look = {"color": colour, "opacity": 1.0 - solid.transparency, "flat_shading": True}
-            vertices = faces.vertices.astype(np.float32)
-            self.server.scene.add_mesh_simple(f"{name}/faces", vertices, faces.corners, **look, **pose)
+            self.server.scene.add_mesh_simple(f"{name}/faces", _padded(faces.vertices), faces.corners, **look)
+        return frame
 
     def look_at(self, positions: Points) -> None:
         """Put the camera where the container and solids, or else the particles (n, d) [m], fill the window."""
