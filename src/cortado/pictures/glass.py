@@ -1,9 +1,11 @@
 """Glass on a ray, of the container and of transparent solids, as Warp functions; and what is behind it."""
 
+from functools import cache
+from typing import Any
+
 import warp as wp
 
 from cortado.pictures.container_room import between, within_tube
-from cortado.pictures.lit_surface import SurfaceHit
 from cortado.pictures.pane import Passed, pane, rim_of
 from cortado.pictures.solid_hit import clear_layers, meet_solid, shaded_solid
 from cortado.pictures.surroundings import FAR, Environment, open_background
@@ -96,36 +98,38 @@ def cylinder_glass(
     return passed
 
 
-@wp.func
-def glass(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32):
-    """The glass that a ray passes up to the distance ``most`` [m]."""
-    passed = Passed()
-    passed.light = wp.vec3(0.0)
-    passed.through = 1.0
-    own_o = s.glass_frame * o
-    own_d = s.glass_frame * d
-    if s.glass == 1:
-        passed = box_glass(s, own_o, own_d, d, s.nearest, most, spread, passed)
-    if s.glass == 2:
-        passed = cylinder_glass(s, own_o, own_d, d, s.nearest, most, spread, passed)
-    if s.solids.has_clear > 0:
-        passed = clear_layers(s, o, d, most, spread, passed)
-    return passed
+@cache
+def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
+    """`glass` and `background`, where there are opaque or transparent solids."""
 
+    @wp.func
+    def glass(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32):
+        """The glass that a ray passes up to the distance ``most`` [m]."""
+        passed = Passed()
+        passed.light = wp.vec3(0.0)
+        passed.through = 1.0
+        own_o = s.glass_frame * o
+        own_d = s.glass_frame * d
+        if s.glass == 1:
+            passed = box_glass(s, own_o, own_d, d, s.nearest, most, spread, passed)
+        if s.glass == 2:
+            passed = cylinder_glass(s, own_o, own_d, d, s.nearest, most, spread, passed)
+        if has_clear:
+            passed = clear_layers(s, o, d, most, spread, passed)
+        return passed
 
-@wp.func
-def background(s: Environment, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d: wp.vec3, spread: wp.float32):
-    """What a ray sees that meets no fluid."""
-    most = FAR
-    if s.has_floor > 0 and d[1] < -1.0e-4:
-        most = wp.max((s.floor_height - o[1]) / d[1], 0.0)
-    met = SurfaceHit()
-    if s.solids.has_opaque > 0:
-        met = meet_solid(s, o, d)
-        met.found = met.found and met.t < most
-    if met.found:
-        most = met.t + 2.0 * s.nearest
-    passed = glass(s, o, d, most, spread)
-    if met.found:
-        return passed.light + passed.through * shaded_solid(s, met, d, 1.0)
-    return passed.light + passed.through * open_background(s, shadow, o, d, spread)
+    @wp.func
+    def background(s: Environment, shadow: wp.array2d(dtype=wp.vec3), o: wp.vec3, d: wp.vec3, spread: wp.float32):
+        """What a ray sees that meets no fluid."""
+        most = FAR
+        if s.has_floor > 0 and d[1] < -1.0e-4:
+            most = wp.max((s.floor_height - o[1]) / d[1], 0.0)
+        if has_opaque:
+            met = meet_solid(s, o, d)
+            if met.found and met.t < most:
+                before = glass(s, o, d, met.t + 2.0 * s.nearest, spread)
+                return before.light + before.through * shaded_solid(s, met, d, 1.0)
+        passed = glass(s, o, d, most, spread)
+        return passed.light + passed.through * open_background(s, shadow, o, d, spread)
+
+    return glass, background

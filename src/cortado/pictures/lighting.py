@@ -1,9 +1,12 @@
 """The light that falls on surfaces, by rays: from all around, and from the lamp."""
 
+from functools import cache
+from typing import Any
+
 import warp as wp
 
 from cortado.pictures.lit_surface import LitSurface
-from cortado.pictures.surroundings import FAR, OPAQUE, Environment
+from cortado.pictures.surroundings import FAR, OPAQUE, Environment, shading_module
 
 BOUNCED = wp.constant(wp.float32(0.45))
 """The part of the light around that falls on solids, and back from them."""
@@ -24,50 +27,57 @@ def past_solids(s: Environment, p: wp.vec3, d: wp.vec3, reach: wp.float32, light
     return wp.lerp(BOUNCED * wp.cw_mul(colour, s.horizon), light, 0.35 * hit.t / reach)
 
 
-@wp.kernel(module=wp.get_module("cortado_shading"), enable_backward=False)
-def illuminate(
-    first: wp.int32,
-    s: Environment,
-    surface: LitSurface,
-    points: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    sun_directions: wp.array(dtype=wp.vec3),
-    reach: wp.float32,
-    clearness: wp.float32,
-    light: wp.array(dtype=wp.vec3),
-):
-    """The light that falls on each of the points of a surface with normals: from all around, as far as neither other
-    fluid nor a solid is within ``reach`` [m], and from the lamp; ``clearness``: the part of it that goes through fluid,
-    from 0 to 1."""
-    i = first + wp.tid()
-    n = normals[i]
-    p = points[i] + s.nearest * n
-    around = wp.vec3(0.0)
-    for k in range(directions.shape[0]):
-        d = wp.normalize(n + 0.999 * directions[k])  # cosine-weighted
-        arriving = wp.lerp(s.horizon, s.zenith, wp.max(d[1], 0.0))
-        if d[1] < 0.0:
-            arriving = 0.55 * s.floor_colour
-        hit = wp.mesh_query_ray(surface.mesh, p, d, reach)
-        if hit.result:
-            arriving = arriving * wp.max(clearness, 0.35 * hit.t / reach)
-        if s.solids.has_opaque > 0:
-            arriving = past_solids(s, p, d, reach, arriving)
-        around += arriving
-    around = around / wp.float32(directions.shape[0])
-    cosine = wp.max(wp.dot(n, s.sun), 0.0)
-    sunlight = wp.float32(0.0)
-    if cosine > 0.0:
-        for k in range(sun_directions.shape[0]):
-            arriving_sun = wp.float32(1.0)
-            hit = wp.mesh_query_ray(surface.mesh, p, sun_directions[k], FAR)
+@cache
+def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
+    """The kernel that finds the light on surfaces, where there are opaque or transparent solids."""
+    module = shading_module(has_opaque, has_clear)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def illuminate(
+        first: wp.int32,
+        s: Environment,
+        surface: LitSurface,
+        points: wp.array(dtype=wp.vec3),
+        normals: wp.array(dtype=wp.vec3),
+        directions: wp.array(dtype=wp.vec3),
+        sun_directions: wp.array(dtype=wp.vec3),
+        reach: wp.float32,
+        clearness: wp.float32,
+        light: wp.array(dtype=wp.vec3),
+    ):
+        """The light that falls on each of the points of a surface with normals: from all around, as far as neither
+        other fluid nor a solid is within ``reach`` [m], and from the lamp; ``clearness``: the part of it that goes
+        through fluid, from 0 to 1."""
+        i = first + wp.tid()
+        n = normals[i]
+        p = points[i] + s.nearest * n
+        around = wp.vec3(0.0)
+        for k in range(directions.shape[0]):
+            d = wp.normalize(n + 0.999 * directions[k])  # cosine-weighted
+            arriving = wp.lerp(s.horizon, s.zenith, wp.max(d[1], 0.0))
+            if d[1] < 0.0:
+                arriving = 0.55 * s.floor_colour
+            hit = wp.mesh_query_ray(surface.mesh, p, d, reach)
             if hit.result:
-                arriving_sun = clearness
-            if s.solids.has_opaque > 0:
-                solid = wp.mesh_query_ray(s.solids.opaque, p, sun_directions[k], FAR)
-                if solid.result and solid.sign > 0.0:
-                    arriving_sun = 0.0
-            sunlight += arriving_sun
-        sunlight = sunlight * cosine / wp.float32(sun_directions.shape[0])
-    light[i] = 0.70 * around + wp.vec3(0.62, 0.60, 0.57) * sunlight
+                arriving = arriving * wp.max(clearness, 0.35 * hit.t / reach)
+            if has_opaque:
+                arriving = past_solids(s, p, d, reach, arriving)
+            around += arriving
+        around = around / wp.float32(directions.shape[0])
+        cosine = wp.max(wp.dot(n, s.sun), 0.0)
+        sunlight = wp.float32(0.0)
+        if cosine > 0.0:
+            for k in range(sun_directions.shape[0]):
+                arriving_sun = wp.float32(1.0)
+                hit = wp.mesh_query_ray(surface.mesh, p, sun_directions[k], FAR)
+                if hit.result:
+                    arriving_sun = clearness
+                if has_opaque:
+                    solid = wp.mesh_query_ray(s.solids.opaque, p, sun_directions[k], FAR)
+                    if solid.result and solid.sign > 0.0:
+                        arriving_sun = 0.0
+                sunlight += arriving_sun
+            sunlight = sunlight * cosine / wp.float32(sun_directions.shape[0])
+        light[i] = 0.70 * around + wp.vec3(0.62, 0.60, 0.57) * sunlight
+
+    return illuminate

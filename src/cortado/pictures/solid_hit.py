@@ -11,14 +11,24 @@ LAYERS = 8
 """Surfaces of transparent solids that a ray passes at most."""
 
 
+@wp.struct
+class SolidHit:
+    """Where a ray meets an opaque solid."""
+
+    t: wp.float32
+    """FAR where it does not."""
+    is_cut: wp.bool
+    """Whether that is a wall of the container, through which the solid reaches."""
+    face: wp.int32
+    u: wp.float32
+    v: wp.float32
+
+
 @wp.func
-def meet_solid(s: Environment, o: wp.vec3, d: wp.vec3):
-    """Where a ray meets an opaque solid: its surface, or a wall of the container at which it is cut."""
-    met = SurfaceHit()
-    met.found = False
+def reach_solid(s: Environment, o: wp.vec3, d: wp.vec3):
+    """Where a ray meets an opaque solid."""
+    met = SolidHit()
     met.t = FAR
-    if s.solids.has_opaque == 0:
-        return met
     part = wp.vec2(-FAR, FAR)
     if s.solids.are_cut > 0:
         part = within_walls(s, o, d)
@@ -28,15 +38,30 @@ def meet_solid(s: Environment, o: wp.vec3, d: wp.vec3):
     hit = wp.mesh_query_ray(s.solids.opaque, o + start * d, d, FAR)
     if not hit.result:
         return met
-    t = start + hit.t
-    is_cut = hit.sign < 0.0 and part[0] > 0.0  # it reaches through the wall
-    if not is_cut and t > part[1] - 2.0 * s.nearest:
-        return met
-    met = at_surface(s.solids.surfaces[OPAQUE], t, d, hit.face, hit.u, hit.v)
-    met.is_solid = True
-    if is_cut:
-        n = wall_normal(s, o + part[0] * d)
+    met.is_cut = hit.sign < 0.0 and part[0] > 0.0
+    if met.is_cut:
         met.t = part[0]
+    elif start + hit.t <= part[1] - 2.0 * s.nearest:
+        met.t = start + hit.t
+    met.face = hit.face
+    met.u = hit.u
+    met.v = hit.v
+    return met
+
+
+@wp.func
+def meet_solid(s: Environment, o: wp.vec3, d: wp.vec3):
+    """The same with what is known of the surface there."""
+    reached = reach_solid(s, o, d)
+    met = SurfaceHit()
+    met.found = False
+    met.t = FAR
+    if reached.t >= FAR:
+        return met
+    met = at_surface(s.solids.surfaces[OPAQUE], reached.t, d, reached.face, reached.u, reached.v)
+    met.is_solid = True
+    if reached.is_cut:
+        n = wall_normal(s, o + reached.t * d)
         met.normal = wp.where(wp.dot(n, d) > 0.0, -n, n)
         met.light = 0.35 * (s.horizon + s.zenith) + 0.62 * wp.vec3(wp.max(wp.dot(met.normal, s.sun), 0.0))
     return met

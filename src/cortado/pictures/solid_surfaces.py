@@ -30,6 +30,11 @@ class SolidSurfaces:
         self._clear = [(one, mesh) for one, mesh in placed if one.is_tank or one.transparency > 0.0]
         self.shadow = solid_shadow(stage, [(one, mesh) for one, mesh in placed if not one.is_tank])
 
+    @property
+    def kinds(self) -> tuple[bool, bool]:
+        """Whether there are opaque, and transparent ones."""
+        return bool(self._opaque), bool(self._clear)
+
     def on_device(self) -> tuple[Any, list[tuple[DeviceSurface, SolidMesh]]]:
         """`Solids`, and their surfaces, which must be kept and lit, with the meshes that they are of."""
         found, surfaces, lit = Solids(), list[tuple[DeviceSurface, SolidMesh]](), [LitSurface(), LitSurface()]
@@ -37,11 +42,11 @@ class SolidSurfaces:
         if self._opaque:
             surfaces.append(self._surface(self._opaque))
             lit[0] = surfaces[-1][0].lit
-            found.has_opaque, found.opaque = 1, lit[0].mesh
+            found.opaque = lit[0].mesh
         if self._clear:
             surfaces.append(self._surface(self._clear))
             lit[1] = surfaces[-1][0].lit
-            found.has_clear, found.clear = 1, lit[1].mesh
+            found.clear = lit[1].mesh
             found.has_tank = int(any(one.is_tank for one, _ in self._clear))
             left = [np.tile(_left(one), (len(mesh.triangles), 1)) for one, mesh in self._clear]
             lit[1].left = wp.array(np.concatenate(left), dtype=wp.vec2, device=self._device)

@@ -10,14 +10,14 @@ from cortado.device.bands import BandLauncher
 from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points
 from cortado.pictures.device_surface import DeviceSurface
-from cortado.pictures.lighting import illuminate
+from cortado.pictures.lighting import illuminate_kernel
 from cortado.pictures.scenery import Scenery, State, processes_for, sceneries, scenery
 from cortado.pictures.solid_mesh import SolidMesh
 from cortado.pictures.solid_surfaces import SolidSurfaces
 from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.surface import Surface
 from cortado.pictures.surroundings import GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Environment
-from cortado.pictures.trace import Eye, find_contrast, trace
+from cortado.pictures.trace import Eye, find_contrast, trace_kernel
 
 ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 """Where in a pixel four more rays go, in pixels from its middle."""
@@ -39,6 +39,8 @@ class SpacePainter:
         self._launch = BandLauncher(self.device)
         self._surroundings, self._eye = _surroundings(stage), _eye(stage)
         self._solids = SolidSurfaces(stage, self.device) if stage.solids else None
+        kinds = self._solids.kinds if self._solids is not None else (False, False)
+        self._trace, self._illuminates = trace_kernel(*kinds), illuminate_kernel(*kinds)
         self._lamps = self._rays_to_light(*LIGHT_RAYS[stage.picture.surface])
         self._lamps_of_solids = self._rays_to_light(*SOLID_RAYS)
 
@@ -77,7 +79,7 @@ class SpacePainter:
             asked = wp.array(pixels, dtype=wp.int32, device=device)
             where = wp.vec2(*offset)
             self._launch(
-                trace, len(pixels), **given, eye=self._eye, shadow=shadow, pixels=asked, offset=where, image=found
+                self._trace, len(pixels), **given, eye=self._eye, shadow=shadow, pixels=asked, offset=where, image=found
             )
             return found
 
@@ -95,7 +97,7 @@ class SpacePainter:
         own = {"points": surface.mesh.points, "normals": surface.lit.normals, "light": surface.lit.light}
         how = {"reach": 0.2 * self.stage.size, "clearness": self.stage.clearness}
         count = len(surface.mesh.points)
-        self._launch(illuminate, count, **given, **own, **how, directions=around, sun_directions=in_lamp)
+        self._launch(self._illuminates, count, **given, **own, **how, directions=around, sun_directions=in_lamp)
 
     def _rays_to_light(self, around: int, lamp: int) -> tuple[wp.array, wp.array]:
         """Directions to all around, and to so many points of the lamp."""

@@ -1,10 +1,13 @@
 """The surface of the fluid, as Warp functions: where rays come into the fluid and out of it."""
 
+from functools import cache
+from typing import Any
+
 import warp as wp
 
 from cortado.pictures.container_room import room, wall_normal
 from cortado.pictures.lit_surface import LitSurface, SurfaceHit, at_surface
-from cortado.pictures.solid_hit import LAYERS, meet_solid
+from cortado.pictures.solid_hit import LAYERS, meet_solid, reach_solid
 from cortado.pictures.surroundings import CLEAR, FAR, Environment
 
 
@@ -77,76 +80,105 @@ def meet_without_solids(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.v
 
 
 @wp.func
-def meet(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3):
-    """Where a ray from outside of the fluid comes into it, which it does not do within transparent solids, unless it
-    meets an opaque one before."""
+def into_fluid(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
+    """Where a ray comes into the fluid on a part of its way, on which no transparent solid is."""
     met = SurfaceHit()
     met.found = False
     met.t = FAR
-    part = room(s, o, d)
     start = wp.max(part[0], 0.0)
-    if part[1] <= start:
+    hit = wp.mesh_query_ray(surface.mesh, o + start * d, d, FAR)
+    if not hit.result:
         return met
+    if hit.sign < 0.0 and part[0] > 0.0:
+        p = o + start * d
+        return at_wall(s, surface, p, d, start, wall_normal(s, p))
+    if start + hit.t > part[1]:
+        return met
+    return at_surface(surface, start + hit.t, d, hit.face, hit.u, hit.v)
+
+
+@wp.func
+def into_fluid_among_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
+    """The same where transparent solids are, within which there is no fluid."""
+    met = SurfaceHit()
+    met.found = False
+    met.t = FAR
+    start = wp.max(part[0], 0.0)
     beside_container = part[0] > 0.0
     beside_solid = wp.bool(False)
-    side = wp.vec3(0.0)  # of the transparent solid that the ray comes out of: its triangle, and where on it
+    face = wp.int32(0)  # of the solid that the ray comes out of
+    place = wp.vec2(0.0)
     layers = wp.int32(0)
     while layers < LAYERS:
         layers += 1
         p = o + start * d
-        in_solid = wp.bool(False)
-        next_side = wp.vec3(0.0)
-        next_start = FAR
-        if s.solids.has_clear > 0:
-            clear = wp.mesh_query_ray(s.solids.clear, p, d, FAR)
+        clear = wp.mesh_query_ray(s.solids.clear, p, d, FAR)
+        in_solid = clear.sign < 0.0
+        end = start + clear.t
+        if not clear.result:
             in_solid = s.solids.has_tank > 0
-            if clear.result:
-                in_solid = clear.sign < 0.0
-                next_start = start + clear.t
-                next_side = wp.vec3(wp.float32(clear.face), clear.u, clear.v)
+            end = FAR
         if not in_solid:
             hit = wp.mesh_query_ray(surface.mesh, p, d, FAR)
             if hit.result and hit.sign < 0.0 and (beside_container or beside_solid):
                 normal = wall_normal(s, p)
                 if beside_solid:
-                    triangle = wp.int32(side[0])
-                    normal = at_surface(s.solids.surfaces[CLEAR], start, d, triangle, side[1], side[2]).normal
+                    normal = at_surface(s.solids.surfaces[CLEAR], start, d, face, place[0], place[1]).normal
                 met = at_wall(s, surface, p, d, start, normal)
-            elif hit.result and start + hit.t <= wp.min(part[1], next_start):
+            elif hit.result and start + hit.t <= wp.min(part[1], end):
                 met = at_surface(surface, start + hit.t, d, hit.face, hit.u, hit.v)
-        if met.found or next_start >= part[1]:
+        if met.found or end >= part[1]:
             break
-        start = next_start + s.nearest
-        side = next_side
+        start = end + s.nearest
+        face = clear.face
+        place = wp.vec2(clear.u, clear.v)
         beside_container = False
         beside_solid = in_solid
-    if met.found and s.solids.has_opaque > 0:
-        solid = meet_solid(s, o, d)
-        if solid.found and solid.t < met.t + 3.0 * s.nearest:  # a solid covers fluid that goes on behind its side
-            met.found = False
-            met.t = FAR
     return met
 
 
-@wp.func
-def leave(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3):
-    """Where a ray within the fluid comes out of it, or meets an opaque solid."""
-    part = room(s, o, d)
-    hit = wp.mesh_query_ray(surface.mesh, o, d, FAR)
-    met = SurfaceHit()
-    met.found = hit.result
-    met.t = 0.0
-    if hit.result and (hit.t <= part[1] or part[1] <= 0.0):
-        met = at_surface(surface, hit.t, d, hit.face, hit.u, hit.v)
-    elif hit.result:  # the wall comes first; what colour fluid has there does not matter
-        met.t = part[1]
-        met.normal = -wall_normal(s, o + part[1] * d)
-    if s.solids.has_clear > 0 and met.found:
-        clear = wp.mesh_query_ray(s.solids.clear, o, d, met.t)
-        if clear.result and clear.sign > 0.0:
-            met = at_surface(s.solids.surfaces[CLEAR], clear.t, d, clear.face, clear.u, clear.v)
-    if s.solids.has_opaque > 0:
-        solid = meet_solid(s, o, d)
-        if solid.found and (not met.found or solid.t < met.t):
-            return solid
-    return met
+@cache
+def surface_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
+    """`meet` and `leave`, where there are opaque or transparent solids."""
+
+    @wp.func
+    def meet(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3):
+        """Where a ray from outside of the fluid comes into it, unless it meets an opaque solid before."""
+        met = SurfaceHit()
+        met.found = False
+        met.t = FAR
+        part = room(s, o, d)
+        if part[1] <= wp.max(part[0], 0.0):
+            return met
+        met = into_fluid_among_clear(s, surface, o, d, part) if has_clear else into_fluid(s, surface, o, d, part)
+        if has_opaque:
+            reached = reach_solid(s, o, d).t
+            if reached < met.t + 3.0 * s.nearest:  # a solid covers fluid that goes on behind its side
+                met.found = False
+                met.t = FAR
+        return met
+
+    @wp.func
+    def leave(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3):
+        """Where a ray within the fluid comes out of it, or meets an opaque solid."""
+        part = room(s, o, d)
+        hit = wp.mesh_query_ray(surface.mesh, o, d, FAR)
+        met = SurfaceHit()
+        met.found = hit.result
+        met.t = 0.0
+        if hit.result and (hit.t <= part[1] or part[1] <= 0.0):
+            met = at_surface(surface, hit.t, d, hit.face, hit.u, hit.v)
+        elif hit.result:  # the wall comes first; what colour fluid has there does not matter
+            met.t = part[1]
+            met.normal = -wall_normal(s, o + part[1] * d)
+        if has_clear:
+            clear = wp.mesh_query_ray(s.solids.clear, o, d, met.t)
+            if met.found and clear.result and clear.sign > 0.0:
+                met = at_surface(s.solids.surfaces[CLEAR], clear.t, d, clear.face, clear.u, clear.v)
+        if has_opaque:
+            solid = meet_solid(s, o, d)
+            if solid.found and (not met.found or solid.t < met.t):
+                return solid
+        return met
+
+    return meet, leave

@@ -3,6 +3,8 @@
 All is in the frame of the picture: y points upwards. Colours are linear.
 """
 
+from typing import Any
+
 import warp as wp
 
 from cortado.pictures.lit_surface import LitSurface
@@ -13,16 +15,19 @@ NO_GLASS, GLASS_BOX, GLASS_CYLINDER = 0, 1, 2
 FAR = wp.constant(wp.float32(1.0e9))
 
 
+def shading_module(has_opaque: bool, has_clear: bool) -> Any:
+    """The Warp module of kernels for scenes with opaque or transparent solids, or with none."""
+    return wp.get_module("cortado_shading" + "_opaque" * has_opaque + "_clear" * has_clear)
+
+
 @wp.struct
 class Solids:
     """What fluid flows around, or is inside of."""
 
-    has_opaque: wp.int32
     opaque: wp.uint64
     """The mesh of opaque ones."""
     are_cut: wp.int32
     """Whether opaque ones are shown within the container only."""
-    has_clear: wp.int32
     clear: wp.uint64
     """The mesh of those that are transparent and of tanks, which all of space outside of a cavity is within."""
     has_tank: wp.int32

@@ -6,13 +6,16 @@ the part 1 - exp(-scattering L), instead of which it gets the colour of the flui
 and of what remains fluid takes away the colours that it does not have.
 """
 
+from functools import cache
+from typing import Any
+
 import warp as wp
 
-from cortado.pictures.glass import background, glass
+from cortado.pictures.glass import glass_functions
 from cortado.pictures.lit_surface import LitSurface
-from cortado.pictures.solid_hit import meet_solid, shaded_solid
-from cortado.pictures.surface_hit import leave, meet
-from cortado.pictures.surroundings import FAR, Environment, mirrored, schlick, sky
+from cortado.pictures.solid_hit import meet_solid, reach_solid, shaded_solid
+from cortado.pictures.surface_hit import surface_functions
+from cortado.pictures.surroundings import FAR, Environment, mirrored, schlick, shading_module, sky
 
 SEGMENTS = 4
 INDEX = wp.constant(wp.float32(1.33))
@@ -45,143 +48,154 @@ def toned(colour: wp.vec3):
     return found
 
 
-@wp.func
-def within(
-    s: Environment,
-    shadow: wp.array2d(dtype=wp.vec3),
-    surface: LitSurface,
-    start: wp.vec3,
-    direction: wp.vec3,
-    colour: wp.vec3,
-    light: wp.vec3,
-    spread: wp.float32,
-):
-    """Light that comes out of the fluid against a ray that was refracted into it."""
-    found = wp.vec3(0.0)
-    through = wp.vec3(1.0)
-    o = start
-    d = direction
-    c = colour
-    lit = light
-    inside = wp.bool(True)
-    for _ in range(SEGMENTS):
+@cache
+def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
+    """The kernel that traces rays, where there are opaque or transparent solids, or none, which takes no time then."""
+    module = shading_module(has_opaque, has_clear)
+    glass, background = glass_functions(has_opaque, has_clear)
+    meet, leave = surface_functions(has_opaque, has_clear)
+
+    @wp.func
+    def within(
+        s: Environment,
+        shadow: wp.array2d(dtype=wp.vec3),
+        surface: LitSurface,
+        start: wp.vec3,
+        direction: wp.vec3,
+        colour: wp.vec3,
+        light: wp.vec3,
+        spread: wp.float32,
+    ):
+        """Light that comes out of the fluid against a ray that was refracted into it."""
+        found = wp.vec3(0.0)
+        through = wp.vec3(1.0)
+        o = start
+        d = direction
+        c = colour
+        lit = light
+        inside = wp.bool(True)
+        for _ in range(SEGMENTS):
+            if inside:
+                met = leave(s, surface, o, d)
+                left = wp.exp(-surface.scattering * met.t)
+                soft = 0.55 * lit + wp.vec3(0.40)
+                found += wp.cw_mul(through, wp.cw_mul(c, soft)) * (1.0 - left)
+                taken = surface.scattering * met.t * TINT
+                tint = wp.vec3(
+                    wp.pow(wp.max(c[0], 0.02), taken),
+                    wp.pow(wp.max(c[1], 0.02), taken),
+                    wp.pow(wp.max(c[2], 0.02), taken),
+                )
+                through = wp.cw_mul(through, tint) * left
+                if met.is_solid:
+                    return found + wp.cw_mul(through, shaded_solid(s, met, d, 0.0))
+            else:
+                met = meet(s, surface, o, d)
+            if not met.found or wp.max(wp.max(through[0], through[1]), through[2]) < 0.02:
+                break
+            p = o + met.t * d
+            n = met.normal
+            cosine = -wp.dot(n, d)
+            if inside:
+                sine2 = INDEX * INDEX * (1.0 - cosine * cosine)
+                if sine2 >= 1.0:
+                    d = wp.normalize(mirrored(d, n))
+                    o = p + s.nearest * n
+                else:
+                    d = wp.normalize(INDEX * d + (INDEX * cosine - wp.sqrt(1.0 - sine2)) * n)
+                    o = p - s.nearest * n
+                    inside = False
+            else:
+                passed = glass(s, o, d, met.t, spread)
+                found += wp.cw_mul(through, passed.light)
+                through = through * passed.through
+                reflectance = schlick(0.02, cosine)
+                r = wp.normalize(mirrored(d, n))
+                found += wp.cw_mul(through, sky(s, wp.vec3(r[0], wp.abs(r[1]), r[2]))) * reflectance
+                through = through * (1.0 - reflectance)
+                c = met.colour
+                lit = met.light
+                sine2 = (1.0 - cosine * cosine) / (INDEX * INDEX)
+                d = wp.normalize(d / INDEX + (cosine / INDEX - wp.sqrt(1.0 - sine2)) * n)
+                o = p - s.nearest * n
+                inside = True
         if inside:
-            met = leave(s, surface, o, d)
-            left = wp.exp(-surface.scattering * met.t)
-            soft = 0.55 * lit + wp.vec3(0.40)
-            found += wp.cw_mul(through, wp.cw_mul(c, soft)) * (1.0 - left)
-            taken = surface.scattering * met.t * TINT
-            tint = wp.vec3(
-                wp.pow(wp.max(c[0], 0.02), taken), wp.pow(wp.max(c[1], 0.02), taken), wp.pow(wp.max(c[2], 0.02), taken)
-            )
-            through = wp.cw_mul(through, tint) * left
-            if met.is_solid:
-                return found + wp.cw_mul(through, shaded_solid(s, met, d, 0.0))
-        else:
-            met = meet(s, surface, o, d)
-        if not met.found or wp.max(wp.max(through[0], through[1]), through[2]) < 0.02:
-            break
+            return found + wp.cw_mul(through, wp.cw_mul(c, lit))
+        return found + wp.cw_mul(through, background(s, shadow, o, d, spread))
+
+    @wp.func
+    def seen(
+        s: Environment,
+        shadow: wp.array2d(dtype=wp.vec3),
+        surface: LitSurface,
+        o: wp.vec3,
+        d: wp.vec3,
+        spread: wp.float32,
+    ):
+        """The light that comes to the eye against a ray."""
+        met = meet(s, surface, o, d)
+        floor_at = FAR
+        if s.has_floor > 0 and d[1] < -1.0e-4:
+            floor_at = (s.floor_height - o[1]) / d[1]
+        if met.t > floor_at or not met.found:
+            found = background(s, shadow, o, d, spread)
+            solid_at = FAR
+            if has_opaque:
+                solid_at = reach_solid(s, o, d).t
+            if floor_at < solid_at:  # the floor is a little glossy
+                r = wp.vec3(d[0], -d[1], d[2])
+                p = o + floor_at * d
+                image = meet(s, surface, p, r)
+                instead_of = sky(s, r)
+                if has_opaque:
+                    solid = meet_solid(s, p + wp.vec3(0.0, s.nearest, 0.0), r)
+                    if not image.found:
+                        image = solid
+                        instead_of = found
+                if image.found:
+                    strength = schlick(0.04, -d[1]) * wp.exp(-2.5 * image.t / s.size)
+                    found += strength * (wp.cw_mul(image.colour, image.light) - instead_of)
+            return toned(found)
         p = o + met.t * d
         n = met.normal
         cosine = -wp.dot(n, d)
-        if inside:
-            sine2 = INDEX * INDEX * (1.0 - cosine * cosine)
-            if sine2 >= 1.0:
-                d = wp.normalize(mirrored(d, n))
-                o = p + s.nearest * n
-            else:
-                d = wp.normalize(INDEX * d + (INDEX * cosine - wp.sqrt(1.0 - sine2)) * n)
-                o = p - s.nearest * n
-                inside = False
-        else:
-            passed = glass(s, o, d, met.t, spread)
-            found += wp.cw_mul(through, passed.light)
-            through = through * passed.through
-            reflectance = schlick(0.02, cosine)
-            r = wp.normalize(mirrored(d, n))
-            found += wp.cw_mul(through, sky(s, wp.vec3(r[0], wp.abs(r[1]), r[2]))) * reflectance
-            through = through * (1.0 - reflectance)
-            c = met.colour
-            lit = met.light
-            sine2 = (1.0 - cosine * cosine) / (INDEX * INDEX)
-            d = wp.normalize(d / INDEX + (cosine / INDEX - wp.sqrt(1.0 - sine2)) * n)
-            o = p - s.nearest * n
-            inside = True
-    if inside:
-        return found + wp.cw_mul(through, wp.cw_mul(c, lit))
-    return found + wp.cw_mul(through, background(s, shadow, o, d, spread))
+        reflectance = schlick(0.02, cosine)
+        r = wp.normalize(mirrored(d, n))
+        start = p + s.nearest * n
+        other = meet(s, surface, start, r)
+        reflected = wp.cw_mul(other.colour, other.light)
+        if not other.found:
+            reflected = background(s, shadow, start, r, spread)
+        sine2 = (1.0 - cosine * cosine) / (INDEX * INDEX)
+        refracted = wp.normalize(d / INDEX + (cosine / INDEX - wp.sqrt(1.0 - sine2)) * n)
+        body = within(s, shadow, surface, p - s.nearest * n, refracted, met.colour, met.light, spread)
+        passed = glass(s, o, d, met.t + 2.0 * s.nearest, spread)
+        return toned(passed.light + passed.through * (reflectance * reflected + (1.0 - reflectance) * body))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def trace(
+        first: wp.int32,
+        eye: Eye,
+        s: Environment,
+        surface: LitSurface,
+        shadow: wp.array2d(dtype=wp.vec3),
+        pixels: wp.array(dtype=wp.int32),
+        offset: wp.vec2,
+        image: wp.array(dtype=wp.vec3),
+    ):
+        """The light of some pixels, through a point of each; ``offset``: where in the pixel, from -0.5 to 0.5."""
+        i = first + wp.tid()
+        pixel = pixels[i]
+        a = 2.0 * (wp.float32(pixel % eye.columns) + 0.5 + offset[0]) / wp.float32(eye.columns) - 1.0
+        b = 1.0 - 2.0 * (wp.float32(pixel / eye.columns) + 0.5 + offset[1]) / wp.float32(eye.rows)
+        d = wp.normalize(eye.forward + a * eye.right + b * eye.up)
+        spread = 2.0 * wp.length(eye.right) / wp.float32(eye.columns)
+        image[i] = seen(s, shadow, surface, eye.position, d, spread)
+
+    return trace
 
 
-@wp.func
-def seen(
-    s: Environment,
-    shadow: wp.array2d(dtype=wp.vec3),
-    surface: LitSurface,
-    o: wp.vec3,
-    d: wp.vec3,
-    spread: wp.float32,
-):
-    """The light that comes to the eye against a ray."""
-    met = meet(s, surface, o, d)
-    floor_at = FAR
-    if s.has_floor > 0 and d[1] < -1.0e-4:
-        floor_at = (s.floor_height - o[1]) / d[1]
-    if met.t > floor_at or not met.found:
-        found = background(s, shadow, o, d, spread)
-        solid_at = FAR
-        if s.solids.has_opaque > 0:
-            solid_at = meet_solid(s, o, d).t
-        if floor_at < solid_at:  # the floor is a little glossy
-            r = wp.vec3(d[0], -d[1], d[2])
-            p = o + floor_at * d
-            image = meet(s, surface, p, r)
-            instead_of = sky(s, r)
-            if not image.found and s.solids.has_opaque > 0:
-                image = meet_solid(s, p + wp.vec3(0.0, s.nearest, 0.0), r)
-                instead_of = found
-            if image.found:
-                strength = schlick(0.04, -d[1]) * wp.exp(-2.5 * image.t / s.size)
-                found += strength * (wp.cw_mul(image.colour, image.light) - instead_of)
-        return toned(found)
-    p = o + met.t * d
-    n = met.normal
-    cosine = -wp.dot(n, d)
-    reflectance = schlick(0.02, cosine)
-    r = wp.normalize(mirrored(d, n))
-    start = p + s.nearest * n
-    other = meet(s, surface, start, r)
-    reflected = wp.cw_mul(other.colour, other.light)
-    if not other.found:
-        reflected = background(s, shadow, start, r, spread)
-    sine2 = (1.0 - cosine * cosine) / (INDEX * INDEX)
-    refracted = wp.normalize(d / INDEX + (cosine / INDEX - wp.sqrt(1.0 - sine2)) * n)
-    body = within(s, shadow, surface, p - s.nearest * n, refracted, met.colour, met.light, spread)
-    passed = glass(s, o, d, met.t + 2.0 * s.nearest, spread)
-    return toned(passed.light + passed.through * (reflectance * reflected + (1.0 - reflectance) * body))
-
-
-@wp.kernel(module=wp.get_module("cortado_shading"), enable_backward=False)
-def trace(
-    first: wp.int32,
-    eye: Eye,
-    s: Environment,
-    surface: LitSurface,
-    shadow: wp.array2d(dtype=wp.vec3),
-    pixels: wp.array(dtype=wp.int32),
-    offset: wp.vec2,
-    image: wp.array(dtype=wp.vec3),
-):
-    """The light of some pixels, through a point of each; ``offset``: where in the pixel, from -0.5 to 0.5."""
-    i = first + wp.tid()
-    pixel = pixels[i]
-    a = 2.0 * (wp.float32(pixel % eye.columns) + 0.5 + offset[0]) / wp.float32(eye.columns) - 1.0
-    b = 1.0 - 2.0 * (wp.float32(pixel / eye.columns) + 0.5 + offset[1]) / wp.float32(eye.rows)
-    d = wp.normalize(eye.forward + a * eye.right + b * eye.up)
-    spread = 2.0 * wp.length(eye.right) / wp.float32(eye.columns)
-    image[i] = seen(s, shadow, surface, eye.position, d, spread)
-
-
-@wp.kernel(module=wp.get_module("cortado_shading"), enable_backward=False)
+@wp.kernel(module=wp.get_module("cortado_contrast"), enable_backward=False)
 def find_contrast(
     first: wp.int32,
     columns: wp.int32,
