@@ -155,7 +155,8 @@ def cloud(name: str, seed: int = 7) -> Cloud:
     s.particles = N
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
     s.filling, s.count = search.filling, search.count
-    s.wall_positions, s.wall_weights, s.wall_feet = search.wall_positions, search.wall_weights, search.wall_feet
+    for name, values in search.walls.items():
+        setattr(s, name, values)
     s.support, s.per_support, s.reach = SUPPORT, 1.0 / SUPPORT, 1.03 * SUPPORT
     s.normalisation = CUBIC_SPLINE.normalisation(dimension, SUPPORT)
     s.self_weight = float(CUBIC_SPLINE.weight(np.zeros(1), dimension, SUPPORT)[0])

@@ -109,7 +109,7 @@ def test_the_plane_shows_pure_colours_and_mixtures():
 def test_a_drop_in_the_plane_is_as_large_as_a_spacing():
     scene = scene_of(2, picture={"width": 300, "height": 200})
     alone = drawn(scene, np.array([[0.3, 0.25]]), np.array([[0.0, 0.0, 0.0]]))
-    pixel = painter(scene, np.zeros((1, 2))).pixel
+    pixel = painter(scene, np.zeros((1, 2))).stage.pixel
     dark = (alone.max(axis=2) < 0.4).sum() * pixel**2
     assert 0.3 * 0.1**2 < dark < 1.5 * 0.1**2
 

@@ -206,8 +206,9 @@ def test_what_enters_a_solid_is_lost_and_said(monkeypatch):
 
     monkeypatch.setattr(walls, "uneven_changes", lambda sums, wanted: np.full(sums.shape[1], -1.0))
     above = {"shape": "box", "lower": [0.5, 0.4], "upper": [0.7, 0.6], "phase": "water"}
+    shelf = {"shape": "box", "lower": [0.3, 0.1], "upper": [0.9, 0.35]}
     with pytest.raises(DivergedError, match="entered the solid 'solid 0' and was at"):
-        Simulation(scene([PILLAR], fluid=[above])).run(400)
+        Simulation(scene([shelf], fluid=[above])).run(400)
 
 
 @pytest.mark.parametrize("slips", [("no", "free"), ("free", "no")])

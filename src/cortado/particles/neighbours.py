@@ -129,6 +129,7 @@ class NeighbourSearch:
         kinds |= {"weights": precision.real, "grips": precision.real}
         self.walls = {f"wall_{name}": wp.zeros(count, dtype=kind, device=device) for name, kind in kinds.items()}
         """What kernels know of wall particles, those at rest first."""
+        self._write_walls(still)
         self._wall_sort = CellSort(grid, len(still), precision, device)
         self._unsorted_walls: WallArrays | None = still
         self.moving = None if begun is None else MovingWalls(moving, len(still), begun, grid, layout)
@@ -153,14 +154,17 @@ class NeighbourSearch:
             self._unsorted_walls = None
         self._sort(positions)
 
-    def _sort_walls(self, walls: WallArrays) -> None:
-        positions, device = self.walls["wall_positions"], self.device
-        self._wall_sort(wp.array(walls.positions, dtype=positions.dtype, device=device))
-        order = self._wall_sort.order.numpy()
+    def _write_walls(self, walls: WallArrays) -> None:
+        """Those at rest, in this order."""
         for name in ("positions", "weights", "grips", "feet"):
-            array, values = self.walls[f"wall_{name}"], getattr(walls, name)[order]
+            array, values = self.walls[f"wall_{name}"], getattr(walls, name)
             if len(values):
-                wp.copy(array, wp.array(values, dtype=array.dtype, device=device), count=len(values))
+                wp.copy(array, wp.array(values, dtype=array.dtype, device=self.device), count=len(values))
+
+    def _sort_walls(self, walls: WallArrays) -> None:
+        dtype = self.walls["wall_positions"].dtype
+        self._wall_sort(wp.array(walls.positions, dtype=dtype, device=self.device))
+        self._write_walls(walls.some(self._wall_sort.order.numpy()))
         self._near_walls.assign(_near_walls(self._grid, self._wall_sort.grid.starts.numpy()))
 
     def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:

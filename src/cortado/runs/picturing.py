@@ -12,6 +12,7 @@ from cortado.pictures.scale import Scale
 from cortado.render.renderer import Renderer
 from cortado.render.scene_renderer import Pictured, scene_renderer
 from cortado.runs.frame import Frame
+from cortado.runs.solid_motion import posed, solid_motions
 from cortado.scene.parameters.parameter import Axis
 from cortado.scene.picture import Picture
 from cortado.scene.quantities import NAMES, sizes
@@ -63,7 +64,8 @@ class Picturing:
         if own:
             table = table.model_copy(update={"colour_by": own.name})
         scene = self.scene.model_copy(update={"picture": table})
-        draws = painter(scene, frame.positions, self.device)
+        motions = solid_motions(scene, {name: values[None] for name, values in frame.others.items()})
+        draws = painter(posed(scene, motions, 0), frame.positions, self.device)
         if table.colour_by is None:
             return draws.image(frame.positions, colours_of(scene, frame.mass_fractions, self.particles))
         values, unit = sizes(table.colour_by, frame[table.colour_by], self.dimension), own.unit if own else None

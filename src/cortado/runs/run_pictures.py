@@ -11,7 +11,9 @@ from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.scale import Scale
 from cortado.pictures.scene_view import scene_view
 from cortado.pictures.scenery import State
+from cortado.runs.moving_painter import MovingPainter
 from cortado.runs.report import Figures
+from cortado.runs.solid_motion import moved
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
@@ -37,20 +39,20 @@ def run_pictures(
 def run_page(scene: Scene, trajectory: Trajectory, device: Any, values: Points | None = None) -> Page:
     """The frames of a run by their number; all are taken from one place. ``values`` (frames, n): what the scene colours
     its particles by."""
-    name, draws = (scene.picture or Picture()).colour_by, painter(scene, trajectory.positions, device)
-    if name is not None and values is not None:
-        scale = Scale.of(name, values)
-        return Page(
-            draws,
-            [lambda k: (trajectory.positions[k], scale.colours(values[k]))],
-            lambda images: scale.beside(alone(images)),
-        )
+    name = (scene.picture or Picture()).colour_by
+    scale = None if name is None or values is None else Scale.of(name, values)
+    moving = MovingPainter(scene, trajectory, device) if moved(scene, trajectory.others) else None
 
     def state(k: int) -> State:
+        if moving is not None:
+            moving.frame = k
         frame = trajectory[k]
+        if scale is not None and values is not None:
+            return frame.positions, scale.colours(values[k])
         return frame.positions, colours_of(scene, frame.mass_fractions, trajectory.particles)
 
-    return Page(draws, [state])
+    draws = moving or painter(scene, trajectory.positions, device)
+    return Page(draws, [state]) if scale is None else Page(draws, [state], lambda images: scale.beside(alone(images)))
 
 
 def trajectory_view(scene: Scene, trajectory: Trajectory) -> str:

@@ -27,7 +27,12 @@ class SolidMotion:
 
 def solid_motions(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> dict[str, SolidMotion]:
     """Of the solids of a scene that move, by their names, from recorded fields (frames, 1, ...) of states."""
-    return {table.name: _motion(table, fields, scene.dimension) for table in moving(scene.solid)}
+    return {table.name: _motion(table, fields, scene.dimension) for table in moved(scene, fields)}
+
+
+def moved(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> list[Any]:
+    """The solids of a scene that move, of which fields of states tell."""
+    return [table for table in moving(scene.solid) if displacement_name(table.name) in fields]
 
 
 def _motion(table: Any, fields: Mapping[str, NDArray[Any]], dimension: int) -> SolidMotion:
@@ -39,3 +44,14 @@ def _motion(table: Any, fields: Mapping[str, NDArray[Any]], dimension: int) -> S
     from scipy.spatial.transform import Rotation
 
     return SolidMotion(positions, (Rotation.from_rotvec(turns) * Rotation.from_rotvec(begun)).as_rotvec())
+
+
+def posed(scene: Scene, motions: Mapping[str, SolidMotion], frame: int) -> Scene:
+    """A scene to be drawn, with the solids that move where they are in a frame."""
+    tables = [_posed(table, motions[table.name], frame) if table.name in motions else table for table in scene.solid]
+    return scene.model_copy(update={"solid": tuple(tables)})
+
+
+def _posed(table: Any, motion: SolidMotion, frame: int) -> Any:
+    rotation = tuple(np.atleast_1d(motion.rotations[frame]).tolist())
+    return table.model_copy(update={"position": tuple(motion.positions[frame].tolist()), "rotation": rotation})
