@@ -9,6 +9,7 @@ from cortado.pictures.mirrored import mirrored
 from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.particle_sets import particles
 from cortado.pictures.scene_view import container_outline, outline, scene_view
+from cortado.pictures.shadow import NODES, REACH
 from cortado.pictures.shown_solids import shown_solids
 from cortado.pictures.solid_lines import solid_outline
 from cortado.pictures.solid_mesh import FAR, SolidMesh
@@ -253,10 +254,16 @@ def test_without_a_container_solids_are_in_the_picture(dimension):
 
 def test_solids_cast_a_shadow_on_the_floor():
     stage = Stage.of(scene_of(3, BALL), COLUMN[3])
-    light = SolidSurfaces(stage, "cpu").shadow
+    surfaces = SolidSurfaces(stage, "cpu")
+    light = surfaces.shadow(stage.solids)
     assert 0.1 < light.min() < 0.5 and light[0, 0].min() == 1.0
+    (ball,) = stage.solids
+    moved = surfaces.shadow([ball.moved(ball.position - (0.2, 0.0, 0.0), ball.turn)])
+    places = [np.array(np.nonzero(one[..., 0] < 0.6)).mean(axis=1) for one in (light, moved)]
+    cell = 2.0 * REACH * stage.size / (NODES - 1)
+    np.testing.assert_allclose((places[0] - places[1]) * cell, [0.2, 0.0], atol=cell)
     clear = Stage.of(scene_of(3, {**BALL, "transparency": 1.0}), COLUMN[3])
-    assert SolidSurfaces(clear, "cpu").shadow.min() == 1.0
+    assert SolidSurfaces(clear, "cpu").shadow(clear.solids).min() == 1.0
 
 
 def test_a_solid_lies_in_the_shadow_of_another():

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from cortado.discretise.shapes import Points
 from cortado.pictures.device_surface import DeviceSurface
 from cortado.pictures.lit_surface import LitSurface
 from cortado.pictures.shadow import solid_shadow
@@ -20,41 +21,51 @@ LONGEST = 0.04
 """Of the sides of triangles, at whose corners light is found, in sizes of what is shown."""
 
 
+Placed = tuple[ShownSolid, SolidMesh]
+
+
 class SolidSurfaces:
-    """Those of the solids of a stage, in their poses."""
+    """Those of the solids of a stage, whose triangles are found once; in poses, for each picture."""
 
     def __init__(self, stage: Stage, device: Any):
-        placed = [(one, _mesh_of(one, stage.size).moved(one.turn, one.position)) for one in stage.solids]
-        self._device, self._are_cut = device, stage.cuts_solids
-        self._opaque = [(one, mesh) for one, mesh in placed if not one.is_tank and one.transparency == 0.0]
-        self._clear = [(one, mesh) for one, mesh in placed if one.is_tank or one.transparency > 0.0]
-        self.shadow = solid_shadow(stage, [(one, mesh) for one, mesh in placed if not one.is_tank])
+        self._stage, self._device = stage, device
+        self._own = [_mesh_of(one, stage.size) for one in stage.solids]
 
     @property
     def kinds(self) -> tuple[bool, bool]:
         """Whether there are opaque, and transparent ones."""
-        return bool(self._opaque), bool(self._clear)
+        clear = [_is_clear(one) for one in self._stage.solids]
+        return not all(clear), any(clear)
 
-    def on_device(self) -> tuple[Any, list[tuple[DeviceSurface, SolidMesh]]]:
-        """`Solids`, and their surfaces, which must be kept and lit, with the meshes that they are of."""
+    def shadow(self, solids: Sequence[ShownSolid]) -> Points:
+        """As `solid_shadow` returns it; ``solids``: those of the stage, in poses."""
+        return solid_shadow(self._stage, [(one, mesh) for one, mesh in self._placed(solids) if not one.is_tank])
+
+    def on_device(self, solids: Sequence[ShownSolid]) -> tuple[Any, list[tuple[DeviceSurface, SolidMesh]]]:
+        """`Solids`, and their surfaces, which must be kept and lit, with the meshes that they are of; ``solids``: those
+        of the stage, in poses."""
         found, surfaces, lit = Solids(), list[tuple[DeviceSurface, SolidMesh]](), [LitSurface(), LitSurface()]
-        found.are_cut = int(self._are_cut)
-        if self._opaque:
-            surfaces.append(self._surface(self._opaque))
+        found.are_cut, placed = int(self._stage.cuts_solids), self._placed(solids)
+        opaque, clear = ([pair for pair in placed if _is_clear(pair[0]) == kind] for kind in (False, True))
+        if opaque:
+            surfaces.append(self._surface(opaque))
             lit[0] = surfaces[-1][0].lit
             found.opaque = lit[0].mesh
-        if self._clear:
-            surfaces.append(self._surface(self._clear))
+        if clear:
+            surfaces.append(self._surface(clear))
             lit[1] = surfaces[-1][0].lit
             found.clear = lit[1].mesh
-            found.has_tank = int(any(one.is_tank for one, _ in self._clear))
-            left = [np.tile(_left(one), (len(mesh.triangles), 1)) for one, mesh in self._clear]
+            found.has_tank = int(any(one.is_tank for one, _ in clear))
+            left = [np.tile(_left(one), (len(mesh.triangles), 1)) for one, mesh in clear]
             lit[1].left = wp.array(np.concatenate(left), dtype=wp.vec2, device=self._device)
             lit[1].from_edges = wp.array(surfaces[-1][1].from_edges, dtype=wp.mat33, device=self._device)
         found.surfaces = wp.array(lit, dtype=LitSurface, device=self._device)
         return found, surfaces
 
-    def _surface(self, solids: Sequence[tuple[ShownSolid, SolidMesh]]) -> tuple[DeviceSurface, SolidMesh]:
+    def _placed(self, solids: Sequence[ShownSolid]) -> list[Placed]:
+        return [(one, mesh.moved(one.turn, one.position)) for one, mesh in zip(solids, self._own, strict=True)]
+
+    def _surface(self, solids: Sequence[Placed]) -> tuple[DeviceSurface, SolidMesh]:
         """Several as one."""
         mesh = SolidMesh.joined([one for _, one in solids])
         colours = np.concatenate([np.tile(one.colour, (len(own.points), 1)) for one, own in solids])
@@ -67,6 +78,11 @@ def _mesh_of(shown: ShownSolid, size: float) -> SolidMesh:
     faces = shown.shape.faces(min(FINE * size, FINE_OWN * own))
     longest = np.inf if shown.transparency == 1.0 else LONGEST * size  # what is clear has no light of its own
     return SolidMesh.of(faces.reversed() if shown.is_tank else faces, longest)
+
+
+def _is_clear(shown: ShownSolid) -> bool:
+    """Whether fluid is seen through it, or in it."""
+    return shown.is_tank or shown.transparency > 0.0
 
 
 def _left(shown: ShownSolid) -> tuple[float, float]:

@@ -57,7 +57,7 @@ class SpacePainter:
         light, corner, cell = fluid.shadow
         s.shadow_corner, s.shadow_cell = wp.vec3(*corner), cell
         if self._solids is not None:
-            light = np.minimum(light, self._solids.shadow)
+            light = np.minimum(light, self._solids.shadow(self.stage.solids))
         shadow = wp.array(light, dtype=wp.vec3, device=self.device)
         with WARP:
             return self._rays(fluid.surface, s, shadow)
@@ -68,7 +68,7 @@ class SpacePainter:
         seen.lit.scattering, seen.lit.reach = self._scattering, 2.0 * self.stage.spacing
         given, solids = {"s": s, "surface": seen.lit}, list[tuple[DeviceSurface, SolidMesh]]()
         if self._solids is not None:
-            s.solids, solids = self._solids.on_device()
+            s.solids, solids = self._solids.on_device(self.stage.solids)
         self._illuminate(seen, self._lamps, given)
         for one, mesh in solids:
             self._illuminate(one, self._lamps_of_solids, given)

@@ -40,8 +40,8 @@ def across_of(vertices: Points, corners: Numbers) -> Points:
 
 
 def unit(vectors: NDArray[Any]) -> Points:
-    """Vectors (..., 3), each 1 long."""
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+    """Vectors (..., 3), each 1 long, but for those of no length."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
 
 
 def cosines_of(vertices: Points, corners: Numbers) -> Points:
