@@ -31,13 +31,16 @@ class Painter(Protocol):
         """The `image` of each state in their order."""
 
 
-def painter(scene: Scene, positions: Points, device: Any = "cpu") -> Painter:
-    """The painter of a scene, whose fluid will be at positions (frames, n, d) [m]; ``device``: that of the rays."""
+def painter(
+    scene: Scene, positions: Points, device: Any = "cpu", poses: Iterable[Scene] = ()
+) -> PlanePainter | SpacePainter:
+    """The painter of a scene, whose fluid will be at positions (frames, n, d) [m]; ``device``: that of the rays;
+    ``poses``: the same scene with its solids where they will be, for them to be in the picture, too."""
     count, particles = np.shape(positions)[-2], np.asarray(positions).reshape(-1, scene.dimension)
     particles = particles[:: max(len(particles) // ENOUGH, 1)]
     if scene.dimension == 2:
-        return PlanePainter(PlaneStage.of(scene, *extent_of(particles)))
-    return SpacePainter(Stage.of(scene, particles), count, device)
+        return PlanePainter(PlaneStage.of(scene, *extent_of(particles), poses))
+    return SpacePainter(Stage.of(scene, particles, poses), count, device)
 
 
 def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:

@@ -1,7 +1,7 @@
 """Pictures of fluid in 2-D: a body with a smooth edge and a little gloss, in its container, on paper."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import starmap
 from typing import ClassVar
 
@@ -13,6 +13,8 @@ from cortado.pictures.gloss import glossy
 from cortado.pictures.mirrored import mirrored
 from cortado.pictures.plane_stage import PlaneStage
 from cortado.pictures.scenery import State
+from cortado.pictures.shown_solids import shown_solids
+from cortado.scene.scene import Scene
 
 SUPPORT = 1.3
 """In spacings: how far a particle is felt."""
@@ -45,6 +47,10 @@ class PlanePainter:
     def images(self, states: Iterable[State]) -> Iterator[Points]:
         """The `image` of each state in their order."""
         return starmap(self.image, states)
+
+    def posed(self, scene: Scene) -> "PlanePainter":
+        """The same with the solids where a scene has them."""
+        return PlanePainter(replace(self.stage, solids=shown_solids(scene)))
 
     def _fluid(self, positions: Points, colours: Points) -> tuple[Points, Points]:
         """(rows, columns) the part of each pixel that fluid covers, and its colour (rows, columns, 3)."""

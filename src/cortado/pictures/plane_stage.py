@@ -1,5 +1,6 @@
 """Everything around the fluid in the plane: paper, the walls of a container or a tank, their shadow, and solids."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from cortado.discretise.shapes import Points
 from cortado.pictures.gloss import glossy
-from cortado.pictures.shown_solids import ShownSolid, shown_solids
+from cortado.pictures.shown_solids import ShownSolid, extent_with, shown_solids
 from cortado.scene.containers import BoxContainer
 from cortado.scene.picture import Picture
 from cortado.scene.scene import Scene
@@ -39,16 +40,15 @@ class PlaneStage:
     solids: tuple[ShownSolid, ...] = ()
 
     @classmethod
-    def of(cls, scene: Scene, lower: Points, upper: Points) -> "PlaneStage":
-        """That of a scene in 2-D, the fluid of which is between lower and upper (2,) [m]."""
+    def of(cls, scene: Scene, lower: Points, upper: Points, poses: Iterable[Scene] = ()) -> "PlaneStage":
+        """That of a scene in 2-D, the fluid of which is between lower and upper (2,) [m]; ``poses`` as of `painter`."""
         container = scene.container if isinstance(scene.container, BoxContainer) else None
         spacing, solids = scene.discretisation.spacing, shown_solids(scene)
         if container is not None:
             lower, upper = (np.asarray(end) for end in container.extent())
         else:
             paper = 0.0 if any(one.is_tank for one in solids) else spacing
-            ends = np.array([(lower - paper, upper + paper), *(one.body.extent() for one in solids)])
-            lower, upper = ends[:, 0].min(axis=0), ends[:, 1].max(axis=0)
+            lower, upper = extent_with((lower - paper, upper + paper), [scene, *poses])
         return cls(scene.picture or Picture(), container, lower, upper, spacing, solids)
 
     @cached_property

@@ -1,5 +1,6 @@
 """The solids of a scene as pictures show them: shapes in poses, with colours."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -14,6 +15,7 @@ from cortado.scene.scene import Scene
 class ShownSolid:
     """A solid in a pose."""
 
+    name: str
     shape: Solid
     """About its middle, not turned; of a tank the cavity."""
     position: Points
@@ -47,20 +49,28 @@ class ShownSolid:
 
 
 def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
-    """Those of a scene, at rest, with the images of them that are a period away and reach into the container."""
+    """Those of a scene, where its tables have them, with the images that are a period away and reach into the
+    container."""
     found = []
     for table in scene.solid:
         shape, middle = table.shape_about()
         position, is_tank = middle if table.position is None else np.array(table.position), table.side == "inside"
         clear = table.transparency if table.transparency is not None else float(is_tank)
         turn, colour = table.turn(scene.dimension), np.array(table.colour)
-        found.append(ShownSolid(shape, position, turn, colour, clear, is_tank))
+        found.append(ShownSolid(table.name, shape, position, turn, colour, clear, is_tank))
     ends, lengths = scene.container.extent(), scene.container.periods(scene.dimension)[1]
     if ends is None or not lengths.any():
         return tuple(found)
     shifts = list(product(*[(0.0, -length, length) if length else (0.0,) for length in lengths]))
     images = [one.moved(one.position + np.array(shift), one.turn) for one in found for shift in shifts]
     return tuple(one for one in images if _overlap(one.body.extent(), ends))
+
+
+def extent_with(ends: tuple[Points, Points], scenes: Iterable[Scene]) -> tuple[Points, Points]:
+    """Lower and upper ends (d,) [m] of all that is between such, and of the solids of scenes."""
+    bodies = [one.body.extent() for scene in scenes for one in shown_solids(scene)]
+    both = np.array([ends, *bodies])
+    return both[:, 0].min(axis=0), both[:, 1].max(axis=0)
 
 
 def _overlap(one: tuple[Points, Points], other: tuple[Points, Points]) -> bool:

@@ -29,7 +29,7 @@ class SolidSurfaces:
 
     def __init__(self, stage: Stage, device: Any):
         self._stage, self._device = stage, device
-        self._own = [_mesh_of(one, stage.size) for one in stage.solids]
+        self._own = {one.name: _mesh_of(one, stage.size) for one in stage.solids}
 
     @property
     def kinds(self) -> tuple[bool, bool]:
@@ -63,7 +63,7 @@ class SolidSurfaces:
         return found, surfaces
 
     def _placed(self, solids: Sequence[ShownSolid]) -> list[Placed]:
-        return [(one, mesh.moved(one.turn, one.position)) for one, mesh in zip(solids, self._own, strict=True)]
+        return [(one, self._own[one.name].moved(one.turn, one.position)) for one in solids]
 
     def _surface(self, solids: Sequence[Placed]) -> tuple[DeviceSurface, SolidMesh]:
         """Several as one."""

@@ -1,6 +1,7 @@
 """Pictures of fluid in 3-D, by a ray tracer on the device of the run."""
 
 from collections.abc import Iterable, Iterator
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from cortado.pictures.stage import Stage, screen_axes
 from cortado.pictures.surface import Surface
 from cortado.pictures.surroundings import GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Environment
 from cortado.pictures.trace import Eye, find_contrast, trace_kernel
+from cortado.scene.scene import Scene
 
 ROTATED_GRID = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 """Where in a pixel four more rays go, in pixels from its middle."""
@@ -51,6 +53,12 @@ class SpacePainter:
     def images(self, states: Iterable[State]) -> Iterator[Points]:
         """The `image` of each state in their order; surfaces of large fluids are computed in several processes."""
         return map(self._traced, sceneries(self.stage, states, self.at_once))
+
+    def posed(self, scene: Scene) -> "SpacePainter":
+        """The same with the solids where a scene has them."""
+        found = copy(self)
+        found.stage = self.stage.posed(scene)
+        return found
 
     def _traced(self, fluid: Scenery) -> Points:
         s = self._surroundings

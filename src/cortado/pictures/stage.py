@@ -1,13 +1,14 @@
 """Where a picture is taken: which way is up, the floor, the container of glass, the lamps, and a camera."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from cortado.discretise.shapes import Points, corners
 from cortado.pictures.mirrored import mirrored
-from cortado.pictures.shown_solids import ShownSolid, shown_solids
+from cortado.pictures.shown_solids import ShownSolid, extent_with, shown_solids
 from cortado.scene.containers import BoxContainer, Container, CylinderContainer
 from cortado.scene.fluids import INDEX_OF_AXIS
 from cortado.scene.picture import Picture
@@ -54,18 +55,16 @@ class Stage:
     """In the frame of the picture."""
 
     @classmethod
-    def of(cls, scene: Scene, positions: Points) -> "Stage":
-        """That of a scene in 3-D, whose fluid will be at positions (n, 3) [m]."""
+    def of(cls, scene: Scene, positions: Points, poses: Iterable[Scene] = ()) -> "Stage":
+        """That of a scene in 3-D, whose fluid will be at positions (n, 3) [m]; ``poses`` as of `painter`."""
         lower, upper = extent_of(positions)
-        solids = shown_solids(scene)
         picture = scene.picture or Picture()
         ends = scene.container.extent()
         frame = upright(np.asarray(scene.forces.gravity))
         if ends is None:
             air = 0.5 * scene.discretisation.spacing + AIR * (1.0 - np.abs(frame[1])) * (upper - lower)
-            air = 0.0 * air if any(one.is_tank for one in solids) else air
-            ends_of_all = np.array([(lower - air, upper + air), *(one.body.extent() for one in solids)])
-            lower, upper = ends_of_all[:, 0].min(axis=0), ends_of_all[:, 1].max(axis=0)
+            air = 0.0 * air if any(table.side == "inside" for table in scene.solid) else air
+            lower, upper = extent_with((lower - air, upper + air), [scene, *poses])
         else:
             lower, upper = np.minimum(lower, ends[0]), np.maximum(upper, ends[1])
         origin = 0.5 * (lower + upper)
@@ -86,10 +85,12 @@ class Stage:
             transparency = 0.0 if several or picture.colour_by is not None else 0.9
         spacing = scene.discretisation.spacing
         cuts = ends is not None and not spilled(scene.container, positions, spacing)
-        placed = tuple(one.within(frame, origin) for one in solids)
-        return cls(
-            frame, origin, low, high, eye, look_at, picture, scene.container, spacing, transparency, cuts, placed
-        )
+        own = cls(frame, origin, low, high, eye, look_at, picture, scene.container, spacing, transparency, cuts, ())
+        return own.posed(scene)
+
+    def posed(self, scene: Scene) -> "Stage":
+        """The same with the solids where a scene has them."""
+        return replace(self, solids=tuple(one.within(self.frame, self.origin) for one in shown_solids(scene)))
 
     @property
     def cuts_solids(self) -> bool:

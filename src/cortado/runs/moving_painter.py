@@ -10,6 +10,9 @@ from cortado.runs.solid_motion import posed, solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.scene import Scene
 
+ENOUGH = 100
+"""Frames that tell where solids come to."""
+
 
 class MovingPainter:
     """A `cortado.pictures.painter.Painter` that is told which frame comes next."""
@@ -17,15 +20,16 @@ class MovingPainter:
     at_once = 1
 
     def __init__(self, scene: Scene, trajectory: Trajectory, device: Any):
-        self._scene, self._positions, self._device = scene, trajectory.positions, device
-        self._motions = solid_motions(scene, trajectory.others)
+        self._scene, self._motions = scene, solid_motions(scene, trajectory.others)
+        frames = range(0, len(trajectory), max(len(trajectory) // ENOUGH, 1))
+        poses = [posed(scene, self._motions, frame) for frame in frames]
+        self._painter = painter(scene, trajectory.positions, device, poses)
         self.frame = 0
         """Number of the frame that is drawn next."""
 
     def image(self, positions: Points, colours: Points) -> Points:
         """A picture of the frame (rows, columns, 3), linear from 0 to 1."""
-        scene = posed(self._scene, self._motions, self.frame)
-        return painter(scene, self._positions, self._device).image(positions, colours)
+        return self._painter.posed(posed(self._scene, self._motions, self.frame)).image(positions, colours)
 
     def images(self, states: Iterable[State]) -> Iterator[Points]:
         """The `image` of each state, as soon as somebody has told its frame."""
