@@ -285,6 +285,23 @@ def test_a_solid_comes_again_with_every_period():
     assert len(shown_solids(scene)) == 2
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_solids_are_drawn_in_their_poses_from_one_place(dimension):
+    """Of a solid that moves, without a container: where it will be is in the picture from the start."""
+    before, after = (
+        scene_of(dimension, {**PILLAR, **pose}, container={"shape": "none"})
+        for pose in ({}, {"position": [1.5, 0.4, 0.2], "rotation": [0.0, 0.0, 1.2] if dimension == 3 else 1.2})
+    )
+    positions = COLUMN[dimension]
+    artist, colours = painter(before, positions, poses=[after]), colours_of(before, None, len(positions))
+    images = [one.image(positions, colours) for one in (artist, artist.posed(before), artist.posed(after))]
+    np.testing.assert_array_equal(images[0], images[1])
+    far = painter(after, positions, poses=[before]).image(positions, colours)
+    np.testing.assert_array_equal(images[2], far)
+    there = [np.argwhere(is_orange(image)).mean(axis=0) for image in (images[0], images[2])]
+    assert there[1][1] - there[0][1] > 0.4 * 240 and (is_orange(images[0]) & is_orange(images[2])).sum() == 0
+
+
 @pytest.mark.parametrize("table", SHAPES, ids=lambda table: table["shape"])
 def test_a_mesh_is_closed_smooth_and_fine(table):
     (shown,) = shown_solids(scene_of(3, table, container={"shape": "none"}, fluid=[
@@ -364,7 +381,7 @@ def test_outlines_are_the_edges_and_the_cuts_of_solids():
 def test_figures_and_views_have_the_lines_of_solids(tmp_path):
     scene = scene_of(2, PILLAR)
     paths = [
-        particles([COLUMN[2]], ["now"], tmp_path / name, container=scene.container.extent(), lines=lines)
+        particles([COLUMN[2]], ["now"], tmp_path / name, container=scene.container.extent(), lines=[lines])
         for name, lines in (("with.png", solid_outline(scene)), ("without.png", solid_outline(scene_of(2))))
     ]
     images = [cortado.pictures.read_picture(path) for path in paths]

@@ -292,6 +292,7 @@ upper = [0.6, 0.5, 0.2]
 rotation = [0.2, 0.3, 0.4]
 colour = [0.7, 0.3, 0.05]
 """
+MOVED = {2: {"position": (0.3, 0.6), "rotation": (1.0,)}, 3: {"position": (0.3, 0.6, 0.1), "rotation": (1.0, 0.0, 0.0)}}
 IN_SPACE = (
     TINY_SCENE.replace("dimension = 2", "dimension = 3")
     .replace("[0.0, 0.0]", "[0.0, 0.0, 0.0]")
@@ -322,6 +323,9 @@ def test_solids_are_seen_where_they_are(scene, dimension):
             found = np.unique(np.round(lines.reshape(-1, 3), 5), axis=0)
             np.testing.assert_allclose(np.unique(np.round(places, 5), axis=0), found, atol=2e-5)
             assert tuple(mesh.color) == tuple(to_srgb(np.array([[[0.7, 0.3, 0.05]]]))[0, 0])
+        window.place_solids(made.model_copy(update={"solid": (made.solid[0].model_copy(update=MOVED[dimension]),)}))
+        np.testing.assert_allclose(frame.position, window._space(np.array(MOVED[dimension]["position"])), atol=1e-6)
+        assert np.abs(frame.wxyz - [w, x, y, z]).max() > 0.05
     finally:
         shown.window.close()
 

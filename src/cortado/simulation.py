@@ -162,7 +162,7 @@ class Simulation(Stepping, Measuring, Picturing):
         """With a picture of its first particles."""
         shown, held = self.positions[: self.free_particles or None], self.scene.container.extent()
         solids = solid_outline(self.scene)
-        return with_picture(self, lambda path: particles([shown], ["t = 0 s"], path, container=held, lines=solids))
+        return with_picture(self, lambda path: particles([shown], ["t = 0 s"], path, container=held, lines=[solids]))
 
     @property
     def _points(self) -> str:

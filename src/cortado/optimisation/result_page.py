@@ -49,7 +49,7 @@ def _draw_ends(problem: Problem, points: Sequence[Mapping[str, Any]], path: Path
     if isinstance(loss, FinalPositions):
         sets, titles = [*sets, loss.target], [*titles, "target"]
     scene = problem.simulation.scene
-    particles(sets, titles, path, container=scene.container.extent(), lines=solid_outline(scene))
+    particles(sets, titles, path, container=scene.container.extent(), lines=[solid_outline(scene)] * len(sets))
 
 
 def _row(name: str, unit: str, first: Any, found: Any) -> tuple[str, ...]:

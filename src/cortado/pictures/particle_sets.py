@@ -26,7 +26,7 @@ def particles(
     colours: Sequence[ArrayLike] | None = None,
     colour_label: str = "",
     container: tuple[ArrayLike, ArrayLike] | None = None,
-    lines: ArrayLike = (),
+    lines: Sequence[ArrayLike] | None = None,
     dimension: int | None = None,
 ) -> Path:
     """Particle sets side by side, such as before, after and target.
@@ -41,28 +41,27 @@ def particles(
             blue, linear light in [0, 1]; None shades by depth.
         colour_label: beside the scale, with its unit.
         container: lower and upper corner (d,) [m], outlined.
-        lines: (k, 2, d) ends of lines [m] that are drawn over the particles, such as those of solids.
+        lines: for each panel (k, 2, d) ends of lines [m] that are drawn over the particles, such as those of solids.
         dimension: 2 or 3; that of the first set when left out. In 2-D a third component is ignored.
     """
     from matplotlib.collections import LineCollection
 
     sets = [np.asarray(one, dtype=float)[:, :dimension] for one in positions]
     values = [None] * len(sets) if colours is None else [np.asarray(one, dtype=float) for one in colours]
-    ends = np.asarray(lines, dtype=float)
-    ends = ends[:, :, :2] if ends.size else np.zeros((0, 2, 2))
-    lower, upper = _bounds([*sets, *ends], container)
+    ends = [np.asarray(one, dtype=float)[:, :, :2] for one in lines or [np.zeros((0, 2, 2))] * len(sets)]
+    lower, upper = _bounds([*sets, *(one.reshape(-1, 2) for one in ends)], container)
     across, up = upper - lower
     panel = min(5.5 if len(sets) > 1 else 8.0, 11.0 / len(sets), 7.0 * across / up)  # width [inch]
     width, height = max(panel * len(sets) + 1.2, 8.0), max(panel * up / across + 1.2, 3.6)
     with drawing(path, width, height) as figure:
         panels = figure.subplots(1, len(sets), sharex=True, sharey=True, squeeze=False)[0]
         scale = _ColourScale(sets, values)
-        for axes, points, own, title in zip(panels, sets, values, titles, strict=True):
+        for axes, points, own, title, drawn in zip(panels, sets, values, titles, ends, strict=True):
             _draw_set(axes, points, scale.rgb(points, own), title)
             if container is not None:
                 _outline(axes, container)
-            if len(ends):
-                axes.add_collection(LineCollection(list(ends), colors=INK, linewidths=1.2))
+            if len(drawn):
+                axes.add_collection(LineCollection(list(drawn), colors=INK, linewidths=1.2))
             axes.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal", xlabel="x [m]")
             axes.grid(False)
         panels[0].set_ylabel("y [m]")

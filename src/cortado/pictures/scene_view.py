@@ -37,14 +37,15 @@ class MovingState(Protocol):
 
 def scene_view(scene: Scene, runs: Mapping[str, Iterable[MovingState]], times: ArrayLike) -> str:
     """HTML that shows runs of a scene side by side, each by its name with a state for each of the times (frames,) [s];
-    see `particle_view`."""
+    see `particle_view`. Solids that move are not shown."""
     turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
     states, times = {name: list(of_run) for name, of_run in runs.items()}, np.asarray(times)
     particles = len(next(iter(states.values()))[0].positions)
     numbers = len(states) * (2 * scene.dimension + 1 + 3 * (len(scene.phase) > 1))
     chosen, stride = thinned(len(times), particles, numbers)
     clouds = [_cloud(scene, name, [of_run[k] for k in chosen], turn, stride) for name, of_run in states.items()]
-    lines = outline(scene) @ turn.T
+    still = tuple(table for table in scene.solid if table.motion == "fixed")
+    lines = outline(scene.model_copy(update={"solid": still})) @ turn.T
     return particle_view(clouds, times[chosen], scene.discretisation.spacing, lines=lines, stride=stride)
 
 

@@ -61,9 +61,9 @@ def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
     ends, lengths = scene.container.extent(), scene.container.periods(scene.dimension)[1]
     if ends is None or not lengths.any():
         return tuple(found)
-    shifts = list(product(*[(0.0, -length, length) if length else (0.0,) for length in lengths]))
+    shifts = list(product(*[(0.0, -length, length) if length else (0.0,) for length in lengths]))[1:]
     images = [one.moved(one.position + np.array(shift), one.turn) for one in found for shift in shifts]
-    return tuple(one for one in images if _overlap(one.body.extent(), ends))
+    return (*found, *(one for one in images if _overlap(one.body.extent(), ends)))
 
 
 def extent_with(ends: tuple[Points, Points], scenes: Iterable[Scene]) -> tuple[Points, Points]:

@@ -179,7 +179,7 @@ def _drawn(simulation: Simulation, path: Path) -> Path:
     colours = colours_of(scene, simulation.mass_fractions, simulation.particles)
     title = f"{scene.name}, the first state{', seen along the third axis' * (scene.dimension == 3)}"
     ends, lines = scene.container.extent(), solid_outline(scene)
-    return particles([simulation.positions], [title], path, colours=[colours], container=ends, lines=lines)
+    return particles([simulation.positions], [title], path, colours=[colours], container=ends, lines=[lines])
 
 
 def _as_text(found: dict[str, Any]) -> str:

@@ -21,6 +21,7 @@ from cortado.runs.run_figures import density_errors, readings
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.run_pictures import run_pictures, trajectory_view
 from cortado.runs.sensors.log import Readings
+from cortado.runs.solid_motion import posed, solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.in_words import scene_in_words
 from cortado.scene.scene import Scene
@@ -67,6 +68,7 @@ def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Fi
     scene = simulation.scene
     shown = sorted({0, len(trajectory.times) // 2, len(trajectory.times) - 1})
     titles = [f"t = {trajectory.times[frame]:.3f} s" for frame in shown]
+    motions = solid_motions(scene, trajectory.others)
     path = particles(
         [trajectory.positions[frame] for frame in shown],
         titles,
@@ -74,7 +76,7 @@ def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Fi
         colours=[np.linalg.norm(trajectory.velocities[frame], axis=1) for frame in shown],
         colour_label="speed [m/s]",
         container=scene.container.extent(),
-        lines=solid_outline(scene),
+        lines=[solid_outline(posed(scene, motions, frame)) for frame in shown],
     )
     along = ", seen along the third axis" * (scene.dimension == 3)
     figures: Figures = [(f"The fluid at the start, half-way and at the end{along}.", path)]

@@ -10,6 +10,7 @@ from cortado.cli.viewer.quantities import HEIGHT_UNITS, own_fields, pull_on_heig
 from cortado.cli.viewer.window import Shown, Window
 from cortado.errors import CortadoError, CortadoWarning
 from cortado.pictures.painter import colours_of
+from cortado.runs.solid_motion import posed, solid_motions
 from cortado.scene.restart import RestartState
 from cortado.scene.stability import longest_step
 from cortado.simulation import Simulation
@@ -86,6 +87,8 @@ class LiveView:
         quantities = quantities_of(state["velocities"], lambda: self.simulation, state, controls)
         quantities |= own_fields(state.fields, self.simulation.particles)
         pull = pull_on_height(lambda: self.simulation, state, controls)
+        scene, fields = self.simulation.scene, {name: np.asarray(field)[None] for name, field in state.fields.items()}
+        self.window.place_solids(posed(scene, solid_motions(scene, fields), 0))
         self.window.show(Shown(state["positions"], colours, quantities, pull))
 
     def _gravity(self) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 from cortado.cli.viewer.quantities import HEIGHT_UNITS, own_fields, pull_on_height, quantities_of, sizes_of
 from cortado.cli.viewer.window import Shown, Window
 from cortado.pictures.painter import colours_of
+from cortado.runs.solid_motion import posed, solid_motions
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.parameters.values import OVER_TIME
 from cortado.scene.scene import Scene
@@ -78,6 +79,7 @@ class RecordedView:
         recorded = {name: sizes_of(values) for name, values in frame.quantities.items()}
         quantities |= {name: partial(np.asarray, values) for name, values in recorded.items()}
         pull = (lambda: self._pulls[k]) if len(self._pulls) else pull_on_height(self._simulation, state, controls)
+        self.window.place_solids(posed(self.scene, solid_motions(self.scene, self.trajectory.others), k))
         self.window.show(Shown(frame.positions, colours, quantities, pull))
 
     def _controls_at(self, k: int) -> dict[str, Any]:

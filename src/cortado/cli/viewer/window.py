@@ -102,6 +102,12 @@ class Window:
         self._shown = shown
         self._draw()
 
+    def place_solids(self, scene: Scene) -> None:
+        """Show the solids where a scene has them, which is otherwise the same."""
+        with self.server.atomic():
+            for frame, solid in zip(self._solids, shown_solids(scene), strict=False):
+                frame.position, frame.wxyz = self._space(solid.position), _quaternion(self._turn @ solid.turn)
+
     def add_still(self, name: str, positions: Points) -> Any:
         """Grey points at positions (n, d) [m] that stay where they are, hidden at first."""
         size = 0.6 * RADIUS * self.scene.discretisation.spacing

@@ -45,7 +45,7 @@ def _particles(made: Setup, result: Result, folder: Path) -> tuple[str, Path]:
     shown = [before, after, made.targets[made.problem.steps]]
     several = len(scene.phase) > 1
     colours = [colours_of(scene, simulation.mass_fractions, simulation.particles)] * len(shown) if several else None
-    ends, lines = scene.container.extent(), solid_outline(scene)
+    ends, lines = scene.container.extent(), [solid_outline(scene)] * len(shown)
     path = particles(shown, TITLES, folder / "particles.png", colours=colours, container=ends, lines=lines)
     return "Where the fluid ends: with the first guess, as found, and the target.", path
 
