@@ -88,7 +88,7 @@ def test_distances_and_nearest_points_are_those_of_the_faces(name):
     lower, upper = solid.extent()
     d = len(lower)
     points = random.uniform(lower - 0.2, upper + 0.2, (300, d))
-    faces = solid.faces(0.06)
+    faces = solid.faces(0.035)
     found = solid.distance(points)
     np.testing.assert_array_equal(found[np.abs(found) > 0.01] < 0.0, winding(points, faces)[np.abs(found) > 0.01] > 0.5)
     shares = random.dirichlet(np.ones(d), (20000 // len(faces.corners) + 1, len(faces.corners)))
