@@ -147,11 +147,12 @@ def test_light_goes_no_further_than_to_a_solid(monkeypatch, tank):
 
 
 @pytest.mark.parametrize(("dimension", "place"), [(2, (0.0, -9.0, 0.0)), (3, (0.0, -9.0, 0.0)), (3, (0.0, 0.0, -0.7))])
-def test_a_solid_that_is_not_seen_changes_no_bit(dimension, place):
-    """Far below a closed container, or behind it: what draws solids draws the rest as it is drawn without any."""
+def test_a_solid_that_is_not_seen_changes_nothing(dimension, place):
+    """Far below a closed container, or behind it: what draws solids draws the rest as it is drawn without any, by other
+    kernels, whose round-off differs."""
     away = {**PILLAR, **{end: (np.array(PILLAR[end]) + place).tolist() for end in ("lower", "upper")}}
     images = [drawn(scene_of(dimension, *solids), COLUMN[dimension]) for solids in ((), (away,))]
-    np.testing.assert_array_equal(images[0], images[1])
+    np.testing.assert_allclose(images[0], images[1], rtol=2e-5)
 
 
 def test_fluid_touches_a_solid_without_a_gap():
