@@ -118,8 +118,8 @@ class MovingWalls:
     def __init__(self, walls: WallArrays, first: int, begun: Poses, grid: Grid, layout: Layout):
         """``walls`` of solids that move, which begin with poses ``begun``; the first of them has the number ``first``
         in the arrays of the search."""
-        self.before, self.after = begun.like(), begun.like()
-        """Poses before and after a step, which somebody else writes."""
+        self.begun, self.before, self.after = begun, begun.like(), begun.like()
+        """Poses at the start, and before and after a step; somebody else writes these."""
         precision, device, count = layout.precision, layout.device, len(walls)
         self._device, self._first, self._all = device, first, layout.members * count
         self._kernels = _kernels(precision)

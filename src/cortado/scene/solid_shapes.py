@@ -1,6 +1,7 @@
 """The shapes that solids may have."""
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -201,15 +202,8 @@ class MeshSolid(SolidTable):
             raise field_error((*path, "shape"), "mesh", '"box", "sphere", "capsule", "cup" or "polygon" in 2-D')
         return super().in_dimension(dimension, path)
 
-    def mesh(self) -> Mesh:
-        """As it is in the file, but for the scale; raises `InputError`."""
-        found = mesh_in_file(self.file).mesh
-        return replace(found, vertices=self.scale * found.vertices)
-
     def shape_about(self) -> tuple[Solid, Points]:
-        mesh = self.mesh()
-        middle = mesh.middle()
-        return replace(mesh, vertices=mesh.vertices - middle), middle
+        return _about_middle(mesh_in_file(self.file).mesh, self.scale)
 
     def thinnest(self) -> float:
         return np.inf
@@ -219,6 +213,13 @@ AnySolid = Annotated[
     BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid | MeshSolid,
     Field(discriminator="shape"),
 ]
+
+
+@lru_cache(maxsize=8)
+def _about_middle(mesh: Mesh, scale: float) -> tuple[Mesh, Points]:
+    """A mesh times a scale, about its middle, and where that is (3,) [m]; once, as looking it up takes a tree."""
+    middle = scale * mesh.middle()
+    return replace(mesh, vertices=scale * mesh.vertices - middle), middle
 
 
 def _crossing(corners: Points) -> tuple[int, int] | None:

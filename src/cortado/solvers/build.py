@@ -155,10 +155,7 @@ def _parts(
 def _moving_solids(scene: Scene, search: NeighbourSearch) -> MovingSolids | None:
     """The solids that move; None without any."""
     names = [table.name for table in moving(scene.solid)]
-    if not names:
-        return None
-    middles, turns = solid_frames(scene)
-    return MovingSolids(names, padded(middles), _in_space(turns), scene.dimension, search)
+    return MovingSolids(names, scene.dimension, search) if names else None
 
 
 def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnergy) -> Phases:

@@ -9,13 +9,11 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from cortado.device.precision import Precision
 from cortado.particles.fields import Entry, StateField
-from cortado.particles.moving_walls import Poses, matrix_of
+from cortado.particles.moving_walls import matrix_of
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout, Parameters, State
 from cortado.scene.motions import displacement_name, turn_name
@@ -97,10 +95,6 @@ class MovingSolids:
     """Makes the part of one solver."""
 
     names: Sequence[str]
-    middles: NDArray[np.float64]
-    """(solids, 3) where they begin [m]"""
-    turns: NDArray[np.float64]
-    """(solids, 3, 3) how they are turned then"""
     dimension: int
     search: NeighbourSearch
     """Whose walls are theirs."""
@@ -124,8 +118,6 @@ class MovingSolidsPart(Part):
             )
         )
         """How far they are from where they began, and turned."""
-        given = made_of.middles, made_of.turns, layout.precision, layout.device
-        self._begun = Poses.still(layout.members, *given)
         self._pose, self._end = _kernels(layout.precision, made_of.dimension)
 
     def begin(self, step: StepContext, state: State) -> None:
@@ -133,8 +125,8 @@ class MovingSolidsPart(Part):
         walls = search.moving
         assert walls is not None
         own: dict[str, Any] = {
-            "middles": self._begun.positions,
-            "turned": self._begun.turns,
+            "middles": walls.begun.positions,
+            "turned": walls.begun.turns,
             "before": walls.before.positions,
             "turns_before": walls.before.turns,
             "after": walls.after.positions,

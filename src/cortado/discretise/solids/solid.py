@@ -164,11 +164,9 @@ class Round(Solid):
         above = arc(np.array([0.0, length]), self.radius, 0.0, np.pi, fine)
         profile = polygon_faces(np.concatenate([above, -above]))
         along = self.half / length if length > 0.0 else np.eye(len(self.half))[-1]
-        frame = np.stack([*across(along), along], axis=1)  # its last column is along the segment
-        if len(self.half) == 2:
-            return profile.moved(frame * np.array([np.linalg.det(frame), 1.0]), np.zeros(2))
-        frame[:, 0] *= np.linalg.det(frame)
-        return revolved_faces(profile, 2, fine).moved(frame, np.zeros(3))
+        flat = len(self.half) == 2
+        upright = profile if flat else revolved_faces(profile, 2, fine)
+        return upright.moved(_standing(along), np.zeros(len(along)))
 
     def _within(self, points: Points) -> Points:
         """(n, d) the nearest points of the segment."""
@@ -235,9 +233,7 @@ class HalfSpace(Solid):
         size = float(np.linalg.norm(self.upper - self.lower))
         middle = 0.5 * (self.lower + self.upper)
         top = middle - (middle @ self.normal - self.height) * self.normal
-        frame = np.stack([*across(self.normal), self.normal], axis=1)
-        frame[:, 0] *= np.linalg.det(frame)
-        return box_faces(np.full(len(middle), size)).moved(frame, top - size * self.normal)
+        return box_faces(np.full(len(middle), size)).moved(_standing(self.normal), top - size * self.normal)
 
 
 @dataclass(frozen=True)
@@ -303,3 +299,10 @@ class Polygon(Solid):
             spans = (y_0 > points[:, 1]) != (y_1 > points[:, 1])
             inside ^= spans & (points[:, 0] < x_0 + (points[:, 1] - y_0) * (x_1 - x_0) / (y_1 - y_0))
         return inside
+
+
+def _standing(direction: Points) -> Points:
+    """(d, d) the rotation matrix that turns the last axis to a unit vector (d,)."""
+    frame = np.stack([*across(direction), direction], axis=1)
+    frame[:, 0] *= np.linalg.det(frame)
+    return frame
