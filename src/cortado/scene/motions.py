@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cortado.errors import MissingDerivativeError
 from cortado.scene.parameters.parameter import Axis, Parameter, Role
+from cortado.scene.schedule import along_lines
 from cortado.scene.solids import SolidTable
 
 
@@ -43,8 +44,7 @@ class Knots:
 
     def at(self, times: NDArray) -> NDArray:
         """(n,) or (n, components) at times (n,) [s]"""
-        columns = self.values.reshape(len(self.times), -1).T
-        found = np.stack([np.interp(times, self.times, column) for column in columns], axis=-1)
+        found = along_lines(times, self.times, self.values.reshape(len(self.times), -1))
         return found.reshape(len(times), *self.values.shape[1:])
 
     def greatest(self) -> float:

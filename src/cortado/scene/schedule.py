@@ -4,7 +4,7 @@ from itertools import pairwise
 from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, create_model, model_validator
 
 from cortado.errors import Words
@@ -12,6 +12,12 @@ from cortado.scene.fields import FieldPath, Several, field_error, quantity
 from cortado.scene.parameters.parameter import Axis, Parameter
 from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.tables import Table
+
+
+def along_lines(times: NDArray, known: ArrayLike, values: NDArray) -> NDArray:
+    """(n, components) at times (n,) [s]: values (k, components) at known times (k,), with straight lines between them,
+    constant before the first and after the last."""
+    return np.stack([np.interp(times, np.asarray(known), column) for column in values.T], axis=-1)
 
 
 class Course(Table):
@@ -34,8 +40,7 @@ class Course(Table):
 
     def at(self, times: NDArray) -> NDArray:
         """(n, components) at times (n,) [s]."""
-        columns = np.array(self.values, dtype=np.float64).T
-        return np.stack([np.interp(times, self.times, column) for column in columns], axis=-1)
+        return along_lines(times, self.times, np.array(self.values, dtype=np.float64))
 
     def rates(self, times: NDArray) -> NDArray:
         """(n, components) the derivative with respect to time at times (n,) [s]; at a time of the course that of what

@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field
 
-from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
+from cortado.scene.fields import FieldPath, Length, Text, Vector, quantity
 from cortado.scene.tables import Table
 
 Reach = Annotated[float, quantity("m", gt=0.0)] | None
@@ -18,11 +18,7 @@ class SensorTable(Table):
     """What its columns in sensors.csv begin with."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        for name in ("lower", "upper", "about"):
-            value = getattr(self, name, None)
-            if value is not None and len(value) != dimension:
-                wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
-                raise field_error((*path, name), value, wanted)
+        self.check_components(("lower", "upper", "about"), dimension, path)
         return super().in_dimension(dimension, path)
 
 

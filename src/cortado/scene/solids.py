@@ -113,13 +113,7 @@ class SolidTable(Table):
         return rotation_matrix(self.rotation or (0.0,) * (2 * dimension - 3))
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        if self.position is not None and len(self.position) != dimension:
-            wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
-            raise field_error((*path, "position"), self.position, wanted)
-        for name in ("velocity", "surface_velocity"):
-            if (value := getattr(self, name)) is not None and len(value) != dimension:
-                wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
-                raise field_error((*path, name), value, wanted)
+        self.check_components(("position", "velocity", "surface_velocity"), dimension, path)
         for name in ("rotation", "angular_velocity"):
             if (value := getattr(self, name)) is not None and len(value) != 2 * dimension - 3:
                 wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"

@@ -3,7 +3,7 @@
 A wrong value ends in a `SceneError`, whether the scene comes from a file or is built in Python.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from typing import Any, ClassVar, Self
 
@@ -53,9 +53,21 @@ class Table(BaseModel):
                 value = getattr(self, name)
                 filled[name] = value if name in self.model_fields_set else value[:dimension]
                 if len(filled[name]) != dimension:
-                    wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
-                    raise field_error((*path, name), value, wanted)
+                    raise components_error((*path, name), value, dimension)
         return self.model_copy(update=filled)
+
+    def check_components(self, names: Iterable[str], dimension: int, path: FieldPath) -> None:
+        """Those fields of these names that are there and given have as many components as there are dimensions."""
+        for name in names:
+            value = getattr(self, name, None)
+            if value is not None and len(value) != dimension:
+                raise components_error((*path, name), value, dimension)
+
+
+def components_error(path: FieldPath, value: Any, dimension: int) -> PydanticCustomError:
+    """What is raised of a vector that has another number of components."""
+    wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
+    return field_error(path, value, wanted)
 
 
 def _unknown_key(key: str, known: list[str]) -> PydanticCustomError:
