@@ -72,8 +72,13 @@ def first_values(fields: Iterable[StateField], parameters: Mapping[str, NDArray]
     for field in fields:
         if field.first is not None and field.first in parameters:
             value = parameters[field.first]
-            found[field.name] = value if field.axis is Axis.PARTICLE else np.atleast_2d(value)[:1]
+            found[field.name] = value if field.axis is Axis.PARTICLE else _first_row(field, value)
     return found
+
+
+def _first_row(field: StateField, value: NDArray) -> NDArray:
+    """(1,) or (1, components) of a parameter of the scene, over time the first row."""
+    return (np.atleast_2d(value) if field.entry is Entry.VECTOR else np.atleast_1d(value))[:1]
 
 
 POSITIONS = StateField("positions", "m", Entry.VECTOR, first="initial_positions")

@@ -27,17 +27,25 @@ class Poses:
     """(members, solids) matrices, from the frame of a solid to space"""
 
     @classmethod
-    def still(cls, members: int, middles: np.ndarray, turns: np.ndarray, precision: Precision, device: Any) -> "Poses":
-        """Where solids begin, (solids, 3) [m] and (solids, 3, 3), in every scene."""
-        several = (members, len(middles))
-        return cls(
-            wp.array(np.broadcast_to(middles, (*several, 3)).copy(), dtype=precision.vector, device=device),
-            wp.array(np.broadcast_to(turns, (*several, 3, 3)).copy(), dtype=matrix_of(precision), device=device),
-        )
+    def zeros(cls, members: int, solids: int, precision: Precision, device: Any) -> "Poses":
+        """Still to be written."""
+        kinds = precision.vector, matrix_of(precision)
+        return cls(*(wp.zeros((members, solids), dtype=kind, device=device) for kind in kinds))
 
-    def like(self) -> "Poses":
-        """Others of the same sizes."""
-        return Poses(wp.clone(self.positions), wp.clone(self.turns))
+
+@dataclass(frozen=True)
+class PoseChanges:
+    """Tangents of `Poses`."""
+
+    positions: wp.array
+    """(members, solids) vectors"""
+    turns: wp.array
+    """(members, solids) vectors: the rotation vector by which they turn further, over the change"""
+
+    @classmethod
+    def zeros(cls, members: int, solids: int, precision: Precision, device: Any) -> "PoseChanges":
+        """Still to be written."""
+        return cls(*(wp.zeros((members, solids), dtype=precision.vector, device=device) for _ in range(2)))
 
 
 @cache
@@ -47,14 +55,16 @@ def matrix_of(precision: Precision) -> Any:
 
 
 @cache
-def _kernels(precision: Precision) -> tuple[Any, Any, Any]:
-    """Those that place wall particles, that write them in the order of their cells, and that say where cells begin."""
+def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
+    """Those that place wall particles, that write them in the order of their cells, that say where cells begin, and
+    that write tangents."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
     module = wp.get_module(f"cortado_moving_walls_{precision.name}")
     module.options["enable_backward"] = False
     vectors = {f"wall_{name}": vector for name in ("positions", "feet", "velocities")}
     own_of: Any = bundle(own=vector, own_feet=vector, own_slides=vector, own_weights=real, own_grips=real)
-    walls_of: Any = bundle(**vectors, wall_weights=real, wall_grips=real)
+    walls_of: Any = bundle(**vectors, wall_weights=real, wall_grips=real, wall_solids=wp.int32)
+    dots_of: Any = bundle(wall_positions_dot=vector, wall_velocities_dot=vector, wall_turns_dot=vector)
 
     @wp.kernel(module=module, enable_backward=False)
     def place(
@@ -98,6 +108,7 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any]:
         walls.wall_velocities[first + p] = moved / time_step[member] + turns[member, k] * of.own_slides[b]
         walls.wall_weights[first + p] = of.own_weights[b]
         walls.wall_grips[first + p] = of.own_grips[b]
+        walls.wall_solids[first + p] = k
 
     @wp.kernel(module=module, enable_backward=False)
     def shift(
@@ -109,18 +120,57 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any]:
         c = wp.tid()
         shifted[c] = starts[c] + first
 
-    return place, write, shift
+    @wp.kernel(module=module, enable_backward=False)
+    def write_tangent(
+        count: int,
+        first: int,
+        order: wp.array(dtype=wp.int32),
+        time_step: wp.array(dtype=real),
+        time_step_dot: wp.array(dtype=real),
+        of: own_of,
+        solid: wp.array(dtype=wp.int32),
+        turns_before: wp.array2d(dtype=matrix),
+        turns: wp.array2d(dtype=matrix),
+        before_dot: wp.array2d(dtype=vector),
+        turned_before_dot: wp.array2d(dtype=vector),
+        after_dot: wp.array2d(dtype=vector),
+        turned_dot: wp.array2d(dtype=vector),
+        wall_velocities: wp.array(dtype=vector),
+        # out
+        walls: dots_of,
+    ):
+        p = wp.tid()
+        j = order[p]
+        member = j // count
+        b = j - member * count
+        k = solid[b]
+        turned, slide = turned_dot[member, k], turns[member, k] * of.own_slides[b]
+        x_dot = after_dot[member, k] + wp.cross(turned, turns[member, k] * of.own[b])
+        x_before_dot = before_dot[member, k] + wp.cross(turned_before_dot[member, k], turns_before[member, k] * of.own[b])
+        dt = time_step[member]
+        moved_dot = x_dot - x_before_dot - time_step_dot[member] * (wall_velocities[first + p] - slide)
+        walls.wall_positions_dot[first + p] = x_dot
+        walls.wall_velocities_dot[first + p] = moved_dot / dt + wp.cross(turned, slide)
+        walls.wall_turns_dot[first + p] = turned
+
+    return place, write, shift, write_tangent
 
 
 class MovingWalls:
     """Those of one search for neighbours, behind the wall particles that are at rest in its arrays."""
 
-    def __init__(self, walls: WallArrays, first: int, begun: Poses, grid: Grid, layout: Layout):
-        """``walls`` of solids that move, which begin with poses ``begun``; the first of them has the number ``first``
-        in the arrays of the search."""
-        self.begun, self.before, self.after = begun, begun.like(), begun.like()
-        """Poses at the start, and before and after a step; somebody else writes these."""
+    def __init__(self, walls: WallArrays, first: int, solids: int, grid: Grid, layout: Layout):
+        """``walls`` of so many solids that move; the first of them has the number ``first`` in the arrays of the
+        search."""
         precision, device, count = layout.precision, layout.device, len(walls)
+        sizes = (layout.members, solids, precision, device)
+        self.solids, self.before, self.after = solids, Poses.zeros(*sizes), Poses.zeros(*sizes)
+        """How many solids, and their poses before and after a step, which somebody else writes."""
+        self.slides = wp.zeros(solids, dtype=precision.vector, device=device)
+        """How fast the surfaces of solids slide along them, in their own frames [m/s]."""
+        slides = np.zeros((solids, 3))
+        slides[walls.solid] = walls.slides
+        self.slides.assign(slides)
         self._device, self._first, self._all = device, first, layout.members * count
         self._kernels = _kernels(precision)
         vectors = {"own": walls.positions, "own_feet": walls.feet, "own_slides": walls.slides}
@@ -141,7 +191,7 @@ class MovingWalls:
 
     def write(self, time_step: wp.array, walls: Mapping[str, wp.array]) -> None:
         """Write them to the arrays of a search, given the length (members,) of the step [s]."""
-        (place, write, shift), before, after = self._kernels, self.before, self.after
+        (place, write, shift, _), before, after = self._kernels, self.before, self.after
         launch(place, self._all, self._device, self._own, positions=after.positions, turns=after.turns)
         self._sort(self._own["x"])
         starts, shifted = self._sort.grid.starts, self.grid.starts
@@ -149,3 +199,18 @@ class MovingWalls:
         poses = {"before": before.positions, "turns_before": before.turns, "turns": after.turns}
         known = {"first": self._first, "order": self._sort.order, "time_step": time_step}
         launch(write, self._all, self._device, self._own, poses, known, walls)
+
+    def write_tangent(
+        self,
+        time_step: wp.array,
+        time_step_dot: wp.array,
+        before: PoseChanges,
+        after: PoseChanges,
+        walls: Mapping[str, wp.array],
+    ) -> None:
+        """Write their tangents, of what `write` has written last."""
+        known = {"first": self._first, "order": self._sort.order, "time_step": time_step}
+        poses = {"turns_before": self.before.turns, "turns": self.after.turns, "time_step_dot": time_step_dot}
+        dots = {"before_dot": before.positions, "turned_before_dot": before.turns}
+        dots |= {"after_dot": after.positions, "turned_dot": after.turns}
+        launch(self._kernels[3], self._all, self._device, self._own, known, poses, dots, walls)

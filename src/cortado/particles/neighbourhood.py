@@ -87,6 +87,14 @@ def neighbourhood_type(precision: Precision) -> Any:
         """How fast a wall particle moves [m/s]; read where the `Discretisation` is moving."""
         wall_feet: wp.array(dtype=vector)
         """From a wall particle to the nearest point of the container's surface [m]."""
+        wall_solids: wp.array(dtype=wp.int32)
+        """The number of the solid that moves whose a wall particle is, -1 of those at rest; where walls move."""
+        wall_positions_dot: wp.array(dtype=vector)
+        """Tangents of their positions, which like the next two are there where walls move."""
+        wall_velocities_dot: wp.array(dtype=vector)
+        """Tangents of their velocities."""
+        wall_turns_dot: wp.array(dtype=vector)
+        """Tangents of how their solid is turned: the rotation vector over the change."""
         support: real
         """Support radius h [m]."""
         per_support: real
@@ -133,6 +141,10 @@ class PairFunctions:
     wall_grip: Any
     wall_foot: Any
     wall_velocity: Any
+    wall_solid: Any
+    wall_position_dot: Any
+    wall_velocity_dot: Any
+    wall_turn_dot: Any
     vectors: Any
     numbers: Any
 
@@ -145,9 +157,9 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
     (grad a . u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x);
     ``per_size`` (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction
     per_size x . G, of second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the
-    list of i), ``wall_position``, ``wall_weight``, ``wall_grip``, ``wall_foot`` and ``wall_velocity``; and ``vectors``
-    and ``numbers``, which load what `UNROLL` neighbours have before any of it is used, so that the loads do not wait
-    for one another (on a GPU a tenth of a whole step).
+    list of i), ``wall_position`` and others, which load what a wall particle has; and ``vectors`` and ``numbers``,
+    which load what `UNROLL` neighbours have before any of it is used, so that the loads do not wait for one another (on
+    a GPU a tenth of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
@@ -238,6 +250,22 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         return load_vector(s.wall_velocities, b)
 
     @wp.func
+    def wall_solid(b: int, s: neighbourhood) -> int:
+        return s.wall_solids[b]
+
+    @wp.func
+    def wall_position_dot(b: int, s: neighbourhood) -> vector:
+        return load_vector(s.wall_positions_dot, b)
+
+    @wp.func
+    def wall_velocity_dot(b: int, s: neighbourhood) -> vector:
+        return load_vector(s.wall_velocities_dot, b)
+
+    @wp.func
+    def wall_turn_dot(b: int, s: neighbourhood) -> vector:
+        return load_vector(s.wall_turns_dot, b)
+
+    @wp.func
     def vectors(a: wp.array(dtype=vector), k: int, i: int, s: neighbourhood) -> rows:
         return wp.matrix_from_rows(
             load_vector(a, neighbour(k, i, s)),
@@ -272,6 +300,10 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         wall_grip=wall_grip,
         wall_foot=wall_foot,
         wall_velocity=wall_velocity,
+        wall_solid=wall_solid,
+        wall_position_dot=wall_position_dot,
+        wall_velocity_dot=wall_velocity_dot,
+        wall_turn_dot=wall_turn_dot,
         vectors=vectors,
         numbers=numbers,
     )

@@ -19,7 +19,7 @@ from cortado.device.lanes import lane_functions
 from cortado.device.launching import MOST_PARTS, KernelLauncher
 from cortado.particles.candidates import scan_around
 from cortado.particles.cells import CellSort, Grid, cell_functions, cell_grid_type
-from cortado.particles.moving_walls import MovingWalls, Poses
+from cortado.particles.moving_walls import MovingWalls
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type
 from cortado.particles.state import Layout
 from cortado.particles.wall_arrays import WallArrays
@@ -108,10 +108,10 @@ class NeighbourSearch:
         walls: WallArrays,
         layout: Layout,
         capacity: int,
-        begun: Poses | None = None,
+        solids: int = 0,
     ):
         """``walls`` at rest are the same ones for all scenes of a batch; those that move stand behind them, one scene
-        after the other, and are written by `MovingWalls.write`. Solids that move begin with poses ``begun``."""
+        after the other, and are written by `MovingWalls.write`, of so many ``solids``."""
         precision, device, particles = discretisation.precision, layout.device, layout.all_particles
         self.particles, self.device = particles, device
         self._fill = fill_kernel(discretisation)
@@ -127,12 +127,16 @@ class NeighbourSearch:
         count = len(still) + layout.members * len(moving)
         kinds = {"positions": precision.vector, "feet": precision.vector, "velocities": precision.vector}
         kinds |= {"weights": precision.real, "grips": precision.real}
+        if solids:
+            kinds |= {"solids": wp.int32} | {f"{name}_dot": precision.vector for name in ("positions", "velocities", "turns")}
         self.walls = {f"wall_{name}": wp.zeros(count, dtype=kind, device=device) for name, kind in kinds.items()}
         """What kernels know of wall particles, those at rest first."""
         self._write_walls(still)
+        if solids and len(still):
+            self.walls["wall_solids"][: len(still)].fill_(-1)
         self._wall_sort = CellSort(grid, len(still), precision, device)
         self._unsorted_walls: WallArrays | None = still
-        self.moving = None if begun is None else MovingWalls(moving, len(still), begun, grid, layout)
+        self.moving = MovingWalls(moving, len(still), solids, grid, layout) if solids else None
         """Those of solids that move."""
         self._grid, self._near_walls = grid, wp.zeros(grid.cells, dtype=wp.bool, device=device)
         self.allocate(capacity)

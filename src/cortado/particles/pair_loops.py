@@ -32,9 +32,11 @@ OVER_WALLS = """\
         _b = _neighbour(_place, i, s)
         _w_b = {weight}(_b, s)
         _x_ij = _separation(_x_i, _wall_position(_b, s), s)
-        {foot}
+        {more}
         {body}
 """
+MOVING = {"v": "_wall_velocity(_b, s)", "x_dot": "_wall_position_dot(_b, s)", "v_dot": "_wall_velocity_dot(_b, s)"}
+"""Entries of arrays that wall particles have where they move."""
 
 Types = Mapping[str, Any]
 """Types by name."""
@@ -61,16 +63,17 @@ def over_fluid(
     )
 
 
-def over_walls(d: Discretisation, arrays: Types, body: Body, footed: bool, rubs: bool) -> str:
-    """A loop over the walls, whose particles have nothing but a place, a weight _w_b, a way to the surface, which
-    ``footed`` loops know as _foot, and, where walls move, a velocity, which is their entry of the array v. Where it
-    ``rubs``, walls that slip freely have no weight."""
+def over_walls(d: Discretisation, arrays: Types, body: Body, known: Iterable[str], rubs: bool) -> str:
+    """A loop over the walls, whose particles have nothing but a place, a weight _w_b, what is ``known`` of
+    `cortado.particles.terms.OF_WALLS`, and, where walls move, a velocity, which is their entry of the array v, and
+    tangents of both. Where it ``rubs``, walls that slip freely have no weight."""
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
-    of_b |= {"v": "_wall_velocity(_b, s)"} if d.moving and "v" in arrays else {}
-    foot = "_foot = _wall_foot(_b, s)" if footed else ""
+    of_b |= {array: text for array, text in MOVING.items() if d.moving and array in arrays}
+    turned = "_wall_turn_dot(_b, s)" if d.moving else zero(d.precision.vector, d)
+    more = {"foot": "_foot = _wall_foot(_b, s)", "turn_dot": f"_turn_dot = {turned}"}
     return OVER_WALLS.format(
         weight="_wall_grip" if rubs else "_wall_weight",
-        foot=foot,
+        more=_lines(8, (text for name, text in more.items() if name in known)),
         body=_lines(8, body({**of_b, "x": "_wall_position(_b, s)"})),
     )
 
@@ -130,6 +133,9 @@ def _known(d: Discretisation) -> dict[str, Any]:
         "wall_grip",
         "wall_foot",
         "wall_velocity",
+        "wall_position_dot",
+        "wall_velocity_dot",
+        "wall_turn_dot",
     )
     return {
         **{f"_{name}": getattr(pair, name) for name in used},

@@ -93,7 +93,7 @@ def _over_walls(wall: Term, d: Discretisation, rubs: bool) -> str:
 
     if "x_ij" not in wall.parameters:
         raise TypeError(f"term {wall.name} has no x_ij, but must have it where it is summed over walls.")
-    return over_walls(d, wall.of_neighbours, body, "foot" in wall.parameters, rubs)
+    return over_walls(d, wall.of_neighbours, body, wall.parameters, rubs)
 
 
 def _terms(term: Term) -> str:

@@ -199,10 +199,11 @@ class SceneParameters:
         found = {name: run[name].copy() for name in self._known.run if name in values}
         for field in self._simulation.initial.fields:
             if field.first in values and field.name in first:
-                if field.first in self._known.run:  # over time: the field begins as its first row
+                if self._known[field.first].axis is Axis.STEP:  # the field begins as its first row
                     found[field.first][0] += first[field.name][0]
                 else:
-                    found[field.first] = found.get(field.first, 0.0) + first[field.name]
+                    own = values[field.first].shape
+                    found[field.first] = found.get(field.first, 0.0) + first[field.name].reshape(own)
         if "tilt" in values:
             found["tilt"] = self._tilt.adjoint(values["tilt"], run["gravity"])
         if "time_step" in values:

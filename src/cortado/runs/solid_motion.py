@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.scene.motions import displacement_name, moving, turn_name
+from cortado.scene.motions import moving, position_name, rotation_name, turn_name
 from cortado.scene.scene import Scene
 
 
@@ -32,15 +32,14 @@ def solid_motions(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> dict[str,
 
 def moved(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> list[Any]:
     """The solids of a scene that move, of which fields of states tell."""
-    return [table for table in moving(scene.solid) if displacement_name(table.name) in fields]
+    return [table for table in moving(scene.solid) if position_name(table.name) in fields]
 
 
 def _motion(table: Any, fields: Mapping[str, NDArray[Any]], dimension: int) -> SolidMotion:
-    positions = table.middle() + fields[displacement_name(table.name)][:, 0].astype(np.float64)
-    turns = fields[turn_name(table.name)][:, 0].astype(np.float64)
-    begun = np.array(table.rotation or (0.0,) * (2 * dimension - 3))
+    names = (name(table.name) for name in (position_name, turn_name, rotation_name))
+    positions, turns, begun = (fields[name][:, 0].astype(np.float64) for name in names)
     if dimension == 2:
-        return SolidMotion(positions, turns + begun[0])
+        return SolidMotion(positions, turns + begun)
     from scipy.spatial.transform import Rotation
 
     return SolidMotion(positions, (Rotation.from_rotvec(turns) * Rotation.from_rotvec(begun)).as_rotvec())

@@ -8,9 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import MissingDerivativeError
-from cortado.scene.parameters.parameter import Axis, Parameter, Role
+from cortado.scene.parameters.parameter import Axis, Parameter, Source
 from cortado.scene.schedule import along_lines
 from cortado.scene.solids import SolidTable
+
+RADIAN = 1.0
+"""What an optimiser would take for a large turn [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,18 +98,55 @@ def greatest_speed(solids: Sequence[SolidTable]) -> float:
 
 
 def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
-    """What steps depend on of solids that move: where they are at the end of each step, as from where they begin."""
-    return [parameter for solid in moving(solids) for parameter in (_displacement(solid), _turn(solid))]
+    """Of solids that move: where they begin, and where they are at the end of each step, as from there."""
+    return [make(solid) for solid in moving(solids) for make in (_position, _rotation, _displacement, _turn)]
+
+
+def position_name(solid: str) -> str:
+    """Of the parameter that says where its middle begins, and of the field of a state that says where it is."""
+    return f"{solid}.position"
+
+
+def rotation_name(solid: str) -> str:
+    """Of the parameter that says how it begins, and of the field that keeps it."""
+    return f"{solid}.rotation"
 
 
 def displacement_name(solid: str) -> str:
-    """Of the parameter, and of the field of a state."""
+    """Of the parameter."""
     return f"{solid}.displacement"
 
 
 def turn_name(solid: str) -> str:
     """Of the parameter, and of the field of a state."""
     return f"{solid}.turn"
+
+
+def _position(solid: SolidTable) -> Parameter:
+    middle = solid.middle()
+    return Parameter(
+        position_name(solid.name),
+        "m",
+        f"where the middle of the solid {solid.name} is at the start",
+        Axis.SCALAR,
+        lambda source: middle,
+        components=lambda dimension, phases: dimension,
+        change=_change_of_place,
+    )
+
+
+def _rotation(solid: SolidTable) -> Parameter:
+    angles = 2 * len(solid.middle()) - 3
+    begun = np.array(solid.rotation or (0.0,) * angles, dtype=np.float64)
+    return Parameter(
+        rotation_name(solid.name),
+        "rad",
+        f"how the solid {solid.name} is turned about its middle at the start",
+        Axis.SCALAR,
+        lambda source: begun.reshape(_shape_of(angles)),
+        components=None if angles == 1 else lambda dimension, phases: dimension,
+        change=lambda source, value: np.full(np.shape(value), RADIAN),
+    )
 
 
 def _displacement(solid: SolidTable) -> Parameter:
@@ -117,30 +157,37 @@ def _displacement(solid: SolidTable) -> Parameter:
         Axis.STEP,
         lambda source: np.zeros(source.scene.dimension),
         components=lambda dimension, phases: dimension,
-        role=Role.CLOCK,
+        change=_change_of_place,
         moment=1.0,
-        course=_course(solid, "positions", "velocity", len(solid.shape_about()[1])),
+        course=_course(solid, "positions", "velocity", len(solid.middle())),
     )
 
 
 def _turn(solid: SolidTable) -> Parameter:
-    dimension = len(solid.shape_about()[1])
-    flat = dimension == 2
+    angles = 2 * len(solid.middle()) - 3
     return Parameter(
         turn_name(solid.name),
         "rad",
         f"how far the solid {solid.name} is turned from how it began, after each step",
         Axis.STEP,
-        lambda source: np.float64(0.0) if flat else np.zeros(3),
-        components=None if flat else lambda dimension, phases: 3,
-        role=Role.CLOCK,
+        lambda source: np.zeros(_shape_of(angles)),
+        components=None if angles == 1 else lambda dimension, phases: dimension,
+        change=lambda source, value: np.full(np.shape(value), RADIAN),
         moment=1.0,
-        course=_course(solid, "rotations", "angular_velocity", 2 * dimension - 3),
+        course=_course(solid, "rotations", "angular_velocity", angles),
     )
 
 
+def _change_of_place(source: Source, value: NDArray) -> NDArray[np.float64]:
+    return np.full(np.shape(value), 10.0 * source.scene.discretisation.spacing)
+
+
+def _shape_of(components: int) -> tuple[int, ...]:
+    return () if components == 1 else (components,)
+
+
 def _course(solid: SolidTable, values: str, rate: str, components: int) -> Steady | Knots:
-    shape = () if components == 1 else (components,)
+    shape = _shape_of(components)
     known: Any = getattr(solid, values)
     if known is not None:
         table = np.array(known, dtype=np.float64).reshape(len(known), *shape)

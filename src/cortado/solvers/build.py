@@ -5,7 +5,6 @@ from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cortado.device.lanes import lanes_for
 from cortado.discretise.calibration import SKIN
@@ -13,7 +12,6 @@ from cortado.discretise.solids.solid import Solid
 from cortado.errors import InputError
 from cortado.particles.arrays import padded
 from cortado.particles.cells import Grid
-from cortado.particles.moving_walls import Poses
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.state import Layout
@@ -92,16 +90,7 @@ def _search(scene: Scene, discrete: DiscreteScene, discretisation: Discretisatio
         positions[own], feet[own] = (positions[own] - middle) @ turn, feet[own] @ turn
     grips = walls.weights * walls.sticks
     arrays = WallArrays(padded(positions), walls.weights, grips, padded(feet), padded(walls.slides), walls.solid)
-    begun = Poses.still(layout.members, padded(middles), _in_space(turns), layout.precision, layout.device)
-    return NeighbourSearch(discretisation, grid, arrays, layout, room, begun if len(middles) else None)
-
-
-def _in_space(turns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(k, 3, 3) rotation matrices, also of those in the plane."""
-    dimension = turns.shape[1]
-    whole = np.tile(np.eye(3), (len(turns), 1, 1))
-    whole[:, :dimension, :dimension] = turns
-    return whole
+    return NeighbourSearch(discretisation, grid, arrays, layout, room, len(middles))
 
 
 def _forces(

@@ -101,7 +101,7 @@ class Containment:
         members, device = layout.members, layout.device
         self._obstacles = (*walled.solids, *walled.moving)
         self._meshes = [_mesh(one, walled.spacing, device) for one in self._obstacles]
-        nothing = Poses.still(members, np.zeros((0, 3)), np.zeros((0, 3, 3)), layout.precision, device)
+        nothing = Poses.zeros(members, 0, layout.precision, device)
         self._poses = (nothing, nothing) if moving is None else (moving.before, moving.after)
         """Before and after a step."""
         self._constants: dict[str, Any] = {

@@ -6,10 +6,12 @@ import warp as wp
 
 from cortado.device.launching import add
 from cortado.particles.arrays import Fields
+from cortado.particles.solid_shares import SolidShares
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particles import ParticleSolver
 from cortado.sph.begin_adjoint import begin_adjoint_kernel
 from cortado.sph.carried import Carried
+from cortado.sph.density import density_solid_kernel
 from cortado.sph.parts import Adjoints, Shares, StepContext, Tangents
 
 
@@ -39,6 +41,8 @@ class ParticleTangent:
             m=d["m"],
         )
         self.carried_dot.sort(context, state_dot)
+        for part in self._parts:
+            part.begin(context, self.dot, state_dot)
         context.launch(solver.density.tangent, *self.dot.named)
         for part in self._parts:
             part.sort(context, self.dot, state_dot)
@@ -81,6 +85,7 @@ class ParticleAdjoint:
             Fields.zeros(layout.all_particles, layout.precision, layout.device),
             solver.new_parameters(steps),
             Shares(names, layout),
+            None if solver.search.moving is None else SolidShares(solver.search.moving, layout),
         )
         """Adjoints; those of the parameters are complete after `collect`."""
         self.carried_bar = Carried(solver.carried_fields, solver.layout)
@@ -93,6 +98,8 @@ class ParticleAdjoint:
         """Forget the adjoints of the parameters of an earlier way back."""
         self.bar.shares.clear()
         self.bar.parameters.clear()
+        if self.bar.solids is not None:
+            self.bar.solids.clear()
 
     def collect(self) -> Parameters:
         """The adjoints of the parameters, of all steps since `begin`."""
@@ -140,10 +147,19 @@ class ParticleAdjoint:
             m_scene_bar = state_bar["reference_density"]
             context.launch(self._solver.integration.collect_masses, *self.bar.named, m_scene_bar=m_scene_bar)
 
+    def begin_parts(self, context: StepContext, state_bar: State) -> None:
+        """Of how the parts begin."""
+        for part in self._parts:
+            part.begin(context, self.bar, state_bar)
+
     def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:
         """Of the rest of `ParticleSolver.sort`."""
         solver, b = self._solver, self.bar.fields
         context.launch(solver.density.adjoint, *self.bar.named)
+        if self.bar.solids is not None:
+            densities = density_solid_kernel(solver.discretisation, solver.topic)
+            self.bar.solids.add(context.launch, densities, *self.bar.named, bar=b["n"])
+        self.begin_parts(context, state_bar)
         scene = {"x_scene": state_bar.positions, "v_scene": state_bar.velocities}
         context.launch(solver.integration.unsort, x=b["x"], v=b["v"], **scene)
         self.carried_bar.unsort(context, carried_bar, state_bar)

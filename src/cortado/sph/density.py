@@ -17,6 +17,7 @@ from cortado.device.lanes import lane_functions
 from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import pair_sum
+from cortado.particles.solid_shares import solid_kernel
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,21 @@ def density_sums(discretisation: Discretisation) -> DensitySums:
         return ((r_i + r_j) * slope(x_ij, s)) * x_ij
 
     return DensitySums(weights=weights, weights_tangent=weights_tangent, weights_adjoint=weights_adjoint)
+
+
+@cache
+def density_solid_kernel(discretisation: Discretisation, topic: str = "density", looped: bool = False) -> Any:
+    """The kernel of what the number density gives to solids, for its adjoints ``bar`` (`SolidShares.add`)."""
+    return solid_kernel(discretisation, topic, _density_work, looped=looped)
+
+
+def _density_work(d: Discretisation) -> Any:
+    real, vector, weight = d.precision.real, d.precision.vector, pair_functions(d).weight
+
+    def density_work(x_ij: vector, bar_i: real, s: neighbourhood_type(d.precision)) -> real:
+        return s.volume * weight(x_ij, s) * bar_i
+
+    return density_work
 
 
 @cache

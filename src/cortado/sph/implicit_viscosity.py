@@ -128,10 +128,12 @@ class ImplicitViscousStress(ViscousStress):
         u_bar = self._y
         u_bar.zero_()
         step.launch(self._force.adjoint, now, {"v_bar": u_bar}, change, *self._known(*bar.named))
+        self.give(step, bar, now, change, {"T": self._T_u})
         step.launch(self._implicit.end_adjoint, {"u_bar": u_bar, "acceleration": self._after}, *bar.named)
         if not self._law.is_newtonian:
             strain = {"A_bar": self._A_bar, **self._no_bars}
             step.launch(self._implicit.strain_adjoint, strain, self._constants, *bar.named)
+            self.give(step, bar, strain, by_force=False)
         self._packed.collect(step, bar)
         return self._r
 

@@ -1,7 +1,8 @@
 """Solids that move as they are told: a part of a step that puts their walls where they are at its end.
 
-A wall particle with the place r in the frame of its solid is at c + R r, with the middle c and the rotation R of the
-solid at the end of the step, and has the velocity that leads there from where it was, over the time step.
+A solid begins at the position c_0 with the rotation R(w_0). At the end of a step it is displaced by d and turned by w:
+a wall particle with the place r in its frame is at c_0 + d + R(w) R(w_0) r then, and has the velocity that leads there
+from where it was, over the time step. States have the position c, the turn w, and w_0.
 """
 
 from collections.abc import Sequence
@@ -11,83 +12,136 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.bundles import bundle
 from cortado.device.precision import Precision
+from cortado.errors import MissingDerivativeError
 from cortado.particles.fields import Entry, StateField
-from cortado.particles.moving_walls import matrix_of
+from cortado.particles.moving_walls import MovingWalls, PoseChanges, matrix_of
 from cortado.particles.neighbours import NeighbourSearch
+from cortado.particles.solid_shares import NAMES
 from cortado.particles.state import Layout, Parameters, State
-from cortado.scene.motions import displacement_name, turn_name
+from cortado.scene.motions import displacement_name, position_name, rotation_name, turn_name
 from cortado.scene.parameters.parameter import Axis
 from cortado.sph.integration import integration_module
 from cortado.sph.part import Part, PartAdjoint, PartTangent
-from cortado.sph.parts import StepContext
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+from cortado.sph.rotations import rotations
+
+
+@dataclass(frozen=True)
+class PoseKernels:
+    """Of one solid, with a thread for each scene."""
+
+    begin: Any
+    """Its poses before and after a step."""
+    tangent: Any
+    """Their tangents."""
+    end: Any
+    """The state at the end; of tangents that of their state."""
+    adjoint: Any
+    """From the adjoints of the poses and of the state at the end to those of the parameters and of the state before."""
 
 
 @cache
-def _kernels(precision: Precision, dimension: int) -> tuple[Any, Any]:
-    """The one that finds the poses of a solid before and after a step, and the one that writes the state after it."""
-    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
-    angle = real if dimension == 2 else vector
+def _kernels(precision: Precision, dimension: int) -> PoseKernels:
+    """In 2 or 3 dimensions."""
+    vector, matrix = precision.vector, matrix_of(precision)
+    of = rotations(precision, dimension)
+    angle, rotation, further, back = of.angle, of.rotation, of.further, of.back
     module = integration_module(precision, False)
-
-    if dimension == 2:
-
-        @wp.func
-        def rotation(turn: angle) -> matrix:
-            c, s, no, one = wp.cos(turn), wp.sin(turn), real(0.0), real(1.0)
-            return matrix(c, -s, no, s, c, no, no, no, one)
-
-    else:
-
-        @wp.func
-        def rotation(turn: angle) -> matrix:
-            """By the formula of Rodrigues."""
-            size, no, one = wp.length(turn), real(0.0), real(1.0)
-            unit = matrix(one, no, no, no, one, no, no, no, one)
-            if size == real(0.0):
-                return unit
-            n = turn / size
-            cross = matrix(no, -n[2], n[1], n[2], no, -n[0], -n[1], n[0], no)
-            return unit + wp.sin(size) * cross + (real(1.0) - wp.cos(size)) * (cross * cross)
+    state = bundle(position=vector, turn=angle, rotation=angle)
+    shares = bundle(**dict.fromkeys(NAMES, vector))
 
     @wp.kernel(module=module, enable_backward=False)
-    def pose(
+    def begin(
         number: int,
         step: wp.array(dtype=wp.int32),
-        displacement: wp.array(dtype=vector),
-        turn: wp.array(dtype=angle),
+        of: state,
+        place: wp.array(dtype=vector),
         displacements: wp.array2d(dtype=vector),
         turns_told: wp.array2d(dtype=angle),
-        middles: wp.array2d(dtype=vector),
-        turned: wp.array2d(dtype=matrix),
         # out
         before: wp.array2d(dtype=vector),
         turns_before: wp.array2d(dtype=matrix),
         after: wp.array2d(dtype=vector),
         turns: wp.array2d(dtype=matrix),
     ):
-        """``middles`` and ``turned``: how solids begin."""
         b = wp.tid()
         k = step[b]
-        before[b, number] = middles[b, number] + displacement[b]
-        after[b, number] = middles[b, number] + displacements[b, k]
-        turns_before[b, number] = rotation(turn[b]) * turned[b, number]
-        turns[b, number] = rotation(turns_told[b, k]) * turned[b, number]
+        begun = rotation(of.rotation[b])
+        before[b, number] = of.position[b]
+        after[b, number] = place[b] + displacements[b, k]
+        turns_before[b, number] = rotation(of.turn[b]) * begun
+        turns[b, number] = rotation(turns_told[b, k]) * begun
+
+    @wp.kernel(module=module, enable_backward=False)
+    def tangent(
+        number: int,
+        step: wp.array(dtype=wp.int32),
+        of: state,
+        dot: state,
+        turns_told: wp.array2d(dtype=angle),
+        place_dot: wp.array(dtype=vector),
+        displacements_dot: wp.array2d(dtype=vector),
+        turns_told_dot: wp.array2d(dtype=angle),
+        # out
+        before_dot: wp.array2d(dtype=vector),
+        turned_before_dot: wp.array2d(dtype=vector),
+        after_dot: wp.array2d(dtype=vector),
+        turned_dot: wp.array2d(dtype=vector),
+    ):
+        b = wp.tid()
+        k = step[b]
+        begun_dot = further(of.rotation[b], dot.rotation[b])
+        before, after = of.turn[b], turns_told[b, k]
+        before_dot[b, number] = dot.position[b]
+        after_dot[b, number] = place_dot[b] + displacements_dot[b, k]
+        turned_before_dot[b, number] = further(before, dot.turn[b]) + rotation(before) * begun_dot
+        turned_dot[b, number] = further(after, turns_told_dot[b, k]) + rotation(after) * begun_dot
 
     @wp.kernel(module=module, enable_backward=False)
     def end(
         step: wp.array(dtype=wp.int32),
+        begun: wp.array(dtype=angle),
+        place: wp.array(dtype=vector),
         displacements: wp.array2d(dtype=vector),
         turns_told: wp.array2d(dtype=angle),
         # out
-        displacement: wp.array(dtype=vector),
+        position: wp.array(dtype=vector),
         turn: wp.array(dtype=angle),
+        rotation: wp.array(dtype=angle),
     ):
         b = wp.tid()
-        displacement[b] = displacements[b, step[b]]
+        position[b] = place[b] + displacements[b, step[b]]
         turn[b] = turns_told[b, step[b]]
+        rotation[b] = begun[b]
 
-    return pose, end
+    @wp.kernel(module=module, enable_backward=False)
+    def adjoint(
+        step: wp.array(dtype=wp.int32),
+        of: state,
+        turns_told: wp.array2d(dtype=angle),
+        share: shares,
+        # in and out: at first of the state at the end, at last of that before
+        bar: state,
+        place_bar: wp.array(dtype=vector),
+        displacements_bar: wp.array2d(dtype=vector),
+        turns_told_bar: wp.array2d(dtype=angle),
+    ):
+        b = wp.tid()
+        k = step[b]
+        before, after = of.turn[b], turns_told[b, k]
+        moved_bar = bar.position[b] + share.force[b]
+        place_bar[b] = place_bar[b] + moved_bar
+        displacements_bar[b, k] = displacements_bar[b, k] + moved_bar
+        turns_told_bar[b, k] = turns_told_bar[b, k] + bar.turn[b] + back(after, share.torque[b])
+        begun_bar = wp.transpose(rotation(after)) * share.torque[b]
+        begun_bar += wp.transpose(rotation(before)) * share.torque_before[b]
+        bar.position[b] = share.force_before[b]
+        bar.turn[b] = back(before, share.torque_before[b])
+        bar.rotation[b] = bar.rotation[b] + back(of.rotation[b], begun_bar)
+
+    return PoseKernels(begin, tangent, end, adjoint)
 
 
 @dataclass(frozen=True)
@@ -99,7 +153,15 @@ class MovingSolids:
     search: NeighbourSearch
     """Whose walls are theirs."""
 
+    @property
+    def walls(self) -> MovingWalls:
+        """Those of the search."""
+        assert self.search.moving is not None
+        return self.search.moving
+
     def part(self, layout: Layout, requires_grad: bool) -> "MovingSolidsPart":
+        if requires_grad:
+            raise MissingDerivativeError("solids that move have no tape: try gradients.Exact.")
         return MovingSolidsPart(self, layout)
 
 
@@ -107,50 +169,105 @@ class MovingSolidsPart(Part):
     """Puts walls where they are at the end of each step."""
 
     def __init__(self, made_of: MovingSolids, layout: Layout):
-        self._made_of, self._layout = made_of, layout
+        self.made_of, self.layout = made_of, layout
         angle = Entry.NUMBER if made_of.dimension == 2 else Entry.VECTOR
         self.fields = tuple(
             field
             for name in made_of.names
             for field in (
-                StateField(displacement_name(name), "m", Entry.VECTOR, Axis.SCALAR),
+                StateField(position_name(name), "m", Entry.VECTOR, Axis.SCALAR, position_name(name)),
                 StateField(turn_name(name), "rad", angle, Axis.SCALAR),
+                StateField(rotation_name(name), "rad", angle, Axis.SCALAR, rotation_name(name)),
             )
         )
-        """How far they are from where they began, and turned."""
-        self._pose, self._end = _kernels(layout.precision, made_of.dimension)
+        """Where they are, how far they are turned from how they began, and how that was."""
+        self.kernels = _kernels(layout.precision, made_of.dimension)
+        self.begun = layout.state(self.fields)
+        """What a step began from."""
 
     def begin(self, step: StepContext, state: State) -> None:
-        search = self._made_of.search
-        walls = search.moving
-        assert walls is not None
+        walls, search = self.made_of.walls, self.made_of.search
         own: dict[str, Any] = {
-            "middles": walls.begun.positions,
-            "turned": walls.begun.turns,
             "before": walls.before.positions,
             "turns_before": walls.before.turns,
             "after": walls.after.positions,
             "turns": walls.after.turns,
-            "threads": self._layout.members,
+            "threads": self.layout.members,
         }
-        for number, name in enumerate(self._made_of.names):
-            now = {"displacement": state[displacement_name(name)], "turn": state[turn_name(name)]}
-            step.launch(self._pose, now, self._told(step.parameters, name), number=number, **own)
+        for number, name in enumerate(self.made_of.names):
+            for field in (position_name(name), turn_name(name), rotation_name(name)):
+                wp.copy(self.begun[field], state[field])
+            known = self.state(self.begun, name), self.told(step.parameters, name)
+            step.launch(self.kernels.begin, *known, number=number, **own)
         walls.write(step.parameters["time_step"], search.walls)
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
-        for name in self._made_of.names:
-            new = {"displacement": state[displacement_name(name)], "turn": state[turn_name(name)]}
-            step.launch(self._end, new, self._told(step.parameters, name), threads=self._layout.members)
+        self.write_end(step, step.parameters, self.begun, state)
 
-    def _told(self, parameters: Parameters, name: str) -> dict[str, wp.array]:
-        told = parameters[displacement_name(name)], parameters[turn_name(name)]
-        return dict(zip(("displacements", "turns_told"), told, strict=True))
+    def write_end(self, step: StepContext, parameters: Parameters, begun: State, state: State) -> None:
+        """The fields at the end of a step, or their tangents."""
+        for name in self.made_of.names:
+            new = {**self.state(state, name), **self.told(parameters, name), "begun": begun[rotation_name(name)]}
+            step.launch(self.kernels.end, new, threads=self.layout.members)
 
-    def new_tangent(self) -> PartTangent:
-        """Nothing that has a derivative changes where they are."""
-        return PartTangent()
+    def state(self, state: State, name: str, suffix: str = "") -> dict[str, wp.array]:
+        """The fields of a solid as kernels call them."""
+        fields = {"position": position_name(name), "turn": turn_name(name), "rotation": rotation_name(name)}
+        return {f"{label}{suffix}": state[field] for label, field in fields.items()}
 
-    def new_adjoint(self) -> PartAdjoint:
-        """As `new_tangent`."""
-        return PartAdjoint()
+    def told(self, parameters: Parameters, name: str, suffix: str = "") -> dict[str, wp.array]:
+        """Where a solid is told to be, as kernels call it."""
+        told = {"place": position_name(name), "displacements": displacement_name(name), "turns_told": turn_name(name)}
+        return {f"{label}{suffix}": parameters[parameter] for label, parameter in told.items()}
+
+    def new_tangent(self) -> "MovingSolidsTangent":
+        return MovingSolidsTangent(self)
+
+    def new_adjoint(self) -> "MovingSolidsAdjoint":
+        return MovingSolidsAdjoint(self)
+
+
+class MovingSolidsTangent(PartTangent):
+    """Forward mode: tangents of the walls."""
+
+    def __init__(self, part: MovingSolidsPart):
+        self._part, layout = part, part.layout
+        sizes = layout.members, part.made_of.walls.solids, layout.precision, layout.device
+        self._before, self._after = PoseChanges.zeros(*sizes), PoseChanges.zeros(*sizes)
+        self._begun = layout.state(part.fields)
+
+    def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        part, before, after = self._part, self._before, self._after
+        own: dict[str, Any] = {
+            "before_dot": before.positions,
+            "turned_before_dot": before.turns,
+            "after_dot": after.positions,
+            "turned_dot": after.turns,
+            "threads": part.layout.members,
+        }
+        for field in part.fields:
+            wp.copy(self._begun[field.name], state_dot[field.name])
+        for number, name in enumerate(part.made_of.names):
+            dots = {**part.state(self._begun, name, "_dot"), **part.told(dot.parameters, name, "_dot")}
+            known = part.state(part.begun, name), part.told(step.parameters, name)
+            step.launch(part.kernels.tangent, dots, *known, number=number, **own)
+        sizes = step.parameters["time_step"], dot.parameters["time_step"]
+        part.made_of.walls.write_tangent(*sizes, before, after, part.made_of.search.walls)
+
+    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        self._part.write_end(step, dot.parameters, self._begun, state_dot)
+
+
+class MovingSolidsAdjoint(PartAdjoint):
+    """Reverse mode: from what particles have given to the adjoints of poses."""
+
+    def __init__(self, part: MovingSolidsPart):
+        self._part = part
+
+    def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
+        part = self._part
+        assert bar.solids is not None
+        for number, name in enumerate(part.made_of.names):
+            bars = {**part.state(state_bar, name, "_bar"), **part.told(bar.parameters, name, "_bar")}
+            known = part.state(part.begun, name), part.told(step.parameters, name), bar.solids.collect(number)
+            step.launch(part.kernels.adjoint, bars, *known, threads=part.layout.members)

@@ -21,6 +21,9 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 class PartTangent:
     """Forward mode of a part."""
 
+    def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        """Of `Part.begin`, from the tangent of the state before the step; ``dot`` has those of the parameters."""
+
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         """Of `Part.sort` and `Part.settle`: from the tangent of the state before the step; ``dot`` has those of the
         sorted particles."""
@@ -41,6 +44,9 @@ class PartAdjoint:
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
         """Of `Part.settle` and `Part.sort`, and of what `Part.end` wrote of sorted particles: ``state_bar`` has the
         adjoint of the part's fields after the step, and becomes that of those before it."""
+
+    def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
+        """Of `Part.begin`, after all others; a part whose fields it has left as they were lets `sort` be."""
 
 
 class Part:

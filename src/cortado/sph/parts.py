@@ -16,6 +16,7 @@ from cortado.device.launching import KernelLauncher, add
 from cortado.discretise.walls.layers import WallLayers
 from cortado.particles.arrays import Arrays, Fields, zeros
 from cortado.particles.neighbourhood import Discretisation
+from cortado.particles.solid_shares import SolidShares
 from cortado.particles.state import Layout, Parameters
 from cortado.scene.discrete_scene import Lattice
 from cortado.scene.parameters.known import argument
@@ -106,6 +107,8 @@ class Adjoints:
     fields: Fields
     parameters: Parameters
     shares: Shares
+    solids: SolidShares | None = None
+    """Of the poses of solids that move; None without any."""
 
     @cached_property
     def named(self) -> tuple[Named, ...]:

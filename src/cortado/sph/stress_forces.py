@@ -82,10 +82,13 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
         control: real,
         least: real,
         foot: vector,
+        turn_dot: vector,
         s: neighbourhood,
     ) -> vector:
-        w, y, u = hold(x_ij, foot, least, s), fall(x_ij, foot), fall_change(x_ij, x_dot_ij, foot)
-        w_dot = wp.dot(hold_gradient(x_ij, foot, least, s), x_dot_ij) - w * m_dot_i / m_i
+        """As that of the moments beside walls that turn."""
+        w, y, rest = hold(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
+        u = fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y)
+        w_dot = wp.dot(hold_gradient(x_ij, foot, least, s), rest) - w * m_dot_i / m_i
         pull = T_i * y + (control * mu_i) * v_ij
         change = T_dot_i * y + T_i * u + control * (mu_dot_i * v_ij + mu_i * v_dot_ij)
         return (real(-1.0) / m_i) * (w_dot * pull + w * change)
@@ -188,3 +191,27 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> StressSums:
         return x_part, (-w * mu) * u, w * wp.dot(own_u, pull) / m_i
 
     return StressSums(force, force_tangent, traction_back, force_back)
+
+
+def stress_work(d: Discretisation) -> Any:
+    """What the sum gives to solids, for the adjoint ``acceleration_bar``, with ``least`` and ``control`` as
+    ``constants`` (`cortado.particles.solid_shares.solid_kernel`)."""
+    precision, contact = d.precision, contact_functions(d)
+    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    fall, hold = contact.fall, contact.hold
+
+    def stress_work(
+        x_ij: vector,
+        v_ij: vector,
+        m_i: real,
+        T_i: matrix,
+        eta_i: real,
+        acceleration_bar_i: vector,
+        constants: precision.pair,
+        foot: vector,
+        s: neighbourhood_type(precision),
+    ) -> real:
+        pull = T_i * fall(x_ij, foot) + (constants[1] * eta_i) * v_ij
+        return (-hold(x_ij, foot, constants[0], s) / m_i) * wp.dot(pull, acceleration_bar_i)
+
+    return stress_work

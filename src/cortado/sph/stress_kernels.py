@@ -23,6 +23,7 @@ Walls without slip: `cortado.sph.wall_contact`.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -30,10 +31,11 @@ from cortado.device.bundles import bundle
 from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.solid_shares import solid_kernel
 from cortado.sph.packed import theta_of
-from cortado.sph.stress_forces import stress_sums
+from cortado.sph.stress_forces import stress_sums, stress_work
 from cortado.sph.stress_functions import stress_functions
-from cortado.sph.stress_moments import moment_sums
+from cortado.sph.stress_moments import moment_sums, moments_work
 from cortado.sph.viscosity_law import Law
 
 
@@ -239,3 +241,10 @@ def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sti
     return Kernels(stress, stress_tangent, stress_adjoint), Kernels(
         acceleration_of, acceleration_tangent, acceleration_adjoint
     )
+
+
+def stress_solid_kernels(discretisation: Discretisation) -> tuple[Any, Any]:
+    """The kernels of what the sums and the force give to solids without slip that move."""
+    works = (moments_work, stress_work)
+    sums, force = (solid_kernel(discretisation, "viscous_stress", work, rubs=True) for work in works)
+    return sums, force

@@ -70,10 +70,13 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
         mu_dot_i: real,
         least: real,
         foot: vector,
+        turn_dot: vector,
         s: neighbourhood,
     ) -> tuple[vector, vector, vector, vector, vector, real]:
-        w, y, u = hold(x_ij, foot, least, s), fall(x_ij, foot), fall_change(x_ij, x_dot_ij, foot)
-        w_dot, thin = wp.dot(hold_gradient(x_ij, foot, least, s), x_dot_ij), fluidity(mu_i)
+        """A wall that turns turns y; the rest of the way changes it as it does beside one that does not."""
+        w, y, rest = hold(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
+        u = fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y)
+        w_dot, thin = wp.dot(hold_gradient(x_ij, foot, least, s), rest), fluidity(mu_i)
         z, z_dot, even = w * y, w_dot * y + w * u, w_dot * y + real(2.0) * w * u
         rub = wp.dot(even, y) * thin - wp.dot(z, y) * thin * thin * mu_dot_i
         others = w_dot * cross_terms(y, y) + w * even_terms(y, u)
@@ -157,3 +160,28 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> MomentSums:
         return x_part, w * pulled, -R_bar_j * w * square * thin_i * thin_i
 
     return MomentSums(moments, moments_tangent, moments_back)
+
+
+def moments_work(d: Discretisation) -> Any:
+    """What the sums give to solids, for their adjoints ``M_bar``, ``A_bar`` and ``R_bar``, with ``least`` the first of
+    the ``constants`` (`cortado.particles.solid_shares.solid_kernel`)."""
+    precision, contact = d.precision, contact_functions(d)
+    real, vector, matrix, fluidity = precision.real, precision.vector, matrix_type(precision), fluidity_function(precision)
+    fall, hold = contact.fall, contact.hold
+
+    def moments_work(
+        x_ij: vector,
+        v_ij: vector,
+        mu_i: real,
+        M_bar_i: matrix,
+        A_bar_i: matrix,
+        R_bar_i: real,
+        constants: precision.pair,
+        foot: vector,
+        s: neighbourhood_type(precision),
+    ) -> real:
+        y = fall(x_ij, foot)
+        bars = wp.dot(y, M_bar_i * y) + wp.dot(v_ij, A_bar_i * y) + R_bar_i * wp.dot(y, y) * fluidity(mu_i)
+        return hold(x_ij, foot, constants[0], s) * bars
+
+    return moments_work

@@ -11,7 +11,7 @@ mean keeps the shear stress continuous between fluids); friction is 0 for a wall
 angular momentum too, but carries no shear to a wall, which the laminar form does.
 """
 
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import warp as wp
@@ -23,6 +23,7 @@ from cortado.device.lanes import lane_functions
 from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import rubbing_sum
+from cortado.particles.solid_shares import solid_kernel
 from cortado.sph.implicit_viscosity import stress_of
 from cortado.sph.pair_forces import PairForm, laminar, pairwise
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
@@ -252,6 +253,32 @@ def viscosity_kernels(discretisation: Discretisation, form: PairForm, sticks: bo
     return Kernels(viscosity, viscosity_tangent, viscosity_adjoint)
 
 
+@cache
+def viscosity_solid_kernel(discretisation: Discretisation, form: PairForm) -> Any:
+    """The kernel of what the force gives to solids that move, for the adjoint ``acceleration_bar``, with kappa times
+    the friction as the first of the ``constants`` (`cortado.particles.solid_shares.solid_kernel`)."""
+
+    def made(d: Discretisation) -> Any:
+        real, vector, phi = d.precision.real, d.precision.vector, form(d).force
+
+        def viscosity_work(
+            x_ij: vector,
+            v_ij: vector,
+            n_i: real,
+            m_i: real,
+            mu_i: real,
+            acceleration_bar_i: vector,
+            constants: d.precision.pair,
+            s: neighbourhood_type(d.precision),
+        ) -> real:
+            scale = constants[0] * s.volume / (m_i * n_i) * mu_i
+            return scale * wp.dot(phi(x_ij, v_ij, s), acceleration_bar_i)
+
+        return viscosity_work
+
+    return solid_kernel(discretisation, form.__name__, made, rubs=True)
+
+
 class Viscosity:
     """A viscous force between neighbours, and with walls."""
 
@@ -261,6 +288,7 @@ class Viscosity:
     def __init__(self, discretisation: Discretisation, form: PairForm, kappa: float, friction: float):
         """``friction`` 0 lets walls slip freely."""
         self._kernels, self.friction = viscosity_kernels(discretisation, form, friction > 0.0), friction
+        self._of_solids = partial(viscosity_solid_kernel, discretisation, form)
         self._constants: dict[str, Any] = {"kappa": kappa, "friction": friction}
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
@@ -272,6 +300,11 @@ class Viscosity:
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
         step.launch(self._kernels.adjoint, *bar.named, **self._constants, acceleration_bar=acceleration_bar)
+        if bar.solids is not None and self.friction > 0.0:
+            factors = self._constants["kappa"] * self.friction, 0.0
+            bar.solids.add(
+                step.launch, self._of_solids(), *bar.named, constants=factors, acceleration_bar=acceleration_bar
+            )
 
 
 def force(setting: Setting) -> Viscosity | ViscousStress | None:

@@ -5,13 +5,14 @@ from typing import Any
 
 import warp as wp
 
+from cortado.device.binding import Named
 from cortado.discretise.calibration import stress_control
 from cortado.scene.parameters.parameter import Parameter
 from cortado.sph.formula import compiled
 from cortado.sph.moment_functions import matrix_type
 from cortado.sph.packed import Packed
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.stress_kernels import stress_kernels
+from cortado.sph.stress_kernels import stress_kernels, stress_solid_kernels
 from cortado.sph.viscosity_law import Law, newtonian_law
 
 CLOSEST = 0.25
@@ -57,10 +58,20 @@ class ViscousStress:
         step.launch(self._stress.tangent, *known, **theta, **change)
         step.launch(self._force.tangent, *known, change, acceleration_in_dot=before, acceleration_dot=after)
 
+    def give(self, step: StepContext, bar: Adjoints, *bars: Named, by_force: bool = True) -> None:
+        """What solids that move are given, by the adjoints M_bar, A_bar and R_bar of the sums, and by that of the
+        acceleration."""
+        if bar.solids is None or not self._made_for[-1]:
+            return
+        constants = self._constants["least"], self._constants["control"]
+        for kernel in stress_solid_kernels(self._made_for[0])[: 1 + by_force]:
+            bar.solids.add(step.launch, kernel, *bars, *bar.named, self._of, constants=constants)
+
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
         known = (*bar.named, self._constants, self._of, {"acceleration_bar": acceleration_bar})
         change = {f"{name}_bar": self._change[name] for name in ("M", "A", "R")}
         theta = {"theta": self._packed.theta(step), "theta_bar": self._packed.shares}
         step.launch(self._stress.adjoint, *known, **theta, **change)
         step.launch(self._force.adjoint, *known, change)
+        self.give(step, bar, {"acceleration_bar": acceleration_bar}, change)
         self._packed.collect(step, bar)

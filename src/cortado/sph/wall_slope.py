@@ -15,6 +15,7 @@ import warp as wp
 from cortado.device.lanes import lane_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import wall_sum
+from cortado.particles.solid_shares import solid_kernel
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,8 @@ class WallSlope:
     """g."""
     change: Any
     """The sum of H with a vector of each particle."""
+    tangent: Any
+    """The tangent of g."""
 
 
 @cache
@@ -43,7 +46,26 @@ def wall_slope_sums(discretisation: Discretisation) -> WallSlope:
     def change(x_ij: vector, along: vector, s: neighbourhood) -> vector:
         return hessian_product(x_ij, along, s)
 
-    return WallSlope(slope, change)
+    @wall_sum(discretisation)
+    def tangent(x_ij: vector, x_dot_ij: vector, s: neighbourhood) -> vector:
+        return hessian_product(x_ij, x_dot_ij, s)
+
+    return WallSlope(slope, change, tangent)
+
+
+def wall_slope_solid_kernel(discretisation: Discretisation) -> Any:
+    """The kernel of what g gives to solids that move, for its adjoints ``bar``
+    (`cortado.particles.solid_shares.solid_kernel`)."""
+    return solid_kernel(discretisation, "wall_slope", _work)
+
+
+def _work(d: Discretisation) -> Any:
+    real, vector, gradient = d.precision.real, d.precision.vector, pair_functions(d).gradient
+
+    def wall_slope_work(x_ij: vector, bar_i: vector, s: neighbourhood_type(d.precision)) -> real:
+        return wp.dot(gradient(x_ij, s), bar_i)
+
+    return wall_slope_work
 
 
 @cache
@@ -52,7 +74,7 @@ def wall_slope_kernels(discretisation: Discretisation) -> WallSlope:
     vector = discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     sums = wall_slope_sums(discretisation)
-    gradients, hessian_products = sums.slope, sums.change
+    gradients, hessian_products, gradients_tangent = sums.slope, sums.change, sums.tangent
     LANES = discretisation.lanes
     lane = lane_functions(discretisation.precision, LANES).lane
     module = discretisation.module(False, "wall_slope")
@@ -82,4 +104,17 @@ def wall_slope_kernels(discretisation: Discretisation) -> WallSlope:
         if lane() == 0:
             wall_slope_change[i] = total
 
-    return WallSlope(slope, change)
+    @wp.kernel(module=discretisation.tangent_module("wall_slope"), enable_backward=False)
+    def tangent(
+        s: neighbourhood,
+        x: wp.array(dtype=vector),
+        x_dot: wp.array(dtype=vector),
+        # out
+        wall_slope_dot: wp.array(dtype=vector),
+    ):
+        i = s.first + wp.tid() // LANES
+        total = gradients_tangent(i, x, x_dot, s)
+        if lane() == 0:
+            wall_slope_dot[i] = total
+
+    return WallSlope(slope, change, tangent)

@@ -20,6 +20,7 @@ from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangen
 from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.solver import Counts, PressureAdjoint, PressureTangent, Solver
 from cortado.sph.parts import StepContext
+from cortado.sph.wall_slope import wall_slope_solid_kernel
 
 OF_PRESSURE = {"pressure", "wall_force"}
 """Quantities that need the step after the state to be solved; others need its neighbours alone."""
@@ -85,7 +86,7 @@ class QuantityEvaluator:
             fields[name].assign(array)
         state_bar = solver.new_state()
         through = self._from_fields if OF_PRESSURE.isdisjoint(wanted) else self._from_pressure
-        parameters = through(fields, own.p, state_bar).collect()
+        parameters = through(fields, own, state_bar).collect()
         found = {name: parameters[name].numpy().astype(np.float64) for name in parameters.names}
         state = state_bar.numpy(self._dimension)
         return {name: array.astype(np.float64) for name, array in state.items()}, found
@@ -145,7 +146,7 @@ class QuantityEvaluator:
         whole.step(self._counts, state_dot, parameters)
         return whole, np.concatenate(whole.pressures(self._rounds)).astype(np.float64)
 
-    def _from_fields(self, fields: Fields, pressure: NDArray, state_bar: State) -> ParticleAdjoint:
+    def _from_fields(self, fields: Fields, own: Particles, state_bar: State) -> ParticleAdjoint:
         adjoint, context = self._field_adjoint, self._solver.context(self._rollout.parameters)
         adjoint.begin()
         adjoint.bar.fields.assign(fields)
@@ -153,10 +154,15 @@ class QuantityEvaluator:
         adjoint.sort(context, state_bar, **{f.name: adjoint.carried_bar[f.name] for f in self._solver.carried_fields})
         return adjoint
 
-    def _from_pressure(self, fields: Fields, pressure: NDArray, state_bar: State) -> PressureAdjoint:
-        adjoint, p_bar = self._pressure_adjoint, self._solver.numbers()
-        p_bar.assign(pressure)
+    def _from_pressure(self, fields: Fields, own: Particles, state_bar: State) -> PressureAdjoint:
+        solver, adjoint = self._solver, self._pressure_adjoint
+        p_bar, slope_bar = solver.numbers(), solver.vectors()
+        p_bar.assign(own.p)
         adjoint.begin()
+        if isinstance(adjoint, ParticleAdjoint) and adjoint.bar.solids is not None:
+            slope_bar.assign(own.slope)
+            slopes, context = wall_slope_solid_kernel(solver.discretisation), solver.context(self._rollout.parameters)
+            adjoint.bar.solids.add(context.launch, slopes, adjoint.bar.named, bar=slope_bar)
         adjoint.from_within(self._counts, fields, p_bar, state_bar, self._rollout.parameters)
         return adjoint
 

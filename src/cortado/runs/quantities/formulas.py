@@ -28,6 +28,8 @@ class Particles:
     """By the names of `Fields`: ``x`` and ``v`` (n, 3), ``n`` and ``m`` (n,)."""
     pressure: NDArray | None
     """(n,) [Pa]; None where none was computed."""
+    slope: NDArray | None = None
+    """(n, 3) of adjoints that of the walls' g."""
 
     @classmethod
     def of(cls, fields: Fields, pressure: NDArray | None) -> Self:
@@ -39,7 +41,7 @@ class Particles:
         """All 0."""
         vectors, numbers = (dict.fromkeys(names, shape) for names, shape in (("xv", (3,)), ("nm", ())))
         fields = {name: np.zeros((particles, *shape)) for name, shape in (vectors | numbers).items()}
-        return cls(fields, np.zeros(particles))
+        return cls(fields, np.zeros(particles), np.zeros((particles, 3)))
 
     def __getitem__(self, name: str) -> NDArray:
         return self.fields[name]
@@ -177,7 +179,7 @@ class WallForceQuantity:
         return (self._strength(at)[:, None] * sums(sums.walls.slope))[:, : self.dimension]
 
     def tangent(self, at: Particles, sums: Sums, dot: Particles, named: tuple[Named, ...]) -> NDArray:
-        slope, change = sums(sums.walls.slope), sums(sums.walls.change, along=dot["x"])
+        slope, change = sums(sums.walls.slope), sums(sums.walls.tangent, *named)
         strength_dot = self.volume**2 / at["n"] ** self.power * (dot.p - self.power * at.p * dot["n"] / at["n"])
         return (strength_dot[:, None] * slope + self._strength(at)[:, None] * change)[:, : self.dimension]
 
@@ -186,6 +188,8 @@ class WallForceQuantity:
         strength_bar = (whole * sums(sums.walls.slope)).sum(axis=1)
         bar.p[:] += strength_bar * self.volume**2 / at["n"] ** self.power
         bar["n"][:] -= self.power * strength_bar * self._strength(at) / at["n"]
+        assert bar.slope is not None
+        bar.slope[:] += self._strength(at)[:, None] * whole
         bar["x"][:] += sums(sums.walls.change, along=self._strength(at)[:, None] * whole)
 
     def _strength(self, at: Particles) -> NDArray:

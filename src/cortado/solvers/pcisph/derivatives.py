@@ -1,6 +1,7 @@
 """The tangent of a replayed PCISPH step, and its transpose, the adjoint."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import warp as wp
 from numpy.typing import NDArray
@@ -11,9 +12,12 @@ from cortado.particles.arrays import Fields
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.pcisph.frozen_pressure import frozen_force_adjoint
+from cortado.solvers.pcisph.pressure_force import pressure_solid_kernel
 from cortado.solvers.pcisph.steps import PcisphSteps
 from cortado.solvers.solver import Counts
+from cortado.sph.density import density_solid_kernel
 from cortado.sph.parts import StepContext
+from cortado.sph.wall_slope import wall_slope_solid_kernel
 
 
 class PcisphAdjoint(ParticleAdjoint):
@@ -22,7 +26,7 @@ class PcisphAdjoint(ParticleAdjoint):
     def __init__(self, solver: PcisphSteps, steps: int):
         super().__init__(solver, steps)
         self._solver, self._force = solver, solver.kernels.force.adjoint
-        self._scaled_bar = solver.vectors()
+        self._scaled_bar, self._slope_bar = solver.vectors(), solver.vectors()
         self._p_bar, self._y_bar, self._r, self._t_bar = (solver.numbers() for _ in range(4))
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
@@ -81,8 +85,11 @@ class PcisphAdjoint(ParticleAdjoint):
                 r=self._r,
                 **pressure_bar,
             )
+            self.push_solids(context, going, it.c[k])
             predicted = {"x_star": it.x_star[k], "v_star": it.v_star[k]}
             context.launch(kernels.pressure.adjoint, going, *known, r=self._r, scaled_bar=scaled_bar, **predicted)
+            densities = density_solid_kernel(solver.discretisation, solver.topic, looped=True)
+            self._give(context, going, densities, x=it.x_star[k], bar=self._r)
         self.predict(context)
         if fields_bar is not None:
             self.add(fields_bar)
@@ -94,10 +101,23 @@ class PcisphAdjoint(ParticleAdjoint):
         self.mix(context, state_bar)
         self.sort(context, state_bar)
 
+    def _give(self, context: StepContext, going: Named, kernel: Any, **arrays: wp.array) -> None:
+        """What solids that move are given in an iteration."""
+        if self.bar.solids is not None:
+            self.bar.solids.add(context.launch, kernel, going, *self.bar.named, **arrays)
+
+    def push_solids(self, context: StepContext, going: Named, c: wp.array) -> None:
+        """What the pressure force of an iteration gives to solids that move."""
+        kernel = pressure_solid_kernel(self._solver.discretisation)
+        self._give(context, going, kernel, c=c, scaled_bar=self._scaled_bar)
+
     def relax_beside_walls(self, context: StepContext) -> None:
         """Of the relaxation beside walls, which depends on positions alone."""
         solver, y = self._solver, {"y": self._solver.wall_relaxation, "y_bar": self._y_bar}
-        context.launch(solver.kernels.wall_relaxation.adjoint, *self.bar.named, **y)
+        context.launch(solver.kernels.wall_relaxation.adjoint, *self.bar.named, **y, slope_bar=self._slope_bar)
+        if self.bar.solids is not None:
+            slopes = wall_slope_solid_kernel(solver.discretisation)
+            self.bar.solids.add(context.launch, slopes, *self.bar.named, bar=self._slope_bar)
 
 
 class FrozenPcisphAdjoint(PcisphAdjoint):
@@ -115,9 +135,13 @@ class FrozenPcisphAdjoint(PcisphAdjoint):
     def relax_beside_walls(self, context: StepContext) -> None:
         pass
 
+    def push_solids(self, context: StepContext, going: Named, c: wp.array) -> None:
+        pass
+
     def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:
         """The adjoint of x' = x + dt v' goes to x as it is, and not with ``x_bar``, to which others have added."""
         b = self.bar.fields
+        self.begin_parts(context, state_bar)
         unsorted = {"x_scene": self._scaled_bar, "v_scene": state_bar.velocities}
         context.launch(self._solver.integration.unsort, x=b["x"], v=b["v"], **unsorted)
         self.carried_bar.unsort(context, carried_bar, state_bar)

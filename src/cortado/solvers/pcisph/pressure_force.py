@@ -13,6 +13,7 @@ from cortado.device.precision import Precision
 from cortado.particles.by_hand import adjoint_of, tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import pair_sum
+from cortado.particles.solid_shares import solid_kernel
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,21 @@ def pressure_share(precision: Precision) -> PressureShare:
         return m_i * excess_bar
 
     return PressureShare(values, adjoints, adjoint)
+
+
+def pressure_solid_kernel(discretisation: Discretisation) -> Any:
+    """The kernel of what the pressure force of an iteration gives to solids that move, for its adjoint ``scaled_bar``
+    (`cortado.particles.solid_shares.solid_kernel`)."""
+    return solid_kernel(discretisation, "pcisph", _work, looped=True)
+
+
+def _work(d: Discretisation) -> Any:
+    real, vector, slope = d.precision.real, d.precision.vector, pair_functions(d).slope
+
+    def pressure_work(x_ij: vector, c_i: real, scaled_bar_i: vector, s: neighbourhood_type(d.precision)) -> real:
+        return -s.volume * c_i * slope(x_ij, s) * wp.dot(x_ij, scaled_bar_i)
+
+    return pressure_work
 
 
 @cache

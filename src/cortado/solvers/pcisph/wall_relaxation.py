@@ -28,7 +28,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
     sums = wall_slope_sums(discretisation)
-    slope, change = sums.slope, sums.change
+    slope, change, slope_tangent = sums.slope, sums.change, sums.tangent
     LANES = discretisation.lanes
     lane = lane_functions(discretisation.precision, LANES).lane
 
@@ -56,7 +56,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
     ):
         i = s.first + wp.tid() // LANES
         total = s.response_scale * slope(i, x, s)
-        total_dot = change(i, x, s.response_scale * x_dot[i], s)
+        total_dot = s.response_scale * slope_tangent(i, x, x_dot, s)
         if lane() > 0:
             return
         y_dot[i] = real(-2.0) * y[i] * y[i] * wp.dot(total, total_dot)
@@ -69,12 +69,17 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
         y_bar: wp.array(dtype=real),
         # in and out
         x_bar: wp.array(dtype=vector),
+        # out
+        slope_bar: wp.array(dtype=vector),
     ):
+        """``slope_bar`` is the adjoint of S."""
         i = s.first + wp.tid() // LANES
         total = s.response_scale * slope(i, x, s)
-        x_sum = change(i, x, (real(-2.0) * y_bar[i] * y[i] * y[i] * s.response_scale) * total, s)
+        along = (real(-2.0) * y_bar[i] * y[i] * y[i] * s.response_scale) * total
+        x_sum = change(i, x, along, s)
         if lane() > 0:
             return
         x_bar[i] = x_bar[i] + x_sum
+        slope_bar[i] = along
 
     return Kernels(wall_relaxation, wall_relaxation_tangent, wall_relaxation_adjoint)

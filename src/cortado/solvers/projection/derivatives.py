@@ -10,9 +10,11 @@ from cortado.device.launching import add
 from cortado.particles.arrays import Fields
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
+from cortado.solvers.projection.beside import beside_solid_kernel
 from cortado.solvers.projection.pressed import pressed_adjoint_kernel
 from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
 from cortado.solvers.solver import Counts
+from cortado.sph.density import density_solid_kernel
 from cortado.sph.parts import StepContext
 
 
@@ -153,6 +155,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         own, sums = kernels.surroundings.adjoint
         for kernel in (own, sums):
             context.launch(kernel, *known, solver.relaxed)
+        if self.bar.solids is not None:
+            self.bar.solids.add(context.launch, beside_solid_kernel(solver.discretisation), *known)
         context.launch(kernels.velocity.time_adjoint, *known, acceleration=solver.accelerations[-1])
         self.predict(context)
         if fields_bar is not None:
@@ -173,6 +177,9 @@ class ProjectionAdjoint(ParticleAdjoint):
             context.launch(move, *known, solver.relaxed, measured, own)
             own = {"x_now": at["x_now"], "n_now_bar": self._n_now_bar, "x_now_bar": self._x_now_bar}
             context.launch(kernels.measure.adjoint, *known, own)
+            if self.bar.solids is not None:
+                densities = density_solid_kernel(solver.discretisation, solver.topic)
+                self.bar.solids.add(context.launch, densities, *known, x=at["x_now"], bar=self._n_now_bar)
         add(self._x_now_bar, self._x_moved_bar)
 
     def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:

@@ -12,7 +12,7 @@ import warp as wp
 
 from cortado.particles.by_hand import tangent_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import fluid_sum, wall_sum
+from cortado.particles.pair_sums import fluid_sum
 from cortado.sph.moment_functions import cross_terms_function, matrix_type, symmetric
 
 CROWDED = 0.25
@@ -34,11 +34,6 @@ class ProjectionSums:
     moments_tangent: Any
     moments_back: Any
     """What adjoints of the moments give to x and m."""
-    beside: Any
-    """gamma = sum w_b g_ib and nu = V sum w_b W_ib of walls."""
-    beside_tangent: Any
-    beside_back: Any
-    """What their adjoints give to x."""
     force: Any
     """sum_j T_j g_ij, for T = k L, which T_i g_i completes."""
     force_tangent: Any
@@ -135,36 +130,6 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
         x_part = hessian_product(x_ij, real(2.0) * both + g_bar_ij - stretch, s) - slope(x_ij, s) * stretch
         h = slope_of_h(m_i, m_j)
         return s.volume * x_part, wp.dot(g, from_i) * h / m_j + wp.dot(g, from_j) * (h - per) / m_i
-
-    @wp.func
-    def normal_part(a: vector, foot: vector) -> vector:
-        """Of a vector, along the normal of a wall at a particle of it."""
-        return (wp.dot(a, foot) / wp.dot(foot, foot)) * foot
-
-    @wall_sum(discretisation)
-    def beside(x_ij: vector, v_j: vector, foot: vector, s: neighbourhood) -> tuple[vector, real, real]:
-        push = s.volume * normal_part(gradient(x_ij, s), foot)
-        return push, s.volume * weight(x_ij, s), wp.dot(push, v_j)
-
-    @wall_sum(discretisation)
-    def beside_tangent(
-        x_ij: vector, x_dot_ij: vector, v_j: vector, foot: vector, s: neighbourhood
-    ) -> tuple[vector, real, real]:
-        change = s.volume * normal_part(hessian_product(x_ij, x_dot_ij, s), foot)
-        return change, s.volume * wp.dot(gradient(x_ij, s), x_dot_ij), wp.dot(change, v_j)
-
-    @wall_sum(discretisation)
-    def beside_back(
-        x_ij: vector,
-        v_j: vector,
-        gamma_bar_i: vector,
-        nu_bar_i: real,
-        drift_bar_i: real,
-        foot: vector,
-        s: neighbourhood,
-    ) -> vector:
-        push = hessian_product(x_ij, normal_part(gamma_bar_i + drift_bar_i * v_j, foot), s)
-        return s.volume * (push + nu_bar_i * gradient(x_ij, s))
 
     @fluid_sum(discretisation)
     def force(x_ij: vector, T_j: six, s: neighbourhood) -> vector:
@@ -277,7 +242,6 @@ def projection_sums(discretisation: Discretisation) -> ProjectionSums:
 
     return ProjectionSums(
         *(moments, moments_tangent, moments_back),
-        *(beside, beside_tangent, beside_back),
         *(force, force_tangent, force_back),
         *(divergence, divergence_tangent, divergence_back),
         *(push, push_tangent, push_back),

@@ -25,6 +25,7 @@ from cortado.device.kernels import Kernels
 from cortado.device.lanes import lane_functions
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.solvers.projection.beside import beside_sums
 from cortado.solvers.projection.sums import projection_sums
 from cortado.sph.moment_functions import matrix_type, moment_functions
 
@@ -172,7 +173,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     real, vector, matrix, weights4 = precision.real, precision.vector, matrix_type(precision), weights_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
     moments, moments_tangent, moments_back = sums.moments, sums.moments_tangent, sums.moments_back
-    beside, beside_tangent, beside_back = sums.beside, sums.beside_tangent, sums.beside_back
+    walls = beside_sums(discretisation)
+    beside, beside_tangent, beside_back = walls.sums, walls.tangent, walls.back
     topic = f"projection_{dimension}d"
     module, tangent_module = discretisation.module(True, topic), discretisation.tangent_module(topic)
     adjoint_module = discretisation.module(False, topic)
@@ -220,6 +222,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         x: wp.array(dtype=vector),
         x_dot: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
+        v_dot: wp.array(dtype=vector),
         m: wp.array(dtype=real),
         m_dot: wp.array(dtype=real),
         of: around,
@@ -229,7 +232,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         """Put together of the gradients of each entry."""
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g_i_dot = moments_tangent(i, x, x_dot, m, m_dot, s)
-        gamma_i_dot, nu_i_dot, drift_i_dot = beside_tangent(i, x, x_dot, v, s)
+        gamma_i_dot, nu_i_dot, drift_i_dot = beside_tangent(i, x, x_dot, v, v_dot, s)
         if lane() > 0:
             return
         M_i_dot, Q_i_dot = change(diagonal, others), change(square, mixed)

@@ -1,0 +1,85 @@
+"""Rotations by rotation vectors, in the plane by angles, and how they change with these.
+
+A rotation R(w) by the vector w turns by |w| about w (Rodrigues). Where w changes by w', it turns further by J(w) w':
+R(w + w') = R(J(w) w') R(w) to first order, with
+
+    J(w) = I + (1 - cos |w|) / |w|^2 [w] + (|w| - sin |w|) / |w|^3 [w]^2,
+
+in which [w] u is the cross product w x u; J(w)^T is J(-w).
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from cortado.device.precision import Precision
+from cortado.particles.moving_walls import matrix_of
+
+SMALL = 1e-3
+"""|w|^2 below which the factors of J are series, to which three terms are enough."""
+
+
+@dataclass(frozen=True)
+class Rotations:
+    """Warp functions of angles, which are vectors, in 2-D numbers."""
+
+    angle: Any
+    """Their type."""
+    rotation: Any
+    """R(w), a 3 x 3 matrix."""
+    further: Any
+    """J(w) w', a vector."""
+    back: Any
+    """The adjoint of w for that of J(w) w'."""
+
+
+@cache
+def rotations(precision: Precision, dimension: int) -> Rotations:
+    """In 2 or 3 dimensions."""
+    real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
+
+    @wp.func
+    def about_z(turn: real) -> matrix:
+        c, s, no, one = wp.cos(turn), wp.sin(turn), real(0.0), real(1.0)
+        return matrix(c, -s, no, s, c, no, no, no, one)
+
+    @wp.func
+    def further_about_z(turn: real, change: real) -> vector:
+        return vector(real(0.0), real(0.0), change)
+
+    @wp.func
+    def back_about_z(turn: real, bar: vector) -> real:
+        return bar[2]
+
+    @wp.func
+    def rotation(turn: vector) -> matrix:
+        size, no, one = wp.length(turn), real(0.0), real(1.0)
+        unit = matrix(one, no, no, no, one, no, no, no, one)
+        if size == real(0.0):
+            return unit
+        n = turn / size
+        cross = matrix(no, -n[2], n[1], n[2], no, -n[0], -n[1], n[0], no)
+        return unit + wp.sin(size) * cross + (real(1.0) - wp.cos(size)) * (cross * cross)
+
+    @wp.func
+    def further(turn: vector, change: vector) -> vector:
+        square = wp.dot(turn, turn)
+        a = real(0.5) - square / real(24.0) + square * square / real(720.0)
+        b = real(1.0 / 6.0) - square / real(120.0) + square * square / real(5040.0)
+        if square > real(SMALL):
+            size = wp.sqrt(square)
+            half = wp.sin(real(0.5) * size)
+            a = real(2.0) * half * half / square
+            b = (size - wp.sin(size)) / (square * size)
+        across = wp.cross(turn, change)
+        return change + a * across + b * wp.cross(turn, across)
+
+    @wp.func
+    def back(turn: vector, bar: vector) -> vector:
+        return further(-turn, bar)
+
+    if dimension == 2:
+        return Rotations(real, about_z, further_about_z, back_about_z)
+    return Rotations(vector, rotation, further, back)
