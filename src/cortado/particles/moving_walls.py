@@ -166,6 +166,19 @@ class MovingWalls:
         sizes = (layout.members, solids, precision, device)
         self.solids, self.before, self.after = solids, Poses.zeros(*sizes), Poses.zeros(*sizes)
         """How many solids, and their poses before and after a step, which somebody else writes."""
+        self.before_dot, self.after_dot = PoseChanges.zeros(*sizes), PoseChanges.zeros(*sizes)
+        """The tangents of these, likewise."""
+        self.named: dict[str, wp.array] = {
+            "before": self.before.positions,
+            "turns_before": self.before.turns,
+            "after": self.after.positions,
+            "turns": self.after.turns,
+            "before_dot": self.before_dot.positions,
+            "turned_before_dot": self.before_dot.turns,
+            "after_dot": self.after_dot.positions,
+            "turned_dot": self.after_dot.turns,
+        }
+        """Poses and their tangents as kernels call them."""
         self.slides = wp.zeros(solids, dtype=precision.vector, device=device)
         """How fast the surfaces of solids slide along them, in their own frames [m/s]."""
         slides = np.zeros((solids, 3))
@@ -191,26 +204,15 @@ class MovingWalls:
 
     def write(self, time_step: wp.array, walls: Mapping[str, wp.array]) -> None:
         """Write them to the arrays of a search, given the length (members,) of the step [s]."""
-        (place, write, shift, _), before, after = self._kernels, self.before, self.after
+        (place, write, shift, _), after = self._kernels, self.after
         launch(place, self._all, self._device, self._own, positions=after.positions, turns=after.turns)
         self._sort(self._own["x"])
         starts, shifted = self._sort.grid.starts, self.grid.starts
         launch(shift, starts.size, self._device, first=self._first, starts=starts, shifted=shifted)
-        poses = {"before": before.positions, "turns_before": before.turns, "turns": after.turns}
         known = {"first": self._first, "order": self._sort.order, "time_step": time_step}
-        launch(write, self._all, self._device, self._own, poses, known, walls)
+        launch(write, self._all, self._device, self._own, self.named, known, walls)
 
-    def write_tangent(
-        self,
-        time_step: wp.array,
-        time_step_dot: wp.array,
-        before: PoseChanges,
-        after: PoseChanges,
-        walls: Mapping[str, wp.array],
-    ) -> None:
+    def write_tangent(self, time_step: wp.array, time_step_dot: wp.array, walls: Mapping[str, wp.array]) -> None:
         """Write their tangents, of what `write` has written last."""
-        known = {"first": self._first, "order": self._sort.order, "time_step": time_step}
-        poses = {"turns_before": self.before.turns, "turns": self.after.turns, "time_step_dot": time_step_dot}
-        dots = {"before_dot": before.positions, "turned_before_dot": before.turns}
-        dots |= {"after_dot": after.positions, "turned_dot": after.turns}
-        launch(self._kernels[3], self._all, self._device, self._own, known, poses, dots, walls)
+        known = {"first": self._first, "order": self._sort.order, "time_step": time_step, "time_step_dot": time_step_dot}
+        launch(self._kernels[3], self._all, self._device, self._own, known, self.named, walls)

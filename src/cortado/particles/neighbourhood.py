@@ -142,6 +142,7 @@ class PairFunctions:
     wall_foot: Any
     wall_velocity: Any
     wall_solid: Any
+    weight_in: Any
     wall_position_dot: Any
     wall_velocity_dot: Any
     wall_turn_dot: Any
@@ -157,7 +158,8 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
     (grad a . u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x);
     ``per_size`` (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction
     per_size x . G, of second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the
-    list of i), ``wall_position`` and others, which load what a wall particle has; and ``vectors`` and ``numbers``,
+    list of i), ``wall_position`` and others, which load what a wall particle has, ``weight_in`` its weight if it is of the given
+    moving solid, and 0 if not; and ``vectors`` and ``numbers``,
     which load what `UNROLL` neighbours have before any of it is used, so that the loads do not wait for one another (on
     a GPU a tenth of a whole step).
     """
@@ -254,6 +256,13 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         return s.wall_solids[b]
 
     @wp.func
+    def weight_in(b: int, solid: int, s: neighbourhood) -> real:
+        weight = real(0.0)
+        if s.wall_solids[b] == solid:
+            weight = load_number(s.wall_weights, b)
+        return weight
+
+    @wp.func
     def wall_position_dot(b: int, s: neighbourhood) -> vector:
         return load_vector(s.wall_positions_dot, b)
 
@@ -301,6 +310,7 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         wall_foot=wall_foot,
         wall_velocity=wall_velocity,
         wall_solid=wall_solid,
+        weight_in=weight_in,
         wall_position_dot=wall_position_dot,
         wall_velocity_dot=wall_velocity_dot,
         wall_turn_dot=wall_turn_dot,

@@ -30,7 +30,7 @@ OVER_FLUID = """\
 OVER_WALLS = """\
     for _place in range(s.fluid_count[i] + _lane(), s.count[i], _LANES):
         _b = _neighbour(_place, i, s)
-        _w_b = {weight}(_b, s)
+        _w_b = {weight}
         _x_ij = _separation(_x_i, _wall_position(_b, s), s)
         {more}
         {body}
@@ -63,16 +63,17 @@ def over_fluid(
     )
 
 
-def over_walls(d: Discretisation, arrays: Types, body: Body, known: Iterable[str], rubs: bool) -> str:
+def over_walls(d: Discretisation, arrays: Types, body: Body, known: Iterable[str], rubs: bool, of_one: bool) -> str:
     """A loop over the walls, whose particles have nothing but a place, a weight _w_b, what is ``known`` of
     `cortado.particles.terms.OF_WALLS`, and, where walls move, a velocity, which is their entry of the array v, and
-    tangents of both. Where it ``rubs``, walls that slip freely have no weight."""
+    tangents of both. Where it ``rubs``, walls that slip freely have no weight, and where it is ``of_one`` all that are
+    not of the moving ``solid``."""
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
     of_b |= {array: text for array, text in MOVING.items() if d.moving and array in arrays}
     turned = "_wall_turn_dot(_b, s)" if d.moving else zero(d.precision.vector, d)
     more = {"foot": "_foot = _wall_foot(_b, s)", "turn_dot": f"_turn_dot = {turned}"}
     return OVER_WALLS.format(
-        weight="_wall_grip" if rubs else "_wall_weight",
+        weight="_wall_grip(_b, s)" if rubs else "_weight_in(_b, solid, s)" if of_one else "_wall_weight(_b, s)",
         more=_lines(8, (text for name, text in more.items() if name in known)),
         body=_lines(8, body({**of_b, "x": "_wall_position(_b, s)"})),
     )
@@ -133,6 +134,7 @@ def _known(d: Discretisation) -> dict[str, Any]:
         "wall_grip",
         "wall_foot",
         "wall_velocity",
+        "weight_in",
         "wall_position_dot",
         "wall_velocity_dot",
         "wall_turn_dot",

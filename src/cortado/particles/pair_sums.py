@@ -69,6 +69,16 @@ def wall_sum(d: Discretisation) -> Decorator:
     return make
 
 
+def solid_sum(d: Discretisation) -> Decorator:
+    """As `wall_sum`, over the walls of the one moving solid that the term's parameter ``solid`` is the number of."""
+
+    def make(function: Function) -> Any:
+        term = Term.of(function)
+        return _made(term, d, _over_walls(term, d, rubs=False, of_one=True), term)
+
+    return make
+
+
 def _check_walls(wall: Term, term: Term) -> None:
     """Raises `TypeError` for a term of walls that does not fit that of the fluid."""
     more = [name for name, kind in (wall.arrays | wall.others).items() if (term.arrays | term.others).get(name) != kind]
@@ -86,14 +96,14 @@ def _over_fluid(term: Term, d: Discretisation, ahead: bool) -> str:
     return over_fluid(d, term.of_neighbours, body, ahead, *knows)
 
 
-def _over_walls(wall: Term, d: Discretisation, rubs: bool) -> str:
+def _over_walls(wall: Term, d: Discretisation, rubs: bool, of_one: bool = False) -> str:
     def body(of_b: Mapping[str, str]) -> list[str]:
         called = f"{_terms(wall)} = _wall_term({wall.seen_from_i(of_b, '-1')})"
         return [called, *(f"_total_{n} += _w_b * _term_{n}" for n in _numbers(wall))]
 
     if "x_ij" not in wall.parameters:
         raise TypeError(f"term {wall.name} has no x_ij, but must have it where it is summed over walls.")
-    return over_walls(d, wall.of_neighbours, body, wall.parameters, rubs)
+    return over_walls(d, wall.of_neighbours, body, wall.parameters, rubs, of_one)
 
 
 def _terms(term: Term) -> str:

@@ -83,9 +83,12 @@ class SolidShares:
         before, after = self._walls.before, self._walls.after
         poses = {"positions": after.positions, "turns": after.turns, "turns_before": before.turns}
         known = {**poses, "slides": self._walls.slides, "constants": self._pair(*constants), "k": 0, "rounds": None}
-        for solid, own in enumerate(self._arrays):
-            bars = {f"{name}_bar": array for name, array in own.items()}
-            launch(kernel, bars, *groups, known, solid=solid, **arrays)
+        for solid in range(self._walls.solids):
+            launch(kernel, self.of(solid), *groups, known, solid=solid, **arrays)
+
+    def of(self, solid: int) -> dict[str, wp.array]:
+        """(n,) vectors that the particles have given to one solid so far, as kernels call them."""
+        return {f"{name}_bar": array for name, array in self._arrays[solid].items()}
 
     def collect(self, solid: int) -> dict[str, wp.array]:
         """The sums (members,) of one solid, by `NAMES`, and begin anew."""

@@ -7,7 +7,15 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.scene.motions import moving, position_name, rotation_name, turn_name
+from cortado.scene.motions import (
+    AXES,
+    angular_velocity_name,
+    moving,
+    position_name,
+    rotation_name,
+    turn_name,
+    velocity_name,
+)
 from cortado.scene.scene import Scene
 
 
@@ -19,10 +27,15 @@ class SolidMotion:
     """(frames, d) of its middle [m]"""
     rotations: NDArray[Any]
     """(frames, 3) rotation vectors, in 2-D (frames,) angles, by which it is turned about its middle [rad]"""
+    velocities: NDArray[Any] | None = None
+    """(frames, d) of the middle of a body that is free [m/s]; None for one that is told where to go."""
+    angular_velocities: NDArray[Any] | None = None
+    """(frames, 3), in 2-D (frames,), of a body that is free [rad/s]; None for others."""
 
     def __getitem__(self, frames: slice) -> Self:
         """In some of the frames."""
-        return type(self)(self.positions[frames], self.rotations[frames])
+        given = (self.positions, self.rotations, self.velocities, self.angular_velocities)
+        return type(self)(*(None if values is None else values[frames] for values in given))
 
 
 def solid_motions(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> dict[str, SolidMotion]:
@@ -36,13 +49,32 @@ def moved(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> list[Any]:
 
 
 def _motion(table: Any, fields: Mapping[str, NDArray[Any]], dimension: int) -> SolidMotion:
-    names = (name(table.name) for name in (position_name, turn_name, rotation_name))
-    positions, turns, begun = (fields[name][:, 0].astype(np.float64) for name in names)
+    name = table.name
+    position, begun = (fields[of(name)][:, 0].astype(np.float64) for of in (position_name, rotation_name))
+    if table.motion == "free":
+        axes = np.stack([fields[f"{name}.{axis}"][:, 0].astype(np.float64) for axis in AXES], axis=-1)
+        moving = {"velocities": fields[velocity_name(name)][:, 0]}
+        moving["angular_velocities"] = fields[angular_velocity_name(name)][:, 0]
+        return SolidMotion(position, _turned(axes + np.eye(dimension, 3), begun, dimension), **moving)
+    turns = fields[turn_name(name)][:, 0].astype(np.float64)
+    return SolidMotion(position, turns + begun if dimension == 2 else _product(turns, begun))
+
+
+def _turned(axes: NDArray[Any], begun: NDArray[Any], dimension: int) -> NDArray[Any]:
+    """The rotations of axes (frames, d, 3), columns in the frame of space, after those that a body began with; in 2-D
+    angles, each the nearest to the one before."""
     if dimension == 2:
-        return SolidMotion(positions, turns + begun)
+        return np.unwrap(np.arctan2(axes[:, 1, 0], axes[:, 0, 0])) + begun
     from scipy.spatial.transform import Rotation
 
-    return SolidMotion(positions, (Rotation.from_rotvec(turns) * Rotation.from_rotvec(begun)).as_rotvec())
+    return _product(Rotation.from_matrix(axes).as_rotvec(), begun)
+
+
+def _product(turns: NDArray[Any], begun: NDArray[Any]) -> NDArray[Any]:
+    """(frames, 3) the rotation vectors of a first rotation and a turn after it."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray((Rotation.from_rotvec(turns) * Rotation.from_rotvec(begun)).as_rotvec())
 
 
 def posed(scene: Scene, motions: Mapping[str, SolidMotion], frame: int) -> Scene:

@@ -1,17 +1,19 @@
 """How solids that move are displaced and turned from where they begin, over time."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import MissingDerivativeError
-from cortado.scene.parameters.parameter import Axis, Parameter, Source
+from cortado.scene.parameters.parameter import Axis, Parameter, Range, Role, Source
 from cortado.scene.schedule import along_lines
 from cortado.scene.solids import SolidTable
 
+AXES = ("turn_x", "turn_y", "turn_z")
+"""How fields of states end that keep how a free body is turned: how far the ends of its unit axes have moved [-]."""
 RADIAN = 1.0
 """What an optimiser would take for a large turn [rad]."""
 
@@ -74,6 +76,16 @@ def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
     return [solid for solid in solids if solid.moves]
 
 
+def told(solids: Sequence[SolidTable]) -> list[SolidTable]:
+    """Those that move as they are told."""
+    return [solid for solid in moving(solids) if solid.motion != "free"]
+
+
+def free(solids: Sequence[SolidTable]) -> list[SolidTable]:
+    """Those that fluid moves."""
+    return [solid for solid in solids if solid.motion == "free"]
+
+
 def solid_frames(scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Of the solids of a scene that move: where their middles are at the start, (k, d) [m], and how they are turned,
     (k, d, d)."""
@@ -98,8 +110,12 @@ def greatest_speed(solids: Sequence[SolidTable]) -> float:
 
 
 def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
-    """Of solids that move: where they begin, and where they are at the end of each step, as from there."""
-    return [make(solid) for solid in moving(solids) for make in (_position, _rotation, _displacement, _turn)]
+    """Of solids that move: where they begin, and where they are at the end of each step, as from there; of free bodies
+    how they begin, and their density."""
+    found = [make(solid) for solid in told(solids) for make in (_position, _rotation, _displacement, _turn)]
+    makers = (_position, _rotation, _velocity, _angular_velocity)
+    begun = [replace(make(solid), role=Role.STATE) for solid in free(solids) for make in makers]
+    return [*found, *begun, *map(_density, free(solids))]
 
 
 def position_name(solid: str) -> str:
@@ -120,6 +136,21 @@ def displacement_name(solid: str) -> str:
 def turn_name(solid: str) -> str:
     """Of the parameter, and of the field of a state."""
     return f"{solid}.turn"
+
+
+def velocity_name(solid: str) -> str:
+    """Of the parameter that says how fast the middle of a free body is at the start, and of the field of a state."""
+    return f"{solid}.velocity"
+
+
+def angular_velocity_name(solid: str) -> str:
+    """Of the parameter that says how fast a free body turns at the start, and of the field of a state."""
+    return f"{solid}.angular_velocity"
+
+
+def density_name(solid: str) -> str:
+    """Of the parameter of a free body."""
+    return f"{solid}.density"
 
 
 def _position(solid: SolidTable) -> Parameter:
@@ -146,6 +177,44 @@ def _rotation(solid: SolidTable) -> Parameter:
         lambda source: begun.reshape(_shape_of(angles)),
         components=None if angles == 1 else lambda dimension, phases: dimension,
         change=lambda source, value: np.full(np.shape(value), RADIAN),
+    )
+
+
+def _velocity(solid: SolidTable) -> Parameter:
+    begun = np.array(solid.velocity or np.zeros(len(solid.middle())), dtype=np.float64)
+    return Parameter(
+        velocity_name(solid.name),
+        "m/s",
+        f"how fast the middle of the body {solid.name} is at the start",
+        Axis.SCALAR,
+        lambda source: begun,
+        components=lambda dimension, phases: dimension,
+        change=lambda source, value: np.ones(np.shape(value)),
+    )
+
+
+def _angular_velocity(solid: SolidTable) -> Parameter:
+    angles = 2 * len(solid.middle()) - 3
+    begun = np.array(solid.angular_velocity or np.zeros(angles), dtype=np.float64)
+    return Parameter(
+        angular_velocity_name(solid.name),
+        "rad/s",
+        f"how fast the body {solid.name} turns at the start",
+        Axis.SCALAR,
+        lambda source: begun.reshape(_shape_of(angles)),
+        components=None if angles == 1 else lambda dimension, phases: dimension,
+        change=lambda source, value: np.ones(np.shape(value)),
+    )
+
+
+def _density(solid: SolidTable) -> Parameter:
+    return Parameter(
+        density_name(solid.name),
+        "kg/m³",
+        f"the mass of the body {solid.name} over its volume",
+        Axis.SCALAR,
+        lambda source: np.float64(solid.density or 0.0),
+        range=Range.POSITIVE,
     )
 
 

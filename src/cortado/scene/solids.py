@@ -39,9 +39,11 @@ class SolidTable(Table):
     rotation: Rotation | None = None
     """How it is turned about its middle [rad], not at all if left out: in 3-D a rotation vector, in 2-D one number,
     counterclockwise."""
-    motion: Literal["fixed", "path"] = "fixed"
-    """Whether it stays where it is, or moves as it is told: by `times` with `positions`, `rotations` or both, or with a
-    steady `velocity`, `angular_velocity` or both."""
+    motion: Literal["fixed", "path", "free"] = "fixed"
+    """Whether it stays where it is; moves as it is told, by `times` with `positions`, `rotations` or both, or with a
+    steady `velocity`, `angular_velocity` or both; or is a rigid body, which fluid and gravity move."""
+    density: Annotated[float, quantity("kg/m3", gt=0.0)] | None = None
+    """Of a free body: its mass over its volume [kg/m³]."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
     """(k,) Times of the path, from 0 on, each greater than the one before [s]; between them it goes in straight lines,
     and after the last it rests."""
@@ -51,9 +53,10 @@ class SolidTable(Table):
     """(k, 3) By which rotation vectors it is turned from how it begins at these times, in 2-D (k,) by which angles; the
     first is 0 [rad]."""
     velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
-    """(d,) Of the middle, if it is steady [m/s]."""
+    """(d,) Of the middle, if it is steady; of a free body at the start [m/s]."""
     angular_velocity: Turning | None = None
-    """About the middle, if it is steady: in 3-D a vector, in 2-D one number, counterclockwise [rad/s]."""
+    """About the middle, if it is steady; of a free body at the start: in 3-D a vector, in 2-D one number,
+    counterclockwise [rad/s]."""
     surface_velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
     """(d,) How fast its surface slides while its shape stays, as that of a belt does, in the frame of the solid
     [m/s]."""
@@ -135,9 +138,14 @@ def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
     """What a path has fits together."""
     rows, steady = ("positions", "rotations"), ("velocity", "angular_velocity")
     given = [name for name in ("times", *rows, *steady) if getattr(solid, name) is not None]
+    if solid.density is not None and solid.motion != "free":
+        raise field_error((*path, "density"), solid.density, 'left out, as only a body whose motion is "free" has a mass')
     if solid.motion == "fixed":
         if given:
             raise field_error((*path, given[0]), Words("given"), 'left out, as motion is "fixed"')
+        return
+    if solid.motion == "free":
+        _check_free(solid, path)
         return
     if solid.times is None:
         if wrong := [name for name in rows if name in given]:
@@ -148,6 +156,19 @@ def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
         _check_knots(solid, dimension, path)
         if wrong := [name for name in steady if name in given]:
             raise field_error((*path, wrong[0]), Words("given"), "left out, as there are times")
+
+
+def _check_free(solid: SolidTable, path: FieldPath) -> None:
+    """A free body has a density, and nothing tells it where to go."""
+    if solid.density is None:
+        raise field_error((*path, "density"), MISSING, 'a density in kg/m3, as motion is "free"')
+    for name in ("times", "positions", "rotations", "surface_velocity"):
+        if getattr(solid, name) is not None:
+            raise field_error((*path, name), Words("given"), 'left out, as motion is "free"')
+    if solid.side == "inside":
+        raise field_error((*path, "side"), solid.side, '"outside", as motion is "free"')
+    if solid.slip == "no":
+        raise field_error((*path, "slip"), solid.slip, '"free", as fluid does not rub bodies that are free')
 
 
 def _check_knots(solid: SolidTable, dimension: int, path: FieldPath) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from cortado.device.lanes import lanes_for
 from cortado.discretise.calibration import SKIN
+from cortado.discretise.solids.mass import Mass
 from cortado.discretise.solids.solid import Solid
 from cortado.errors import InputError
 from cortado.particles.arrays import padded
@@ -28,6 +29,7 @@ from cortado.solvers.particles import ParticleSystem
 from cortado.sph.diffusion import Diffusion
 from cortado.sph.emitter import Nozzle
 from cortado.sph.free_energy import MOBILITIES, FreeEnergy
+from cortado.sph.free_solids import FreeSolids, FreeTable
 from cortado.sph.makers import ForceMaker
 from cortado.sph.mixture import Phases
 from cortado.sph.moving_solids import MovingSolids
@@ -138,13 +140,25 @@ def _parts(
 ) -> list[PartMaker]:
     """The parts that are no forces, in the order in which they end a step."""
     found: list[PartMaker | None] = [_phases(scene, discretisation, free_energy), _nozzle(scene, discrete)]
-    return [part for part in (*found, _moving_solids(scene, search)) if part is not None]
+    found += [_free_solids(scene, discrete, search), _moving_solids(scene, search)]
+    return [part for part in found if part is not None]
+
+
+def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch) -> FreeSolids | None:
+    """The bodies that fluid moves; None without any."""
+    tables = [
+        FreeTable(table.name, number, Mass.of(table.own_solid()).in_volumes(discrete.lattice.volume))
+        for number, table in enumerate(moving(scene.solid))
+        if table.motion == "free"
+    ]
+    return FreeSolids(tables, scene.dimension, search) if tables else None
 
 
 def _moving_solids(scene: Scene, search: NeighbourSearch) -> MovingSolids | None:
-    """The solids that move; None without any."""
-    names = [table.name for table in moving(scene.solid)]
-    return MovingSolids(names, scene.dimension, search) if names else None
+    """The solids that move, which write the walls of all of these; None without any."""
+    tables = moving(scene.solid)
+    numbers = {table.name: number for number, table in enumerate(tables) if table.motion != "free"}
+    return MovingSolids(numbers, scene.dimension, search) if tables else None
 
 
 def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnergy) -> Phases:

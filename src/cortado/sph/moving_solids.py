@@ -5,7 +5,7 @@ a wall particle with the place r in its frame is at c_0 + d + R(w) R(w_0) r then
 from where it was, over the time step. States have the position c, the turn w, and w_0.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -16,7 +16,7 @@ from cortado.device.bundles import bundle
 from cortado.device.precision import Precision
 from cortado.errors import MissingDerivativeError
 from cortado.particles.fields import Entry, StateField
-from cortado.particles.moving_walls import MovingWalls, PoseChanges, matrix_of
+from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.solid_shares import NAMES
 from cortado.particles.state import Layout, Parameters, State
@@ -148,7 +148,8 @@ def _kernels(precision: Precision, dimension: int) -> PoseKernels:
 class MovingSolids:
     """Makes the part of one solver."""
 
-    names: Sequence[str]
+    numbers: Mapping[str, int]
+    """Of those that are told where to go, by name, among those that move."""
     dimension: int
     search: NeighbourSearch
     """Whose walls are theirs."""
@@ -166,14 +167,14 @@ class MovingSolids:
 
 
 class MovingSolidsPart(Part):
-    """Puts walls where they are at the end of each step."""
+    """Puts walls where they are at the end of each step: its own, and those of other parts that come before it."""
 
     def __init__(self, made_of: MovingSolids, layout: Layout):
         self.made_of, self.layout = made_of, layout
         angle = Entry.NUMBER if made_of.dimension == 2 else Entry.VECTOR
         self.fields = tuple(
             field
-            for name in made_of.names
+            for name in made_of.numbers
             for field in (
                 StateField(position_name(name), "m", Entry.VECTOR, Axis.SCALAR, position_name(name)),
                 StateField(turn_name(name), "rad", angle, Axis.SCALAR),
@@ -187,18 +188,11 @@ class MovingSolidsPart(Part):
 
     def begin(self, step: StepContext, state: State) -> None:
         walls, search = self.made_of.walls, self.made_of.search
-        own: dict[str, Any] = {
-            "before": walls.before.positions,
-            "turns_before": walls.before.turns,
-            "after": walls.after.positions,
-            "turns": walls.after.turns,
-            "threads": self.layout.members,
-        }
-        for number, name in enumerate(self.made_of.names):
+        for name, number in self.made_of.numbers.items():
             for field in (position_name(name), turn_name(name), rotation_name(name)):
                 wp.copy(self.begun[field], state[field])
             known = self.state(self.begun, name), self.told(step.parameters, name)
-            step.launch(self.kernels.begin, *known, number=number, **own)
+            step.launch(self.kernels.begin, *known, walls.named, number=number, threads=self.layout.members)
         walls.write(step.parameters["time_step"], search.walls)
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
@@ -206,7 +200,7 @@ class MovingSolidsPart(Part):
 
     def write_end(self, step: StepContext, parameters: Parameters, begun: State, state: State) -> None:
         """The fields at the end of a step, or their tangents."""
-        for name in self.made_of.names:
+        for name in self.made_of.numbers:
             new = {**self.state(state, name), **self.told(parameters, name), "begun": begun[rotation_name(name)]}
             step.launch(self.kernels.end, new, threads=self.layout.members)
 
@@ -231,28 +225,19 @@ class MovingSolidsTangent(PartTangent):
     """Forward mode: tangents of the walls."""
 
     def __init__(self, part: MovingSolidsPart):
-        self._part, layout = part, part.layout
-        sizes = layout.members, part.made_of.walls.solids, layout.precision, layout.device
-        self._before, self._after = PoseChanges.zeros(*sizes), PoseChanges.zeros(*sizes)
-        self._begun = layout.state(part.fields)
+        self._part = part
+        self._begun = part.layout.state(part.fields)
 
     def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        part, before, after = self._part, self._before, self._after
-        own: dict[str, Any] = {
-            "before_dot": before.positions,
-            "turned_before_dot": before.turns,
-            "after_dot": after.positions,
-            "turned_dot": after.turns,
-            "threads": part.layout.members,
-        }
+        part, walls = self._part, self._part.made_of.walls
         for field in part.fields:
             wp.copy(self._begun[field.name], state_dot[field.name])
-        for number, name in enumerate(part.made_of.names):
+        for name, number in part.made_of.numbers.items():
             dots = {**part.state(self._begun, name, "_dot"), **part.told(dot.parameters, name, "_dot")}
             known = part.state(part.begun, name), part.told(step.parameters, name)
-            step.launch(part.kernels.tangent, dots, *known, number=number, **own)
+            step.launch(part.kernels.tangent, dots, *known, walls.named, number=number, threads=part.layout.members)
         sizes = step.parameters["time_step"], dot.parameters["time_step"]
-        part.made_of.walls.write_tangent(*sizes, before, after, part.made_of.search.walls)
+        walls.write_tangent(*sizes, part.made_of.search.walls)
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         self._part.write_end(step, dot.parameters, self._begun, state_dot)
@@ -267,7 +252,7 @@ class MovingSolidsAdjoint(PartAdjoint):
     def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
         part = self._part
         assert bar.solids is not None
-        for number, name in enumerate(part.made_of.names):
+        for name, number in part.made_of.numbers.items():
             bars = {**part.state(state_bar, name, "_bar"), **part.told(bar.parameters, name, "_bar")}
             known = part.state(part.begun, name), part.told(step.parameters, name), bar.solids.collect(number)
             step.launch(part.kernels.adjoint, bars, *known, threads=part.layout.members)

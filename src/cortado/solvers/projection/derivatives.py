@@ -13,8 +13,10 @@ from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangen
 from cortado.solvers.projection.beside import beside_solid_kernel
 from cortado.solvers.projection.pressed import pressed_adjoint_kernel
 from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
+from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
 from cortado.solvers.solver import Counts
 from cortado.sph.density import density_solid_kernel
+from cortado.sph.free_solids import FreeSolidsAdjoint, FreeSolidsTangent
 from cortado.sph.parts import StepContext
 
 
@@ -34,6 +36,8 @@ class ProjectionTangent(ParticleTangent):
         self._x_star_dot, self._v_star_dot, self._v_new_dot = (solver.vectors() for _ in range(3))
         self._u_dot, self._delta_dot, self._x_moved_dot, self._x_now_dot = (solver.vectors() for _ in range(4))
         self._k_dot, self._y_dot, self._c_dot = (solver.numbers() for _ in range(3))
+        free = [part for part in self._parts if isinstance(part, FreeSolidsTangent)]
+        self._bodies = None if solver.bodies is None else BodiesTangent(solver.bodies, free[0].bodies)
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
         """Replace the tangent of the replayed step's state by that of its result."""
@@ -42,6 +46,8 @@ class ProjectionTangent(ParticleTangent):
         self.sort(context, state_dot)
         known = (*self.dot.named, self._around, solver.around)
         context.launch(kernels.surroundings.tangent, *known, solver.relaxed)
+        if self._bodies is not None:
+            self._bodies.begin(context, self.dot, self._around["a_dot"])
         self.predict(context, solver.v_star, self._x_star_dot, self._v_star_dot)
         start = {"k_before": solver.carried[IMPULSE], "k_before_dot": self.carried_dot[IMPULSE]}
         steps = {"k_dot": self._k_dot, "y_dot": self._y_dot}
@@ -78,8 +84,14 @@ class ProjectionTangent(ParticleTangent):
             change = {"u_dot": self._u_dot, "y_dot": self._y_dot, "k_dot": self._k_dot}
             self._pull_along(context, known, at["y"], self._y_dot, u=at["u"], u_dot=self._u_dot)
             new = {"k_out_dot": self._k_dot, "y_out_dot": self._y_dot, "beta": solver.momenta[k]}
-            context.launch(kernels.update.tangent, *known, at, solver.relaxed, change, new)
+            drift = {}
+            if self._bodies is not None:
+                drift_dot = self._around["drift_dot"]
+                drift = {"drift_dot": self._bodies.drifted(context, self.dot, drift_dot, at["y"], self._y_dot)}
+            context.launch(kernels.update.tangent, *known, at, solver.relaxed, change, new, **drift)
         k = solver.iterates[iterations]["k"]
+        if self._bodies is not None:
+            self._bodies.settle(context, self.dot, k, self._k_dot)
         self._pull_along(context, known, k, self._k_dot, u=solver.v_new, u_dot=self._v_new_dot)
 
     def _pull_along(
@@ -105,6 +117,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._pull, self._push = pull["T"], pull["S"]
         self._m_unused, self._k_before_bar, self._n_now_bar = (solver.numbers() for _ in range(3))
         self._k_bar, self._y_bar, self._c_bar, self._d_bar = (solver.numbers() for _ in range(4))
+        free = [part for part in self._parts if isinstance(part, FreeSolidsAdjoint)]
+        self._bodies = None if solver.bodies is None else BodiesAdjoint(solver.bodies, free[0].bodies)
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         """Replace the adjoint of the replayed step's result by that of its state."""
@@ -136,6 +150,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         for array in (*self.bar.fields.arrays(), *self._around.values(), self._x_moved_bar, self._c_bar, self._y_bar):
             array.zero_()
         wp.copy(self._k_bar, self.carried_bar[IMPULSE])
+        if self._bodies is not None:
+            self._bodies.begin()
 
     def _finish(
         self, counts: Counts, state_bar: State, parameters: Parameters, fields_bar: Fields | None = None
@@ -152,6 +168,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._project(context, known, counts[0])
         start = {"k_before": solver.carried[IMPULSE], "k_before_bar": self._k_before_bar}
         context.launch(kernels.pressure.start.adjoint, *known, start, k_bar=self._k_bar, y_bar=self._y_bar)
+        if self._bodies is not None:
+            self._bodies.finish(context, self.bar, self._around["a_bar"])
         own, sums = kernels.surroundings.adjoint
         for kernel in (own, sums):
             context.launch(kernel, *known, solver.relaxed)
@@ -196,12 +214,17 @@ class ProjectionAdjoint(ParticleAdjoint):
         steps = {"f": self._f, "T": self._pull}
         context.launch(velocity.end_adjoint, *known, last, steps, y=k)
         context.launch(velocity.velocity.adjoint, *known, steps, y=k, y_bar=self._k_bar)
+        if self._bodies is not None:
+            self._bodies.settle(context, self.bar, k, self._k_bar)
 
     def _back(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], beta: float) -> None:
         """Of one iteration, from those of k' and y' to those of k and y, and of v*."""
         solver, (clamp, divergence) = self._solver, self._solver.kernels.pressure.update.adjoint
         steps = {"f": self._f, "T": self._pull, "S": self._push}
         steps |= {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": self._d_bar}
-        context.launch(clamp, *known, at, solver.relaxed, steps, beta=beta)
+        drift = {} if self._bodies is None else {"drift_bar": self._bodies.drift_bar}
+        context.launch(clamp, *known, at, solver.relaxed, steps, **drift, beta=beta)
         context.launch(divergence, *known, at, steps, v_star=solver.v_star)
         context.launch(solver.kernels.velocity.velocity.adjoint, *known, at, steps)
+        if self._bodies is not None:
+            self._bodies.drifted(context, self.bar, self._around["drift_bar"], at["y"], self._y_bar)

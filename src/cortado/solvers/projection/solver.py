@@ -1,5 +1,6 @@
 """The velocity projection as a `Solver`: its steps, forward, and their derivatives."""
 
+from cortado.errors import MissingDerivativeError
 from cortado.particles.state import Parameters
 from cortado.solvers.projection.derivatives import ProjectionAdjoint, ProjectionTangent
 from cortado.solvers.projection.fixed_point import FixedPointAdjoint
@@ -17,4 +18,6 @@ class Projection(ProjectionSteps):
         return ProjectionAdjoint(self, steps)
 
     def implicit_adjoint(self, steps: int, tolerance: float, iterations: int) -> ResumingAdjoint:
+        if self.bodies is not None:
+            raise MissingDerivativeError("bodies that are free have no implicit adjoint: try gradients.Exact.")
         return FixedPointAdjoint(self, steps, tolerance, iterations)

@@ -16,6 +16,7 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Parameters, State
 from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
+from cortado.solvers.projection.bodies import Bodies
 from cortado.solvers.projection.constants import ProjectionConstants
 from cortado.solvers.projection.moving import moving_kernels
 from cortado.solvers.projection.pressure import PressureKernels, pressure_kernels
@@ -24,6 +25,7 @@ from cortado.solvers.projection.shifting import shift_kernels
 from cortado.solvers.projection.surroundings import entries, surrounding_kernels
 from cortado.solvers.projection.velocity import VelocityKernels, velocity_kernels
 from cortado.solvers.solver import Counts
+from cortado.sph.free_solids import FreeSolidsPart
 from cortado.sph.moment_functions import matrix_type, symmetric
 from cortado.sph.parts import StepContext
 
@@ -83,6 +85,9 @@ class ProjectionSteps(ParticleSolver):
         self.repaired = [self.new_arrays(**self._repair_kinds)]
         """x_k, lambda and n - 1 before each repair."""
         self.x_star, self.v_star, self.v_new, self.x_moved, self.delta = (self.vectors() for _ in range(5))
+        free = [part for part in self.parts if isinstance(part, FreeSolidsPart)]
+        self.bodies = Bodies(free[0], self.discretisation, self.layout) if free else None
+        """Those that fluid moves; None without any."""
         self.momenta = momenta(iterations)
         limits = (LoopLimits(count, count, 0.0, 0.0) for count in (iterations, repairs))
         names = ("iterations", "divergence_errors"), ("repairs", "density_errors")
@@ -150,6 +155,8 @@ class ProjectionSteps(ParticleSolver):
         """Everything but the pressure, and the first one."""
         context, kernels, first = self.sort(state, parameters), self.kernels, self.iterates[0]
         context.launch(kernels.surroundings.forward, self.around, self.relaxed)
+        if self.bodies is not None:
+            self.bodies.begin(context, self.around["a"])
         predicted = {"x_star": self.x_star, "v_star": self.v_star}
         context.launch(self.integration.predict, acceleration=self.accelerate(context), **predicted)
         started = {"k": first["k"], "y": first["y"], "T": self.pull, "k_before": self.carried[IMPULSE]}
@@ -161,11 +168,16 @@ class ProjectionSteps(ParticleSolver):
         kernels, at, new = self.kernels, self.iterates[before], self.iterates[after]
         context.launch(kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star, T=self.pull)
         out = {"k_out": new["k"], "y_out": new["y"], "T": self.pull, "error": self.loops[0].errors}
-        context.launch(kernels.pressure.update.forward, self.around, at, self.relaxed, out, beta=self.momenta[k])
+        out["drift"] = self.around["drift"]
+        if self.bodies is not None:
+            out["drift"] = self.bodies.drifted(context, self.around["drift"], at["y"])
+        context.launch(kernels.pressure.update.forward, out, self.around, at, self.relaxed, beta=self.momenta[k])
 
     def move(self, context: StepContext, last: int) -> None:
         """The new velocities, by the k of a slot, and the positions that they and the shift lead to."""
         kernels, at = self.kernels, {"y": self.iterates[last]["y"], "T": self.pull}
+        if self.bodies is not None:
+            self.bodies.settle(context, at["y"])
         context.launch(kernels.velocity.velocity.forward, self.around, at, v_star=self.v_star, u=self.v_new)
         flow, first = {"v_flow": self.v_new, "delta": self.delta}, self.repaired[0]
         context.launch(kernels.shift.forward, self.around, self.kept, self.shifted, flow)

@@ -1,0 +1,221 @@
+"""Rigid bodies in a step of the projection, forward and with derivatives: see `cortado.solvers.projection.body_kernels`."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.device.binding import Named
+from cortado.device.launching import add
+from cortado.particles.state import Layout
+from cortado.scene.motions import density_name
+from cortado.solvers.projection.body_kernels import body_kernels
+from cortado.solvers.projection.body_motion import motion_kernels
+from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+
+Arrays = dict[str, wp.array]
+
+
+class Held:
+    """What particles know of one body in a step, or tangents or adjoints of it, by a ``suffix`` of their names."""
+
+    def __init__(self, body: FreeBody, layout: Layout, suffix: str = ""):
+        self.body, self._layout = body, layout
+        precision, device, size = layout.precision, layout.device, layout.all_particles
+        kinds = {"gamma_of": precision.vector, "arm": precision.vector, "sizes": precision.pair}
+        self.known = {f"{name}{suffix}": wp.zeros(size, dtype=kind, device=device) for name, kind in kinds.items()}
+        self.shares = {
+            f"{name}{suffix}": wp.zeros(size, dtype=precision.vector, device=device) for name in ("pulled", "twisted")
+        }
+        self.moved = {
+            f"{name}{suffix}": wp.zeros(layout.members, dtype=precision.vector, device=device) for name in "VWL"
+        }
+        """V, W and L of an iteration."""
+        self._sums = [layout.sum_of(precision.vector) for _ in range(2)]
+        self._suffix, self._whole = suffix, layout.sum_of(precision.pair)
+        self.whole: Arrays = {}
+        """The sums of the sizes."""
+
+    def add_sizes(self) -> None:
+        """Of all particles of a scene."""
+        self.whole = {f"whole{self._suffix}": self._whole(self.known[f"sizes{self._suffix}"])}
+
+    def sums(self) -> Arrays:
+        """(members,) those of y gamma and of y r x gamma."""
+        found = (total(share) for total, share in zip(self._sums, self.shares.values(), strict=True))
+        return dict(zip((f"pulled_sum{self._suffix}", f"twisted_sum{self._suffix}"), found, strict=True))
+
+
+def begun(motion: Mapping[str, wp.array]) -> Arrays:
+    """V, W and L at the start of a step as kernels call them: V_0, W_0 and L_0."""
+    return {f"{name[0]}_0{name[1:]}": array for name, array in motion.items()}
+
+
+class Bodies:
+    """Those of one solver, forward."""
+
+    def __init__(self, part: FreeSolidsPart, discretisation: Any, layout: Layout):
+        self.part, self.layout = part, layout
+        self.kernels, self.motion = body_kernels(discretisation), motion_kernels(layout.precision)
+        self.held = [Held(body, layout) for body in part.bodies]
+        self.drift = wp.zeros(layout.all_particles, dtype=layout.precision.real, device=layout.device)
+
+    def known(self, context: StepContext, held: Held) -> tuple[Named, ...]:
+        """What kernels know of a body."""
+        body = held.body
+        inverse = np.linalg.eigvalsh(np.linalg.pinv(body.table.mass.inertia))
+        constants = {"volume": body.table.mass.volume, "greatest": float(inverse.max()), "solid": body.table.number}
+        own = held.known, held.shares, held.whole, constants, begun(body.before), self.part.poses
+        return *own, *body.known(context)
+
+    def begin(self, context: StepContext, a: wp.array) -> None:
+        """Look at what is around them, and add to the diagonal."""
+        for held in self.held:
+            context.launch(self.kernels.hold.forward, *self.known(context, held))
+            held.add_sizes()
+            context.launch(self.kernels.weigh.forward, *self.known(context, held), a=a)
+
+    def move(self, context: StepContext, held: Held, y: wp.array, moved: Arrays) -> Arrays:
+        """Write V, W and L by pressures y, and return the sums of these."""
+        known = self.known(context, held)
+        context.launch(self.kernels.pull.forward, *known, y=y)
+        sums = held.sums()
+        context.launch(self.motion.move.forward, sums, moved, *known, threads=self.layout.members)
+        return sums
+
+    def drifted(self, context: StepContext, drift: wp.array, y: wp.array) -> wp.array:
+        """The drift of walls with the velocities that pressures y give to bodies."""
+        for held in self.held:
+            self.move(context, held, y, held.moved)
+            context.launch(self.motion.carry.forward, held.moved, *self.known(context, held), drift_in=drift, drift=self.drift)
+            drift = self.drift
+        return drift
+
+    def settle(self, context: StepContext, y: wp.array) -> None:
+        """Have bodies end with the velocities that pressures y give them."""
+        for held in self.held:
+            self.move(context, held, y, held.body.moved)
+
+
+class BodiesTangent:
+    """Forward mode."""
+
+    def __init__(self, bodies: Bodies, changes: list[Changes]):
+        self._bodies, self._changes = bodies, changes
+        self._held = [Held(held.body, bodies.layout, "_dot") for held in bodies.held]
+        self.drift = wp.zeros_like(bodies.drift)
+
+    def _known(self, context: StepContext, dot: Tangents, k: int) -> tuple[Named, ...]:
+        bodies, held, own = self._bodies, self._bodies.held[k], self._held[k]
+        rates = {"density_dot": dot.parameters[density_name(held.body.table.name)]}
+        dots = own.known, own.shares, own.whole, begun(self._changes[k].before), rates
+        return *dots, *dot.named, *bodies.known(context, held)
+
+    def begin(self, context: StepContext, dot: Tangents, a_dot: wp.array) -> None:
+        kernels = self._bodies.kernels
+        for k, own in enumerate(self._held):
+            context.launch(kernels.hold.tangent, *self._known(context, dot, k))
+            own.add_sizes()
+            context.launch(kernels.weigh.tangent, *self._known(context, dot, k), a_dot=a_dot)
+
+    def _move(self, context: StepContext, dot: Tangents, k: int, y: tuple[wp.array, wp.array], moved: Arrays, out: Arrays) -> None:
+        bodies, held, own = self._bodies, self._bodies.held[k], self._held[k]
+        sums = bodies.move(context, held, y[0], moved)
+        known = self._known(context, dot, k)
+        context.launch(bodies.kernels.pull.tangent, *known, y=y[0], y_dot=y[1])
+        context.launch(
+            bodies.motion.move.tangent, sums, own.sums(), moved, out, *known, threads=bodies.layout.members
+        )
+
+    def drifted(
+        self, context: StepContext, dot: Tangents, drift_dot: wp.array, y: wp.array, y_dot: wp.array
+    ) -> wp.array:
+        """Of `Bodies.drifted`."""
+        for k, own in enumerate(self._held):
+            moved = self._bodies.held[k].moved
+            self._move(context, dot, k, (y, y_dot), moved, own.moved)
+            drifts = {"drift_in_dot": drift_dot, "drift_dot": self.drift}
+            context.launch(self._bodies.motion.carry.tangent, moved, own.moved, drifts, *self._known(context, dot, k))
+            drift_dot = self.drift
+        return drift_dot
+
+    def settle(self, context: StepContext, dot: Tangents, y: wp.array, y_dot: wp.array) -> None:
+        """Of `Bodies.settle`."""
+        for k, held in enumerate(self._bodies.held):
+            self._move(context, dot, k, (y, y_dot), held.body.moved, self._changes[k].moved)
+
+
+class BodiesAdjoint:
+    """Reverse mode."""
+
+    def __init__(self, bodies: Bodies, changes: list[Changes]):
+        self._bodies, self._changes = bodies, changes
+        layout = bodies.layout
+        self._held = [Held(held.body, layout, "_bar") for held in bodies.held]
+        self.drift_bar = wp.zeros_like(bodies.drift)
+        """That of the drift of one iteration."""
+        self._turned = [{"turned_bar": wp.zeros_like(own.turned_end)} for own in changes]
+        self._faster = {name: wp.zeros_like(changes[0].turned_end) for name in ("V_bar", "W_bar")}
+        self._none = {"L_bar": wp.zeros_like(changes[0].turned_end)}
+        self._weigh, self._sizes = layout.sum_of(layout.precision.pair), wp.zeros_like(bodies.held[0].known["sizes"])
+        vectors = {"dtype": layout.precision.vector, "device": layout.device}
+        self._sums_bar = {f"{name}_sum_bar": wp.zeros(layout.members, **vectors) for name in ("pulled", "twisted")}
+
+    def _known(self, context: StepContext, bar: Adjoints, k: int) -> tuple[Named, ...]:
+        held, own, table = self._bodies.held[k], self._held[k], self._bodies.held[k].body.table
+        rates = {"density_bar": bar.parameters[density_name(table.name)], "time_step_bar": bar.parameters["time_step"]}
+        bars = own.known, begun(self._changes[k].before), self._turned[k], self._sums_bar, rates
+        return *bars, *bar.named, *self._bodies.known(context, held)
+
+    def begin(self) -> None:
+        """Of a step."""
+        for own in self._held:
+            for array in own.known.values():
+                array.zero_()
+
+    def _move(self, context: StepContext, bar: Adjoints, k: int, y: wp.array, moved: Arrays, bars: Named, y_bar: wp.array) -> None:
+        """From the adjoints of V, W and L to that of y."""
+        bodies, held = self._bodies, self._bodies.held[k]
+        sums = bodies.move(context, held, y, moved)
+        known = self._known(context, bar, k)
+        context.launch(bodies.motion.move.adjoint, bars, sums, moved, *known, threads=bodies.layout.members)
+        context.launch(bodies.kernels.pull.adjoint, *known, y=y, y_bar=y_bar)
+
+    def settle(self, context: StepContext, bar: Adjoints, y: wp.array, y_bar: wp.array) -> None:
+        """Of `Bodies.settle`."""
+        for k, held in enumerate(self._bodies.held):
+            self._move(context, bar, k, y, held.body.moved, self._changes[k].moved, y_bar)
+
+    def drifted(self, context: StepContext, bar: Adjoints, drift_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
+        """Of `Bodies.drifted`, for ``self.drift_bar``, which goes to ``drift_bar``, too, and is 0 again."""
+        bodies = self._bodies
+        (adjoint, slower) = bodies.motion.carry.adjoint
+        for k, held in enumerate(bodies.held):
+            bodies.move(context, held, y, held.moved)
+            known = self._known(context, bar, k)
+            context.launch(adjoint, held.moved, *known, carried_bar=self.drift_bar)
+            for array, total in zip(self._faster.values(), held.sums().values(), strict=True):
+                wp.copy(array, total)
+            bars = {**self._faster, **self._none}
+            context.launch(slower, bars, *known, threads=bodies.layout.members)
+            self._move(context, bar, k, y, held.moved, bars, y_bar)
+        add(self.drift_bar, drift_bar)
+        self.drift_bar.zero_()
+
+    def finish(self, context: StepContext, bar: Adjoints, a_bar: wp.array) -> None:
+        """Of `Bodies.begin`, to what particles and poses are given."""
+        bodies = self._bodies
+        share, weigh, end = bodies.kernels.weigh.adjoint
+        for k, held in enumerate(bodies.held):
+            known = self._known(context, bar, k)
+            context.launch(share, *known, a_bar=a_bar, sizes_share=self._sizes)
+            weighed = {"weighed": self._weigh(self._sizes)}
+            context.launch(weigh, weighed, *known, a_bar=a_bar)
+            context.launch(end, weighed, *known, threads=bodies.layout.members)
+            assert bar.solids is not None
+            given = bar.solids.of(held.body.table.number)
+            context.launch(bodies.kernels.hold.adjoint, given, *known)
+            add(self._turned[k]["turned_bar"], self._changes[k].turned_after)
+            self._turned[k]["turned_bar"].zero_()

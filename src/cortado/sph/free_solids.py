@@ -1,0 +1,215 @@
+"""Rigid bodies that fluid and gravity move, as a part of a step: see `cortado.sph.free_kernels`.
+
+The part puts walls where bodies would go and writes where they end. What makes them faster in between, the solver does,
+which leaves V, W and L of the end in `FreeBody.moved`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from cortado.device.binding import Named
+from cortado.device.launching import add
+from cortado.discretise.solids.mass import Mass
+from cortado.errors import MissingDerivativeError
+from cortado.particles.fields import Entry, StateField
+from cortado.particles.moving_walls import MovingWalls, matrix_of
+from cortado.particles.neighbours import NeighbourSearch
+from cortado.particles.state import Layout, State
+from cortado.scene.motions import (
+    AXES,
+    angular_velocity_name,
+    density_name,
+    position_name,
+    rotation_name,
+    velocity_name,
+)
+from cortado.scene.parameters.parameter import Axis
+from cortado.sph.free_kernels import free_kernels
+from cortado.sph.part import Part, PartAdjoint, PartTangent
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+
+NAMES = {
+    "position": position_name,
+    "rotation": rotation_name,
+    "velocity": velocity_name,
+    "angular_velocity": angular_velocity_name,
+}
+"""Of fields of a state that begin as parameters, by what kernels call them."""
+MOTION = ("V", "W", "L")
+
+
+@dataclass(frozen=True)
+class FreeTable:
+    """A free body of a scene."""
+
+    name: str
+    number: int
+    """Among the solids that move."""
+    mass: Mass
+    """With a density of 1, in volumes of a particle."""
+
+
+@dataclass(frozen=True)
+class FreeSolids:
+    """Makes the part of one solver."""
+
+    tables: Sequence[FreeTable]
+    dimension: int
+    search: NeighbourSearch
+    """Whose walls are theirs."""
+
+    @property
+    def walls(self) -> MovingWalls:
+        """Those of the search."""
+        assert self.search.moving is not None
+        return self.search.moving
+
+    def part(self, layout: Layout, requires_grad: bool) -> "FreeSolidsPart":
+        if requires_grad:
+            raise MissingDerivativeError("solids that move have no tape: try gradients.Exact.")
+        return FreeSolidsPart(self, layout)
+
+
+class FreeBody:
+    """One body in a step."""
+
+    def __init__(self, table: FreeTable, dimension: int, layout: Layout):
+        self.table, vector = table, layout.precision.vector
+        angle = Entry.NUMBER if dimension == 2 else Entry.VECTOR
+        angles = {"rotation": angle, "angular_velocity": angle}
+        units = {"position": "m", "rotation": "rad", "velocity": "m/s", "angular_velocity": "rad/s"}
+        self.names = {label: name(table.name) for label, name in NAMES.items()}
+        self.names |= {label: f"{table.name}.{label}" for label in AXES}
+        """Of fields of a state, by what kernels call them."""
+        begun = (
+            StateField(self.names[label], unit, angles.get(label, Entry.VECTOR), Axis.SCALAR, self.names[label])
+            for label, unit in units.items()
+        )
+        self.fields = (*begun, *(StateField(self.names[label], "", Entry.VECTOR, Axis.SCALAR) for label in AXES))
+        self.begun = layout.state(self.fields)
+        """What a step began from."""
+        matrix = matrix_of(layout.precision)
+        inertia, inverse = table.mass.inertia, np.linalg.pinv(table.mass.inertia)
+        self.constants: dict[str, Any] = {"number": table.number, "inertia": matrix(*inertia.ravel())}
+        self.constants["inverse"] = matrix(*inverse.ravel())
+        self.before, self.moved = (
+            {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in MOTION} for _ in range(2)
+        )
+        """V, W and L at the start of a step, and V_1, W_1 and L_1."""
+
+    def state(self, state: State, suffix: str = "") -> dict[str, wp.array]:
+        """The fields of a state as kernels call them."""
+        return {f"{label}{suffix}": state[name] for label, name in self.names.items()}
+
+    def known(self, step: StepContext) -> tuple[Named, ...]:
+        """What all kernels know of it."""
+        density = step.parameters[density_name(self.table.name)]
+        return self.constants, self.state(self.begun), {"density": density}
+
+
+class FreeSolidsPart(Part):
+    """The bodies of one solver."""
+
+    def __init__(self, made_of: FreeSolids, layout: Layout):
+        self.made_of, self.layout = made_of, layout
+        self.bodies = [FreeBody(table, made_of.dimension, layout) for table in made_of.tables]
+        self.fields = tuple(field for body in self.bodies for field in body.fields)
+        self.kernels = free_kernels(layout.precision, made_of.dimension)
+        self.poses = made_of.walls.named
+
+    def begin(self, step: StepContext, state: State) -> None:
+        for body in self.bodies:
+            for field in body.fields:
+                wp.copy(body.begun[field.name], state[field.name])
+            step.launch(
+                self.kernels.predict.forward, body.before, self.poses, *body.known(step), threads=self.layout.members
+            )
+
+    def end(self, step: StepContext, state: State, moved: State) -> None:
+        for body in self.bodies:
+            new = body.state(state, "_new")
+            known = (*body.known(step), body.moved, self.poses)
+            step.launch(self.kernels.end.forward, new, *known, threads=self.layout.members)
+
+    def new_tangent(self) -> "FreeSolidsTangent":
+        return FreeSolidsTangent(self)
+
+    def new_adjoint(self) -> "FreeSolidsAdjoint":
+        return FreeSolidsAdjoint(self)
+
+
+class Changes:
+    """Tangents or adjoints of one body in a step."""
+
+    def __init__(self, body: FreeBody, layout: Layout, suffix: str):
+        vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
+        self.body = body
+        self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
+        self.turned_end, self.turned_after = wp.zeros(**vectors), wp.zeros(**vectors)
+        """Adjoints of a further turn of R, by the end of the step, and of R', by what moves the body."""
+
+    def clear(self) -> None:
+        """Begin anew."""
+        for array in (*self.before.values(), *self.moved.values(), self.turned_end, self.turned_after):
+            array.zero_()
+
+
+class FreeSolidsTangent(PartTangent):
+    """Forward mode."""
+
+    def __init__(self, part: FreeSolidsPart):
+        self._part = part
+        self.bodies = [Changes(body, part.layout, "_dot") for body in part.bodies]
+
+    def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        self._launch(self._part.kernels.predict.tangent, step, dot, state_dot, begins=True)
+
+    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        self._launch(self._part.kernels.end.tangent, step, dot, state_dot, begins=False)
+
+    def _launch(self, kernel: Any, step: StepContext, dot: Tangents, state_dot: State, begins: bool) -> None:
+        part = self._part
+        for own in self.bodies:
+            body = own.body
+            sizes = {"time_step_dot": dot.parameters["time_step"]}
+            sizes["density_dot"] = dot.parameters[density_name(body.table.name)]
+            dots = {**body.state(state_dot, "_dot"), **(own.before if begins else own.moved)}
+            known = (*body.known(step), body.before if begins else body.moved, part.poses)
+            step.launch(kernel, dots, sizes, *known, threads=part.layout.members)
+
+
+class FreeSolidsAdjoint(PartAdjoint):
+    """Reverse mode."""
+
+    def __init__(self, part: FreeSolidsPart):
+        self._part = part
+        self.bodies = [Changes(body, part.layout, "_bar") for body in part.bodies]
+
+    def end(self, step: StepContext, bar: Any, state_bar: State, moved_bar: State) -> State:
+        part = self._part
+        for own in self.bodies:
+            body, bars = own.body, {**self._bars(own, bar, state_bar), **own.moved, "turned_end": own.turned_end}
+            known = (*body.known(step), body.moved, part.poses)
+            step.launch(part.kernels.end.adjoint, bars, *known, threads=part.layout.members)
+        return moved_bar
+
+    def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
+        part = self._part
+        assert bar.solids is not None
+        for own in self.bodies:
+            body = own.body
+            bars = {**self._bars(own, bar.parameters, state_bar), **own.before, "turned_end": own.turned_end}
+            given = bar.solids.collect(body.table.number)
+            add(own.turned_after, given["torque"])
+            known = (*body.known(step), given)
+            step.launch(part.kernels.predict.adjoint, bars, *known, threads=part.layout.members)
+            own.clear()
+
+    def _bars(self, own: Changes, bar: Any, state_bar: State) -> dict[str, wp.array]:
+        sizes = {"time_step_bar": bar["time_step"], "density_bar": bar[density_name(own.body.table.name)]}
+        return {**own.body.state(state_bar, "_bar"), **sizes}
+
