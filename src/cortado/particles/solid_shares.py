@@ -23,6 +23,7 @@ import warp as wp
 
 from cortado.device.binding import Named
 from cortado.device.bundles import bundle
+from cortado.device.launching import add
 from cortado.particles.moving_walls import MovingWalls, matrix_of
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.state import Layout
@@ -75,6 +76,10 @@ class SolidShares:
             {name: wp.zeros(size, dtype=vector, device=device) for name in NAMES} for _ in range(walls.solids)
         ]
         self._sums = [{name: layout.sum_of(vector) for name in NAMES} for _ in range(walls.solids)]
+        self._whole = [
+            {name: wp.zeros(layout.members, dtype=vector, device=device) for name in NAMES[:2]} for _ in range(walls.solids)
+        ]
+        """What was given by others than particles."""
 
     def add(
         self, launch: Callable[..., None], kernel: Any, *groups: Named, constants: tuple[float, float] = (0.0, 0.0), **arrays: Any
@@ -93,15 +98,24 @@ class SolidShares:
     def collect(self, solid: int) -> dict[str, wp.array]:
         """The sums (members,) of one solid, by `NAMES`, and begin anew."""
         found = {name: total(self._arrays[solid][name]) for name, total in self._sums[solid].items()}
-        for array in self._arrays[solid].values():
-            array.zero_()
+        for name, given in self._whole[solid].items():
+            add(given, found[name])
+        self._forget(solid)
         return found
+
+    def add_whole(self, solid: int, force: wp.array, torque: wp.array) -> None:
+        """(members,) f and t of one solid, which others than particles give."""
+        for given, own in zip((force, torque), self._whole[solid].values(), strict=True):
+            add(given, own)
 
     def clear(self) -> None:
         """Forget what was given."""
-        for own in self._arrays:
-            for array in own.values():
-                array.zero_()
+        for solid in range(self._walls.solids):
+            self._forget(solid)
+
+    def _forget(self, solid: int) -> None:
+        for array in (*self._arrays[solid].values(), *self._whole[solid].values()):
+            array.zero_()
 
 
 WorkMaker = Callable[[Discretisation], Callable[..., Any]]

@@ -9,7 +9,7 @@ import numpy as np
 from cortado.device.lanes import lanes_for
 from cortado.discretise.calibration import SKIN
 from cortado.discretise.solids.mass import Mass
-from cortado.discretise.solids.solid import Solid
+from cortado.discretise.solids.solid import Hollow, Solid
 from cortado.errors import InputError
 from cortado.particles.arrays import padded
 from cortado.particles.cells import Grid
@@ -23,8 +23,10 @@ from cortado.scene.motions import moving, solid_frames
 from cortado.scene.parameters.registry import PARAMETERS
 from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
-from cortado.solvers.containment import Obstacle, Walled
+from cortado.solvers.contacts import Contacts, Touching
+from cortado.solvers.containment import Walled
 from cortado.solvers.makers import SolverSetting
+from cortado.solvers.obstacles import FINE, Obstacle
 from cortado.solvers.particles import ParticleSystem
 from cortado.sph.diffusion import Diffusion
 from cortado.sph.emitter import Nozzle
@@ -65,7 +67,7 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
             search,
             _forces(scene, discrete, discretisation, layout, setting.forces),
             [*discrete.periods, *[0.0] * (3 - scene.dimension)],
-            _parts(scene, discrete, discretisation, setting.free_energy, search),
+            _parts(scene, discrete, discretisation, setting.free_energy, search, layout),
             discrete.fluid.emitted.start,
             _walled(scene, discrete),
             of_one_lane=lambda: system(replace(discretisation, lanes=1, taped=True)),
@@ -137,21 +139,48 @@ def _parts(
     discretisation: Discretisation,
     free_energy: FreeEnergy,
     search: NeighbourSearch,
+    layout: Layout,
 ) -> list[PartMaker]:
     """The parts that are no forces, in the order in which they end a step."""
     found: list[PartMaker | None] = [_phases(scene, discretisation, free_energy), _nozzle(scene, discrete)]
-    found += [_free_solids(scene, discrete, search), _moving_solids(scene, search)]
+    found += [_free_solids(scene, discrete, search, layout), _moving_solids(scene, search)]
     return [part for part in found if part is not None]
 
 
-def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch) -> FreeSolids | None:
+def _free_solids(
+    scene: Scene, discrete: DiscreteScene, search: NeighbourSearch, layout: Layout
+) -> FreeSolids | None:
     """The bodies that fluid moves; None without any."""
     tables = [
         FreeTable(table.name, number, Mass.of(table.own_solid()).in_volumes(discrete.lattice.volume))
         for number, table in enumerate(moving(scene.solid))
         if table.motion == "free"
     ]
-    return FreeSolids(tables, scene.dimension, search) if tables else None
+    if not tables:
+        return None
+    spacing, touching = scene.discretisation.spacing, _touching(scene, discrete)
+    return FreeSolids(tables, scene.dimension, search, lambda part: Contacts(part, touching, spacing, layout))
+
+
+def _touching(scene: Scene, discrete: DiscreteScene) -> list[Touching]:
+    """What each body that is free may touch: the container and solids at rest, and each other solid that moves."""
+    moved, spacing, walls = moving(scene.solid), scene.discretisation.spacing, discrete.walls
+    bodies = [number for number, table in enumerate(moved) if table.motion == "free"]
+    sides = scene.container.solids(scene.dimension, discrete.lattice.support)
+    still = [Obstacle("container", side, isinstance(side, Hollow), np.inf) for side in sides]
+    still += [_obstacle(table, table.solid()) for table in scene.solid if not table.moves]
+    found = []
+    for body, number in enumerate(bodies):
+        table, own = moved[number], walls.solid == number
+        feet = walls.positions[own] - table.middle() + walls.feet[own]
+        near = feet[np.linalg.norm(walls.feet[own], axis=1) < spacing] @ table.turn(scene.dimension)
+        points = np.concatenate([near, table.own_solid().faces(FINE * spacing).vertices])
+        found.append(Touching(body, -1, -1, still, points))
+        for against, one in enumerate(moved):
+            if against != number:
+                other = bodies.index(against) if against in bodies else -1
+                found.append(Touching(body, against, other, [_obstacle(one, one.own_solid())], points))
+    return found
 
 
 def _moving_solids(scene: Scene, search: NeighbourSearch) -> MovingSolids | None:

@@ -11,35 +11,19 @@ from cortado.device.launching import KernelLauncher
 from cortado.device.precision import Precision
 from cortado.discretise.region import TOLERANCE, Region
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.solid import Solid
 from cortado.particles.arrays import padded
 from cortado.particles.moving_walls import MovingWalls, Poses
 from cortado.particles.state import Layout, State
 from cortado.solvers.containment_kernels import NO_PARTICLE, bounds_type, lost_kernel, solids_type
+from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh
 
 DEEPEST, THINNEST = 1.0, 0.45
 """In spacings, and of the thickness of a solid: particles that are deeper in it are lost. Sharp edges, behind which
 there are few wall particles, let some in by half a spacing."""
 REACH = 4.0
 """In spacings: how far from a surface particles are looked at."""
-HEIGHT = 100.0
-"""Of a mesh that stands for a plane shape, over its width."""
-FINE = 0.2
-"""In spacings: the width of faces by which round solids are looked at."""
 FURTHEST = 1e6
 """In spacings from the region of the first particles and walls: particles beyond are lost."""
-
-
-@dataclass(frozen=True)
-class Obstacle:
-    """A solid, which particles cannot enter."""
-
-    name: str
-    solid: Solid
-    is_hollow: bool
-    """Whether fluid is inside of the shape."""
-    thickness: float
-    """Of its thinnest part [m], as far as it is known; infinite otherwise."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +84,7 @@ class Containment:
         self._kernel = lost_kernel(layout.precision)
         members, device = layout.members, layout.device
         self._obstacles = (*walled.solids, *walled.moving)
-        self._meshes = [_mesh(one, walled.spacing, device) for one in self._obstacles]
+        self._meshes = [obstacle_mesh(one, walled.spacing, device) for one in self._obstacles]
         nothing = Poses.zeros(members, 0, layout.precision, device)
         self._poses = (nothing, nothing) if moving is None else (moving.before, moving.after)
         """Before and after a step."""
@@ -191,7 +175,7 @@ class Containment:
 
     def _made_solids(self, device: wp.Device) -> Any:
         precision, walled = self._precision, self.walled
-        solids, middles = solids_type(precision)(), [_middle(one) for one in self._obstacles]
+        solids, middles = solids_type(precision)(), [middle_of(one) for one in self._obstacles]
         places = padded(np.array(middles)) if middles else np.zeros((0, 3))
         periods = padded(walled.periods[None])[0]
         solids.meshes = wp.array([mesh.id for mesh in self._meshes], dtype=wp.uint64, device=device)
@@ -221,31 +205,3 @@ class Containment:
         bounds.radius, bounds.rim = region.radius + tolerance, region.rim
         bounds.nearest, bounds.furthest = vector(furthest.lower), vector(furthest.upper)
         return bounds
-
-
-def _middle(one: Obstacle) -> Points:
-    """(d,) of the box around its shape [m]."""
-    lower, upper = one.solid.extent()
-    return np.asarray(0.5 * (lower + upper))
-
-
-def _mesh(one: Obstacle, spacing: float, device: wp.Device) -> wp.Mesh:
-    """The surface of its shape about its middle; in the plane, where it is as high as it is far from anything else."""
-    faces = one.solid.faces(FINE * spacing)
-    faces = faces.reversed() if one.is_hollow else faces
-    vertices, corners = faces.vertices - _middle(one), faces.corners
-    if vertices.shape[1] == 2:
-        height = HEIGHT * (np.ptp(vertices) + spacing)
-        low, high, count = (
-            np.insert(vertices, 2, -height, axis=1),
-            np.insert(vertices, 2, height, axis=1),
-            len(vertices),
-        )
-        a, b = corners.T
-        vertices = np.concatenate([low, high])
-        corners = np.concatenate([np.stack([a, b, b + count], axis=1), np.stack([a, b + count, a + count], axis=1)])
-    return wp.Mesh(
-        points=wp.array(vertices, dtype=wp.vec3f, device=device),
-        indices=wp.array(corners.ravel(), dtype=wp.int32, device=device),
-        support_winding_number=True,
-    )

@@ -4,15 +4,14 @@ The part puts walls where bodies would go and writes where they end. What makes 
 which leaves V, W and L of the end in `FreeBody.moved`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
 
 from cortado.device.binding import Named
-from cortado.device.launching import add
 from cortado.discretise.solids.mass import Mass
 from cortado.errors import MissingDerivativeError
 from cortado.particles.fields import Entry, StateField
@@ -40,6 +39,7 @@ NAMES = {
 }
 """Of fields of a state that begin as parameters, by what kernels call them."""
 MOTION = ("V", "W", "L")
+GIVEN = ("pushed", "twisted")
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,8 @@ class FreeSolids:
     dimension: int
     search: NeighbourSearch
     """Whose walls are theirs."""
+    contacts: "Callable[[FreeSolidsPart], Touch]"
+    """Makes what finds what bodies touch."""
 
     @property
     def walls(self) -> MovingWalls:
@@ -72,6 +74,19 @@ class FreeSolids:
         if requires_grad:
             raise MissingDerivativeError("solids that move have no tape: try gradients.Exact.")
         return FreeSolidsPart(self, layout)
+
+
+class Touch(Protocol):
+    """What finds what bodies touch, once poses are known, and writes `FreeBody.given`."""
+
+    def look(self, step: StepContext) -> None:
+        """For all bodies."""
+
+    def tangent(self, changes: "Sequence[Changes]") -> Any:
+        """Something with a ``look(step, dot)`` that writes `Changes.given`."""
+
+    def adjoint(self, changes: "Sequence[Changes]") -> Any:
+        """Something with a ``look(step, bar)`` that goes on from `Changes.given`."""
 
 
 class FreeBody:
@@ -96,6 +111,8 @@ class FreeBody:
         inertia, inverse = table.mass.inertia, np.linalg.pinv(table.mass.inertia)
         self.constants: dict[str, Any] = {"number": table.number, "inertia": matrix(*inertia.ravel())}
         self.constants["inverse"] = matrix(*inverse.ravel())
+        self.given = {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in GIVEN}
+        """Momentum that it gets from what it touches, and its moment."""
         self.before, self.moved = (
             {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in MOTION} for _ in range(2)
         )
@@ -120,6 +137,7 @@ class FreeSolidsPart(Part):
         self.fields = tuple(field for body in self.bodies for field in body.fields)
         self.kernels = free_kernels(layout.precision, made_of.dimension)
         self.poses = made_of.walls.named
+        self.touch = made_of.contacts(self)
 
     def begin(self, step: StepContext, state: State) -> None:
         for body in self.bodies:
@@ -128,6 +146,9 @@ class FreeSolidsPart(Part):
             step.launch(
                 self.kernels.predict.forward, body.before, self.poses, *body.known(step), threads=self.layout.members
             )
+
+    def sort(self, step: StepContext, state: State) -> None:
+        self.touch.look(step)
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
         for body in self.bodies:
@@ -149,12 +170,13 @@ class Changes:
         vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
         self.body = body
         self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
-        self.turned_end, self.turned_after = wp.zeros(**vectors), wp.zeros(**vectors)
-        """Adjoints of a further turn of R, by the end of the step, and of R', by what moves the body."""
+        self.given = {f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN}
+        self.turned_end = wp.zeros(**vectors)
+        """The adjoint of a further turn of R, by the end of the step."""
 
     def clear(self) -> None:
         """Begin anew."""
-        for array in (*self.before.values(), *self.moved.values(), self.turned_end, self.turned_after):
+        for array in (*self.before.values(), *self.moved.values(), *self.given.values(), self.turned_end):
             array.zero_()
 
 
@@ -164,9 +186,13 @@ class FreeSolidsTangent(PartTangent):
     def __init__(self, part: FreeSolidsPart):
         self._part = part
         self.bodies = [Changes(body, part.layout, "_dot") for body in part.bodies]
+        self._touch = part.touch.tangent(self.bodies)
 
     def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         self._launch(self._part.kernels.predict.tangent, step, dot, state_dot, begins=True)
+
+    def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        self._touch.look(step, dot)
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         self._launch(self._part.kernels.end.tangent, step, dot, state_dot, begins=False)
@@ -188,6 +214,7 @@ class FreeSolidsAdjoint(PartAdjoint):
     def __init__(self, part: FreeSolidsPart):
         self._part = part
         self.bodies = [Changes(body, part.layout, "_bar") for body in part.bodies]
+        self._touch = part.touch.adjoint(self.bodies)
 
     def end(self, step: StepContext, bar: Any, state_bar: State, moved_bar: State) -> State:
         part = self._part
@@ -197,15 +224,16 @@ class FreeSolidsAdjoint(PartAdjoint):
             step.launch(part.kernels.end.adjoint, bars, *known, threads=part.layout.members)
         return moved_bar
 
+    def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
+        self._touch.look(step, bar)
+
     def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
         part = self._part
         assert bar.solids is not None
         for own in self.bodies:
             body = own.body
             bars = {**self._bars(own, bar.parameters, state_bar), **own.before, "turned_end": own.turned_end}
-            given = bar.solids.collect(body.table.number)
-            add(own.turned_after, given["torque"])
-            known = (*body.known(step), given)
+            known = (*body.known(step), bar.solids.collect(body.table.number))
             step.launch(part.kernels.predict.adjoint, bars, *known, threads=part.layout.members)
             own.clear()
 

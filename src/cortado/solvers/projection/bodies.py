@@ -82,6 +82,8 @@ class Bodies:
         known = self.known(context, held)
         context.launch(self.kernels.pull.forward, *known, y=y)
         sums = held.sums()
+        for given, total in zip(held.body.given.values(), sums.values(), strict=True):
+            add(given, total)
         context.launch(self.motion.move.forward, sums, moved, *known, threads=self.layout.members)
         return sums
 
@@ -125,9 +127,10 @@ class BodiesTangent:
         sums = bodies.move(context, held, y[0], moved)
         known = self._known(context, dot, k)
         context.launch(bodies.kernels.pull.tangent, *known, y=y[0], y_dot=y[1])
-        context.launch(
-            bodies.motion.move.tangent, sums, own.sums(), moved, out, *known, threads=bodies.layout.members
-        )
+        sums_dot = own.sums()
+        for given, total in zip(self._changes[k].given.values(), sums_dot.values(), strict=True):
+            add(given, total)
+        context.launch(bodies.motion.move.tangent, sums, sums_dot, moved, out, *known, threads=bodies.layout.members)
 
     def drifted(
         self, context: StepContext, dot: Tangents, drift_dot: wp.array, y: wp.array, y_dot: wp.array
@@ -181,6 +184,8 @@ class BodiesAdjoint:
         sums = bodies.move(context, held, y, moved)
         known = self._known(context, bar, k)
         context.launch(bodies.motion.move.adjoint, bars, sums, moved, *known, threads=bodies.layout.members)
+        for total, given in zip(self._sums_bar.values(), self._changes[k].given.values(), strict=True):
+            add(total, given)
         context.launch(bodies.kernels.pull.adjoint, *known, y=y, y_bar=y_bar)
 
     def settle(self, context: StepContext, bar: Adjoints, y: wp.array, y_bar: wp.array) -> None:
@@ -217,5 +222,6 @@ class BodiesAdjoint:
             assert bar.solids is not None
             given = bar.solids.of(held.body.table.number)
             context.launch(bodies.kernels.hold.adjoint, given, *known)
-            add(self._turned[k]["turned_bar"], self._changes[k].turned_after)
-            self._turned[k]["turned_bar"].zero_()
+            turned = self._turned[k]["turned_bar"]
+            bar.solids.add_whole(held.body.table.number, self._none["L_bar"], turned)
+            turned.zero_()

@@ -1,0 +1,222 @@
+"""Bodies that touch the container, solids and each other: see `cortado.solvers.contact_kernels`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from cortado.device.binding import Named
+from cortado.device.launching import sum_of
+from cortado.particles.arrays import padded
+from cortado.particles.state import Layout
+from cortado.scene.motions import density_name
+from cortado.solvers.contact_kernels import contact_kernels
+from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh
+from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart
+from cortado.sph.parts import Adjoints, StepContext, Tangents
+
+Arrays = dict[str, wp.array]
+SHARES = ("push", "twist", "other")
+
+
+@dataclass(frozen=True)
+class Touching:
+    """One body and what it may touch: solids at rest, or one that moves."""
+
+    body: int
+    """Number of a free body among those."""
+    against: int
+    """Number of the other among the solids that move; -1 of those at rest."""
+    other: int
+    """Number of the other among the bodies that are free; -1 of others."""
+    obstacles: Sequence[Obstacle]
+    points: NDArray[np.float64]
+    """(n, d) of the surface of the body, in its frame [m]"""
+
+
+class Contact:
+    """One of them in the steps of a solver."""
+
+    def __init__(self, touching: Touching, spacing: float, layout: Layout):
+        self.touching, precision, device = touching, layout.precision, layout.device
+        self.meshes = [obstacle_mesh(one, spacing, device) for one in touching.obstacles]
+        self.places: list[dict[str, Any]] = [
+            {
+                "mesh": mesh.id,
+                "middle": precision.vector(*padded(middle_of(one)[None])[0]),
+                "side": -1.0 if one.is_hollow else 1.0,
+            }
+            for one, mesh in zip(touching.obstacles, self.meshes, strict=True)
+        ]
+        points = padded(touching.points)
+        self.count, self._layout = len(points), layout
+        self.own = wp.array(points, dtype=precision.vector, device=device)
+        self.all = layout.members * self.count
+
+    def arrays(self, names: Sequence[str], dtype: Any) -> Arrays:
+        """(members points,) by name, all 0."""
+        return {name: wp.zeros(self.all, dtype=dtype, device=self._layout.device) for name in names}
+
+    def total(self, dtype: Any) -> Any:
+        """What adds up values of points, scene by scene."""
+        return sum_of(dtype, self.count, self._layout.device, self._layout.members)
+
+
+class Seen:
+    """What a body's points find, or tangents of it, by a suffix."""
+
+    def __init__(self, contact: Contact, layout: Layout, suffix: str = ""):
+        real, vector = layout.precision.real, layout.precision.vector
+        self._suffix = suffix
+        self.numbers = contact.arrays([f"depth{suffix}", f"square{suffix}"], real)
+        self.normals = contact.arrays([f"normal{suffix}"], vector)
+        self.shares = contact.arrays([f"{name}{suffix}" for name in SHARES], vector)
+        self._whole, self._sums = contact.total(real), [contact.total(vector) for _ in SHARES]
+
+    def clear(self) -> None:
+        """Nothing is found."""
+        for array in (*self.numbers.values(), *self.normals.values()):
+            array.zero_()
+
+    def whole(self) -> Arrays:
+        """(members,) S"""
+        return {f"whole{self._suffix}": self._whole(self.numbers[f"square{self._suffix}"])}
+
+    def sums(self) -> Arrays:
+        """(members,) of what points push with."""
+        shares = zip(self.shares.items(), self._sums, strict=True)
+        names = [f"{name}_sum{self._suffix}" for name in SHARES]
+        return dict(zip(names, (total(share) for (_, share), total in shares), strict=True))
+
+
+class Contacts:
+    """Those of the bodies of one solver; a step looks for them once poses are known."""
+
+    def __init__(self, part: FreeSolidsPart, touching: Sequence[Touching], spacing: float, layout: Layout):
+        self.part, self.layout, self.kernels = part, layout, contact_kernels(layout.precision)
+        self.contacts = [Contact(one, spacing, layout) for one in touching if len(one.obstacles)]
+        self.seen = [Seen(contact, layout) for contact in self.contacts]
+        self._whole: list[Arrays] = [{} for _ in self.contacts]
+        self._sums: list[Arrays] = [{} for _ in self.contacts]
+
+    def bodies(self, number: int) -> tuple[FreeBody, FreeBody]:
+        """The body of a contact and the other one, or itself again."""
+        touching, bodies = self.contacts[number].touching, self.part.bodies
+        own = bodies[touching.body]
+        return own, own if touching.other < 0 else bodies[touching.other]
+
+    def known(self, step: StepContext, number: int) -> tuple[Named, ...]:
+        """What kernels know of a contact."""
+        contact, seen, (own, other) = self.contacts[number], self.seen[number], self.bodies(number)
+        volumes = self.layout.precision.pair(own.table.mass.volume, other.table.mass.volume)
+        constants: dict[str, Any] = {
+            "points": contact.count,
+            "number": own.table.number,
+            "against": contact.touching.against,
+            "is_free": contact.touching.other >= 0,
+            "volumes": volumes,
+            "own": contact.own,
+            "density": step.parameters[density_name(own.table.name)],
+            "other_density": step.parameters[density_name(other.table.name)],
+        }
+        found = seen.numbers, seen.normals, seen.shares, self._whole[number], self._sums[number]
+        return constants, *found, self.part.poses
+
+    def look(self, step: StepContext) -> None:
+        """Write what bodies are pushed with."""
+        for body in self.part.bodies:
+            for array in body.given.values():
+                array.zero_()
+        for number, (contact, seen) in enumerate(zip(self.contacts, self.seen, strict=True)):
+            seen.clear()
+            known = self.known(step, number)
+            for place in contact.places:
+                step.launch(self.kernels.look.forward, place, *known, threads=contact.all)
+            self._whole[number] = seen.whole()
+            step.launch(self.kernels.push.forward, *self.known(step, number), threads=contact.all)
+            self._sums[number] = seen.sums()
+            own, other = self.bodies(number)
+            given = {**own.given, **{f"{name}_other": array for name, array in other.given.items()}}
+            step.launch(self.kernels.give.forward, given, *self.known(step, number), threads=self.layout.members)
+
+
+    def tangent(self, changes: Sequence[Changes]) -> "ContactsTangent":
+        """Forward mode."""
+        return ContactsTangent(self, changes)
+
+    def adjoint(self, changes: Sequence[Changes]) -> "ContactsAdjoint":
+        """Reverse mode."""
+        return ContactsAdjoint(self, changes)
+
+
+class ContactsTangent:
+    """Forward mode."""
+
+    def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
+        self._contacts, self._changes = contacts, changes
+        self._seen = [Seen(contact, contacts.layout, "_dot") for contact in contacts.contacts]
+
+    def look(self, step: StepContext, dot: Tangents) -> None:
+        """Of `Contacts.look`."""
+        contacts, kernels = self._contacts, self._contacts.kernels
+        for own in self._changes:
+            for array in own.given.values():
+                array.zero_()
+        for number, (contact, seen) in enumerate(zip(contacts.contacts, self._seen, strict=True)):
+            known = (seen.numbers, seen.normals, seen.shares, *contacts.known(step, number))
+            step.launch(kernels.look.tangent, *known, threads=contact.all)
+            step.launch(kernels.push.tangent, seen.whole(), *known, threads=contact.all)
+            bodies, (own, other) = contacts.bodies(number), _both(contact, self._changes)
+            rates = {"time_step_dot": dot.parameters["time_step"]}
+            for name, body in zip(("density_dot", "other_density_dot"), bodies, strict=True):
+                rates[name] = dot.parameters[density_name(body.table.name)]
+            given = {**own.given, **_of_other(other.given)}
+            members = contacts.layout.members
+            step.launch(kernels.give.tangent, given, rates, seen.sums(), *known, threads=members)
+
+
+class ContactsAdjoint:
+    """Reverse mode."""
+
+    def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
+        self._contacts, self._changes = contacts, changes
+        layout = contacts.layout
+        real, vector, moved = layout.precision.real, layout.precision.vector, ("own_force", "own_torque", "other_force", "other_torque")
+        self._work = [contact.arrays(["work", "weighed"], real) for contact in contacts.contacts]
+        self._moved = [contact.arrays(moved, vector) for contact in contacts.contacts]
+        self._weighed = [contact.total(real) for contact in contacts.contacts]
+        self._sums = [{name: contact.total(vector) for name in moved} for contact in contacts.contacts]
+        self._shares = {f"{name}_bar": wp.zeros(layout.members, dtype=vector, device=layout.device) for name in SHARES}
+
+    def look(self, step: StepContext, bar: Adjoints) -> None:
+        """Of `Contacts.look`, to the adjoints of poses."""
+        contacts, kernels = self._contacts, self._contacts.kernels
+        assert bar.solids is not None
+        for number, contact in enumerate(contacts.contacts):
+            bodies, (own, other) = contacts.bodies(number), _both(contact, self._changes)
+            rates = {"time_step_bar": bar.parameters["time_step"]}
+            for name, body in zip(("density_bar", "other_density_bar"), bodies, strict=True):
+                rates[name] = bar.parameters[density_name(body.table.name)]
+            given = {**own.given, **_of_other(other.given)}
+            work, moved, known = self._work[number], self._moved[number], contacts.known(step, number)
+            step.launch(kernels.give.adjoint, given, rates, self._shares, *known, threads=contacts.layout.members)
+            step.launch(kernels.push.adjoint, self._shares, work, *known, threads=contact.all)
+            weighed = {"weighed_sum": self._weighed[number](work["weighed"])}
+            step.launch(kernels.look.adjoint, self._shares, work, moved, weighed, *known, threads=contact.all)
+            sums = {name: total(moved[name]) for name, total in self._sums[number].items()}
+            bar.solids.add_whole(bodies[0].table.number, sums["own_force"], sums["own_torque"])
+            if contact.touching.against >= 0:
+                bar.solids.add_whole(contact.touching.against, sums["other_force"], sums["other_torque"])
+
+
+def _both(contact: Contact, changes: Sequence[Changes]) -> tuple[Changes, Changes]:
+    own = changes[contact.touching.body]
+    return own, own if contact.touching.other < 0 else changes[contact.touching.other]
+
+
+def _of_other(given: Arrays) -> Arrays:
+    """``pushed_bar`` as ``pushed_other_bar``."""
+    return {f"{name.split('_')[0]}_other_{name.split('_')[1]}": array for name, array in given.items()}

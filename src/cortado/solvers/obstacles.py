@@ -1,0 +1,54 @@
+"""Solids as meshes on a device, for those who ask how deep something is in them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from cortado.discretise.shapes import Points
+from cortado.discretise.solids.solid import Solid
+
+FINE = 0.2
+"""In spacings: the width of faces by which round solids are looked at."""
+HEIGHT = 100.0
+"""Of a mesh that stands for a plane shape, over its width."""
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A solid, which particles cannot enter."""
+
+    name: str
+    solid: Solid
+    is_hollow: bool
+    """Whether fluid is inside of the shape."""
+    thickness: float
+    """Of its thinnest part [m], as far as it is known; infinite otherwise."""
+
+
+def middle_of(one: Obstacle) -> Points:
+    """(d,) of the box around its shape [m]."""
+    lower, upper = one.solid.extent()
+    return np.asarray(0.5 * (lower + upper))
+
+
+def obstacle_mesh(one: Obstacle, spacing: float, device: wp.Device) -> wp.Mesh:
+    """The surface of its shape about its middle; in the plane, where it is as high as it is far from anything else."""
+    faces = one.solid.faces(FINE * spacing)
+    faces = faces.reversed() if one.is_hollow else faces
+    vertices, corners = faces.vertices - middle_of(one), faces.corners
+    if vertices.shape[1] == 2:
+        height = HEIGHT * (np.ptp(vertices) + spacing)
+        low, high, count = (
+            np.insert(vertices, 2, -height, axis=1),
+            np.insert(vertices, 2, height, axis=1),
+            len(vertices),
+        )
+        a, b = corners.T
+        vertices = np.concatenate([low, high])
+        corners = np.concatenate([np.stack([a, b, b + count], axis=1), np.stack([a, b + count, a + count], axis=1)])
+    return wp.Mesh(
+        points=wp.array(vertices, dtype=wp.vec3f, device=device),
+        indices=wp.array(corners.ravel(), dtype=wp.int32, device=device),
+        support_winding_number=True,
+    )
