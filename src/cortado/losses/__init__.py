@@ -7,6 +7,7 @@ from cortado.losses.loss import Frames, Loss, Snapshot, SnapshotAdjoint, fingerp
 from cortado.losses.positions import FinalPositions
 from cortado.losses.recorded import Recorded
 from cortado.losses.series import SensorMatch, Series
+from cortado.losses.solid_pose import SolidPose
 
 __all__ = [
     "CentreOfMass",
@@ -21,6 +22,7 @@ __all__ = [
     "Snapshot",
     "SnapshotAdjoint",
     "SnapshotBatch",
+    "SolidPose",
     "fingerprint",
 ]
 
