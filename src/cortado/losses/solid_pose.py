@@ -42,7 +42,9 @@ class SolidPose:
         name, names = self.name, end.state.names
         if position_name(name) not in names:
             moving = [field.removesuffix(".position") for field in names if field.endswith(".position")]
-            raise InputError(f"name is {name!r}, but must be that of a solid that moves: {', '.join(moving) or 'none does'}.")
+            raise InputError(
+                f"name is {name!r}, but must be that of a solid that moves: {', '.join(moving) or 'none does'}."
+            )
         value, bars = 0.0, {}
         if self.position is not None:
             position = end[position_name(name)]

@@ -146,7 +146,9 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         k = solid[b]
         turned, slide = turned_dot[member, k], turns[member, k] * of.own_slides[b]
         x_dot = after_dot[member, k] + wp.cross(turned, turns[member, k] * of.own[b])
-        x_before_dot = before_dot[member, k] + wp.cross(turned_before_dot[member, k], turns_before[member, k] * of.own[b])
+        x_before_dot = before_dot[member, k] + wp.cross(
+            turned_before_dot[member, k], turns_before[member, k] * of.own[b]
+        )
         dt = time_step[member]
         moved_dot = x_dot - x_before_dot - time_step_dot[member] * (wall_velocities[first + p] - slide)
         walls.wall_positions_dot[first + p] = x_dot
@@ -214,5 +216,10 @@ class MovingWalls:
 
     def write_tangent(self, time_step: wp.array, time_step_dot: wp.array, walls: Mapping[str, wp.array]) -> None:
         """Write their tangents, of what `write` has written last."""
-        known = {"first": self._first, "order": self._sort.order, "time_step": time_step, "time_step_dot": time_step_dot}
+        known = {
+            "first": self._first,
+            "order": self._sort.order,
+            "time_step": time_step,
+            "time_step_dot": time_step_dot,
+        }
         launch(self._kernels[3], self._all, self._device, self._own, known, self.named, walls)

@@ -77,12 +77,18 @@ class SolidShares:
         ]
         self._sums = [{name: layout.sum_of(vector) for name in NAMES} for _ in range(walls.solids)]
         self._whole = [
-            {name: wp.zeros(layout.members, dtype=vector, device=device) for name in NAMES[:2]} for _ in range(walls.solids)
+            {name: wp.zeros(layout.members, dtype=vector, device=device) for name in NAMES[:2]}
+            for _ in range(walls.solids)
         ]
         """What was given by others than particles."""
 
     def add(
-        self, launch: Callable[..., None], kernel: Any, *groups: Named, constants: tuple[float, float] = (0.0, 0.0), **arrays: Any
+        self,
+        launch: Callable[..., None],
+        kernel: Any,
+        *groups: Named,
+        constants: tuple[float, float] = (0.0, 0.0),
+        **arrays: Any,
     ) -> None:
         """What a sum gives, by the kernel that `solid_kernel` makes of it."""
         before, after = self._walls.before, self._walls.after
@@ -122,7 +128,9 @@ WorkMaker = Callable[[Discretisation], Callable[..., Any]]
 
 
 @cache
-def solid_kernel(discretisation: Discretisation, topic: str, make: WorkMaker, rubs: bool = False, looped: bool = False) -> Any:
+def solid_kernel(
+    discretisation: Discretisation, topic: str, make: WorkMaker, rubs: bool = False, looped: bool = False
+) -> Any:
     """The kernel of one sum, for `SolidShares.add`, in the Warp module of a ``topic``.
 
     ``make(discretisation)`` gives W, a term of walls (`cortado.particles.terms`) that returns a number, of functions
@@ -195,7 +203,16 @@ def _sum(term: Term, d: Discretisation, seen: Any, rubs: bool, module: Any) -> A
         by_v=by_v,
         by_foot=" + _wp.cross(_foot, _w_b * _by_foot)" if "foot" in term.parameters else "",
     )
-    used = ("separation", "neighbour", "wall_position", "wall_weight", "wall_grip", "wall_foot", "wall_velocity", "wall_solid")
+    used = (
+        "separation",
+        "neighbour",
+        "wall_position",
+        "wall_weight",
+        "wall_grip",
+        "wall_foot",
+        "wall_velocity",
+        "wall_solid",
+    )
     known: dict[str, Any] = {
         **{f"_{name}": getattr(pair, name) for name in used},
         "_real": precision.real,

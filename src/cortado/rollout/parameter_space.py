@@ -17,13 +17,11 @@ from cortado.rollout.rollout import Rollout
 from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
 from cortado.rollout.step_bounds import greatest_step
 from cortado.scene.parameters.parameter import Role
-from cortado.scene.parameters.registry import names
 from cortado.scene.parameters.values import Arrays, Values, check_known, checked_value, scene_values
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.scene.stability import divergence_advice
 from cortado.scene.viscous_forms import parameter_sentence
 
-STATE = names(Role.STATE)
 STATE_TIME = "time"
 """What the time of a state is called among derivatives with respect to its fields."""
 DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
@@ -149,7 +147,7 @@ class ParameterSpace:
     def check_restarts(self, states: Sequence[RestartState], values: Arrays) -> None:
         """Whether states, one for each scene, are of this simulation, and ``values`` go with them; raises
         `InputError`."""
-        for name in STATE if states else ():
+        for name in self._known.state if states else ():
             if name in values:
                 raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
         simulation = self._simulation
@@ -161,7 +159,7 @@ class ParameterSpace:
 
     def check_directions(self, along: Arrays) -> None:
         """Whether directions go with a state; raises `InputError`."""
-        for name in STATE:
+        for name in self._known.state:
             if name in along:
                 raise InputError(
                     f"direction {name} is given, but must be left out: give it among those of the state's fields."

@@ -12,6 +12,7 @@ from cortado.scene.containers import check_length
 from cortado.scene.emitter import EmitterTable
 from cortado.scene.fields import MISSING, FieldPath, field_error
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
+from cortado.scene.free_bodies import check_free
 from cortado.scene.mixture import MixtureTable
 from cortado.scene.model import SceneTables
 from cortado.scene.overlaps import check_distinct, check_overlaps
@@ -46,6 +47,7 @@ def check_scene(scene: SceneTables) -> None:
     _check_place(scene)
     for index, solid in enumerate(scene.solid):
         check_solid(("solid", index), solid, spacing)
+    check_free(scene)
     for index, fluid in enumerate(scene.fluid):
         _check_inside(scene, index, fluid)
         if isinstance(fluid, PointsFluid):

@@ -139,7 +139,9 @@ def _check_motion(solid: SolidTable, dimension: int, path: FieldPath) -> None:
     rows, steady = ("positions", "rotations"), ("velocity", "angular_velocity")
     given = [name for name in ("times", *rows, *steady) if getattr(solid, name) is not None]
     if solid.density is not None and solid.motion != "free":
-        raise field_error((*path, "density"), solid.density, 'left out, as only a body whose motion is "free" has a mass')
+        raise field_error(
+            (*path, "density"), solid.density, 'left out, as only a body whose motion is "free" has a mass'
+        )
     if solid.motion == "fixed":
         if given:
             raise field_error((*path, given[0]), Words("given"), 'left out, as motion is "fixed"')

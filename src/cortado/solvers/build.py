@@ -147,12 +147,12 @@ def _parts(
     return [part for part in found if part is not None]
 
 
-def _free_solids(
-    scene: Scene, discrete: DiscreteScene, search: NeighbourSearch, layout: Layout
-) -> FreeSolids | None:
+def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch, layout: Layout) -> FreeSolids | None:
     """The bodies that fluid moves; None without any."""
     tables = [
-        FreeTable(table.name, number, Mass.of(table.own_solid()).in_volumes(discrete.lattice.volume))
+        FreeTable(
+            table.name, number, Mass.of(table.own_solid()).in_volumes(scene.discretisation.spacing**scene.dimension)
+        )
         for number, table in enumerate(moving(scene.solid))
         if table.motion == "free"
     ]

@@ -12,7 +12,6 @@ bodies, with M m / (M + m), would swing with sqrt(q) / dt. Nothing is lost in it
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import warp as wp
 
@@ -262,7 +261,8 @@ def contact_kernels(precision: Precision) -> ContactKernels:
 
     given = bundle(pushed=vector, twisted=vector)
     sums, sum_dots = (
-        bundle(**dict.fromkeys((f"{name}_sum{end}" for name in ("push", "twist", "other")), vector)) for end in ("", "_dot")
+        bundle(**dict.fromkeys((f"{name}_sum{end}" for name in ("push", "twist", "other")), vector))
+        for end in ("", "_dot")
     )
 
     @wp.func
@@ -358,7 +358,9 @@ def contact_kernels(precision: Precision) -> ContactKernels:
             from_other = -pushed_other_bar[b]
             other_bar = -twisted_other_bar[b]
         push_bar = own_bar.pushed_bar[b] + from_other
-        c_bar = wp.dot(by.push_sum[b], push_bar) + wp.dot(by.twist_sum[b], twist_bar) + wp.dot(by.other_sum[b], other_bar)
+        c_bar = (
+            wp.dot(by.push_sum[b], push_bar) + wp.dot(by.twist_sum[b], twist_bar) + wp.dot(by.other_sum[b], other_bar)
+        )
         mass_bar = stiffness * c_bar / dt
         bar.density[b] = bar.density[b] + mass_bar * part(m, m_other, is_free) * volumes[0]
         bar.time_step[b] = bar.time_step[b] - c_bar * c / dt

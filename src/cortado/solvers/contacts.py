@@ -142,7 +142,6 @@ class Contacts:
             given = {**own.given, **{f"{name}_other": array for name, array in other.given.items()}}
             step.launch(self.kernels.give.forward, given, *self.known(step, number), threads=self.layout.members)
 
-
     def tangent(self, changes: Sequence[Changes]) -> "ContactsTangent":
         """Forward mode."""
         return ContactsTangent(self, changes)
@@ -184,7 +183,11 @@ class ContactsAdjoint:
     def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
         self._contacts, self._changes = contacts, changes
         layout = contacts.layout
-        real, vector, moved = layout.precision.real, layout.precision.vector, ("own_force", "own_torque", "other_force", "other_torque")
+        real, vector, moved = (
+            layout.precision.real,
+            layout.precision.vector,
+            ("own_force", "own_torque", "other_force", "other_torque"),
+        )
         self._work = [contact.arrays(["work", "weighed"], real) for contact in contacts.contacts]
         self._moved = [contact.arrays(moved, vector) for contact in contacts.contacts]
         self._weighed = [contact.total(real) for contact in contacts.contacts]

@@ -9,7 +9,6 @@ L_1 gives it there, so that both momenta are kept.
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import warp as wp
 
@@ -35,7 +34,11 @@ class FreeKernels:
 def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
     """In 2 or 3 dimensions."""
     real, vector, matrix = precision.real, precision.vector, matrix_of(precision)
-    flat, space, of_body = rotations(precision, dimension), rotations(precision, 3), free_functions(precision, dimension)
+    flat, space, of_body = (
+        rotations(precision, dimension),
+        rotations(precision, 3),
+        free_functions(precision, dimension),
+    )
     angle, begun_rotation, begun_further, begun_back = flat.angle, flat.rotation, flat.further, flat.back
     rotation, further, back = space.rotation, space.further, space.back
     state, about, angle_of, attitude = of_body.state, of_body.about, of_body.angle_of, of_body.attitude
@@ -163,7 +166,9 @@ def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
         later.position_new[b] = of.position[b] + dt * moved.V[b]
         later.rotation_new[b] = of.rotation[b]
         later.velocity_new[b] = moved.V[b]
-        later.angular_velocity_new[b] = angle_of(rate(turning * turns_before[b, number], inverse, moved.L[b]) / density[b])
+        later.angular_velocity_new[b] = angle_of(
+            rate(turning * turns_before[b, number], inverse, moved.L[b]) / density[b]
+        )
 
     @wp.kernel(module=module, enable_backward=False)
     def end_tangent(
@@ -214,7 +219,13 @@ def free_kernels(precision: Precision, dimension: int) -> FreeKernels:
     ):
         """From the adjoint of the state to those of V_1, W_1, L_1, and of a further turn of R."""
         b = wp.tid()
-        dt, w, L, turning, before = time_step[b], moved.W[b], moved.L[b], rotation(time_step[b] * moved.W[b]), attitude(b, of)
+        dt, w, L, turning, before = (
+            time_step[b],
+            moved.W[b],
+            moved.L[b],
+            rotation(time_step[b] * moved.W[b]),
+            attitude(b, of),
+        )
         R = turning * turns_before[b, number]
         spin, spin_bar = rate(R, inverse, L) / density[b], about(bar.angular_velocity[b])
         spun = rate(R, inverse, spin_bar) / density[b]

@@ -240,4 +240,3 @@ class FreeSolidsAdjoint(PartAdjoint):
     def _bars(self, own: Changes, bar: Any, state_bar: State) -> dict[str, wp.array]:
         sizes = {"time_step_bar": bar["time_step"], "density_bar": bar[density_name(own.body.table.name)]}
         return {**own.body.state(state_bar, "_bar"), **sizes}
-

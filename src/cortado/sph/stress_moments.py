@@ -166,7 +166,12 @@ def moments_work(d: Discretisation) -> Any:
     """What the sums give to solids, for their adjoints ``M_bar``, ``A_bar`` and ``R_bar``, with ``least`` the first of
     the ``constants`` (`cortado.particles.solid_shares.solid_kernel`)."""
     precision, contact = d.precision, contact_functions(d)
-    real, vector, matrix, fluidity = precision.real, precision.vector, matrix_type(precision), fluidity_function(precision)
+    real, vector, matrix, fluidity = (
+        precision.real,
+        precision.vector,
+        matrix_type(precision),
+        fluidity_function(precision),
+    )
     fall, hold = contact.fall, contact.hold
 
     def moments_work(

@@ -28,7 +28,9 @@ class Mass:
         lower, upper = solid.extent()
         dimension = len(lower)
         step = float((upper - lower).max()) / POINTS[dimension]
-        sides = [lo + step * (np.arange(int(np.ceil((hi - lo) / step)) + 1)) for lo, hi in zip(lower, upper, strict=True)]
+        sides = [
+            lo + step * (np.arange(int(np.ceil((hi - lo) / step)) + 1)) for lo, hi in zip(lower, upper, strict=True)
+        ]
         points = np.stack([axis.ravel() for axis in np.meshgrid(*sides, indexing="ij")], axis=-1)
         parts = np.clip(0.5 - solid.distance(points) / step, 0.0, 1.0) * step**dimension
         volume = float(parts.sum())

@@ -4,7 +4,7 @@ import numpy as np
 
 from cortado.errors import InputError
 from cortado.optimisation.layers.layer import PARAMETER, Array, Named, Shapes, named, on_host, part
-from cortado.rollout.parameter_space import STATE, ParameterSpace
+from cortado.rollout.parameter_space import ParameterSpace
 from cortado.scene.parameters.values import Arrays
 from cortado.simulation import Simulation
 
@@ -24,7 +24,7 @@ class LayerParameters:
         """Raises `InputError` for arrays that no parameters have."""
         for name, shape in part(given, PARAMETER).items():
             shapes = self._space.shapes(name)
-            if with_state and name in STATE:
+            if with_state and name in self._simulation.known.state:
                 raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
             if shape not in shapes:
                 raise InputError(f"parameter {name} has shape {shape}, but must be {' or '.join(map(str, shapes))}.")

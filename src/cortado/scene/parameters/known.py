@@ -35,6 +35,8 @@ class Known(Mapping[str, Parameter]):
         """Those of forces and of a solver."""
         self.run = tuple(name for name, p in self.items() if p.role in (Role.RUN, Role.CLOCK))
         """Names of what steps depend on."""
+        self.state = tuple(name for name, p in self.items() if p.role is Role.STATE)
+        """Names of what the first state has, and other states have of their own."""
         self.over_time = tuple(name for name, p in self.items() if p.axis is Axis.STEP)
         """Names of those that may have a row for each step."""
         self.vectors = tuple(name for name in self.run if self[name].components is not None)

@@ -91,7 +91,9 @@ class Bodies:
         """The drift of walls with the velocities that pressures y give to bodies."""
         for held in self.held:
             self.move(context, held, y, held.moved)
-            context.launch(self.motion.carry.forward, held.moved, *self.known(context, held), drift_in=drift, drift=self.drift)
+            context.launch(
+                self.motion.carry.forward, held.moved, *self.known(context, held), drift_in=drift, drift=self.drift
+            )
             drift = self.drift
         return drift
 
@@ -122,7 +124,9 @@ class BodiesTangent:
             own.add_sizes()
             context.launch(kernels.weigh.tangent, *self._known(context, dot, k), a_dot=a_dot)
 
-    def _move(self, context: StepContext, dot: Tangents, k: int, y: tuple[wp.array, wp.array], moved: Arrays, out: Arrays) -> None:
+    def _move(
+        self, context: StepContext, dot: Tangents, k: int, y: tuple[wp.array, wp.array], moved: Arrays, out: Arrays
+    ) -> None:
         bodies, held, own = self._bodies, self._bodies.held[k], self._held[k]
         sums = bodies.move(context, held, y[0], moved)
         known = self._known(context, dot, k)
@@ -178,7 +182,9 @@ class BodiesAdjoint:
             for array in own.known.values():
                 array.zero_()
 
-    def _move(self, context: StepContext, bar: Adjoints, k: int, y: wp.array, moved: Arrays, bars: Named, y_bar: wp.array) -> None:
+    def _move(
+        self, context: StepContext, bar: Adjoints, k: int, y: wp.array, moved: Arrays, bars: Named, y_bar: wp.array
+    ) -> None:
         """From the adjoints of V, W and L to that of y."""
         bodies, held = self._bodies, self._bodies.held[k]
         sums = bodies.move(context, held, y, moved)

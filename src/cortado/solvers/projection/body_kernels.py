@@ -16,7 +16,6 @@ body's part of the matrix has no eigenvalue beyond 2.
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import warp as wp
 

@@ -98,7 +98,9 @@ def motion_kernels(precision: Precision) -> MotionKernels:
         later: moving,
         later_bar: bundle(V_bar=vector, W_bar=vector, L_bar=vector),
         # in and out
-        bar: bundle(time_step=real, density=real, V_0=vector, L_0=vector, turned=vector, pulled_sum=vector, twisted_sum=vector),
+        bar: bundle(
+            time_step=real, density=real, V_0=vector, L_0=vector, turned=vector, pulled_sum=vector, twisted_sum=vector
+        ),
         gravity_bar: wp.array2d(dtype=vector),
     ):
         """The adjoints of the sums are written, others added to; ``turned_bar`` is that of a further turn of R'."""

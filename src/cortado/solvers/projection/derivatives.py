@@ -11,9 +11,9 @@ from cortado.particles.arrays import Fields
 from cortado.particles.state import Parameters, State
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.projection.beside import beside_solid_kernel
+from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.pressed import pressed_adjoint_kernel
 from cortado.solvers.projection.steps import IMPULSE, ProjectionSteps
-from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
 from cortado.solvers.solver import Counts
 from cortado.sph.density import density_solid_kernel
 from cortado.sph.free_solids import FreeSolidsAdjoint, FreeSolidsTangent

@@ -1,0 +1,40 @@
+"""What bodies that are free need of a scene, and where they may begin."""
+
+from cortado.errors import Words
+from cortado.scene.fields import field_error
+from cortado.scene.model import SceneTables
+from cortado.scene.motions import free
+from cortado.scene.sentences import point_in_words
+
+DEEPEST = 0.25
+"""In spacings: how deep bodies may begin in walls and in each other."""
+FINE = 0.5
+"""In spacings: the width of faces by whose corners round bodies are looked at."""
+
+
+def check_free(scene: SceneTables) -> None:
+    """Bodies are moved by the projection alone, and begin outside of walls and of each other."""
+    bodies = free(scene.solid)
+    if not bodies:
+        return
+    if scene.solver.kind != "projection":
+        wanted = (
+            f'"projection", as the solid {bodies[0].name!r} is free, and pressures that are not shared with it move it'
+        )
+        raise field_error(("solver", "kind"), scene.solver.kind, wanted)
+    if not scene.forces.pressure:
+        raise field_error(("forces", "pressure"), False, f"true, as the solid {bodies[0].name!r} is free")
+    spacing, lengths = scene.discretisation.spacing, scene.container.periods(scene.dimension)[1]
+    region = scene.container.region(scene.dimension).opened(lengths)
+    for index, table in enumerate(scene.solid):
+        if table.motion != "free":
+            continue
+        points = table.solid().faces(FINE * spacing).vertices
+        depths = [("the container", region.distance(points))]
+        others = (other for other in scene.solid if other is not table)
+        depths += [(f"the solid {other.name!r}", -other.solid().distance(points)) for other in others]
+        for name, depth in depths:
+            if depth.max() > DEEPEST * spacing:
+                place = point_in_words(points[depth.argmax()])
+                wanted = f"at most a quarter of a spacing, {DEEPEST * spacing:g} m, in it"
+                raise field_error(("solid", index), Words(f"{depth.max():g} m deep in {name} at {place}"), wanted)
