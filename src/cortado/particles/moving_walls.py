@@ -146,7 +146,8 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         k = solid[b]
         turned, slide = turned_dot[member, k], turns[member, k] * of.own_slides[b]
         x_dot = after_dot[member, k] + wp.cross(turned, turns[member, k] * of.own[b])
-        x_before_dot = before_dot[member, k] + wp.cross(turned_before_dot[member, k], turns_before[member, k] * of.own[b])
+        arm_before = turns_before[member, k] * of.own[b]
+        x_before_dot = before_dot[member, k] + wp.cross(turned_before_dot[member, k], arm_before)
         dt = time_step[member]
         moved_dot = x_dot - x_before_dot - time_step_dot[member] * (wall_velocities[first + p] - slide)
         walls.wall_positions_dot[first + p] = x_dot

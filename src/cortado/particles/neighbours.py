@@ -128,7 +128,8 @@ class NeighbourSearch:
         kinds = {"positions": precision.vector, "feet": precision.vector, "velocities": precision.vector}
         kinds |= {"weights": precision.real, "grips": precision.real}
         if solids:
-            kinds |= {"solids": wp.int32} | {f"{name}_dot": precision.vector for name in ("positions", "velocities", "turns")}
+            dots = ("positions_dot", "velocities_dot", "turns_dot")
+            kinds |= {"solids": wp.int32, **dict.fromkeys(dots, precision.vector)}
         self.walls = {f"wall_{name}": wp.zeros(count, dtype=kind, device=device) for name, kind in kinds.items()}
         """What kernels know of wall particles, those at rest first."""
         self._write_walls(still)

@@ -1,7 +1,7 @@
 """What sums over walls give to the adjoints of where solids that move are.
 
-For a sum S_i = sum_b w_b T(x_ib, foot_b, v_b, ...) over wall particles and an adjoint of each S_i, particle i gives, with
-W = T . S_i^, to wall particle b
+For a sum S_i = sum_b w_b T(x_ib, foot_b, v_b, ...) over wall particles and an adjoint of each S_i, particle i gives,
+with W = T . S_i^, to wall particle b
 
     x_b^ = -w_b dW / dx_ib,   foot_b^ = w_b dW / dfoot_b,   v_b^ = w_b dW / dv_b,
 
@@ -77,7 +77,12 @@ class SolidShares:
         self._sums = [{name: layout.sum_of(vector) for name in NAMES} for _ in range(walls.solids)]
 
     def add(
-        self, launch: Callable[..., None], kernel: Any, *groups: Named, constants: tuple[float, float] = (0.0, 0.0), **arrays: Any
+        self,
+        launch: Callable[..., None],
+        kernel: Any,
+        *groups: Named,
+        constants: tuple[float, float] = (0.0, 0.0),
+        **arrays: Any,
     ) -> None:
         """What a sum gives, by the kernel that `solid_kernel` makes of it."""
         before, after = self._walls.before, self._walls.after
@@ -105,7 +110,9 @@ WorkMaker = Callable[[Discretisation], Callable[..., Any]]
 
 
 @cache
-def solid_kernel(discretisation: Discretisation, topic: str, make: WorkMaker, rubs: bool = False, looped: bool = False) -> Any:
+def solid_kernel(
+    discretisation: Discretisation, topic: str, make: WorkMaker, rubs: bool = False, looped: bool = False
+) -> Any:
     """The kernel of one sum, for `SolidShares.add`, in the Warp module of a ``topic``.
 
     ``make(discretisation)`` gives W, a term of walls (`cortado.particles.terms`) that returns a number, of functions
@@ -143,7 +150,7 @@ def solid_kernel(discretisation: Discretisation, topic: str, make: WorkMaker, ru
         member = i // s.particles
         if s.count[i] <= s.fluid_count[i]:
             return
-        if LOOPED:
+        if LOOPED:  # noqa: SIM102, as Warp reads both sides of an `and`
             if k >= rounds[member]:
                 return
         R = turns[member, solid]
@@ -178,7 +185,8 @@ def _sum(term: Term, d: Discretisation, seen: Any, rubs: bool, module: Any) -> A
         by_v=by_v,
         by_foot=" + _wp.cross(_foot, _w_b * _by_foot)" if "foot" in term.parameters else "",
     )
-    used = ("separation", "neighbour", "wall_position", "wall_weight", "wall_grip", "wall_foot", "wall_velocity", "wall_solid")
+    of_walls = (f"wall_{name}" for name in ("position", "weight", "grip", "foot", "velocity", "solid"))
+    used = ("separation", "neighbour", *of_walls)
     known: dict[str, Any] = {
         **{f"_{name}": getattr(pair, name) for name in used},
         "_real": precision.real,

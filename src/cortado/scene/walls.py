@@ -94,9 +94,11 @@ def _around(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
 
 
 def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Those of one solid that moves, as if nothing else were there, but for its own images where it fills a period. They
-    are found in its own frame, so that they do not depend on where it begins, nor, unless it fills a period, on how it
-    is turned."""
+    """Those of one solid that moves, as if nothing else were there, but for its own images where it fills a period.
+
+    They are found in its own frame, so that they do not depend on where it begins, nor, unless it fills a period, on
+    how it is turned.
+    """
     dimension, turn = len(periods), table.turn(len(periods))
     lower, upper = table.solid().extent()
     filled = np.where(upper - lower > periods * (1.0 - WHOLE), periods, 0.0)
