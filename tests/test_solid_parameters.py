@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 
-from cortado import Problem, SceneError, Simulation, optimise
+from cortado import Problem, Simulation, certify
+from cortado.certificate.perturbations import coherent_directions, scales
 from cortado.errors import InputError, MissingDerivativeError
 from cortado.gradients import Tape
 from cortado.losses import CentreOfMass
 from cortado.losses.series import SensorMatch
-from cortado.optimisation.inverse.knots import knot_values
-from cortado.optimisation.inverse.setup import setup
-from cortado.optimisation.inverse.task import load_task
 from cortado.sensors import PressureProbe, WallForce
 from finite_differences import decades, distance
 from test_moving_solids import ROTOR, WATER, plane, space
@@ -226,66 +224,15 @@ def test_in_single_precision_they_are_right_to_its_digits():
         np.testing.assert_allclose(found[name], array, atol=1e-2 * np.abs(array).max(), err_msg=name)
 
 
-TASK = """
-dimension = 2
-discretisation.spacing = 0.05
-container = {shape = "box", lower = [0.0, 0.0], upper = [1.0, 1.0], slip = "no"}
-solver = {kind = "projection", time_step = 0.001}
-
-[[phase]]
-name = "water"
-rest_density = 1000.0
-viscosity = 1.0
-
-[[fluid]]
-shape = "box"
-lower = [0.0, 0.0]
-upper = [0.6, 0.4]
-phase = "water"
-
-[[solid]]
-name = "rotor"
-shape = "box"
-lower = [0.2, 0.15]
-upper = [0.4, 0.25]
-motion = "path"
-velocity = [0.0, 0.0]
-slip = "no"
-
-[problem]
-steps = 10
-target.rotor.displacement = [[0.0, 0.0], [0.004, 0.001], [0.002, 0.0]]
-target.rotor.turn = [0.0, 0.05]
-
-[optimise]
-start.rotor.displacement = [[0.0, 0.0], [0.0, 0.0]]
-start.rotor.turn = [0.0, 0.0]
-bounds.rotor.turn = [-0.1, 0.1]
-knots = 3
-optimiser = "lbfgs"
-learning_rate = 0.001
-iterations = 20
-"""
-
-
-def test_a_task_searches_a_path_by_its_knots(tmp_path):
-    """Also one of numbers, and a knot is where the solid is at the end of its step."""
-    file = tmp_path / "task.toml"
-    file.write_text(TASK)
-    made = setup(load_task(file), "cpu", "float64")
-    assert made.start["rotor.displacement"].shape == (3, 2) and made.start["rotor.turn"].shape == (3,)
-    found = optimise(made.search, made.start, optimiser="lbfgs", iterations=8, bounds=made.bounds)
-    assert found.loss < 0.5 * made.search.value(made.start)
-    knots = knot_values(made, found.parameters, made.search.parameters(found.parameters))
-    np.testing.assert_allclose(knots["rotor.turn"].times, [0.001, 0.0055, 0.01], rtol=1e-12)
-    np.testing.assert_allclose(knots["rotor.turn"].true, [0.0, 0.025, 0.05], atol=1e-12)
-
-
-def test_a_task_offers_what_its_solids_have(tmp_path):
-    file = tmp_path / "task.toml"
-    file.write_text(TASK.replace("rotor.turn", "rotor.turning"))
-    with pytest.raises(SceneError, match=r"'rotor\.turning' is unknown, but must be one of .*, rotor\.turn\."):
-        load_task(file)
+def test_a_certificate_moves_a_path_steadily_and_finds_its_derivatives_right():
+    """It does not let a solid jump in the first step."""
+    scene = plane(ROTOR)
+    problem, (point, _) = problem_of(scene), point_of(scene)
+    along = coherent_directions(problem, point, scales(problem, point), np.random.default_rng(0))
+    for name in ("rotor.displacement", "rotor.turn"):
+        rows = along[name].reshape(STEPS, -1)
+        np.testing.assert_allclose(rows, np.multiply.outer(np.arange(1, STEPS + 1) / STEPS, rows[-1]), rtol=1e-12)
+    assert certify(problem, point).right
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,8 @@ def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Ar
 
 
 def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Random directions that are smooth in space and constant in time, which move the fluid as a whole.
+    """Random directions that are smooth in space and constant in time, which move the fluid as a whole; of a path that
+    begins at 0 they grow in time.
 
     An independent random number for each particle would only move particles against their neighbours.
     """
@@ -107,5 +108,7 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
         field = random.standard_normal(columns)
         if parameter.role is Role.STATE:
             field = field + x @ random.standard_normal((x.shape[1], *columns))
+        if parameter.grows and values[name].ndim > parameter.rank:
+            field = np.multiply.outer(np.arange(1.0, problem.steps + 1.0) / problem.steps, field)
         found[name] = sizes[name] * field
     return found
