@@ -151,7 +151,7 @@ def test_losses_of_sensors_have_them(sensor):
 
 
 def test_the_time_step_has_a_derivative_where_the_path_is_given():
-    scene = plane(ROTOR, forces={"viscosity": "stress"})
+    scene = plane({**ROTOR, "surface_velocity": [0.7, 0.0]}, forces={"viscosity": "stress"})
     point, along = point_of(scene)
     check(problem_of(scene), {**point, "time_step": np.array(0.001)}, {**along, "time_step": np.array(1e-3)})
 
