@@ -134,8 +134,6 @@ class Circulation(Operation):
 
 
 class WallSlope(Operation):
-    """The sum of forward mode is that of reverse mode too."""
-
     inputs, outputs = ("x",), ("wall_slope",)
 
     def __init__(self, cloud):
@@ -145,15 +143,13 @@ class WallSlope(Operation):
     def forward(self, values):
         return launch(self.kernels.slope, s=self.s, **values, wall_slope=VECTORS)
 
-    def change(self, values, along):
-        found = launch(self.kernels.change, s=self.s, **values, along=along, wall_slope_change=VECTORS)
-        return found["wall_slope_change"]
-
     def tangent(self, values, dots):
-        return {"wall_slope": self.change(values, dots["x"])}
+        found = launch(self.kernels.tangent, s=self.s, **values, **dotted(dots), wall_slope_dot=VECTORS)
+        return {"wall_slope": found["wall_slope_dot"]}
 
     def adjoint(self, values, bars):
-        return {"x": self.change(values, bars["wall_slope"])}
+        found = launch(self.kernels.change, s=self.s, **values, along=bars["wall_slope"], wall_slope_change=VECTORS)
+        return {"x": found["wall_slope_change"]}
 
 
 def swirl(x, v, t, rate, centre):

@@ -49,6 +49,19 @@ CASES = {
     ),
     "forces of one's own": splash,
     "the projection": lambda: two_layers(solver={"kind": "projection", "time_step": 0.0021}),
+    "a solid that moves": lambda: scene(solid=[BALL], solver={"kind": "projection", "time_step": 0.0021}),
+    "a solid that moves, PCISPH, stress": lambda: scene(
+        forces={"gravity": [1.0, -9.81, 0.0], "viscosity": "stress"}, solid=[BALL]
+    ),
+}
+BALL = {
+    "name": "ball",
+    "shape": "sphere",
+    "centre": [0.1, 0.1, 0.1],
+    "radius": 0.06,
+    "motion": "path",
+    "velocity": [0.5, 0.0, 0.0],
+    "slip": "no",
 }
 
 
@@ -170,12 +183,15 @@ def test_any_number_of_ranges_gives_the_same_bits(name):
 
 
 def sums_over_neighbours() -> set[str]:
-    """Names of all kernels whose first argument is what lies around a particle."""
+    """Names of all kernels whose first argument is what lies around a particle, and of those that are made of what a
+    sum gives to solids."""
     names = set()
     for path in ROOT.rglob("*.py"):
         if path.relative_to(ROOT).as_posix() == APART:
             continue
         for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and node.name.endswith("_work") and node.args.args[-1].arg == "s":
+                names.add(f"{node.name}_share")
             if isinstance(node, ast.FunctionDef) and any("wp.kernel" in ast.unparse(d) for d in node.decorator_list):
                 first = node.args.args[0].annotation if node.args.args else None
                 if first is not None and ast.unparse(first) == "neighbourhood":

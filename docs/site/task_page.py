@@ -38,8 +38,9 @@ examples. Below the scene of the page before, these tables make a task that find
 {toml(WHOLE)}
     cortado optimise task.toml --out runs/task
 
-Parameters, wherever a table names some, are those of [this list](parameters.md). A key whose last but one column says
-*needed* has to be there. Each example below replaces the table of the same name.
+Parameters, wherever a table names some, are those of [this list](parameters.md), and those of
+[solids that move](solids.md#where-solids-are-as-parameters), such as `target.paddle.displacement`. A key whose last but
+one column says *needed* has to be there. Each example below replaces the table of the same name.
 """
 
 PARTS = [

@@ -49,7 +49,7 @@ def everything(problem: Problem, chosen: Arrays) -> Arrays:
 
     Values are the chosen ones, else the scene's, as its schedule has them; parameters over time have a row for each
     step. A viscosity of 0 cannot be decreased and is left out; so is a mobility in a scene of one phase, where it does
-    nothing, and a time step where solids move, which has no derivative.
+    nothing.
     """
     values = {**ParameterSpace(problem.simulation, problem.steps).defaults(), **chosen}
     found = {}
@@ -59,7 +59,6 @@ def everything(problem: Problem, chosen: Arrays) -> Arrays:
         idle = over_time and problem.steps == 0
         idle = idle or (name == "gravity" and "tilt" in chosen)
         idle = idle or not _moves_both_ways(parameter, value)
-        idle = idle or (name == "time_step" and any(solid.moves for solid in problem.simulation.scene.solid))
         if idle or not parameter.acts(problem.simulation, values):
             continue
         row = value.shape[value.ndim - parameter.rank :]
@@ -93,7 +92,8 @@ def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Ar
 
 
 def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Random directions that are smooth in space and constant in time, which move the fluid as a whole.
+    """Random directions that are smooth in space and constant in time, which move the fluid as a whole; of a path that
+    begins at 0 they grow in time.
 
     An independent random number for each particle would only move particles against their neighbours.
     """
@@ -108,5 +108,7 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
         field = random.standard_normal(columns)
         if parameter.role is Role.STATE:
             field = field + x @ random.standard_normal((x.shape[1], *columns))
+        if parameter.grows and values[name].ndim > parameter.rank:
+            field = np.multiply.outer(np.arange(1.0, problem.steps + 1.0) / problem.steps, field)
         found[name] = sizes[name] * field
     return found

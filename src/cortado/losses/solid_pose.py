@@ -19,8 +19,8 @@ class SolidPose:
     should be, and, for a rotation that is off by a small angle, the squared angle times that of a length l."""
 
     def __init__(self, name: str, position: Any = None, rotation: Any = None, length: float = 1.0):
-        """``name`` of the solid; ``position`` (d,) of its middle [m] and ``rotation``, in 3-D a rotation vector (3,), in
-        2-D a number, [rad], either or both; ``length`` l [m], greater than 0."""
+        """``name`` of the solid; ``position`` (d,) of its middle [m] and ``rotation``, in 3-D a rotation vector (3,),
+        in 2-D a number, [rad], either or both; ``length`` l [m], greater than 0."""
         if not isinstance(name, str):
             raise InputError(f"name is {shown(name)}, but must be the name of a solid.")
         if position is None and rotation is None:

@@ -64,6 +64,7 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
     vectors = {f"wall_{name}": vector for name in ("positions", "feet", "velocities")}
     own_of: Any = bundle(own=vector, own_feet=vector, own_slides=vector, own_weights=real, own_grips=real)
     walls_of: Any = bundle(**vectors, wall_weights=real, wall_grips=real, wall_solids=wp.int32)
+    length_of: Any = bundle(time_step=real, time_step_dot=real)
     dots_of: Any = bundle(wall_positions_dot=vector, wall_velocities_dot=vector, wall_turns_dot=vector)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -125,8 +126,7 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         count: int,
         first: int,
         order: wp.array(dtype=wp.int32),
-        time_step: wp.array(dtype=real),
-        time_step_dot: wp.array(dtype=real),
+        length: length_of,
         of: own_of,
         solid: wp.array(dtype=wp.int32),
         turns_before: wp.array2d(dtype=matrix),
@@ -146,11 +146,10 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         k = solid[b]
         turned, slide = turned_dot[member, k], turns[member, k] * of.own_slides[b]
         x_dot = after_dot[member, k] + wp.cross(turned, turns[member, k] * of.own[b])
-        x_before_dot = before_dot[member, k] + wp.cross(
-            turned_before_dot[member, k], turns_before[member, k] * of.own[b]
-        )
-        dt = time_step[member]
-        moved_dot = x_dot - x_before_dot - time_step_dot[member] * (wall_velocities[first + p] - slide)
+        arm_before = turns_before[member, k] * of.own[b]
+        x_before_dot = before_dot[member, k] + wp.cross(turned_before_dot[member, k], arm_before)
+        dt = length.time_step[member]
+        moved_dot = x_dot - x_before_dot - length.time_step_dot[member] * (wall_velocities[first + p] - slide)
         walls.wall_positions_dot[first + p] = x_dot
         walls.wall_velocities_dot[first + p] = moved_dot / dt + wp.cross(turned, slide)
         walls.wall_turns_dot[first + p] = turned

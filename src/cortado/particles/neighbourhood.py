@@ -158,10 +158,9 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
     (grad a . u), ``slope_gradient`` (grad a), ``gradient`` (G), ``hessian_product`` (H u = a u + (grad a . u) x);
     ``per_size`` (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction
     per_size x . G, of second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the
-    list of i), ``wall_position`` and others, which load what a wall particle has, ``weight_in`` its weight if it is of the given
-    moving solid, and 0 if not; and ``vectors`` and ``numbers``,
-    which load what `UNROLL` neighbours have before any of it is used, so that the loads do not wait for one another (on
-    a GPU a tenth of a whole step).
+    list of i), ``wall_position`` and others, which load what a wall particle has, ``weight_in`` (its weight if it is of
+    the given moving solid, and 0 if not); and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have
+    before any of it is used, so that the loads do not wait for one another (on a GPU a tenth of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)

@@ -127,12 +127,12 @@ class NeighbourSearch:
         count = len(still) + layout.members * len(moving)
         kinds = {"positions": precision.vector, "feet": precision.vector, "velocities": precision.vector}
         kinds |= {"weights": precision.real, "grips": precision.real}
-        if solids:
-            kinds |= {"solids": wp.int32} | {
-                f"{name}_dot": precision.vector for name in ("positions", "velocities", "turns")
-            }
-        self.walls = {f"wall_{name}": wp.zeros(count, dtype=kind, device=device) for name, kind in kinds.items()}
-        """What kernels know of wall particles, those at rest first."""
+        own = {"solids": wp.int32, **dict.fromkeys(("positions_dot", "velocities_dot", "turns_dot"), precision.vector)}
+        sizes = {**dict.fromkeys(kinds, count), **dict.fromkeys(own, count if solids else 0)}
+        self.walls = {
+            f"wall_{name}": wp.zeros(sizes[name], dtype=kind, device=device) for name, kind in {**kinds, **own}.items()
+        }
+        """What kernels know of wall particles, those at rest first; of solids that move nothing without any."""
         self._write_walls(still)
         if solids and len(still):
             self.walls["wall_solids"][: len(still)].fill_(-1)

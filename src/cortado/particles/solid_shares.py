@@ -1,7 +1,7 @@
 """What sums over walls give to the adjoints of where solids that move are.
 
-For a sum S_i = sum_b w_b T(x_ib, foot_b, v_b, ...) over wall particles and an adjoint of each S_i, particle i gives, with
-W = T . S_i^, to wall particle b
+For a sum S_i = sum_b w_b T(x_ib, foot_b, v_b, ...) over wall particles and an adjoint of each S_i, particle i gives,
+with W = T . S_i^, to wall particle b
 
     x_b^ = -w_b dW / dx_ib,   foot_b^ = w_b dW / dfoot_b,   v_b^ = w_b dW / dv_b,
 
@@ -168,7 +168,7 @@ def solid_kernel(
         member = i // s.particles
         if s.count[i] <= s.fluid_count[i]:
             return
-        if LOOPED:
+        if LOOPED:  # noqa: SIM102, as Warp reads both sides of an `and`
             if k >= rounds[member]:
                 return
         R = turns[member, solid]
@@ -203,16 +203,8 @@ def _sum(term: Term, d: Discretisation, seen: Any, rubs: bool, module: Any) -> A
         by_v=by_v,
         by_foot=" + _wp.cross(_foot, _w_b * _by_foot)" if "foot" in term.parameters else "",
     )
-    used = (
-        "separation",
-        "neighbour",
-        "wall_position",
-        "wall_weight",
-        "wall_grip",
-        "wall_foot",
-        "wall_velocity",
-        "wall_solid",
-    )
+    of_walls = (f"wall_{name}" for name in ("position", "weight", "grip", "foot", "velocity", "solid"))
+    used = ("separation", "neighbour", *of_walls)
     known: dict[str, Any] = {
         **{f"_{name}": getattr(pair, name) for name in used},
         "_real": precision.real,

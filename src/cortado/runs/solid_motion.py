@@ -34,8 +34,8 @@ class SolidMotion:
 
     def __getitem__(self, frames: slice) -> Self:
         """In some of the frames."""
-        given = (self.positions, self.rotations, self.velocities, self.angular_velocities)
-        return type(self)(*(None if values is None else values[frames] for values in given))
+        moving = (None if one is None else one[frames] for one in (self.velocities, self.angular_velocities))
+        return type(self)(self.positions[frames], self.rotations[frames], *moving)
 
 
 def solid_motions(scene: Scene, fields: Mapping[str, NDArray[Any]]) -> dict[str, SolidMotion]:

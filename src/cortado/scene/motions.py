@@ -228,6 +228,7 @@ def _displacement(solid: SolidTable) -> Parameter:
         components=lambda dimension, phases: dimension,
         change=_change_of_place,
         moment=1.0,
+        grows=True,
         course=_course(solid, "positions", "velocity", len(solid.middle())),
     )
 
@@ -243,6 +244,7 @@ def _turn(solid: SolidTable) -> Parameter:
         components=None if angles == 1 else lambda dimension, phases: dimension,
         change=lambda source, value: np.full(np.shape(value), RADIAN),
         moment=1.0,
+        grows=True,
         course=_course(solid, "rotations", "angular_velocity", angles),
     )
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from cortado.discretise.region import Region
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.solid import Solid
+from cortado.discretise.solids.solid import Placed, Solid
 from cortado.discretise.solids.walls import ExposedSurface, WallPoints, solid_places
 from cortado.discretise.walls.layers import Planes, WallLayers
 from cortado.discretise.walls.places import Places
@@ -94,15 +94,22 @@ def _around(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
 
 
 def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Those of one solid that moves, as if nothing else were there, but for its own images where it fills a period."""
-    solid, dimension = table.solid(), len(periods)
-    lower, upper = solid.extent()
+    """Those of one solid that moves, as if nothing else were there, but for its own images where it fills a period.
+
+    They are found in its own frame, so that they do not depend on where it begins, nor, unless it fills a period, on
+    how it is turned.
+    """
+    dimension, turn = len(periods), table.turn(len(periods))
+    lower, upper = table.solid().extent()
     filled = np.where(upper - lower > periods * (1.0 - WHOLE), periods, 0.0)
-    room = Room(Region.everywhere(dimension), (solid,), filled)
-    surface = ExposedSurface.of(room, room.images(solid), lower, lattice.support, lattice.spacing)
+    solid = Placed(table.own_solid(), np.zeros(dimension), turn) if filled.any() else table.own_solid()
+    room, begins = Room(Region.everywhere(dimension), (solid,), filled), solid.extent()[0]
+    surface = ExposedSurface.of(room, room.images(solid), begins, lattice.support, lattice.spacing)
     nothing = Places.upright(np.zeros((0, dimension)))
     points, weights = _weighed(surface, nothing, room.solids, layers, lattice)
-    found = Walls.of(points, weights, np.full(len(points), table.sticks))
+    frame = np.eye(dimension) if filled.any() else turn
+    placed = replace(points, positions=table.middle() + points.positions @ frame.T, feet=points.feet @ frame.T)
+    found = Walls.of(placed, weights, np.full(len(points), table.sticks))
     slides = np.tile(table.surface_velocity or (0.0,) * dimension, (len(points), 1))
     return replace(found, slides=slides, solid=np.full(len(points), number))
 

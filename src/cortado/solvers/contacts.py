@@ -14,6 +14,7 @@ from cortado.particles.arrays import padded
 from cortado.particles.state import Layout
 from cortado.scene.motions import density_name
 from cortado.solvers.contact_kernels import contact_kernels
+from cortado.solvers.contact_strength import strength_kernels
 from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart
 from cortado.sph.parts import Adjoints, StepContext, Tangents
@@ -97,6 +98,7 @@ class Contacts:
 
     def __init__(self, part: FreeSolidsPart, touching: Sequence[Touching], spacing: float, layout: Layout):
         self.part, self.layout, self.kernels = part, layout, contact_kernels(layout.precision)
+        self.strength = strength_kernels(layout.precision)
         self.contacts = [Contact(one, spacing, layout) for one in touching if len(one.obstacles)]
         self.seen = [Seen(contact, layout) for contact in self.contacts]
         self._whole: list[Arrays] = [{} for _ in self.contacts]
@@ -140,7 +142,7 @@ class Contacts:
             self._sums[number] = seen.sums()
             own, other = self.bodies(number)
             given = {**own.given, **{f"{name}_other": array for name, array in other.given.items()}}
-            step.launch(self.kernels.give.forward, given, *self.known(step, number), threads=self.layout.members)
+            step.launch(self.strength.forward, given, *self.known(step, number), threads=self.layout.members)
 
     def tangent(self, changes: Sequence[Changes]) -> "ContactsTangent":
         """Forward mode."""
@@ -174,7 +176,7 @@ class ContactsTangent:
                 rates[name] = dot.parameters[density_name(body.table.name)]
             given = {**own.given, **_of_other(other.given)}
             members = contacts.layout.members
-            step.launch(kernels.give.tangent, given, rates, seen.sums(), *known, threads=members)
+            step.launch(contacts.strength.tangent, given, rates, seen.sums(), *known, threads=members)
 
 
 class ContactsAdjoint:
@@ -205,7 +207,7 @@ class ContactsAdjoint:
                 rates[name] = bar.parameters[density_name(body.table.name)]
             given = {**own.given, **_of_other(other.given)}
             work, moved, known = self._work[number], self._moved[number], contacts.known(step, number)
-            step.launch(kernels.give.adjoint, given, rates, self._shares, *known, threads=contacts.layout.members)
+            step.launch(contacts.strength.adjoint, given, rates, self._shares, *known, threads=contacts.layout.members)
             step.launch(kernels.push.adjoint, self._shares, work, *known, threads=contact.all)
             weighed = {"weighed_sum": self._weighed[number](work["weighed"])}
             step.launch(kernels.look.adjoint, self._shares, work, moved, weighed, *known, threads=contact.all)

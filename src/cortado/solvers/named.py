@@ -2,6 +2,7 @@
 
 from importlib import import_module
 
+from cortado.scene.motions import moving
 from cortado.scene.parameters.known import REGISTRY, Known
 from cortado.scene.scene import Scene
 from cortado.scene.solvers import OWN, PackageSolver, SolverTable
@@ -33,9 +34,9 @@ def forces_named(scene: Scene) -> tuple[ForceMaker, ...]:
 
 
 def known_in(scene: Scene) -> Known:
-    """The parameters of a scene by itself, those of parts of packages among them; raises `InputError` where two of them
-    have one name."""
+    """The parameters of a scene by itself, those of parts of packages and of solids that move among them; raises
+    `InputError` where two of them have one name."""
     own = scene.force or any(phase.rheology for phase in scene.phase) or isinstance(scene.solver, PackageSolver)
-    if not own:
+    if not (own or moving(scene.solid)):
         return REGISTRY
-    return known_of(forces_named(scene), solver_named(scene.solver))
+    return known_of(forces_named(scene), solver_named(scene.solver), scene.solid)

@@ -197,7 +197,7 @@ def stress_work(d: Discretisation) -> Any:
     """What the sum gives to solids, for the adjoint ``acceleration_bar``, with ``least`` and ``control`` as
     ``constants`` (`cortado.particles.solid_shares.solid_kernel`)."""
     precision, contact = d.precision, contact_functions(d)
-    real, vector, matrix = precision.real, precision.vector, matrix_type(precision)
+    real, vector, matrix, pair = precision.real, precision.vector, matrix_type(precision), precision.pair
     fall, hold = contact.fall, contact.hold
 
     def stress_work(
@@ -207,7 +207,7 @@ def stress_work(d: Discretisation) -> Any:
         T_i: matrix,
         eta_i: real,
         acceleration_bar_i: vector,
-        constants: precision.pair,
+        constants: pair,
         foot: vector,
         s: neighbourhood_type(precision),
     ) -> real:

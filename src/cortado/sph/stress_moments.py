@@ -166,13 +166,8 @@ def moments_work(d: Discretisation) -> Any:
     """What the sums give to solids, for their adjoints ``M_bar``, ``A_bar`` and ``R_bar``, with ``least`` the first of
     the ``constants`` (`cortado.particles.solid_shares.solid_kernel`)."""
     precision, contact = d.precision, contact_functions(d)
-    real, vector, matrix, fluidity = (
-        precision.real,
-        precision.vector,
-        matrix_type(precision),
-        fluidity_function(precision),
-    )
-    fall, hold = contact.fall, contact.hold
+    real, vector, matrix, pair = precision.real, precision.vector, matrix_type(precision), precision.pair
+    fall, hold, fluidity = contact.fall, contact.hold, fluidity_function(precision)
 
     def moments_work(
         x_ij: vector,
@@ -181,7 +176,7 @@ def moments_work(d: Discretisation) -> Any:
         M_bar_i: matrix,
         A_bar_i: matrix,
         R_bar_i: real,
-        constants: precision.pair,
+        constants: pair,
         foot: vector,
         s: neighbourhood_type(precision),
     ) -> real:

@@ -259,7 +259,7 @@ def viscosity_solid_kernel(discretisation: Discretisation, form: PairForm) -> An
     the friction as the first of the ``constants`` (`cortado.particles.solid_shares.solid_kernel`)."""
 
     def made(d: Discretisation) -> Any:
-        real, vector, phi = d.precision.real, d.precision.vector, form(d).force
+        real, vector, pair, phi = d.precision.real, d.precision.vector, d.precision.pair, form(d).force
 
         def viscosity_work(
             x_ij: vector,
@@ -268,7 +268,7 @@ def viscosity_solid_kernel(discretisation: Discretisation, form: PairForm) -> An
             m_i: real,
             mu_i: real,
             acceleration_bar_i: vector,
-            constants: d.precision.pair,
+            constants: pair,
             s: neighbourhood_type(d.precision),
         ) -> real:
             scale = constants[0] * s.volume / (m_i * n_i) * mu_i
@@ -301,10 +301,8 @@ class Viscosity:
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
         step.launch(self._kernels.adjoint, *bar.named, **self._constants, acceleration_bar=acceleration_bar)
         if bar.solids is not None and self.friction > 0.0:
-            factors = self._constants["kappa"] * self.friction, 0.0
-            bar.solids.add(
-                step.launch, self._of_solids(), *bar.named, constants=factors, acceleration_bar=acceleration_bar
-            )
+            factors, given = (self._constants["kappa"] * self.friction, 0.0), {"acceleration_bar": acceleration_bar}
+            bar.solids.add(step.launch, self._of_solids(), given, *bar.named, constants=factors)
 
 
 def force(setting: Setting) -> Viscosity | ViscousStress | None:

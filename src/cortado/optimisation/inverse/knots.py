@@ -15,9 +15,10 @@ class KnotValues:
     """Of one parameter; between two knots it changes along a straight line."""
 
     times: np.ndarray
-    """(k,) [s] A step has the value of its middle, so the first knot is half a step after the start of the run."""
+    """(k,) [s] A step has the value of its middle, so the first knot is half a step after the start of the run; that of
+    where something is is a step after it."""
     start: np.ndarray
-    """(k, d) in the unit of the parameter, as the search started."""
+    """(k, d), or (k,) of numbers, in the unit of the parameter, as the search started."""
     estimate: np.ndarray
     """(k, d) in the unit of the parameter."""
     true: np.ndarray | None
@@ -37,9 +38,11 @@ def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndar
         if isinstance(bijector, TimeInterpolation):
             true = made.true_parameter(name)
             if true is not None:
-                course = np.broadcast_to(true, (bijector.steps, *np.shape(true)[-1:]))
+                rank = made.task.known[name].rank
+                course = np.broadcast_to(true, (bijector.steps, *np.shape(true)[np.ndim(true) - rank :]))
                 true = _without_round_off(bijector.coordinate(course))
-            found[name] = KnotValues((bijector.places + 0.5) * step, made.start[name], coordinates[name], true)
+            times = (bijector.places + made.task.known[name].moment) * step
+            found[name] = KnotValues(times, made.start[name], coordinates[name], true)
     return found
 
 

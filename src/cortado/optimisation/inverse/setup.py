@@ -141,7 +141,7 @@ def _coordinates(task: Task, start: Arrays) -> dict[str, Bijector]:
     for name, value in start.items():
         if name == "mass_fractions":
             found[name] = Softmax()
-        elif name in task.known.over_time and value.ndim == 2 and task.optimise.knots is not None:
+        elif task.known.has_rows(name, value) and task.optimise.knots is not None:
             found[name] = TimeInterpolation(task.problem.steps, task.optimise.knots)
     return found
 

@@ -94,7 +94,7 @@ def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, k
             found[name] = array
             continue
         shapes = _shapes(known[name], scene, steps)
-        if name in known.over_time and array.ndim == 2 and 2 <= len(array) <= steps and array.shape[1:] == shapes[0]:
+        if known.has_rows(name, array) and 2 <= len(array) <= steps and array.shape[1:] == shapes[0]:
             array = TimeInterpolation(steps, len(array)).parameter(array)
         if array.shape not in shapes:
             wanted = _in_words(shapes)
@@ -120,7 +120,7 @@ def _check_range(parameter: Parameter, field: str, array: np.ndarray) -> None:
 
 def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mapping[str, Any], known: Known) -> None:
     """Raises `SceneError` for an option that does not fit the others, so that none is silently ignored."""
-    over_time = [name for name in known.over_time if name in start and start[name].ndim == 2]
+    over_time = [name for name in known.over_time if name in start and known.has_rows(name, start[name])]
     if optimise.knots is not None and not over_time:
         raise SceneError(None, "optimise.knots", optimise.knots, "left out, as nothing that is optimised has rows")
     if optimise.knots is not None and optimise.knots > problem.steps:
@@ -167,8 +167,8 @@ def _check_bounds(
         raise SceneError(None, field, pair.tolist(), "greater than 0, as the parameter is changed by factors")
     _check_range(known[name], field, pair)
     shape = _shapes(known[name], scene, 0)[0] if isinstance(value, str) else value.shape
-    if optimise.knots is not None and name in known.over_time and len(shape) == 2:
-        shape = (optimise.knots, shape[1])
+    if optimise.knots is not None and known.has_rows(name, value):
+        shape = (optimise.knots, *shape[1:])
     try:
         np.broadcast_to(pair[0], shape)
     except ValueError:

@@ -162,7 +162,7 @@ class QuantityEvaluator:
         if isinstance(adjoint, ParticleAdjoint) and adjoint.bar.solids is not None:
             slope_bar.assign(own.slope)
             slopes, context = wall_slope_solid_kernel(solver.discretisation), solver.context(self._rollout.parameters)
-            adjoint.bar.solids.add(context.launch, slopes, adjoint.bar.named, bar=slope_bar)
+            adjoint.bar.solids.add(context.launch, slopes, *adjoint.bar.named, bar=slope_bar)
         adjoint.from_within(self._counts, fields, p_bar, state_bar, self._rollout.parameters)
         return adjoint
 

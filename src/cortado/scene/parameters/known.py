@@ -3,6 +3,7 @@
 Without Warp."""
 
 from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,11 @@ class Known(Mapping[str, Parameter]):
         """Names of what steps depend on and has the components of a vector."""
         self.courses = {p.name: p.course for p in self.own if p.course is not None}
         """How these change while a scene runs."""
+
+    def has_rows(self, name: str, value: Any) -> bool:
+        """Whether a value of a parameter has rows in time: one for each step, or for each of some knots."""
+        parameter = self[name]
+        return parameter.axis is Axis.STEP and np.ndim(value) == parameter.rank + 1
 
     def __getitem__(self, name: str) -> Parameter:
         return self._by_name[name]

@@ -93,6 +93,8 @@ class Parameter:
     """The largest at which an optional force is likely to be stable."""
     moment: float = 0.5
     """Of a parameter over time: when within a step its row is taken from a schedule; 0 is the start, 1 the end."""
+    grows: bool = False
+    """Whether one over time is 0 where a run begins, so that a steady change of it grows."""
     course: Changing | None = None
     """How one over time, of a force of one's own, changes where it is not given."""
 

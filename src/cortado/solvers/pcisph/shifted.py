@@ -16,6 +16,7 @@ from cortado.particles.state import Layout, Parameters, State
 from cortado.solvers.loop import LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.pcisph.solver import Pcisph
+from cortado.solvers.projection.beside import beside_solid_kernel
 from cortado.solvers.projection.constants import ProjectionConstants
 from cortado.solvers.projection.shifting import shift_kernels
 from cortado.solvers.projection.surroundings import entries, surrounding_kernels
@@ -88,6 +89,7 @@ class Shift(Part):
 
     def __init__(self, maker: ShiftMaker, layout: Layout):
         precision, own = layout.precision, (maker.discretisation, maker.dimension)
+        self.discretisation = maker.discretisation
         self.surroundings, self.shift = surrounding_kernels(*own), shift_kernels(*own)
         self.place, self.place_adjoint = place_kernels(precision)
         constants = maker.constants
@@ -179,3 +181,5 @@ class ShiftAdjoint(PartAdjoint):
             step.launch(kernel, *known, self._kept, shift.kept, flow)
         for kernel in shift.surroundings.adjoint:
             step.launch(kernel, *known)
+        if bar.solids is not None:
+            bar.solids.add(step.launch, beside_solid_kernel(shift.discretisation), *known)

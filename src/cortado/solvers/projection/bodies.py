@@ -1,4 +1,4 @@
-"""Rigid bodies in a step of the projection, forward and with derivatives: see `cortado.solvers.projection.body_kernels`."""
+"""Rigid bodies in a step of the projection, and derivatives: see `cortado.solvers.projection.body_kernels`."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -9,9 +9,9 @@ impulses y, the body's density rho and its volume K in those of a particle,
 is the transpose of what its velocity adds to the divergence, - gamma_i . (V + W x r_i), of which that with the velocity
 (V_0, W_0) of its walls is counted with those of all walls. Linear momentum is kept to round-off.
 
-The particles around a light body all move it. The diagonal a_i of the iteration gets |gamma_i| sum_j |gamma_j| / (rho K)
-+ lambda |r_i x gamma_i| sum_j |r_j x gamma_j| / rho, with lambda the largest eigenvalue of I^-1, divided by which the
-body's part of the matrix has no eigenvalue beyond 2.
+The particles around a light body all move it. The diagonal a_i of the iteration gets |gamma_i| sum_j |gamma_j| / (rho
+K) + lambda |r_i x gamma_i| sum_j |r_j x gamma_j| / rho, with lambda the largest eigenvalue of I^-1, divided by which
+the body's part of the matrix has no eigenvalue beyond 2.
 """
 
 from dataclasses import dataclass

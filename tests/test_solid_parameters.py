@@ -1,0 +1,263 @@
+"""Where solids are, as parameters: reverse and forward mode of all four, in each solver and with each force."""
+
+import numpy as np
+import pytest
+
+from cortado import Problem, Simulation, certify
+from cortado.certificate.perturbations import coherent_directions, scales
+from cortado.errors import InputError, MissingDerivativeError
+from cortado.gradients import Tape
+from cortado.losses import CentreOfMass
+from cortado.losses.series import SensorMatch
+from cortado.sensors import PressureProbe, WallForce
+from finite_differences import decades, distance
+from test_moving_solids import ROTOR, WATER, plane, space
+
+PASTE = {
+    "name": "paste",
+    "rest_density": 1000.0,
+    "viscosity": 4.0,
+    "rheology": {"kind": "bingham", "yield_stress": 8.0, "regularisation": 0.5},
+}
+OIL = {"name": "oil", "rest_density": 800.0, "viscosity": 3.0}
+BALL = {
+    "name": "ball",
+    "shape": "sphere",
+    "centre": [0.45, 0.3],
+    "radius": 0.06,
+    "motion": "path",
+    "velocity": [-0.3, 0.2],
+    "slip": "free",
+}
+NOZZLE = {"phase": "water", "outlet": [0.8, 0.5], "radius": 0.08, "length": 0.2, "flow_rate": 0.2}
+PCISPH = {"kind": "pcisph", "time_step": 0.001}
+STEPS = 5
+
+
+class Weighted:
+    """The sum of weights times the squares of a quantity's values."""
+
+    def __init__(self, name, weights):
+        self.name, self.weights = name, weights
+
+    def value(self, end):
+        return float((self.weights * end[self.name] ** 2).sum())
+
+    def adjoint(self, end):
+        return {self.name: 2.0 * self.weights * end[self.name]}
+
+
+def body(phase, lower=(0.0, 0.0), upper=(0.6, 0.4)):
+    return {"shape": "box", "lower": list(lower), "upper": list(upper), "phase": phase}
+
+
+def pasty(solver, **forces):
+    return plane(ROTOR, phase=[PASTE], fluid=[body("paste")], solver=solver, forces={"viscosity": "stress", **forces})
+
+
+def periodic():
+    container = {"shape": "box", "lower": [0, 0], "upper": [0.6, 1], "periodic": [True, False], "slip": "no"}
+    return plane({**ROTOR, "lower": [0.48, 0.15], "upper": [0.68, 0.25]}, container=container)
+
+
+SCENES = {
+    "projection": lambda: plane(ROTOR),
+    "pcisph": lambda: plane(ROTOR, solver=PCISPH),
+    "space": space,
+    "space, pcisph": lambda: space(solver=PCISPH, forces={"viscosity": "stress"}),
+    "paste": lambda: pasty({"kind": "projection", "time_step": 0.001}),
+    "paste, implicit": lambda: pasty({"kind": "projection", "time_step": 0.001}, viscous_solve="implicit"),
+    "paste, implicit, pcisph": lambda: pasty(PCISPH, viscous_solve="implicit"),
+    "laminar": lambda: plane(ROTOR, solver=PCISPH, forces={"viscosity": "laminar"}),
+    "two phases": lambda: plane(
+        ROTOR, phase=[WATER, OIL], fluid=[body("water", upper=(0.6, 0.2)), body("oil", lower=(0.0, 0.2))]
+    ),
+    "belt": lambda: plane(
+        {**ROTOR, "surface_velocity": [0.7, 0.0]}, container={"shape": "box", "lower": [0, 0], "upper": [1, 1]}
+    ),
+    "two solids": lambda: plane(ROTOR, BALL),
+    "periodic": periodic,
+    "mixture": lambda: plane(
+        ROTOR,
+        phase=[WATER, OIL],
+        fluid=[body("water", upper=(0.6, 0.2)), body("oil", lower=(0.0, 0.2))],
+        mixture={"interface_width": 0.06, "mobility": 1e-3},
+    ),
+    "tension": lambda: plane(ROTOR, forces={"surface_tension": 2.0}),
+    "tension, pcisph": lambda: plane(ROTOR, solver=PCISPH, forces={"surface_tension": 2.0}),
+    "shifting": lambda: plane(ROTOR, solver={**PCISPH, "shifting": True}),
+    "emitter": lambda: plane(
+        ROTOR, emitter={"phase": "water", "outlet": [0.8, 0.5], "radius": 0.08, "length": 0.2, "flow_rate": 0.2}
+    ),
+}
+
+
+def point_of(scene, steps=STEPS, seed=0):
+    """The parameters of all solids of a scene, by name, and a direction there."""
+    random, d = np.random.default_rng(seed), scene.dimension
+    times = scene.solver.time_step * np.arange(1, steps + 1)
+    point, along = {}, {}
+    for solid in (table for table in scene.solid if table.moves):
+        angles = () if d == 2 else (3,)
+        begun = np.array(solid.rotation or (0.2,) * (2 * d - 3)).reshape(angles)
+        drift = 0.2 * np.multiply.outer(times, random.normal(size=d))
+        turned = np.multiply.outer(times, 3.0 * random.normal(size=angles))
+        own = {
+            "position": (solid.middle() + 0.003, 0.1),
+            "rotation": (begun, 1.0),
+            "displacement": (drift + 1e-5 * random.normal(size=drift.shape), 1e-3),
+            "turn": (turned + 1e-4 * random.normal(size=turned.shape), 0.01),
+        }
+        point |= {f"{solid.name}.{name}": value for name, (value, _) in own.items()}
+        along |= {f"{solid.name}.{name}": size * random.normal(size=value.shape) for name, (value, size) in own.items()}
+    return point, along
+
+
+def problem_of(scene, quantity="speed", precision="float64"):
+    simulation = Simulation(scene, precision=precision)
+    weights = np.random.default_rng(1).uniform(size=simulation.quantity(quantity).shape)
+    return Problem(simulation, STEPS, Weighted(quantity, weights))
+
+
+def check(problem, point, along):
+    """One by one reverse and forward mode, to round-off, and all of them together differences."""
+    gradient, forward = problem.value_and_gradient(point)[1], 0.0
+    for name, direction in along.items():
+        found = problem.tangent(point, {name: direction})
+        assert (gradient[name] * direction).sum() == pytest.approx(found, rel=1e-10), name
+        forward += found
+    assert distance(problem.value, point, along, forward, decades(4.0, 7.0), enough=1e-7) < 1e-6
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_all_four_have_derivatives(name):
+    scene = SCENES[name]()
+    check(problem_of(scene), *point_of(scene))
+
+
+@pytest.mark.parametrize("quantity", ["density", "pressure", "vorticity", "wall_force"])
+@pytest.mark.parametrize("kind", ["projection", "pcisph"])
+def test_losses_of_what_is_read_of_a_state_have_them(kind, quantity):
+    """As walls where they will be at the end of the next step are in it."""
+    scene = SCENES[kind]()
+    check(problem_of(scene, quantity), *point_of(scene))
+
+
+@pytest.mark.parametrize("sensor", [WallForce(upper=[0.35, 2.0], about=[0.1, 0.05]), PressureProbe([0.45, 0.2], 0.12)])
+def test_losses_of_sensors_have_them(sensor):
+    scene = plane(ROTOR)
+    loss = SensorMatch(sensor, np.zeros(len(sensor.columns(2))))
+    check(Problem(Simulation(scene, precision="float64"), STEPS, loss), *point_of(scene))
+
+
+def test_the_time_step_has_a_derivative_where_the_path_is_given():
+    scene = plane({**ROTOR, "surface_velocity": [0.7, 0.0]}, forces={"viscosity": "stress"})
+    point, along = point_of(scene)
+    check(problem_of(scene), {**point, "time_step": np.array(0.001)}, {**along, "time_step": np.array(1e-3)})
+
+
+@pytest.mark.parametrize("kind", ["projection", "pcisph"])
+def test_a_solid_that_is_told_where_it_begins_is_that_of_a_scene_that_says_so(kind):
+    """To round-off, if the fluid is there: its walls do not depend on where it begins or how it is turned."""
+    place, turned, at = [0.46, 0.21], 0.3, {"fluid": [body("water", upper=(0.3, 0.4))]}
+    solver = {"kind": kind, "time_step": 0.001}
+    told = plane({**ROTOR, "position": [0.6, 0.3]}, solver=solver, **at)
+    own = plane({**ROTOR, "position": place, "rotation": turned}, solver=solver, **at)
+    there = problem_of(own)
+    fluid = {"initial_positions": there.simulation.positions}
+    given = {**fluid, "rotor.position": place, "rotor.rotation": turned}
+    found = problem_of(told).value(given)
+    assert found == pytest.approx(there.value({}), rel=1e-12)
+    assert abs(found / problem_of(told).value(fluid) - 1.0) > 1e-6
+
+
+def test_a_displacement_and_a_turn_are_from_where_it_begins():
+    scene = plane(ROTOR)
+    point, _ = point_of(scene)
+    run = Simulation(scene, precision="float64").run(STEPS, point)
+    motion = run.solids["rotor"]
+    np.testing.assert_allclose(motion.positions[0], point["rotor.position"], rtol=1e-15)
+    np.testing.assert_allclose(motion.positions[1:], point["rotor.position"] + point["rotor.displacement"], rtol=1e-15)
+    np.testing.assert_allclose(motion.rotations[1:], point["rotor.rotation"] + point["rotor.turn"], rtol=1e-14)
+
+
+def test_scenes_of_a_batch_have_the_bits_of_single_ones():
+    scene = plane(ROTOR, BALL)
+    points = [point_of(scene, seed=seed)[0] for seed in range(2)]
+    one, loss = Simulation(scene, precision="float64"), CentreOfMass([0.5, 0.3])
+    several = Problem(Simulation(scene, batch=2, precision="float64"), STEPS, loss)
+    values, gradients = several.value_and_gradient(
+        {name: np.stack([point[name] for point in points]) for name in points[0]}
+    )
+    for b, point in enumerate(points):
+        value, gradient = Problem(one, STEPS, loss).value_and_gradient(point)
+        assert values[b] == value
+        for name, array in gradient.items():
+            np.testing.assert_array_equal(gradients[name][b], array, err_msg=name)
+
+
+def test_a_run_that_goes_on_has_the_bits_and_the_derivatives_of_a_whole_one():
+    """With the same parameters, of those over time the rows that are left."""
+    scene = plane(ROTOR)
+    simulation, (point, along) = Simulation(scene, precision="float64"), point_of(scene)
+
+    def some(values, rows):
+        return {name: value[rows] if len(value.shape and value) == STEPS else value for name, value in values.items()}
+
+    whole = simulation.run(STEPS, point)
+    first = simulation.run(2, some(point, slice(2)))
+    rest = simulation.run(STEPS - 2, some(point, slice(2, None)), state=first.last_state)
+    np.testing.assert_array_equal(rest.positions[-1], whole.positions[-1])
+    np.testing.assert_array_equal(rest.solids["rotor"].rotations, whole.solids["rotor"].rotations[2:])
+    check(
+        Problem(simulation, STEPS - 2, CentreOfMass([0.5, 0.3])).beginning_at(first.last_state),
+        some(point, slice(2, None)),
+        some(along, slice(2, None)),
+    )
+
+
+def test_in_single_precision_they_are_right_to_its_digits():
+    scene = plane(ROTOR, forces={"viscosity": "stress"})
+    point, _ = point_of(scene)
+    exact, found = (problem_of(scene, precision=p).value_and_gradient(point)[1] for p in ("float64", "float32"))
+    for name, array in exact.items():
+        np.testing.assert_allclose(found[name], array, atol=1e-2 * np.abs(array).max(), err_msg=name)
+
+
+def test_a_certificate_moves_a_path_steadily_and_finds_its_derivatives_right():
+    """It does not let a solid jump in the first step."""
+    scene = plane(ROTOR)
+    problem, (point, _) = problem_of(scene), point_of(scene)
+    along = coherent_directions(problem, point, scales(problem, point), np.random.default_rng(0))
+    for name in ("rotor.displacement", "rotor.turn"):
+        rows = along[name].reshape(STEPS, -1)
+        np.testing.assert_allclose(rows, np.multiply.outer(np.arange(1, STEPS + 1) / STEPS, rows[-1]), rtol=1e-12)
+    assert certify(problem, point).right
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("rotor.position", np.zeros((STEPS, 2)), r"has shape \(5, 2\), but must be \(2,\) in m"),
+        ("rotor.rotation", [0.1, 0.2], r"has shape \(2,\), but must be \(\) in rad"),
+        ("rotor.displacement", np.zeros((3, 2)), r"has shape \(3, 2\), but must be \(2,\) or \(5, 2\) in m"),
+        ("rotor.turn", np.zeros((STEPS, 1)), r"has shape \(5, 1\), but must be \(\) or \(5,\) in rad"),
+        ("rotor.position", [np.nan, 0.0], "has a value that is not finite"),
+        ("ball.position", [0.1, 0.1], r"'ball.position' is unknown, but must be one of .*, rotor.turn in this scene"),
+    ],
+)
+def test_a_bad_place_is_a_sentence(name, value, sentence):
+    with pytest.raises(InputError, match=sentence):
+        problem_of(plane(ROTOR)).value({name: value})
+
+
+def test_a_solid_at_rest_is_no_parameter():
+    fixed = {name: ROTOR[name] for name in ("name", "shape", "lower", "upper")}
+    with pytest.raises(InputError, match=r"'rotor.position' is unknown"):
+        problem_of(plane(fixed)).value({"rotor.position": [0.3, 0.2]})
+
+
+def test_a_tape_beside_solids_that_move_is_refused():
+    problem = problem_of(SCENES["pcisph"]())
+    with pytest.raises(MissingDerivativeError, match=r"solids that move have no tape: try gradients.Exact"):
+        problem.value_and_gradient({"rotor.position": [0.3, 0.2]}, gradient=Tape())
