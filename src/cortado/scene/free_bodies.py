@@ -1,5 +1,9 @@
 """What bodies that are free need of a scene, and where they may begin."""
 
+import numpy as np
+
+from cortado.discretise.shapes import Points
+from cortado.discretise.solids.solid import Solid
 from cortado.errors import Words
 from cortado.scene.fields import field_error
 from cortado.scene.model import SceneTables
@@ -8,8 +12,9 @@ from cortado.scene.sentences import point_in_words
 
 DEEPEST = 0.25
 """In spacings: how deep bodies may begin in walls and in each other."""
-FINE = 0.5
-"""In spacings: the width of faces by whose corners round bodies are looked at."""
+FINE, MOST = 0.5, 40
+"""In spacings: how far apart the points are by which a body is looked at, of which there are at most so many along an
+axis."""
 
 
 def check_free(scene: SceneTables) -> None:
@@ -29,7 +34,7 @@ def check_free(scene: SceneTables) -> None:
     for index, table in enumerate(scene.solid):
         if table.motion != "free":
             continue
-        points = table.solid().faces(FINE * spacing).vertices
+        points = _within(table.solid(), FINE * spacing)
         depths = [("the container", region.distance(points))]
         others = (other for other in scene.solid if other is not table)
         depths += [(f"the solid {other.name!r}", -other.solid().distance(points)) for other in others]
@@ -38,3 +43,10 @@ def check_free(scene: SceneTables) -> None:
                 place = point_in_words(points[depth.argmax()])
                 wanted = f"at most a quarter of a spacing, {DEEPEST * spacing:g} m, in it"
                 raise field_error(("solid", index), Words(f"{depth.max():g} m deep in {name} at {place}"), wanted)
+
+
+def _within(solid: Solid, step: float) -> Points:
+    """(n, d) the corners of a solid, and points of a lattice in it."""
+    sides = [np.linspace(a, b, min(int((b - a) / step) + 2, MOST)) for a, b in zip(*solid.extent(), strict=True)]
+    points = np.stack([axis.ravel() for axis in np.meshgrid(*sides, indexing="ij")], axis=-1)
+    return np.concatenate([solid.faces(step).vertices, points[solid.distance(points) < 0.0]])

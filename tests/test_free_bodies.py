@@ -1,0 +1,286 @@
+"""Rigid bodies that fluid moves: momenta, floating, contact, derivatives, states, and what is refused."""
+
+import numpy as np
+import pytest
+
+from cortado import InputError, Problem, Scene, SceneError, Simulation
+from cortado.discretise.solids.mass import Mass
+from cortado.errors import MissingDerivativeError
+from cortado.gradients import ImplicitPressure, Tape
+from cortado.losses import CentreOfMass, SolidPose
+from cortado.solvers.contact_strength import STIFFNESS
+
+RAFT = {
+    "name": "raft",
+    "shape": "box",
+    "lower": [0.2, 0.32],
+    "upper": [0.45, 0.48],
+    "motion": "free",
+    "density": 500.0,
+    "rotation": 0.2,
+    "velocity": [0.1, -0.3],
+    "angular_velocity": 2.0,
+}
+BRICK = {
+    **RAFT,
+    "lower": [0.1, 0.22, 0.1],
+    "upper": [0.3, 0.36, 0.25],
+    "rotation": [0.2, 0.1, -0.3],
+    "velocity": [0.1, -0.3, 0.1],
+    "angular_velocity": [1.0, 2.0, -3.0],
+}
+
+
+def plane(*solids, **tables):
+    fluid = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.6, 0.4], "phase": "water"}
+    return Scene(
+        **{
+            "dimension": 2,
+            "discretisation": {"spacing": 0.05},
+            "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 1.0}],
+            "fluid": [fluid],
+            "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]},
+            "solver": {"kind": "projection", "time_step": 0.001},
+            "solid": list(solids),
+            **tables,
+        }
+    )
+
+
+def space(*solids, **tables):
+    fluid = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.4, 0.3, 0.4], "phase": "water"}
+    container = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [0.5, 0.6, 0.4]}
+    return plane(*solids, **{"dimension": 3, "fluid": [fluid], "container": container, **tables})
+
+
+def begun(scene):
+    """What the bodies of a scene begin with, as parameters."""
+    found = {}
+    for table in scene.solid:
+        flat = scene.dimension == 2
+        turned = table.rotation or (0.0,) * (2 * scene.dimension - 3)
+        found[f"{table.name}.position"] = np.array(table.middle())
+        found[f"{table.name}.rotation"] = np.array(turned[0] if flat else turned)
+        if table.motion == "free":
+            found[f"{table.name}.velocity"] = np.array(table.velocity)
+            found[f"{table.name}.density"] = np.array(table.density)
+            if table.angular_velocity is not None:
+                turning = table.angular_velocity
+                found[f"{table.name}.angular_velocity"] = np.array(turning[0] if flat else turning)
+    return found
+
+
+def touching():
+    """Two bodies on the floor that touch each other, and an arm that comes down on one."""
+    raft = {**RAFT, "lower": [0.2, -0.002], "upper": [0.45, 0.18], "rotation": 0.01, "angular_velocity": 0.5}
+    ball = {"name": "ball", "shape": "sphere", "centre": [0.52, 0.14], "radius": 0.08, "motion": "free"}
+    ball |= {"density": 300.0, "velocity": [-0.3, 0.1]}
+    arm = {"name": "arm", "shape": "box", "lower": [0.3, 0.175], "upper": [0.36, 0.3]}
+    return plane(raft, ball, {**arm, "motion": "path", "velocity": [0.0, -0.2]})
+
+
+def touching_in_space():
+    raft = {**BRICK, "lower": [0.2, -0.002, 0.1], "upper": [0.4, 0.14, 0.3], "rotation": [0.01, 0.02, 0.01]}
+    ball = {"name": "ball", "shape": "sphere", "centre": [0.3, 0.22, 0.2], "radius": 0.085, "motion": "free"}
+    return space(raft, {**ball, "density": 300.0, "velocity": [0.0, -0.4, 0.1]})
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_mass_has_the_volume_and_the_inertia_of_its_shape(dimension):
+    table = (plane(RAFT) if dimension == 2 else space(BRICK)).solid[0]
+    mass, sides = Mass.of(table.own_solid()), np.subtract(table.upper, table.lower)
+    assert mass.volume == pytest.approx(np.prod(sides), rel=2e-3)
+    about_z = np.prod(sides) * (sides[0] ** 2 + sides[1] ** 2) / 12.0
+    assert mass.inertia[2, 2] == pytest.approx(about_z, rel=3e-3)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_body_and_fluid_in_free_space_keep_their_momentum(dimension):
+    """Water hits a body; without the body's share of the pressures it would keep its velocity."""
+    s = 0.05 if dimension == 2 else 0.08
+    ends = [-0.5] + [-0.25] * (dimension - 1), [-0.1] + [0.25] * (dimension - 1)
+    water = {"shape": "box", "lower": ends[0], "upper": ends[1], "phase": "water"}
+    water["velocity"] = [1.0, 0.2, 0.0][:dimension]
+    body = {"name": "raft", "shape": "box", "lower": [0.0, -0.4, -0.3][:dimension], "motion": "free"}
+    body |= {"upper": [0.3, 0.1, 0.1][:dimension], "density": 400.0}
+    scene = plane(
+        body,
+        dimension=dimension,
+        discretisation={"spacing": s},
+        fluid=[water],
+        container={"shape": "none"},
+        forces={"gravity": [0.0] * dimension},
+        solver={"kind": "projection", "time_step": 0.002},
+    )
+    run = Simulation(scene, precision="float64").run(200, record_every=50)
+    solid = run.solids["raft"]
+    mass = 400.0 * Mass.of(scene.solid[0].own_solid()).volume
+    momentum = 1000.0 * s**dimension * run.velocities.sum(axis=1) + mass * solid.velocities
+    assert np.abs(momentum - momentum[0]).max() < 1e-12 * np.abs(momentum[0]).max()
+    assert solid.velocities[-1][0] > 0.3
+
+
+def test_a_body_in_nothing_falls_and_turns_as_bodies_do():
+    """Far from water: free fall, and a turn that keeps the angular momentum, here about an axis between its own."""
+    scene = space({**BRICK, "lower": [0.1, 0.45, 0.1], "upper": [0.2, 0.5, 0.25]}, container={"shape": "none"})
+    run = Simulation(scene, precision="float64").run(100, record_every=20)
+    solid, t = run.solids["raft"], 0.001 * np.arange(0, 101, 20)
+    assert np.allclose(solid.velocities[:, 1], -0.3 - 9.81 * t, rtol=1e-12)
+    inertia = Mass.of(scene.solid[0].own_solid()).inertia
+    from scipy.spatial.transform import Rotation
+
+    R = Rotation.from_rotvec(solid.rotations).as_matrix()
+    L = np.einsum("fij,jk,flk,fl->fi", R, inertia, R, solid.angular_velocities)
+    assert np.abs(L - L[0]).max() < 1e-12 * np.abs(L[0]).max()
+    assert np.abs(solid.angular_velocities - solid.angular_velocities[0]).max() > 0.1
+
+
+@pytest.mark.slow
+def test_a_box_floats_as_deep_as_it_should():
+    raft = {
+        "name": "raft",
+        "shape": "box",
+        "lower": [0.3, 0.3],
+        "upper": [0.7, 0.5],
+        "motion": "free",
+        "density": 500.0,
+    }
+    scene = plane(
+        raft,
+        discretisation={"spacing": 0.025},
+        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 5.0}],
+        fluid=[{"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 0.4], "phase": "water"}],
+    )
+    simulation = Simulation(scene)
+    run = simulation.run(1500, record_every=75)
+    level = len(simulation.positions) * 0.025**2 + 0.5 * 0.4 * 0.2
+    drafts = level - (run.solids["raft"].positions[:, 1] - 0.1)
+    assert drafts[10:].mean() == pytest.approx(0.1, rel=0.03)
+
+
+def test_a_body_lies_on_the_floor():
+    """Held by its contact alone: n points as deep as d push it with n d^3 / sqrt(n d^4) = sqrt(n) d."""
+    box = {"name": "raft", "shape": "box", "lower": [0.7, 0.0], "upper": [0.9, 0.1], "motion": "free", "density": 500.0}
+    solid = Simulation(plane(box), precision="float64").run(150, record_every=1).solids["raft"]
+    alone = 9.81 * 0.001**2 / STIFFNESS
+    assert alone / np.sqrt(20.0) < 0.05 - solid.positions[-1, 1] < alone / 2.0
+    assert np.abs(solid.velocities[-20:]).max() < 1e-3
+    assert np.abs(solid.positions[:, 0] - 0.8).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("made", "loss"),
+    [
+        (lambda: plane(RAFT), CentreOfMass([0.5, 0.3])),
+        (lambda: space(BRICK), SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
+        (touching, SolidPose("raft", [0.3, 0.2], 0.3, length=0.2)),
+        (touching_in_space, SolidPose("raft", [0.3, 0.2, 0.2], [0.3, 0.1, 0.2], length=0.2)),
+    ],
+    ids=["plane", "space", "touching", "touching in space"],
+)
+def test_derivatives_of_bodies(made, loss):
+    """Reverse and forward mode to round-off, and differences, of all that a body begins with and of its density."""
+    scene = made()
+    problem, random = Problem(Simulation(scene, precision="float64"), 6, loss), np.random.default_rng(3)
+    values = {**begun(scene), "gravity": np.array([0.5, -9.81, 0.2][: scene.dimension])}
+    scales = {"density": 50.0, "position": 0.01}
+    along = {
+        name: scales.get(name.split(".")[-1], 0.3) * random.normal(size=np.shape(value))
+        for name, value in values.items()
+    }
+    _, gradient = problem.value_and_gradient(values)
+    for name, change in along.items():
+        forward = problem.tangent(values, {name: change})
+        assert (gradient[name] * change).sum() == pytest.approx(forward, rel=1e-10)
+    forward = problem.tangent(values, along)
+
+    def value(h):
+        return problem.value({name: values[name] + h * along[name] for name in along})
+
+    assert min(abs((value(h) - value(-h)) / (2.0 * h) / forward - 1.0) for h in (1e-5, 1e-6, 1e-7)) < 1e-6
+
+
+def test_the_time_step_has_a_derivative_beside_bodies():
+    problem = Problem(Simulation(space(BRICK), precision="float64"), 6, SolidPose("raft", [0.3, 0.2, 0.2]))
+    _, gradient = problem.value_and_gradient({"time_step": 0.001})
+    value = [problem.value({"time_step": 0.001 + h}) for h in (-1e-8, 1e-8)]
+    assert gradient["time_step"] == pytest.approx(problem.tangent({"time_step": 0.001}, {"time_step": 1.0}), rel=1e-10)
+    assert gradient["time_step"] == pytest.approx((value[1] - value[0]) / 2e-8, rel=1e-5)
+
+
+def test_a_run_goes_on_from_a_state_with_the_same_bits():
+    simulation = Simulation(touching())
+    whole, first = simulation.run(20), simulation.run(8)
+    rest = simulation.run(12, state=first.last_state)
+    assert np.array_equal(whole.positions[-1], rest.positions[-1])
+    assert np.array_equal(whole.solids["raft"].rotations[-1], rest.solids["raft"].rotations[-1])
+    with pytest.raises(InputError, match=r"parameter raft\.velocity is given, but must be left out with a state"):
+        simulation.run(1, controls={"raft.velocity": [0.0, 0.0]}, state=first.last_state)
+
+
+def test_a_batch_has_the_bits_of_single_runs():
+    scene, loss = touching(), SolidPose("raft", [0.3, 0.2], 0.3)
+    densities = [300.0, 700.0]
+    single = [Problem(Simulation(scene), 8, loss).value_and_gradient({"raft.density": rho}) for rho in densities]
+    several = Problem(Simulation(scene, batch=2), 8, loss).value_and_gradient({"raft.density": np.array(densities)})
+    for b, (value, gradient) in enumerate(single):
+        assert several[0][b] == value
+        assert several[1]["raft.density"][b] == gradient["raft.density"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "tables", "sentence"),
+    [
+        ({"density": None}, {}, r"solid\[0\]\.density is missing, but must be a density"),
+        ({"density": -1.0}, {}, r"solid\[0\]\.density"),
+        ({"motion": "fixed"}, {}, r"solid\[0\]\.density is 500"),
+        ({"slip": "no"}, {}, r"solid\[0\]\.slip .* fluid does not rub"),
+        ({"side": "inside"}, {}, r"solid\[0\]\.side"),
+        ({"times": [0.0, 1.0]}, {}, r"solid\[0\]\.times"),
+        ({"surface_velocity": [1.0, 0.0]}, {}, r"solid\[0\]\.surface_velocity"),
+        ({"lower": [-0.1, 0.3]}, {}, r"solid\[0\] is .* m deep in the container at"),
+        ({}, {"solver": {"time_step": 0.001}}, r"solver\.kind is 'pcisph', but must be \"projection\""),
+        ({}, {"forces": {"pressure": False}}, r"forces\.pressure"),
+    ],
+)
+def test_what_a_body_cannot_be_is_a_sentence(changes, tables, sentence):
+    with pytest.raises(SceneError, match=sentence):
+        plane({name: value for name, value in {**RAFT, **changes}.items() if value is not None}, **tables)
+
+
+def test_bodies_do_not_begin_in_each_other():
+    with pytest.raises(SceneError, match=r"solid\[0\] is .* m deep in the solid 'other' at"):
+        plane(RAFT, {**RAFT, "name": "other", "rotation": 0.3})
+
+
+@pytest.mark.parametrize("estimator", [Tape(), ImplicitPressure()])
+def test_what_has_no_derivative_beside_bodies_says_so(estimator):
+    problem = Problem(Simulation(plane(RAFT)), 3, CentreOfMass([0.5, 0.3]))
+    with pytest.raises(MissingDerivativeError):
+        problem.value_and_gradient({"gravity": [0.0, -9.81]}, gradient=estimator)
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"name": "raft"}, "position and rotation are left out"),
+        ({"name": 3, "position": [0.0, 0.0]}, "name is 3"),
+        ({"name": "raft", "position": [0.0, 0.0], "length": 0.0}, "length is 0.0"),
+    ],
+)
+def test_a_bad_pose_is_a_sentence(given, sentence):
+    with pytest.raises(InputError, match=sentence):
+        SolidPose(**given)
+
+
+@pytest.mark.parametrize(
+    ("loss", "sentence"),
+    [
+        (SolidPose("boat", [0.0, 0.0]), "name is 'boat', but must be that of a solid that moves: raft"),
+        (SolidPose("raft", [0.0, 0.0, 0.0]), r"position has shape \(3,\), but must be \(2,\)"),
+        (SolidPose("raft", rotation=[0.0, 0.0, 0.0]), r"rotation has shape \(3,\), but must be \(1,\)"),
+    ],
+)
+def test_a_pose_of_another_scene_is_a_sentence(loss, sentence):
+    with pytest.raises(InputError, match=sentence):
+        Problem(Simulation(plane(RAFT)), 1, loss).value({})
