@@ -35,6 +35,11 @@ class Precision:
         """Of a number."""
         return np.dtype(self.numpy).itemsize
 
+    @property
+    def six(self) -> Any:
+        """Warp vector type of six components: a symmetric matrix."""
+        return _vector_type(self.real, 6)
+
     def fractions(self, phases: int) -> Any:
         """Warp vector type of one number for each phase."""
         return _vector_type(self.real, phases)

@@ -20,6 +20,8 @@ class Loads:
     """Of an array of vectors, one after the other in memory."""
     number: Any
     """Of an array of numbers, one after the other in memory."""
+    six: Any
+    """Of an array of six numbers each, one after the other in memory: in three loads on a GPU, and not in six."""
 
 
 @cache
@@ -29,7 +31,7 @@ def loads(precision: Precision, taped: bool) -> Loads:
 
 
 def _of_warp(precision: Precision) -> Loads:
-    real, vector = precision.real, precision.vector
+    real, vector, six = precision.real, precision.vector, precision.six
 
     @wp.func
     def neighbour(lists: wp.array2d(dtype=wp.int32), k: int, i: int) -> int:
@@ -43,11 +45,18 @@ def _of_warp(precision: Precision) -> Loads:
     def load_number(a: wp.array(dtype=real), j: int) -> real:
         return a[j]
 
-    return Loads(neighbour, load_vector, load_number)
+    @wp.func
+    def load_six(a: wp.array(dtype=six), j: int) -> six:
+        return a[j]
+
+    return Loads(neighbour, load_vector, load_number, load_six)
 
 
 def _direct(precision: Precision) -> Loads:
-    real, vector = precision.real, precision.vector
+    real, vector, six = precision.real, precision.vector, precision.six
+    two = {4: "float2", 8: "double2"}[precision.bytes]
+    by_two = f"const {two}* p = (const {two}*)(a.data + j); {two} u = p[0], v = p[1], w = p[2]; "
+    by_two += "return {{u.x, u.y, v.x, v.y, w.x, w.y}};"
     place = "(long long)i * lists.strides[1] + (long long)k * lists.strides[0]"
 
     @wp.func_native(f"return *(const int*)((const char*)lists.data + {place});")
@@ -59,4 +68,7 @@ def _direct(precision: Precision) -> Loads:
     @wp.func_native("return a.data[j];")
     def load_number(a: wp.array(dtype=real), j: int) -> real: ...
 
-    return Loads(neighbour, load_vector, load_number)
+    @wp.func_native(f"#if defined(__CUDA_ARCH__)\n{by_two}\n#else\nreturn a.data[j];\n#endif\n")
+    def load_six(a: wp.array(dtype=six), j: int) -> six: ...
+
+    return Loads(neighbour, load_vector, load_number, load_six)

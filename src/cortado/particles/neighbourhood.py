@@ -148,6 +148,7 @@ class PairFunctions:
     wall_turn_dot: Any
     vectors: Any
     numbers: Any
+    sixes: Any
 
 
 @cache
@@ -159,8 +160,8 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
     ``per_size`` (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction
     per_size x . G, of second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the
     list of i), ``wall_position`` and others, which load what a wall particle has, ``weight_in`` (its weight if it is of
-    the given moving solid, and 0 if not); and ``vectors`` and ``numbers``, which load what `UNROLL` neighbours have
-    before any of it is used, so that the loads do not wait for one another (on a GPU a tenth of a whole step).
+    the given moving solid, and 0 if not); and ``vectors``, ``numbers`` and ``sixes``, which load what `UNROLL` neighbours
+    have before any of it is used, so that the loads do not wait for one another (on a GPU a tenth of a whole step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
@@ -169,7 +170,8 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
     smooth_slope_gradient = smooth.slope_gradient
     reciprocal = arithmetic(discretisation.precision, discretisation.taped).reciprocal
     load = loads(discretisation.precision, discretisation.taped)
-    load_neighbour, load_vector, load_number = load.neighbour, load.vector, load.number
+    load_neighbour, load_vector, load_number, load_six = load.neighbour, load.vector, load.number, load.six
+    six, six_rows = discretisation.precision.six, wp.types.matrix(shape=(UNROLL, 6), dtype=real)
     rows = wp.types.matrix(shape=(UNROLL, 3), dtype=real)
     row = wp.types.vector(length=UNROLL, dtype=real)
 
@@ -291,6 +293,15 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
             load_number(a, neighbour(k + 3, i, s)),
         )
 
+    @wp.func
+    def sixes(a: wp.array(dtype=six), k: int, i: int, s: neighbourhood) -> six_rows:
+        return wp.matrix_from_rows(
+            load_six(a, neighbour(k, i, s)),
+            load_six(a, neighbour(k + 1, i, s)),
+            load_six(a, neighbour(k + 2, i, s)),
+            load_six(a, neighbour(k + 3, i, s)),
+        )
+
     return PairFunctions(
         separation=nearest_image if discretisation.periodic else difference,
         weight=weight,
@@ -315,4 +326,5 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         wall_turn_dot=wall_turn_dot,
         vectors=vectors,
         numbers=numbers,
+        sixes=sixes,
     )

@@ -52,7 +52,8 @@ def over_fluid(
     ``ahead`` loads what `UNROLL` neighbours have before any of it is used, so that loads do not wait for one another;
     ``numbered`` loops know the number _j of a neighbour, ``separated`` ones _x_ij.
     """
-    loads = {d.precision.vector: "_vectors", d.precision.real: "_numbers"} if ahead else {}
+    kinds = {d.precision.vector: "_vectors", d.precision.real: "_numbers", d.precision.six: "_sixes"}
+    loads = kinds if ahead else {}
     loaded = {array: loads[kind] for array, kind in arrays.items() if kind in loads}
     of_j = {array: f"_{array}_j[_more]" if array in loaded else f"{array}[_j]" for array in arrays}
     return OVER_FLUID.format(
@@ -129,6 +130,7 @@ def _known(d: Discretisation) -> dict[str, Any]:
         "neighbour",
         "vectors",
         "numbers",
+        "sixes",
         "wall_position",
         "wall_weight",
         "wall_grip",

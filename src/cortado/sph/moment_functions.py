@@ -48,7 +48,7 @@ class Symmetric:
 def symmetric(precision: Precision) -> Symmetric:
     """Of a precision."""
     vector, matrix = precision.vector, matrix_type(precision)
-    six = wp.types.vector(length=6, dtype=precision.real)
+    six = precision.six
 
     @wp.func
     def pack(M: matrix) -> six:
