@@ -2,7 +2,7 @@
 
 Steps are launched in chunks without a host read in between; at the end of a chunk the host looks whether the
 neighbour lists were long enough (if not, they grow and the chunk is repeated) and whether a particle was lost. A chunk
-of steps, or a step back, is a captured graph on a GPU, and on a CPU where launches take one thread.
+of steps, or a step back or along, is a captured graph on a GPU, and on a CPU where launches take one thread.
 """
 
 from collections.abc import Callable, Mapping
@@ -94,8 +94,8 @@ class Rollout:
         self._series = StateSeries(self.initial, length)
         self._chunk = [self._series.state(k) for k in range(length)]
         """The states of the last chunk."""
-        self._tangent: tuple[Parameters, StepTangent] | None = None
-        """The last one, with the tangents of the parameters that it was made for."""
+        self._tangent: tuple[Parameters, StepTangent, State] | None = None
+        """The last one, with the tangents of the parameters that it was made for, and that of the present state."""
         self._generation = -1
         self._forget_stale_graphs()
         self.goes_on = False
@@ -224,6 +224,7 @@ class Rollout:
         self._chunks: dict[int, CapturedGraph] = {}
         """Graphs by their number of steps."""
         self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
+        self._steps_along: dict[Counts, CapturedGraph] = {}
 
     # ---- derivatives ---------------------------------------------------------------------------------------------
 
@@ -269,22 +270,30 @@ class Rollout:
 
     @in_turn
     def tangent(self, dot: State, parameters_dot: Parameters, observe: Observer) -> None:
-        """From ``dot``, the tangent of the first state, to that of every state, given to ``observe``; `forward` has
-        run with these parameters."""
+        """From ``dot``, the tangent of the first state, which becomes that of the last, to those of all states, which
+        ``observe`` is given; `forward` has run with these parameters."""
         self._require("along a tangent", self._run)
-        solver, state = self.solver, self._buffer
-        solver.set_substeps(self.substeps)
+        self.solver.set_substeps(self.substeps)
+        self._forget_stale_graphs()
         if self._tangent is None or self._tangent[0] is not parameters_dot:
-            self._tangent = parameters_dot, solver.tangent(parameters_dot)
-        derivative = self._tangent[1]
-        state.assign(self.initial)
-        observe(0, dot)
+            self._tangent = parameters_dot, self.solver.tangent(parameters_dot), self.solver.new_state()
+            self._steps_along.clear()
+        _, derivative, present = self._tangent
+        self._buffer.assign(self.initial)
+        present.assign(dot)
+        observe(0, present)
         for n in range(self.steps):
-            counts = self._seek(n)
-            solver.replay(state, self.parameters, counts)
-            derivative.step(counts, dot, self.parameters)
-            solver.write_state(counts, self.parameters, state)
-            observe(n + 1, dot)
+            if (counts := self._seek(n)) not in self._steps_along:
+                work = partial(self._step_along, derivative, counts, present)
+                self._steps_along[counts] = CapturedGraph(work, self.solver.launch)
+            self._steps_along[counts]()
+            observe(n + 1, present)
+        dot.assign(present)
+
+    def _step_along(self, derivative: StepTangent, counts: Counts, dot: State) -> None:
+        self.solver.replay(self._buffer, self.parameters, counts)
+        derivative.step(counts, dot, self.parameters)
+        self.solver.write_state(counts, self.parameters, self._buffer)
 
     def last_state(self) -> State:
         """The state after all steps of the last forward run, for a way back that is about to begin."""

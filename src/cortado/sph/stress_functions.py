@@ -137,7 +137,8 @@ def stress_functions(precision: Precision, dimension: int, law: Law, module: Any
         mu_dot = wp.ddot(by_M, M_dot) + wp.ddot(by_A, A_dot) + by_R * R_dot + by_mu * mu_i_dot
         mu_dot += wp.dot(by_theta, theta_dot)
         T_dot = matrix()
-        for k in range(9):
+        count = int(9)  # not a number: Warp would write the gradient out for each
+        for k in range(count):
             entry = matrix()
             entry[k // 3, k % 3] = real(1.0)
             for_M, for_A, for_mu, _for_C, _for_entry = wp.grad(traction_work)(M, A_u, mu, control, entry)

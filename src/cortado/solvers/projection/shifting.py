@@ -167,7 +167,8 @@ def shift_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         member = i // s.particles
         dt, A_dot = time_step[member], wp.matrix_from_rows(row_x, row_y, row_z)
         total = vector()
-        for k in range(3):
+        count = int(3)  # not a number: Warp would write the gradient out for each
+        for k in range(count):
             unit = vector()
             unit[k] = real(1.0)
             by_A, by_crowd, by_M, by_g, by_gamma, by_u, by_dt = along(

@@ -238,7 +238,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         M_i_dot, Q_i_dot = change(diagonal, others), change(square, mixed)
         M, Q, g, gamma, nu, m_i = of.M[i], of.Q[i], of.g[i], of.gamma[i], of.nu[i], m[i]
         L_dot, weights_dot, a_dot = matrix(), weights4(), real(0.0)
-        for k in range(14):
+        count = int(14)  # not a number: Warp would write the gradient out for each
+        for k in range(count):
             L_unit, a_unit, weights_unit = matrix(), real(0.0), weights4()
             if k < 9:
                 L_unit[k // 3, k % 3] = real(1.0)
