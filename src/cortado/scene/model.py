@@ -11,7 +11,7 @@ from pydantic import Field, ValidationInfo, create_model, field_validator, model
 from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import EmitterTable
 from cortado.scene.fields import Colour, Flag, Several, Text, Vector, count, field_error, quantity
-from cortado.scene.fluids import AnyFluid
+from cortado.scene.filled_shapes import AnyFluid
 from cortado.scene.mixture import MixtureTable
 from cortado.scene.package_tables import AnyForces
 from cortado.scene.parameters.registry import PARAMETERS
