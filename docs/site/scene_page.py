@@ -239,6 +239,11 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "radius = 0.4\nheight = 0.7\nthickness = 0.1\nrotation = [0.0, 0.0, 0.2]",
             ),
             (
+                "PlaneSolid",
+                "### A plane",
+                '[[solid]]\nname = "slope"\nshape = "plane"\nposition = [0.5, 0.2, 0.25]\nnormal = [-0.3, 1.0, 0.0]',
+            ),
+            (
                 "MeshSolid",
                 "### A mesh from a file",
                 '[[solid]]\nname = "block"\nshape = "mesh"\nfile = "block.stl"\nscale = 0.001\n'

@@ -166,7 +166,10 @@ class SceneTables(Table):
             if table.name in [one.name for one in tables[:index]]:
                 wanted = f"another name than those of the {info.field_name}s before"
                 raise field_error((index, "name"), table.name, wanted)
-        return cls._resolve_fluids(tables, info)
+        tables = cls._resolve_fluids(tables, info)
+        if info.field_name != "solid" or not {"dimension", "container"} <= set(info.data):
+            return tables
+        return tuple(solid.in_container(info.data["container"], (index,)) for index, solid in enumerate(tables))
 
     @field_validator("fluid")
     @classmethod

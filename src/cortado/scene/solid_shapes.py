@@ -10,6 +10,7 @@ from cortado.discretise.solids.solid import Box, Polygon, Revolved, Round, Solid
 from cortado.scene.fields import FieldPath, Length, Vector, field_error, quantity
 from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
 from cortado.scene.outlines import MeshShape, PolygonShape
+from cortado.scene.planes import PlaneSolid
 from cortado.scene.solids import SolidTable
 
 Size = Annotated[float, quantity("m", gt=0.0)]
@@ -162,6 +163,6 @@ class MeshSolid(MeshShape, SolidTable):
 
 
 AnySolid = Annotated[
-    BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid | MeshSolid,
+    BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid | PlaneSolid | MeshSolid,
     Field(discriminator="shape"),
 ]

@@ -11,6 +11,7 @@ from pydantic import BeforeValidator, Field
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.solid import Hollow, Placed, Solid
 from cortado.errors import Words, shown
+from cortado.scene.containers import Container
 from cortado.scene.fields import MISSING, Colour, FieldPath, Length, Text, field_error, quantity
 from cortado.scene.tables import Table
 
@@ -87,6 +88,10 @@ class SolidTable(Table):
     @abstractmethod
     def thinnest(self) -> float:
         """Of its thinnest part [m]; infinite where that is not known."""
+
+    def in_container(self, container: Container, path: FieldPath) -> Self:
+        """This table, at a path, as it is in a container, which shapes without an end need to know."""
+        return self
 
     def wall_count(self, spacing: float) -> float:
         """About how many wall particles one layer has, without making any."""
