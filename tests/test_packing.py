@@ -54,10 +54,9 @@ def near_air(scene: Scene, found: DiscreteScene) -> np.ndarray:
     places = np.stack(np.meshgrid(*[np.arange(a, b, SPACING / 2) for a, b in ends]), axis=-1).reshape(-1, x.shape[1])
     empty = scene.container.region(scene.dimension).distance(places) < 0.0
     for fluid in scene.fluid:
-        region = (
-            Region.between(*map(np.array, (fluid.lower, fluid.upper))) if fluid.shape == "box" else fluid.region(0.1)
-        )
-        empty &= region.distance(places) > 0.0
+        ends = (np.array(fluid.lower), np.array(fluid.upper)) if fluid.shape == "box" else None
+        outside = fluid.distance(places, SPACING) if ends is None else Region.between(*ends).distance(places)
+        empty &= outside > 0.0
     lower, lengths = period(scene)
     return are_near(x, places[empty], reach, lower, lengths) if empty.any() else np.zeros(len(x), dtype=bool)
 

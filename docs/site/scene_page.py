@@ -130,6 +130,19 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 '[[fluid]]\nshape = "cylinder"\nbase = [0.5, 0.1, 0.25]\nradius = 0.2\nheight = 0.4\nphase = "water"',
             ),
             (
+                "MeshFluid",
+                "### Fluid in a mesh",
+                '[[fluid]]\nshape = "mesh"\nfile = "block.stl"\nscale = 0.001\nposition = [0.3, 0.3, 0.25]\n'
+                'rotation = [0.0, 0.5, 0.0]\nphase = "water"',
+            ),
+            (
+                "PolygonFluid",
+                "### Fluid in a polygon",
+                'name = "a wedge"\ndimension = 2\n\n[[fluid]]\nshape = "polygon"\n'
+                'corners = [[0.0, 0.0], [0.6, 0.0], [0.0, 0.6]]\nphase = "water"\n\n'
+                '[container]\nshape = "box"\nlower = [0.0, 0.0]\nupper = [1.0, 1.0]',
+            ),
+            (
                 "PointsFluid",
                 "### Fluid from a file",
                 '[[fluid]]\nshape = "points"\nfile = "drop.npy"\nphase = "water"',
@@ -224,6 +237,11 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
                 "### A cup",
                 '[container]\nshape = "none"\n\n[[solid]]\nname = "cup"\nshape = "cup"\nbase = [0.25, -0.1, 0.25]\n'
                 "radius = 0.4\nheight = 0.7\nthickness = 0.1\nrotation = [0.0, 0.0, 0.2]",
+            ),
+            (
+                "PlaneSolid",
+                "### A plane",
+                '[[solid]]\nname = "slope"\nshape = "plane"\nposition = [0.5, 0.2, 0.25]\nnormal = [-0.3, 1.0, 0.0]',
             ),
             (
                 "MeshSolid",

@@ -13,6 +13,7 @@ from cortado.device.precision import Precision
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.particles.loads import loads
 from cortado.particles.smoothing import smoothing_functions
+from cortado.particles.wall_functions import wall_functions
 
 UNROLL = 4
 """Fluid neighbours that a loop takes at a time, so that their loads overlap; lists are filled up to a multiple of it
@@ -160,8 +161,9 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
     ``per_size`` (1 / (|x|^2 + 0.01 h^2), which covers coincident particles), ``factor`` (F = laplacian_correction
     per_size x . G, of second derivatives after Brookshaw 1985) and ``factor_gradient``; ``neighbour`` (the k-th in the
     list of i), ``wall_position`` and others, which load what a wall particle has, ``weight_in`` (its weight if it is of
-    the given moving solid, and 0 if not); and ``vectors``, ``numbers`` and ``sixes``, which load what `UNROLL` neighbours
-    have before any of it is used, so that the loads do not wait for one another (on a GPU a tenth of a whole step).
+    the given moving solid, and 0 if not); and ``vectors``, ``numbers`` and ``sixes``, which load what `UNROLL`
+    neighbours have before any of it is used, so that the loads do not wait for one another (on a GPU a tenth of a whole
+    step).
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood = neighbourhood_type(discretisation.precision)
@@ -233,49 +235,6 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         return load_neighbour(s.neighbours, k, i)
 
     @wp.func
-    def wall_position(b: int, s: neighbourhood) -> vector:
-        return load_vector(s.wall_positions, b)
-
-    @wp.func
-    def wall_weight(b: int, s: neighbourhood) -> real:
-        return load_number(s.wall_weights, b)
-
-    @wp.func
-    def wall_grip(b: int, s: neighbourhood) -> real:
-        return load_number(s.wall_grips, b)
-
-    @wp.func
-    def wall_foot(b: int, s: neighbourhood) -> vector:
-        return load_vector(s.wall_feet, b)
-
-    @wp.func
-    def wall_velocity(b: int, s: neighbourhood) -> vector:
-        return load_vector(s.wall_velocities, b)
-
-    @wp.func
-    def wall_solid(b: int, s: neighbourhood) -> int:
-        return s.wall_solids[b]
-
-    @wp.func
-    def weight_in(b: int, solid: int, s: neighbourhood) -> real:
-        weight = real(0.0)
-        if s.wall_solids[b] == solid:
-            weight = load_number(s.wall_weights, b)
-        return weight
-
-    @wp.func
-    def wall_position_dot(b: int, s: neighbourhood) -> vector:
-        return load_vector(s.wall_positions_dot, b)
-
-    @wp.func
-    def wall_velocity_dot(b: int, s: neighbourhood) -> vector:
-        return load_vector(s.wall_velocities_dot, b)
-
-    @wp.func
-    def wall_turn_dot(b: int, s: neighbourhood) -> vector:
-        return load_vector(s.wall_turns_dot, b)
-
-    @wp.func
     def vectors(a: wp.array(dtype=vector), k: int, i: int, s: neighbourhood) -> rows:
         return wp.matrix_from_rows(
             load_vector(a, neighbour(k, i, s)),
@@ -314,16 +273,7 @@ def pair_functions(discretisation: Discretisation) -> PairFunctions:
         factor=factor,
         factor_gradient=factor_gradient,
         neighbour=neighbour,
-        wall_position=wall_position,
-        wall_weight=wall_weight,
-        wall_grip=wall_grip,
-        wall_foot=wall_foot,
-        wall_velocity=wall_velocity,
-        wall_solid=wall_solid,
-        weight_in=weight_in,
-        wall_position_dot=wall_position_dot,
-        wall_velocity_dot=wall_velocity_dot,
-        wall_turn_dot=wall_turn_dot,
+        **wall_functions(discretisation.precision, discretisation.taped, neighbourhood),
         vectors=vectors,
         numbers=numbers,
         sixes=sixes,

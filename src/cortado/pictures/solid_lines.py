@@ -23,7 +23,7 @@ def solid_outline(scene: Scene) -> Points:
 def own_faces(shown: ShownSolid) -> Faces:
     """Faces of a solid about its middle, not turned, few enough for lines and for viewers."""
     sizes = np.ptp(shown.shape.extent(), axis=0)
-    return shown.shape.faces(np.pi / SIDES * float(max(sizes.min(), 0.25 * sizes.max())))
+    return shown.shape.shown_faces(np.pi / SIDES * float(max(sizes.min(), 0.25 * sizes.max())))
 
 
 def own_lines(shown: ShownSolid) -> Points:

@@ -75,7 +75,7 @@ class SolidSurfaces:
 def _mesh_of(shown: ShownSolid, size: float) -> SolidMesh:
     """That of a solid about its middle; of a tank its outside is within the cavity."""
     own = float(np.ptp(shown.shape.extent(), axis=0).max())
-    faces = shown.shape.faces(min(FINE * size, FINE_OWN * own))
+    faces = shown.shape.shown_faces(min(FINE * size, FINE_OWN * own))
     longest = np.inf if shown.transparency == 1.0 else LONGEST * size  # what is clear has no light of its own
     return SolidMesh.of(faces.reversed() if shown.is_tank else faces, longest)
 

@@ -13,15 +13,13 @@ import numpy as np
 from cortado.discretise.pairs import apart, pairs_within
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import Points, grid
-from cortado.scene.fluids import Fluid, RegionFluid, RoundFluid
+from cortado.scene.fluids import ALIGNED, Fluid, RegionFluid
 
 FINER = 4
 """Cells at the surface are cut into so many along each axis to measure a volume."""
 LOOSENESS, MOST_LOOSENESS = 0.05, 0.008
 """Particles that a round body lacks, over those in its outermost spacing, and over all of its own: particles off the
 lattice see each other as denser than as many on it, by 4 % with the Wendland kernels and a support of 2 spacings."""
-ALIGNED = 1e-3
-"""In spacings: by how much the surface of a solid may be off the faces of the cells that are outside of it."""
 FAR = 4.0
 """In spacings: how deep in a body depths are told apart."""
 DIGITS = 6
@@ -31,8 +29,8 @@ DIGITS = 6
 def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGuard[RegionFluid]:
     """Whether particles of a body may have another density than the lattice: where its own surface cuts cells, or where
     it is no further than ``reach`` [m] from a solid."""
-    if not isinstance(fluid, RegionFluid) or isinstance(fluid, RoundFluid):
-        return isinstance(fluid, RoundFluid)
+    if not isinstance(fluid, RegionFluid) or fluid.cuts_cells(spacing):
+        return isinstance(fluid, RegionFluid)
     return bool(len(room.solids) and (room.from_solids(fluid.particles(spacing), reach) < reach).any())
 
 
@@ -48,7 +46,7 @@ class CutBody:
     def distance(self, points: Points, reach: float) -> Points:
         """(n,) how far points (n, d) [m] are outside of the body, negative inside [m]. What is not less than a reach
         [m] in size may be any other number of its sign that is not."""
-        return np.maximum(self.fluid.region(self.spacing).distance(points), self.room.distance(points, reach))
+        return np.maximum(self.fluid.distance(points, self.spacing, reach), self.room.distance(points, reach))
 
     def shares(self, points: Points) -> Points:
         """(n,) the part of the cell around each of the points (n, d) [m] that is within the body."""
@@ -83,8 +81,8 @@ class CutBody:
         return points[np.sort(np.argsort(depths, kind="stable")[: self.count])]
 
     def _cuts_cells(self) -> bool:
-        """Whether a surface goes through cells: that of a round body, or that of a solid."""
-        if isinstance(self.fluid, RoundFluid):
+        """Whether a surface goes through cells: that of the body, or that of a solid."""
+        if self.fluid.cuts_cells(self.spacing):
             return True
         from_solids = self.room.from_solids(self.fluid.particles(self.spacing), self.spacing)
         return bool((np.abs(from_solids) < (0.5 - ALIGNED) * self.spacing).any())

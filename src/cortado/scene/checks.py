@@ -15,11 +15,11 @@ from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
 from cortado.scene.free_bodies import check_free
 from cortado.scene.mixture import MixtureTable
 from cortado.scene.model import SceneTables
+from cortado.scene.outlines import MeshShape
 from cortado.scene.overlaps import check_distinct, check_overlaps
 from cortado.scene.parameters.registry import BY_NAME
 from cortado.scene.room import room_of
 from cortado.scene.sentences import point_in_words
-from cortado.scene.solid_shapes import MeshSolid
 from cortado.scene.solids import check_solid
 from cortado.scene.stability import chosen_limits
 
@@ -92,14 +92,11 @@ def _check_phases(scene: SceneTables) -> None:
 
 
 def _check_files(scene: SceneTables) -> None:
-    for index, solid in enumerate(scene.solid):
-        if isinstance(solid, MeshSolid):
-            try:
-                size = scene.discretisation.spacing, scene.discretisation.support_radius
-                read_mesh(solid.file, solid.scale, *size, scene.container.extent())
-            except InputError as error:
-                sentence = f"cannot be used: {error}"
-                raise field_error(("solid", index, "file"), solid.file, "a file of a mesh", sentence) from None
+    support = scene.discretisation.support_radius
+    for name, tables, reach in (("solid", scene.solid, support), ("fluid", scene.fluid, None)):
+        for index, table in enumerate(tables):
+            if isinstance(table, MeshShape):
+                _check_mesh(scene, (name, index, "file"), table, reach)
     for index, fluid in enumerate(scene.fluid):
         if isinstance(fluid, PointsFluid):
             try:
@@ -107,6 +104,14 @@ def _check_files(scene: SceneTables) -> None:
             except InputError as error:
                 sentence = f"cannot be used: {error}"
                 raise field_error(("fluid", index, "file"), fluid.file, "a file of positions", sentence) from None
+
+
+def _check_mesh(scene: SceneTables, path: FieldPath, table: MeshShape, reach: float | None) -> None:
+    """A mesh can be read, and it fits beside the particles; ``reach`` is the support of a solid's [m]."""
+    try:
+        read_mesh(table.file, table.scale, scene.discretisation.spacing, reach, scene.container.extent())
+    except InputError as error:
+        raise field_error(path, table.file, "a file of a mesh", f"cannot be used: {error}") from None
 
 
 def _check_counts(scene: SceneTables) -> None:
@@ -156,7 +161,7 @@ def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
     """Containers are convex: if the corners of a box around the particles are inside, all are. A body that is too long
     along an axis is refused before any of its particles is made."""
     spacing = scene.discretisation.spacing
-    if scene.container.contains(fluid.corners(spacing), 1e-6 * spacing).all():
+    if scene.container.contains(fluid.box_corners(spacing), 1e-6 * spacing).all():
         return
     region, (lower, upper) = scene.container.region(scene.dimension), fluid.extent(spacing)
     for ends, beyond in ((lower, region.lower - lower), (upper, upper - region.upper)):

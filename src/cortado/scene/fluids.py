@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import ValidationInfo, field_validator, model_validator
 
 from cortado.discretise.region import Region
 from cortado.discretise.room import Room
@@ -15,6 +15,8 @@ from cortado.scene.points import read_points
 from cortado.scene.tables import Table
 
 INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
+ALIGNED = 1e-3
+"""In spacings: by how much a surface may be off the faces of cells that it does not cut."""
 
 
 class FluidBody(Table):
@@ -42,7 +44,7 @@ class Fluid(FluidBody):
     velocity: Vector[Annotated[float, quantity("m/s")]] = (0.0, 0.0, 0.0)
     """(d,) Velocity at the start [m/s]."""
 
-    def corners(self, spacing: float) -> Points:
+    def box_corners(self, spacing: float) -> Points:
         """(2^d, d) the corners of the extent [m]."""
         return corners(*self.extent(spacing))
 
@@ -81,8 +83,13 @@ class RegionFluid(LatticeFluid):
     """A body that fills a region."""
 
     @abstractmethod
-    def region(self, spacing: float) -> Region:
-        """What it fills; of a box its whole cells."""
+    def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
+        """(n,) how far points (n, d) [m] are outside of what it fills, of a box its whole cells, negative inside [m].
+        What is not less than a reach [m] in size may be any other number of its sign that is not."""
+
+    def cuts_cells(self, spacing: float) -> bool:
+        """Whether its surface goes through cells of the lattice."""
+        return False
 
     def lattice(self, spacing: float, reach: float) -> Points:
         """(n, d) [m] points of a lattice in the box around the shape and as far as ``reach`` [m] beyond it, one for
@@ -107,12 +114,12 @@ class BoxFluid(RegionFluid):
     def block(self, spacing: float) -> Block:
         return block_between(self.lower, self.upper, spacing)
 
-    def region(self, spacing: float) -> Region:
+    def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
         first, last = self.block(spacing).extent
-        return Region.between(first - 0.5 * spacing, last + 0.5 * spacing)
+        return Region.between(first - 0.5 * spacing, last + 0.5 * spacing).distance(points)
 
     def witnesses(self, spacing: float) -> Points:
-        return self.corners(spacing)
+        return self.box_corners(spacing)
 
 
 class RoundFluid(RegionFluid):
@@ -121,7 +128,10 @@ class RoundFluid(RegionFluid):
 
     def particles(self, spacing: float) -> Points:
         points = self.block(spacing).points()
-        return points[self.region(spacing).contains(points, 0.0)]
+        return points[self.distance(points, spacing, spacing) <= 0.0]
+
+    def cuts_cells(self, spacing: float) -> bool:
+        return True
 
 
 class SphereFluid(RoundFluid):
@@ -136,8 +146,8 @@ class SphereFluid(RoundFluid):
     def block(self, spacing: float) -> Block:
         return block_about(self.centre, np.full(len(self.centre), self.radius), spacing)
 
-    def region(self, spacing: float) -> Region:
-        return Region.ball(np.array(self.centre), self.radius)
+    def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
+        return Region.ball(np.array(self.centre), self.radius).distance(points)
 
 
 class CylinderFluid(RoundFluid):
@@ -165,8 +175,9 @@ class CylinderFluid(RoundFluid):
         standing = np.where(np.arange(3) == axis, base + 0.5 * spacing, block.first)
         return Block(standing, block.counts, spacing)
 
-    def region(self, spacing: float) -> Region:
-        return Region.cylinder(np.array(self.base), self.radius, self.height, INDEX_OF_AXIS[self.axis])
+    def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
+        axis = INDEX_OF_AXIS[self.axis]
+        return Region.cylinder(np.array(self.base), self.radius, self.height, axis).distance(points)
 
     def lattice(self, spacing: float, reach: float) -> Points:
         """Stretched along the axis, so that whole layers fill the height, and narrowed across it by as much."""
@@ -205,9 +216,6 @@ class PointsFluid(Fluid):
 
     def particles(self, spacing: float) -> Points:
         return self.points().copy()
-
-
-AnyFluid = Annotated[BoxFluid | CylinderFluid | SphereFluid | PointsFluid, Field(discriminator="shape")]
 
 
 def beside_scene(file: str, info: ValidationInfo) -> str:

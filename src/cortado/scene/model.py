@@ -11,7 +11,7 @@ from pydantic import Field, ValidationInfo, create_model, field_validator, model
 from cortado.scene.containers import AnyContainer, NoContainer
 from cortado.scene.emitter import EmitterTable
 from cortado.scene.fields import Colour, Flag, Several, Text, Vector, count, field_error, quantity
-from cortado.scene.fluids import AnyFluid
+from cortado.scene.filled_shapes import AnyFluid
 from cortado.scene.mixture import MixtureTable
 from cortado.scene.package_tables import AnyForces
 from cortado.scene.parameters.registry import PARAMETERS
@@ -166,7 +166,10 @@ class SceneTables(Table):
             if table.name in [one.name for one in tables[:index]]:
                 wanted = f"another name than those of the {info.field_name}s before"
                 raise field_error((index, "name"), table.name, wanted)
-        return cls._resolve_fluids(tables, info)
+        tables = cls._resolve_fluids(tables, info)
+        if info.field_name != "solid" or not {"dimension", "container"} <= set(info.data):
+            return tables
+        return tuple(solid.in_container(info.data["container"], (index,)) for index, solid in enumerate(tables))
 
     @field_validator("fluid")
     @classmethod

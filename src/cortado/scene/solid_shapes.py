@@ -1,18 +1,16 @@
 """The shapes that solids may have."""
 
-from dataclasses import replace
-from functools import lru_cache
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from cortado.discretise.shapes import Points
-from cortado.discretise.solids.mesh import Mesh
-from cortado.discretise.solids.mesh_files import mesh_in_file
 from cortado.discretise.solids.solid import Box, Polygon, Revolved, Round, Solid
-from cortado.scene.fields import FieldPath, Length, Text, Vector, field_error, quantity
-from cortado.scene.fluids import INDEX_OF_AXIS, beside_scene, check_order, refuse_plane
+from cortado.scene.fields import FieldPath, Length, Vector, field_error, quantity
+from cortado.scene.fluids import INDEX_OF_AXIS, check_order, refuse_plane
+from cortado.scene.outlines import MeshShape, PolygonShape
+from cortado.scene.planes import PlaneSolid
 from cortado.scene.solids import SolidTable
 
 Size = Annotated[float, quantity("m", gt=0.0)]
@@ -150,96 +148,21 @@ class CupSolid(SolidTable):
         return moment / (whole - cavity)
 
 
-class PolygonSolid(SolidTable):
+class PolygonSolid(PolygonShape, SolidTable):
     """A polygon, in 2-D."""
-
-    shape: Literal["polygon"] = "polygon"
-    corners: Annotated[
-        tuple[Annotated[tuple[Length, ...], Field(min_length=2, max_length=2)], ...], Field(min_length=3)
-    ]
-    """(m, 2) The corners, one after the other along the edge, either way round [m]."""
-
-    @model_validator(mode="after")
-    def _check_sides(self) -> Self:
-        if crossing := _crossing(np.array(self.corners)):
-            first, second = crossing
-            wanted = f"corners of sides that do not cross, as sides {first} and {second} do"
-            raise field_error(("corners",), self.corners, wanted)
-        return self
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        if dimension == 3:
-            raise field_error((*path, "shape"), "polygon", '"box", "sphere", "capsule", "cylinder" or "cup" in 3-D')
-        return super().in_dimension(dimension, path)
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        corners = np.array(self.corners)
-        following = np.roll(corners, -1, axis=0)
-        parts = corners[:, 0] * following[:, 1] - following[:, 0] * corners[:, 1]
-        middle = ((corners + following) * parts[:, None]).sum(axis=0) / (3.0 * parts.sum())
-        return Polygon(corners - middle), middle
 
     def thinnest(self) -> float:
         return np.inf
 
 
-class MeshSolid(SolidTable):
+class MeshSolid(MeshShape, SolidTable):
     """What a mesh of triangles holds, in 3-D."""
-
-    shape: Literal["mesh"] = "mesh"
-    file: Text
-    """Its name: STL, OBJ, PLY, glTF or GLB; beside the scene file, and absolute once read."""
-    scale: Annotated[float, quantity(gt=0.0)] = 1.0
-    """What its lengths are multiplied with, such as 0.001 where they are millimetres."""
-
-    @field_validator("file")
-    @classmethod
-    def _make_absolute(cls, file: str, info: ValidationInfo) -> str:
-        return beside_scene(file, info)
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        if dimension == 2:
-            raise field_error((*path, "shape"), "mesh", '"box", "sphere", "capsule", "cup" or "polygon" in 2-D')
-        return super().in_dimension(dimension, path)
-
-    def shape_about(self) -> tuple[Solid, Points]:
-        return _about_middle(mesh_in_file(self.file).mesh, self.scale)
 
     def thinnest(self) -> float:
         return np.inf
 
 
 AnySolid = Annotated[
-    BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid | MeshSolid,
+    BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid | PlaneSolid | MeshSolid,
     Field(discriminator="shape"),
 ]
-
-
-@lru_cache(maxsize=8)
-def _about_middle(mesh: Mesh, scale: float) -> tuple[Mesh, Points]:
-    """A mesh times a scale, about its middle, and where that is (3,) [m]; once, as looking it up takes a tree."""
-    middle = scale * mesh.middle()
-    return replace(mesh, vertices=scale * mesh.vertices - middle), middle
-
-
-def _crossing(corners: Points) -> tuple[int, int] | None:
-    """The numbers of two sides of a polygon that meet beside its corners, or of one without a length."""
-    count, sides = len(corners), np.roll(corners, -1, axis=0) - corners
-
-    def turned(a: Points, b: Points) -> float:
-        return float(a[0] * b[1] - a[1] * b[0])
-
-    for first in range(count):
-        if not sides[first].any():
-            return first, first
-        for second in range(first + 1, count):
-            apart = corners[second] - corners[first]
-            across = turned(sides[first], sides[second])
-            if (second - first) in (1, count - 1):  # neighbours, which may only lie on each other
-                if across == 0.0 and sides[first] @ sides[second] < 0.0:
-                    return first, second
-            elif across != 0.0:
-                along = turned(apart, sides[second]) / across, turned(apart, sides[first]) / across
-                if all(0.0 <= part <= 1.0 for part in along):
-                    return first, second
-    return None

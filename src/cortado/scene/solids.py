@@ -11,6 +11,7 @@ from pydantic import BeforeValidator, Field
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.solid import Hollow, Placed, Solid
 from cortado.errors import Words, shown
+from cortado.scene.containers import Container
 from cortado.scene.fields import MISSING, Colour, FieldPath, Length, Text, field_error, quantity
 from cortado.scene.tables import Table
 
@@ -91,6 +92,10 @@ class SolidTable(Table):
     def thinnest(self) -> float:
         """Of its thinnest part [m]; infinite where that is not known."""
 
+    def in_container(self, container: Container, path: FieldPath) -> Self:
+        """This table, at a path, as it is in a container, which shapes without an end need to know."""
+        return self
+
     def wall_count(self, spacing: float) -> float:
         """About how many wall particles one layer has, without making any."""
         lower, upper = self.shape_about()[0].extent()
@@ -118,11 +123,16 @@ class SolidTable(Table):
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         self.check_components(("position", "velocity", "surface_velocity"), dimension, path)
         for name in ("rotation", "angular_velocity"):
-            if (value := getattr(self, name)) is not None and len(value) != 2 * dimension - 3:
-                wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
-                raise field_error((*path, name), value, wanted)
+            check_turn((*path, name), getattr(self, name), dimension)
         _check_motion(self, dimension, path)
         return super().in_dimension(dimension, path)
+
+
+def check_turn(path: FieldPath, value: tuple[float, ...] | None, dimension: int) -> None:
+    """A rotation or an angular velocity, if given, is a number in 2-D and a vector in 3-D."""
+    if value is not None and len(value) != 2 * dimension - 3:
+        wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
+        raise field_error(path, value, wanted)
 
 
 def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:

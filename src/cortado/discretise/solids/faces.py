@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import corners as corners_of
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,25 @@ def box_faces(half: Points) -> Faces:
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
     squares = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     return Faces(half * signs, np.array([t for a, b, c, d in squares for t in ((a, b, c), (a, c, d))]))
+
+
+def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -> Faces:
+    """Of the part of a box, between corners (d,) [m], that is below a plane with a unit normal (d,) at a height along
+    it [m]."""
+    from scipy.spatial import ConvexHull
+
+    ends = corners_of(lower, upper)
+    heights = ends @ normal - height
+    first, second = np.nonzero((heights[:, None] < 0.0) & (heights[None] > 0.0))
+    edges = (ends[first] != ends[second]).sum(axis=1) == 1
+    first, second = first[edges], second[edges]
+    along = (heights[first] / (heights[first] - heights[second]))[:, None]
+    hull = ConvexHull(np.concatenate([ends[heights <= 0.0], ends[first] + along * (ends[second] - ends[first])]))
+    if len(lower) == 2:
+        return polygon_faces(hull.points[hull.vertices])
+    a, b, c = np.moveaxis(hull.points[hull.simplices], 1, 0)
+    inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0.0
+    return Faces(hull.points, np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices).astype(np.int64))
 
 
 def polygon_faces(corners: Points) -> Faces:

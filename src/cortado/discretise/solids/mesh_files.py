@@ -11,7 +11,7 @@ import numpy as np
 from cortado.discretise.shapes import Points
 from cortado.discretise.solids.mesh import Mesh
 from cortado.discretise.solids.mesh_checks import FoundMesh, found_mesh
-from cortado.discretise.solids.mesh_fit import check_fit
+from cortado.discretise.solids.mesh_fit import check_fit, check_unit
 from cortado.discretise.solids.triangle_tree import Numbers
 from cortado.errors import CortadoWarning, InputError, Words, shown
 from cortado.files.input_files import reason, regular_file
@@ -26,10 +26,11 @@ def read_mesh(
     path: str,
     scale: float,
     spacing: float,
-    support: float,
+    support: float | None = None,
     container: tuple[Points, Points] | None = None,
 ) -> Mesh:
-    """A solid out of a file, beside particles a spacing [m] apart that see each other up to a support [m].
+    """A solid out of a file, beside particles a spacing [m] apart that see each other up to a support [m], or a body of
+    fluid, which may be as thin as it likes.
 
     Raises `InputError`, a sentence that names the file and says what is wrong, where, and what to do; warns with
     `CortadoWarning` of what is probably not meant.
@@ -38,12 +39,17 @@ def read_mesh(
         path: of the file.
         scale: what its lengths are multiplied with, 0.001 where they are millimetres.
         spacing: [m].
-        support: [m].
+        support: [m]; None of a body of fluid.
         container: lower and upper corner, each (3,) [m], of the box around the container of the fluid, if there is one.
     """
     found = mesh_in_file(path)
     mesh = replace(found.mesh, vertices=scale * found.mesh.vertices)
-    for note in (*found.notes, *check_fit(mesh, repr(path), scale, spacing, support, container)):
+    notes, what = found.notes, repr(path)
+    if support is None:
+        check_unit(mesh, what, scale, spacing, container)
+    else:
+        notes = (*notes, *check_fit(mesh, what, scale, spacing, support, container))
+    for note in notes:
         warnings.warn(note, CortadoWarning, stacklevel=2)
     return mesh
 

@@ -32,14 +32,14 @@ def check_fit(
 
     ``container``: lower and upper corner, each (3,) [m], of the box around it.
     """
-    lower, upper = mesh.extent()
-    length = float((upper - lower).max())
-    _check_unit(length, what, scale, spacing, None if container is None else float(np.ptp(container, axis=0).max()))
+    check_unit(mesh, what, scale, spacing, container)
     return tuple(_thickness_notes(mesh, what, spacing, support))
 
 
-def _check_unit(length: float, what: str, scale: float, spacing: float, room: float | None) -> None:
-    """``length`` of the mesh and of the ``room`` [m]."""
+def check_unit(mesh: Mesh, what: str, scale: float, spacing: float, container: tuple[Points, Points] | None) -> None:
+    """The first part of `check_fit`: raises `InputError` where a mesh is far too large or too small."""
+    length = float(np.ptp(mesh.extent(), axis=0).max())
+    room = None if container is None else float(np.ptp(container, axis=0).max())
     beside = 100.0 * spacing if room is None else room
     if length > TOO_LARGE * beside:
         times = f"{length / spacing:,.0f} spacings" if room is None else f"{length / room:,.0f} times the container"

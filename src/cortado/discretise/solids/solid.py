@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points, across
-from cortado.discretise.solids.faces import Faces, arc, box_faces, polygon_faces, revolved_faces
+from cortado.discretise.solids.faces import Faces, arc, box_faces, cut_box_faces, polygon_faces, revolved_faces
 
 Which = NDArray[np.bool_]
 
@@ -31,6 +31,10 @@ class Solid(ABC):
     @abstractmethod
     def faces(self, fine: float) -> Faces:
         """Its surface in flat faces, some ``fine`` [m] wide where it is round."""
+
+    def shown_faces(self, fine: float) -> Faces:
+        """The same as pictures have it: within the box around it."""
+        return self.faces(fine)
 
     def distance_up_to(self, points: Points, reach: float) -> Points:
         """(n,) the `distance` of points (n, d) [m] where it is less than a reach [m] in size; elsewhere what has its
@@ -234,6 +238,9 @@ class HalfSpace(Solid):
         middle = 0.5 * (self.lower + self.upper)
         top = middle - (middle @ self.normal - self.height) * self.normal
         return box_faces(np.full(len(middle), size)).moved(_standing(self.normal), top - size * self.normal)
+
+    def shown_faces(self, fine: float) -> Faces:
+        return cut_box_faces(self.lower, self.upper, self.normal, self.height)
 
 
 @dataclass(frozen=True)
