@@ -50,13 +50,14 @@ SLOW = {
     "test_browser",
     "test_docs",
     "test_examples",
+    "test_held_water",
     "test_kernel_cache",
     "test_memory",
     "test_readme",
     "test_silence",
     "test_terminal",
 }
-"""Files: pages in a browser, processes that compile kernels, examples, documents' code."""
+"""Files: pages in a browser, processes that compile kernels, examples, documents' code, solids in water."""
 SLOW_TESTS = {
     "test_certificate": {
         "test_a_sign_flipped_is_found_in_float32",

@@ -1,16 +1,20 @@
-"""How near are flows beside solids that move to what is known? ``python validation/solids.py [--only cavity]`` prints
-the greatest errors over the speed of what moves; 7 minutes on one core for the cavity at a Reynolds number of 400."""
+"""How near are flows beside solids to what is known, and do solids hold water? ``python validation/solids.py [--only
+cavity]`` prints what each case found; 7 minutes on one core for the cavity at a Reynolds number of 400."""
 
 import argparse
 import csv
+import sys
 import time
 import warnings
 from pathlib import Path
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from cortado import Scene, Simulation
 from cortado.errors import CortadoWarning
+from held_water import MESHES, cup_turned, meshes, stirred
+from piston_waves import piston
 
 DATA = Path(__file__).parents[1] / "tests" / "data"
 FRAMES = 60
@@ -71,6 +75,11 @@ def _at(point: np.ndarray, x: np.ndarray, values: np.ndarray, width: float) -> f
 CASES = {
     "cavity, Re 100, 50 x 50": lambda: cavity(50, 100, 12.0),
     "cavity, Re 400, 50 x 50": lambda: cavity(50, 400, 40.0),
+    "stirred, 8,000 particles": lambda: stirred(92, 2000),
+    "cup-turned, 8,000 particles": lambda: cup_turned(100, 4000),
+    **{f"meshes, 500 steps, {name}": lambda name=name: meshes(500, name) for name in MESHES},
+    "piston, kd = 1.5, 20 deep": lambda: piston(20, 1.5, 0.03),
+    "piston, kd = 1.5, 30 deep": lambda: piston(30, 1.5, 0.03),
 }
 
 

@@ -86,14 +86,14 @@ class ExposedSurface:
 
     def walls(self, layers: WallLayers, planes: Planes) -> WallPoints:
         """Wall particles in layers at the depths of those of flat walls, each with the weight of as much of a flat wall
-        as its part of the layer is, and less where it is less deep: it counts the same for the first row of fluid."""
+        as its part of the layer is, and less where it is less deep: it counts the same for the first row of fluid. None
+        counts as deeper than its layer, as those may seem whose foot is hidden where parts of a solid overlap."""
         parts, first_row = [], 0.5 * self.spacing
         for depth, weight in zip(layers.depths, layers.weights, strict=True):
             found = self.beneath(depth)
             feet = self._feet_of(found.points) - found.points
-            depths, which = np.unique(
-                np.round(np.linalg.norm(feet, axis=1) / self.spacing, DIGITS), return_inverse=True
-            )
+            found_depths = np.minimum(np.linalg.norm(feet, axis=1) / self.spacing, depth / self.spacing + TOLERANCE)
+            depths, which = np.unique(np.round(found_depths, DIGITS), return_inverse=True)
             seen = np.array([planes.weight(first_row + self.spacing * one) for one in depths])[which]
             parts.append(
                 WallPoints(found.points, weight * found.shares * planes.weight(first_row + depth) / seen, feet)
